@@ -1,7 +1,7 @@
-"""Overhead of the Gymnasium environment over `env.step`: the same environment, in turns.
+"""Overhead of the Gymnasium environment over `env.step`: the same environment, alternating.
 
-Ends of episodes are spread over all steps, as in training. With `final observations`, `env.step` observes episodes
-as they end, which the Gymnasium environment needs; without, it does not.
+Ends of episodes are spread over all steps, as in training. With `final observations`, `env.step` records final
+observations, as required by the Gymnasium environment.
 """
 
 from __future__ import annotations

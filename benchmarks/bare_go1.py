@@ -1,10 +1,10 @@
-"""The comparison: Go1 on flat ground with `mujoco.batch` and rsl_rl, and nothing between them.
+"""Baseline: Go1 on flat ground with `mujoco.batch` and rsl_rl only.
 
 Model, control, observations, commands and pushes are those of `Mjlab-Velocity-Flat-Unitree-Go1`, and
-contacts as simple as its `cpu` profile makes them (here also where the policy is evaluated); rewards
-are a few lines written by hand, and PPO is rsl_rl's with the settings of the profile, but for mirror
-images. `python benchmarks/bare_go1.py MINUTES SEED` trains for so long, evaluating as it goes, and
-prints one line of JSON for each evaluation.
+contacts are simplified as in its `cpu` profile (here also in evaluations); rewards
+are hand-written, and PPO is rsl_rl's with the settings of the profile, without mirror
+images. `python benchmarks/bare_go1.py MINUTES SEED` trains and evaluates, and
+prints one line of JSON per evaluation.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class BareGo1(VecEnv):
         return rotate_back(qpos[:, 3:7], qvel[:, :3]), qvel[:, 3:6]
 
     def errors(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return how far linear (N,) and angular velocity (N,) are from the command."""
+        """Return the errors of linear (N,) and angular velocity (N,)."""
         linear, angular = self.velocities()
         return (
             (self._command[:, :2] - linear[:, :2]).norm(dim=1),
@@ -186,7 +186,7 @@ def evaluate(env: BareGo1, policy: Any) -> dict[str, float]:
 
 
 def profile_cfg() -> tuple[dict[str, Any], int]:
-    """Return the learner's config, as rsl_rl takes it, and the number of environments."""
+    """Return rsl_rl's learner config and the number of environments."""
     from dataclasses import asdict
 
     from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
@@ -197,7 +197,7 @@ def profile_cfg() -> tuple[dict[str, Any], int]:
         for unused in ("cnn_cfg", "rnn_type", "rnn_hidden_dim", "rnn_num_layers"):
             cfg[model].pop(unused)
     cfg["critic"].pop("distribution_cfg")
-    # Mirror images are made of the task's observation terms.
+    # Mirror images require the task's observation terms.
     cfg["algorithm"]["symmetry_cfg"] = None
     return cfg, load_env_cfg(task, profile="cpu").scene.num_envs
 
@@ -215,16 +215,16 @@ def main() -> None:
         runner.learn(every, init_at_random_ep_len=iterations == 0)
         iterations += every
         with torch.inference_mode():
-            figures = evaluate(beside, runner.get_inference_policy())
+            metrics = evaluate(beside, runner.get_inference_policy())
         seconds = time.perf_counter() - begin
         samples = iterations * num_envs * cfg["num_steps_per_env"]
         print(
             json.dumps(
-                {"seconds": seconds, "iterations": iterations, "samples": samples} | figures
+                {"seconds": seconds, "iterations": iterations, "samples": samples} | metrics
             ),
             flush=True,
         )
-        if figures["linear"] < 0.25 and figures["angular"] < 0.35 and figures["falls"] < 0.05:
+        if metrics["linear"] < 0.25 and metrics["angular"] < 0.35 and metrics["falls"] < 0.05:
             break
 
 

@@ -1,4 +1,4 @@
-"""The comparison: cartpole swing-up with `mujoco.batch` and rsl_rl, and nothing between them.
+"""Baseline: cartpole swing-up with `mujoco.batch` and rsl_rl only.
 
 Model, reward, observations, episode length and PPO settings are those of the task; everything is
 written out by hand for this one task. `python benchmarks/bare_loop.py ITERATIONS SEED` prints the

@@ -1,13 +1,13 @@
-"""Images a second of the native engine's cameras, beside `mujoco.batch`'s rays and MuJoCo's renderer.
+"""Images per second of the native engine's cameras, next to `mujoco.batch`'s rays and MuJoCo's renderer.
 
 The scene is that of `Mjlab-Lift-Cube-Yam-Rgb`: the wrist camera of the YAM arm at 32 x 32 pixels,
-which sees the cube, the ground and the arm's collision shapes. The arms stand at random poses near
-home. All take turns in one run, so that their ratios hold on a machine that others use too; and so does the CPU time of an image:
+with the cube, the ground and the arm's collision shapes in view. The arms stand at random poses near
+home. All alternate in one run, so that ratios and CPU time per image hold on a shared machine:
 
-- depth and segmentation, and colours as well, by `Simulation.render` (what `sim.sense()` calls);
-- the bare rays of `mujoco.batch`, one for each pixel against all geoms, which yield a depth and a geom;
-- MuJoCo's own offscreen renderer, an environment after another, where OpenGL is available: the same
-  two images, and colours as the model has them, with shadows.
+- depth and segmentation, and colors as well, by `Simulation.render` (what `sim.sense()` calls);
+- the bare rays of `mujoco.batch`, one per pixel against all geoms, for depth and geom id;
+- MuJoCo's own offscreen renderer, one environment after another, if OpenGL is available: the same
+  two images, and colors of the model, with shadows.
 
 Run alone: `python benchmarks/cameras.py`, with the number of environments if not 512. In software
 OpenGL needs `MUJOCO_GL=osmesa`.
@@ -35,10 +35,10 @@ from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, open_rend
 
 TASK, SENSOR, SIZE = "Mjlab-Lift-Cube-Yam-Rgb", "camera_d405", 32
 # Images a second of two cores that are to be reached.
-BOTH, COLOURS = "depth and segmentation", "colours"
-WANTED = {BOTH: 4000.0, COLOURS: 2500.0}
-# How many times MuJoCo's renderer in software, drawing the same images, is to be reached.
-TIMES_RENDERER = {BOTH: 100.0, COLOURS: 0.0}
+BOTH, COLORS = "depth and segmentation", "colors"
+WANTED = {BOTH: 4000.0, COLORS: 2500.0}
+# Target speed-up over MuJoCo's software renderer on the same images.
+TIMES_RENDERER = {BOTH: 100.0, COLORS: 0.0}
 BARE, RENDERER = "bare `mujoco.batch` rays", "MuJoCo's renderer"
 REPEATS = 15
 
@@ -68,7 +68,7 @@ class BareRays:
 
 
 def _pixel_rays(fovy: float) -> torch.Tensor:
-    """Return unit vectors (SIZE^2, 3) through the centres of pixels, in the camera's frame."""
+    """Return unit vectors (SIZE^2, 3) through the centers of pixels, in the camera's frame."""
     half = np.tan(np.radians(fovy) / 2)
     x = (2 * (torch.arange(SIZE) + 0.5) / SIZE - 1) * half
     v, u = torch.meshgrid(-x, x, indexing="ij")
@@ -90,14 +90,14 @@ class Renderers:
         mujoco.mj_camlight(self._sim.mj_model, self._data)
         self._renderer.update_scene(self._data, self._camera_id)
 
-    def colours(self, count: int) -> None:
+    def colors(self, count: int) -> None:
         """Render as the model has it, with shadows; their map is 8192 x 8192 pixels."""
         for env in range(count):
             self._pose(env)
             self._renderer.render()
 
     def depth_and_segmentation(self, count: int) -> None:
-        """Render the two, which are two images to it."""
+        """Render depth and segmentation, two separate images for this renderer."""
         renderer = self._renderer
         for env in range(count):
             self._pose(env)
@@ -121,13 +121,13 @@ def build(num_envs: int) -> ManagerBasedRlEnv:
 
 
 def measure(num_envs: int = 512) -> list[Row]:
-    """Measure both kinds of images, beside bare rays and, where there is OpenGL, the renderer."""
+    """Measure both kinds of images, next to bare rays and, if OpenGL is available, the renderer."""
     env = build(num_envs)
     sim, sensor = env.sim, env.scene[SENSOR]
     groups, camera = sensor.view.geom_groups, sensor.camera_idx
     views = {
         name: (CameraView(camera, SIZE, SIZE, types, groups),)
-        for name, types in ((BOTH, ("depth", "segmentation")), (COLOURS, ("rgb",)))
+        for name, types in ((BOTH, ("depth", "segmentation")), (COLORS, ("rgb",)))
     }
     samples: dict[str, tuple[Callable[[], Any], int]] = {
         name: (functools.partial(sim.render, view), num_envs) for name, view in views.items()
@@ -154,7 +154,7 @@ def renderer_samples(sim: Simulation, camera: int) -> dict[str, tuple[Callable[[
         return {}
     return {
         f"{RENDERER}, {BOTH}": (lambda: renderers.depth_and_segmentation(8), 8),
-        f"{RENDERER}, {COLOURS}": (lambda: renderers.colours(1), 1),
+        f"{RENDERER}, {COLORS}": (lambda: renderers.colors(1), 1),
     }
 
 

@@ -1,4 +1,4 @@
-"""Running what is measured in a process of its own."""
+"""Measured commands, run in separate processes."""
 
 from __future__ import annotations
 

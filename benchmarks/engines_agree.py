@@ -1,6 +1,6 @@
-"""Whether a policy scores the same on both engines: the demo's Go1, on the same 32 episodes.
+"""Score of one policy on both engines: the demo's Go1, on the same 32 episodes.
 
-Without a GPU, Warp runs on the CPU, which takes five minutes.
+Without a GPU, Warp runs on the CPU, in five minutes.
 """
 
 from __future__ import annotations

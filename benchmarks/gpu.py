@@ -1,9 +1,8 @@
-"""The proof on a GPU: `make gpu`, or `python benchmarks/gpu.py --device cuda:0 --part parity ...`.
+"""GPU validation: `make gpu`, or `python benchmarks/gpu.py --device cuda:0 --part parity ...`.
 
-Any Python with the dependencies runs it, without a network and whether or not mjlab is installed.
+Runs on any Python with the dependencies, without a network and without an installed mjlab.
 Each part is a process with a time limit. Its JSON, and the table of all parts, are written row by
-row, so that neither a part that fails nor the end of the machine's time takes back what was measured
-before.
+row, so that failures and time limits do not lose earlier results.
 
 `--device cpu --tiny` runs the same parts, at sizes of a few seconds, on Warp's CPU device.
 """
@@ -105,7 +104,7 @@ class Record:
 
     @property
     def passed(self) -> bool:
-        """True if the part ended by itself and no figure to reach was missed."""
+        """True if the part ended by itself and reached all targets."""
         return self.content["status"] == "done" and all(
             row.reached is not False for row in self.rows
         )
@@ -164,7 +163,7 @@ def run_part(part: str, options: Options) -> bool:
 
 
 def start_part(part: str, options: Options, seconds: float) -> Record:
-    """Run a part in a process of its own, which is ended when `seconds` are over."""
+    """Run a part in a separate process, terminated after `seconds`."""
     print(f"\n{part}: {PARTS[part].what} (at most {seconds:.0f} s)", flush=True)
     command = [sys.executable, str(Path(__file__)), "--in-process", "--part", part]
     command += ["--device", options.device, "--output", str(options.output)]
@@ -295,7 +294,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _end(*_: Any) -> None:
-    # What is left to do is done on the way out: processes are ended, and files say so.
+    # Clean-up handlers end the processes and record it in the files.
     raise SystemExit("out of time")
 
 

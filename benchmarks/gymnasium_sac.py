@@ -4,7 +4,7 @@
 
 Published for HalfCheetah (SAC, one environment, an update of 256 transitions for every step): a mean
 return of about 10,000 after a million steps (Haarnoja et al., arXiv 1812.05905, figure 1). Here the
-same number of updates is made with several environments at once.
+same number of updates uses several parallel environments.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mjlab.rl.run_logger import IterationStats, TrainingObserver
 
 
 class GymnasiumVecEnv(VecEnv):
-    """Gymnasium environments as rsl_rl wants to see them; actions are in (-1, 1)."""
+    """Gymnasium environments with the interface of rsl_rl; actions are in (-1, 1)."""
 
     def __init__(self, name: str, num_envs: int, seed: int) -> None:
         self._envs = gymnasium.make_vec(

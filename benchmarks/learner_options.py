@@ -26,7 +26,7 @@ _PPO_VARIANTS: dict[str, dict[str, Any]] = {
     "compiled": {"torch_compile_mode": "default"},
     "bfloat16, compiled": {"use_mixed_precision": True, "torch_compile_mode": "default"},
 }
-# Learner, profile and what is changed of its config, by name. The first of each learner is compared with.
+# Learner, profile and config changes, by name. The first of each learner is the baseline.
 CASES: dict[str, tuple[tuple[str, str | None], dict[str, dict[str, Any]]]] = {
     "PPO, 128-64": (("ppo", "cpu"), _PPO_VARIANTS),
     "PPO, 512-256-128": (("ppo", None), _PPO_VARIANTS),
@@ -38,9 +38,9 @@ CASES: dict[str, tuple[tuple[str, str | None], dict[str, dict[str, Any]]]] = {
 
 
 class _Times(TrainingObserver):
-    """Seconds of the iterations but those of the first turn, in which things warm up.
+    """Seconds of all iterations except those of the first turn (warm-up).
 
-    Those of updates, or of SAC, which learns between steps, the whole.
+    PPO: seconds of updates. SAC learns between steps: seconds of whole iterations.
     """
 
     def __init__(self, learner: str) -> None:
@@ -96,8 +96,8 @@ def _runner(learner: Any, profile: str | None, edits: dict[str, Any]) -> MjlabOn
     runner = MjlabOnPolicyRunner(env, asdict(cfg))
     algorithm: Any = runner.alg
     if learner == "sac":
-        # One after the other: beside the physics, updates show only where they take longer.
-        algorithm._beside_physics = False
+        # Sequential: in parallel with the physics, updates show only if they take longer.
+        algorithm._is_concurrent = False
     return runner
 
 

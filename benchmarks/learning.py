@@ -1,4 +1,4 @@
-"""How fast the swing-up is solved: iterations, and seconds from the command line on."""
+"""Iterations until the swing-up is solved, and seconds from the start of the command."""
 
 from __future__ import annotations
 

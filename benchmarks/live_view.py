@@ -1,12 +1,12 @@
-"""What `train --live` costs: speed of training with a browser connected, without one, and apart.
+"""Cost of `train --live`: training speed with a browser connected, and without one.
 
-Training of Go1 on flat ground runs once. A client that takes what a browser takes, and draws
-nothing, connects and disconnects again and again meanwhile, so that both kinds of iterations are
+Training of Go1 on flat ground runs once. A client that receives the data of a browser, without
+drawing, connects and disconnects repeatedly, so that both kinds of iterations are
 spread over the same minutes. `python benchmarks/live_view.py [MINUTES]` prints one line of JSON:
-steps per second of both kinds, the median over neighbouring blocks of their ratio, and the processor
-time that the view took, in cores.
+steps per second of both kinds, the median of their ratio over neighboring blocks, and the processor
+time of the view, in cores.
 
-The machine has to be quiet otherwise: what is looked for is 2 %.
+The machine must be idle otherwise: the expected effect is 2 %.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Recorder(TrainingObserver):
         # The page is watched in blocks of an odd number.
         spawn = multiprocessing.get_context("spawn")
         self._block = spawn.Value("i", 0)
-        # What a browser does is not done by the process that is measured.
+        # The client is a separate process: its work must not count for the measured one.
         url = view._exchange.url
         self._client = spawn.Process(target=_watch_when_there, args=(url, self._block), daemon=True)
         self._client.start()
@@ -100,8 +100,8 @@ def _cpu_time(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def figures(minutes: float) -> dict[str, float]:
-    """Train for so long; return the figures."""
+def measure_costs(minutes: float) -> dict[str, float]:
+    """Train for `minutes`; return the results."""
     recorders: list[Recorder] = []
     base: Any = load_runner_cls(TASK)
 
@@ -122,12 +122,12 @@ def figures(minutes: float) -> dict[str, float]:
 
 
 def summary(rows: list[tuple[int, float, float, float]]) -> dict[str, float]:
-    """Return the figures of (block, steps per second, time, processor time) of each iteration."""
+    """Return the results from (block, steps per second, time, processor time) of each iteration."""
     blocks: dict[int, list[float]] = {}
     cores: dict[bool, list[float]] = {False: [], True: []}
     for before, row in zip(rows, rows[1:], strict=False):
-        # Iterations that the client came or went in belong to neither kind; nor does the first
-        # block that is watched, in which the view is built.
+        # Iterations during a connect or disconnect belong to neither kind; nor does the first
+        # watched block, because it includes the start of the view.
         if row[0] == before[0] and row[0] > 1:
             blocks.setdefault(row[0], []).append(row[1])
             cores[row[0] % 2 == 1].append((row[3] - before[3]) / (row[2] - before[2]))
@@ -149,7 +149,7 @@ def summary(rows: list[tuple[int, float, float, float]]) -> dict[str, float]:
 
 
 def measure(minutes: float = 10.0) -> list[Row]:
-    """Measure in a process of its own, for training takes over its process; return one row."""
+    """Measure in a separate process, because training takes over its process; return one row."""
     seen = json.loads(output_of([sys.executable, __file__, str(minutes)]).splitlines()[-1])
     cost, error = 1.0 - seen["ratio"], seen["ratio_standard_error"]
     return [
@@ -175,4 +175,4 @@ def verdict(cost: float, error: float) -> bool | None:
 if __name__ == "__main__":
     # As `train` sets it.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    print(json.dumps(figures(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)))
+    print(json.dumps(measure_costs(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)))

@@ -1,4 +1,4 @@
-"""How far differential inverse kinematics ends from its target: 1024 YAM arms, reaches of 10 cm."""
+"""Position error of differential inverse kinematics: 1024 YAM arms, reaches of 10 cm."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TIMESTEP = 0.005
 
 @dataclass(frozen=True)
 class Case:
-    """What the action has to reach."""
+    """Target of the action."""
 
     what: str
     orientation_weight: float
@@ -105,7 +105,7 @@ class Reach:
         self.passed = -float("inf")
 
     def residuals(self) -> torch.Tensor:
-        """Return each hand's distance from its target, in metres."""
+        """Return each hand's distance from its target (m)."""
         return (self.term._get_frame_pose()[0] - self.target).norm(dim=1)
 
     def watch_limits(self) -> None:

@@ -2,14 +2,13 @@
 
 `make reference`, or `python benchmarks/reference.py --tasks Mjlab-Cartpole-Swingup --seeds 5`, trains one
 seed after the other under the task's `cpu` profile, until the task is solved or `--minutes` are over, and
-scores the last policy by `evaluate` on a seed that was not trained with. After each seed it writes
+scores the last policy by `evaluate` on a seed not used in training. After each seed it writes
 
 - `src/mjlab/reference/TASK.cpu.json` (or `gpu`), which ships with the package and is read by `verify`,
-- `docs/reference/runs/index.md`, and the picture of the task beside it.
+- `docs/reference/runs/index.md`, and the plot of the task next to it.
 
-Seeds that a file has already are kept. Interrupted ones are resumed, unless the code was changed in
-between, because a seed is of one commit: they are then trained from the start. `--again` replaces seeds of
-other commits.
+Seeds already in a file are kept. Interrupted ones are resumed; after a code change they are trained from
+the start, because a seed belongs to one commit. `--again` replaces seeds of other commits.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from mjlab.scripts.devices import resolve_device  # noqa: E402
 from mjlab.scripts.reference import (  # noqa: E402
     DATA,
     ENDED,
-    FIGURE,
+    METRIC,
     Kind,
     Reference,
     SeedRecord,
@@ -64,10 +63,10 @@ KINDS: tuple[Kind, ...] = ("cpu", "gpu")
 MINUTES = 60.0
 SEEDS = {"Mjlab-Cartpole-Swingup": 5}
 """Seeds of tasks that are trained in seconds; others have three."""
-# For a task without the profile: tasks have one environment, and an evaluation of the cartpole takes as
-# long as ten iterations.
+# For a task without the profile: tasks have one environment, and an evaluation of the cartpole takes the
+# time of ten iterations.
 _FLAGS = ["--num-envs", "512", "--agent.evaluation.min-interval", "6"]
-# Curves are to begin at the start, and not where training data hint that the task may be solved.
+# Evaluate from the first iteration, not only once training data suggest that the task is solved.
 _EVALUATIONS = [
     *("--agent.evaluation.trigger-return", "-1e9"),
     *("--agent.evaluation.first-iteration", "0"),
@@ -78,12 +77,12 @@ _SETTINGS = "settings.json"
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Settings of reference runs, and the folders that they write to."""
+    """Settings and output folders of reference runs."""
 
     device: str
     """Torch device."""
     minutes: float
-    """Minutes of training for a seed."""
+    """Minutes of training per seed."""
     again: bool
     """Replace seeds of other commits."""
     flags: list[str]
@@ -104,7 +103,7 @@ class Options:
 
 
 def make(task: str, seeds: int, options: Options) -> bool:
-    """Train the missing seeds of a task; return whether to go on with other tasks.
+    """Train the missing seeds of a task; return False if interrupted.
 
     Raises:
         UserError: the task's file has seeds with other settings.
@@ -120,7 +119,7 @@ def make(task: str, seeds: int, options: Options) -> bool:
         print(f"{task}, seed {seed} of {seeds}", flush=True)
         record = _train(reference, seed, commit, options)
         if record is None:
-            print("Stopped. The same command goes on from here.")
+            print("Stopped. Run the same command to continue.")
             return False
         reference.put(record)
         reference.save(options.data)
@@ -154,7 +153,7 @@ def _reference(task: str, options: Options) -> Reference:
 
 
 def _train(reference: Reference, seed: int, commit: str, options: Options) -> SeedRecord | None:
-    """Train a seed, or what is left of it, and score it; None if this process was told to stop."""
+    """Train a seed, or the rest of it, and score it; None on a stop signal."""
     folder = options.log_root / options.kind / reference.task / f"seed_{seed}"
     _clear_unless_same(folder, {"commit": commit, "flags": reference.train_flags})
     run = _newest_run(folder)
@@ -169,10 +168,10 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
         status, stopped = run_forwarding_signals(command, left)
         run = _newest_run(folder)
         ended = None if run is None else end_of(run)
-        # A signal that went to the training process alone ends it with 0 as well.
+        # A signal sent to the training process alone ends it with 0 as well.
         if stopped or (ended == "interrupted" and time.monotonic() - begin < left):
             return None
-        # Not by the status, because the time limit may have come after training.
+        # The status does not count: the time limit may have passed after training.
         if ended not in (*ENDED, "interrupted"):
             raise RuntimeError(f"Training of seed {seed} ended with status {status}.")
     assert run is not None
@@ -191,7 +190,7 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
 
 
 def _clear_unless_same(folder: Path, settings: dict[str, Any]) -> None:
-    """Remove the runs in `folder`, unless they were made with the same settings."""
+    """Remove the runs in `folder`, unless made with the same settings."""
     marker = folder / _SETTINGS
     if marker.is_file() and json.loads(marker.read_text()) == settings:
         return
@@ -211,14 +210,14 @@ def _score(reference: Reference, run: Path, seed: int, options: Options) -> dict
     command = [sys.executable, "-m", "mjlab.scripts.evaluate", reference.task]
     command += ["--checkpoint-file", str(checkpoints_in(run)[-1]), "--device", options.device]
     command += ["--num-episodes", str(options.episodes), "--seed", str(seed), "--json", "True"]
-    # What changes the task changes it for the evaluation too.
+    # Flags of the environment apply to the evaluation too.
     flags = reference.flags
     for position, flag in enumerate(flags):
         if flag.startswith("--env."):
             command += flags[position : position + (1 if "=" in flag else 2)]
     printed = output_of(command)
     score = json.loads(printed[printed.index("{") :])
-    # A path of this machine.
+    # The path is local to this machine.
     del score["policy"]
     return score
 
@@ -237,14 +236,14 @@ def code_commit() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this package and of libraries that the figures depend on."""
+    """Return the versions of this package and of libraries that affect results."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     libraries = {name: importlib.metadata.version(name) for name in _LIBRARIES}
     return {"mjlab": project["version"], **libraries}
 
 
 def machine(device: str) -> dict[str, Any]:
-    """Return the machine in words."""
+    """Return a description of the machine."""
     gpu = None
     if device.startswith("cuda"):
         import torch
@@ -257,21 +256,21 @@ def machine(device: str) -> dict[str, Any]:
 
 _HEAD = """# Reference runs
 
-Every stock task, trained under its `cpu` profile (without one, with its own settings and 512 environments), each
-seed until its evaluations say that the task is solved, or until its time was over. `make reference` makes this page.
+Every stock task, trained under its `cpu` profile (without one, with its default settings and 512 environments), each
+seed until its evaluations solve the task, or until its time limit. `make reference` generates this page.
 [`uv run verify TASK`](../command_line.md#verify) trains one more seed and compares it with these.
 
-- **Samples** are environment steps, over all environments. **Minutes** are those of collecting and learning. Evaluations
-  come on top; these runs have more of them than others, from their start on, so that there are curves.
-- **Final** is what `evaluate` says of the last policies, on seeds that were not trained with: the mean over seeds and, in
-  brackets, the lowest and the highest end of their 95 % intervals. Figures that decide whether a task is solved are
-  shown; all are below.
-- Curves are mean returns of evaluations, over seeds, with one sample standard deviation shaded.
+- **Samples**: environment steps, over all environments. **Minutes**: rollouts and updates, without evaluations.
+  These runs are evaluated from the start, more often than others, to record curves.
+- **Final**: result of `evaluate` for the last policies, on seeds not used in training: the mean over seeds and, in
+  brackets, the lowest and the highest end of their 95 % intervals. The table shows metrics of the success criterion;
+  the sections show all.
+- Curves: mean evaluation returns over seeds, with one sample standard deviation shaded.
 """
 
 
 def write_pages(data: Path, pages: Path, tasks: tuple[str, ...] = ()) -> None:
-    """Write the page of all references in `data`, and the pictures of `tasks`."""
+    """Write the page of all references in `data`, and the plots of `tasks`."""
     pages.mkdir(parents=True, exist_ok=True)
     for task in tasks:
         _draw([reference for kind in KINDS if (reference := _load(data, task, kind))], pages)
@@ -297,7 +296,7 @@ def page(data: Path) -> str:
 
 
 def stock_tasks() -> list[str]:
-    """Return the tasks that come with the package."""
+    """Return the tasks of the package."""
     return [task for task in list_tasks() if task.startswith("Mjlab-")]
 
 
@@ -307,7 +306,7 @@ def _load(data: Path, task: str, kind: Kind) -> Reference | None:
 
 
 def _summary(reference: Reference | None) -> tuple[str, str, str]:
-    """Return samples, minutes and final figures of a reference, for the table."""
+    """Return samples, minutes and final metrics of a reference, for the table."""
     if reference is None or not reference.seeds:
         return "not run", "", ""
     runs = [seed.run for seed in reference.seeds]
@@ -324,22 +323,22 @@ def _summary(reference: Reference | None) -> tuple[str, str, str]:
 
 
 def _deciding(reference: Reference) -> list[str]:
-    """Return the figures by which the task counts as solved; the return where nothing is said."""
+    """Return the metrics of the task's success criterion, by default the return."""
     from mjlab.tasks.registry import load_rl_cfg
 
     cfg = load_rl_cfg(reference.task, profile=reference.profile).evaluation
-    names = [FIGURE] if cfg.solved_return is not None else []
+    names = [METRIC] if cfg.solved_return is not None else []
     names += [*cfg.solved_below, *cfg.solved_above]
-    known = [name for name in names if _figure(reference.seeds[0].evaluation, name) is not None]
-    return known or [FIGURE]
+    known = [name for name in names if _metric(reference.seeds[0].evaluation, name) is not None]
+    return known or [METRIC]
 
 
 def _section(task: str, references: list[Reference]) -> str:
-    """Return the picture of a task, and a table of its seeds for each kind of device."""
+    """Return the plot of a task, and a table of its seeds for each kind of device."""
     lines = [f"## {task}", "", f"![Curves of {task}]({task}.png)", ""]
     for reference in references:
         newest = reference.seeds[-1]
-        names = _all_figures(newest.evaluation)
+        names = _all_metrics(newest.evaluation)
         libraries = ", ".join(f"{name} {value}" for name, value in newest.versions.items())
         cores = f"{newest.machine['cores']} cores ({newest.machine['processor']})"
         where = ", ".join(filter(None, (newest.machine["gpu"], cores)))
@@ -359,13 +358,13 @@ def _section(task: str, references: list[Reference]) -> str:
     return "\n".join(lines)
 
 
-def _all_figures(evaluation: dict[str, Any]) -> list[str]:
+def _all_metrics(evaluation: dict[str, Any]) -> list[str]:
     rates = ("success_rate", "failure_rate")
-    return [FIGURE, *(r for r in rates if evaluation[r] is not None), *evaluation["metrics"]]
+    return [METRIC, *(r for r in rates if evaluation[r] is not None), *evaluation["metrics"]]
 
 
-def _figure(evaluation: dict[str, Any], name: str) -> tuple[float, float, float] | None:
-    """Return a figure of an evaluation with the ends of its interval; None if it has none."""
+def _metric(evaluation: dict[str, Any], name: str) -> tuple[float, float, float] | None:
+    """Return a metric of an evaluation with the ends of its interval; None if missing."""
     if name in evaluation["metrics"]:
         value, interval = evaluation["metrics"][name].values()
     else:
@@ -375,12 +374,12 @@ def _figure(evaluation: dict[str, Any], name: str) -> tuple[float, float, float]
 
 
 def _final(name: str, evaluations: list[dict[str, Any]]) -> str:
-    """Return the mean of a figure over seeds, and the outermost ends of their intervals."""
-    found = [figure for evaluation in evaluations if (figure := _figure(evaluation, name))]
+    """Return the mean of a metric over seeds, and the outermost ends of their intervals."""
+    found = [metric for evaluation in evaluations if (metric := _metric(evaluation, name))]
     if not found:
         return ""
     values, lows, highs = zip(*found, strict=True)
-    form = ".1%" if name.endswith("_rate") else ".3g" if name != FIGURE else ",.0f"
+    form = ".1%" if name.endswith("_rate") else ".3g" if name != METRIC else ",.0f"
     mean = sum(values) / len(values)
     return f"{mean:{form}} [{min(lows):{form}}, {max(highs):{form}}]"
 
@@ -413,27 +412,27 @@ def _draw(references: list[Reference], pages: Path) -> None:
 
 
 def main() -> int:
-    """Make what the command line asks for; return the exit status."""
+    """Run the command line; return the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--tasks", nargs="+", help="tasks; all stock tasks without it")
-    parser.add_argument("--seeds", type=int, help="seeds 1 to N; without it 3, the swing-up 5")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="time limit for a seed")
+    parser.add_argument("--tasks", nargs="+", help="tasks; default: all stock tasks")
+    parser.add_argument("--seeds", type=int, help="seeds 1 to N; default: 3, swing-up: 5")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="time limit per seed")
     parser.add_argument("--again", action="store_true", help="replace seeds of other commits")
-    parser.add_argument("--device", help="cpu, cuda:0, ...; without it a GPU where there is one")
+    parser.add_argument("--device", help="cpu, cuda:0, ...; default: a GPU if available")
     parser.add_argument("--flags", default="", help="further flags of `train`, in one word")
     parser.add_argument("--episodes", type=int, default=256, help="of the final evaluations")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the JSON files")
-    parser.add_argument("--pages", type=Path, default=PAGES, help="folder of page and pictures")
+    parser.add_argument("--pages", type=Path, default=PAGES, help="folder of page and plots")
     parser.add_argument("--log-root", type=Path, default=ROOT / "logs" / "reference")
-    parser.add_argument("--page-only", action="store_true", help="train nothing, write the page")
+    parser.add_argument("--page-only", action="store_true", help="write the page without training")
     args = parser.parse_args()
     if args.page_only:
         drawn = [task for task in stock_tasks() if any(_load(args.data, task, k) for k in KINDS)]
         write_pages(args.data, args.pages, tuple(drawn))
         return 0
-    # Commands of this checkout, wherever mjlab is installed.
+    # Run commands of this checkout, also if mjlab is installed elsewhere.
     os.environ["PYTHONPATH"] = os.pathsep.join(
         filter(None, (str(ROOT / "src"), os.environ.get("PYTHONPATH")))
     )
@@ -457,11 +456,11 @@ def main() -> int:
                 if not make(task, args.seeds or SEEDS.get(task, 3), options):
                     return 0
             except (UserError, RuntimeError) as error:
-                # Other tasks may train all the same.
+                # Continue with other tasks.
                 print(f"error: {task}: {error}", file=sys.stderr, flush=True)
                 failed.append(task)
     except KeyboardInterrupt:
-        print("Stopped. The same command goes on from here.", file=sys.stderr)
+        print("Stopped. Run the same command to continue.", file=sys.stderr)
         return 130
     except (UserError, UnknownTaskError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Whether training repeats: the bits of the weights, whatever the threads, and after a kill."""
+"""Bitwise repeatability of training: other thread counts, and resume after a kill."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of the benchmark table, and where they go."""
+"""Rows and output of the benchmark table."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class Row:
     """One line of the table."""
 
     what: str
-    """What was measured."""
+    """Measured quantity."""
     measured: str
-    """The figure."""
+    """Measured value."""
     compared_with: str
-    """The comparison, measured in the same run, and its figure."""
+    """Comparison, measured in the same run, with its value."""
     to_reach: str
-    """The figure to reach."""
+    """Target."""
     reached: bool | None
-    """Whether it was reached; None where there is nothing to reach."""
+    """True if the target was reached. None: no target."""
 
 
 def show(rows: list[Row]) -> str:

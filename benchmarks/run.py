@@ -37,7 +37,7 @@ def main() -> None:
     for benchmark in (*quick, learning, live_view, walking, engines_agree):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()
-        # Written after each, so that a run that is stopped has left what it measured.
+        # Write after each benchmark, so that a stopped run keeps its results.
         write(rows)
     print(show(rows))
     print(f"\nWritten to {RESULTS / 'table.md'}")

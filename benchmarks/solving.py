@@ -1,7 +1,7 @@
-"""Training a task until it is solved, and scoring what it learned in episodes that no run has seen.
+"""Runs trained until a task is solved, and scores of the policies on unused seeds.
 
-The evaluation that stopped a run says more good of it than is true, because a worse one would not have
-stopped it. So values to publish are those of `evaluate`, on seeds of which none was trained with.
+The evaluation that stopped a run is biased upwards, because a worse one would not have
+stopped it. So published values are those of `evaluate`, on seeds not used in training.
 """
 
 from __future__ import annotations

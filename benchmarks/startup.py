@@ -1,4 +1,4 @@
-"""How long the command lines take to start."""
+"""Start-up time of the commands."""
 
 from __future__ import annotations
 

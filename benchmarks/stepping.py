@@ -1,7 +1,7 @@
-"""Environments that step in a process of their own, of this checkout or of another.
+"""Environments stepped in a separate process, of this checkout or of another.
 
-`python benchmarks/side_by_side.py FOLDER` compares `env.step` with that of another checkout (of an
-earlier commit, say, with its own `.venv`), taking turns. `growth.py` compares numbers of environments.
+`python benchmarks/side_by_side.py FOLDER` compares `env.step` with that of another checkout (such as an
+earlier commit, with its own `.venv`), alternating. `growth.py` compares numbers of environments.
 """
 
 from __future__ import annotations

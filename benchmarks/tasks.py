@@ -68,9 +68,9 @@ def recorded_rays(env: ManagerBasedRlEnv) -> list[RayQuery]:
 def measure_case(case: Case) -> Row:
     """Measure one task.
 
-    The bare loop steps the same models, those of the environments with what their events have
-    randomized, and makes each of its steps from the states in which the environments are, with the
-    same controls: what a robot does decides what its physics costs.
+    The bare loop steps the environments' models, including randomized fields, and starts each step
+    from the states of the environments, with the same controls: the cost of physics depends on the
+    motion of the robot.
     """
     env = make_env(case.task, case.num_envs)
     generator = torch.Generator().manual_seed(0)

@@ -58,8 +58,8 @@ def measure() -> list[Row]:
             over_bare >= 0.90,
         ),
         Row(
-            "the same, with `xpos` read: the task alone reads only `qpos` and `qvel`, for which the "
-            "native engine leaves out the forward",
+            "the same, with `xpos` read: the task reads only `qpos` and `qvel`, so the native engine "
+            "skips the forward",
             f"{over_bare_reading:.2f} ({NUM_ENVS / reading_time:,.0f} env-steps/s)",
             f"bare `mujoco.batch` loop: {NUM_ENVS / bare_again:,.0f} env-steps/s",
             "at least 0.85",

@@ -1,4 +1,4 @@
-"""Timing that several things take turns in, and the bare `mujoco.batch` loop they are compared with."""
+"""Timers of alternating functions, and the bare `mujoco.batch` loop for comparison."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class BareLoop:
         self._decimation = decimation
         names = ["qpos", "qvel", "ctrl"]
         if model.nmocap > 0:
-            # Where the bases of arms are.
+            # Positions of the arms' bases.
             names += ["mocap_pos", "mocap_quat"]
         self.state = {name: self._batch.bind(name) for name in names}
         self.qpos, self.qvel, self.ctrl = (self.state[name] for name in names[:3])

@@ -1,10 +1,10 @@
-"""The project's own examination: `make torture`, or `python benchmarks/torture.py --part kills ...`.
+"""Robustness tests: `make torture`, or `python benchmarks/torture.py --part kills ...`.
 
-Runs families of trials that do what people, machines and the network do to a program: signals at
-random moments, damaged and hostile files, full disks, mistaken flags, broken physics, strange clients.
-A trial is held if nothing was wrong in silence, lost or stuck, and a command's error was one message
-and no traceback. Prints how many were tried, held and failed by family, and each failure with the
-command that repeats it. The exit status is 1 if one failed. Needs Linux.
+Runs families of trials with faults of users, machines and the network: signals at
+random moments, damaged and hostile files, full disks, wrong flags, broken physics, malformed clients.
+A trial holds if nothing fails silently, gets lost or hangs, and a command's error is one message
+without a traceback. Prints the numbers of trials tried, held and failed by family, and each failure with the
+command that repeats it. The exit status is 1 if a trial failed. Requires Linux.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from torture_parts.trials import Verdict, run_trials  # noqa: E402
 
 PARTS = ("kills", "damage", "limits", "command_lines", "config_files", "physics", "page")
 MINUTES = 15.0
-"""Wall clock of all parts on two cores, for which their numbers of trials are set."""
+"""Wall-clock minutes of all parts on two cores with the default numbers of trials."""
 
 
 @dataclass
@@ -63,11 +63,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--trial needs one --part")
     source = str(args.checkout.resolve() / "src")
     sys.path.insert(0, source)
-    # Processes of their own are to find the same files.
+    # Child processes must find the same files.
     paths = [source, *filter(None, [os.environ.get("PYTHONPATH")])]
     os.environ["PYTHONPATH"] = os.pathsep.join(paths)
     preload()
-    # Forked processes share memory for as long as nobody writes to it.
+    # Forked processes share memory until one writes to it.
     gc.collect()
     gc.freeze()
     results = []

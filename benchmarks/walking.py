@@ -1,8 +1,8 @@
-"""How fast Go1 learns to walk on two cores, with the task's `cpu` profile, beside a bare loop.
+"""Time until Go1 walks, on two cores with the task's `cpu` profile, next to a bare loop.
 
-`uv run --group dev python benchmarks/walking.py [SEED ...]` trains seeds 1 to 3 unless told otherwise,
-and the bare loop of `bare_go1.py` with the first. Training stops when its evaluations say so, and the
-policy is then scored by `evaluate` on other episodes, of the task as it is without the profile. Tracking is
+`uv run --group dev python benchmarks/walking.py [SEED ...]` trains the given seeds (default: 1 to 3),
+and the bare loop of `bare_go1.py` with the first. Evaluations stop training, and `evaluate` then scores the
+policy on other episodes, of the task without the profile. Tracking is
 reached if in these 400 episodes the mean error of linear velocity is under 0.25 m/s, of angular velocity
 under 0.35 rad/s, and under 5 % of them ended in a fall.
 """
@@ -79,13 +79,13 @@ def _shown(run: Solved | None) -> str:
     )
 
 
-def _shown_bare(figures: dict[str, float] | None) -> str:
-    if figures is None:
+def _shown_bare(metrics: dict[str, float] | None) -> str:
+    if metrics is None:
         return "no evaluation"
     errors = (
-        f"{figures['linear']:.2f} m/s, {figures['angular']:.2f} rad/s, {figures['falls']:.0%} falls"
+        f"{metrics['linear']:.2f} m/s, {metrics['angular']:.2f} rad/s, {metrics['falls']:.0%} falls"
     )
-    return f"{figures['seconds'] / 60:.1f} min ({figures['iterations']} iterations; {errors})"
+    return f"{metrics['seconds'] / 60:.1f} min ({metrics['iterations']} iterations; {errors})"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Sphinx settings. Everything is built from this checkout, without network."""
+"""Sphinx settings. Builds from this checkout, without a network."""
 
 from __future__ import annotations
 
@@ -33,36 +33,36 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
 
-# Terms that take older parameters too are shown with today's: Sphinx reads defaults from the source.
+# Show terms that accept older parameters with current ones: Sphinx reads defaults from the source.
 for _term in vars(velocity_mdp).values():
     if hasattr(_term, "__wrapped__") and "__signature__" in vars(_term):
         del _term.__signature__
 
-# How docstrings are written: sections as Google has them, and `Params`, the section of class-based
-# terms, whose parameters are given in a config.
+# Docstring style: Google sections, and `Params` for class-based terms (parameters of the term
+# config).
 _SECTIONS: Any = Config(
     napoleon_custom_sections=[("Params", "params_style")], napoleon_use_rtype=False
 )
 
-# A line that ends with a colon, and indented text after it, which is a formula or code.
+# A line that ends with a colon, followed by an indented formula or code.
 _FORMULA = re.compile(r"(?m)^(\S.*):\n\n((?:    .*\n?|\n)+)")
 _CODE = re.compile(r"(?<!`)`([^`]+)`(?!`)")
 
 
 def _to_rst(app: Sphinx, what: Any, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Turn a docstring, which is plain text with backquotes around code, into reStructuredText."""
-    # Three parts to a formula: the text before it, the line above it, and itself.
+    """Convert a docstring, plain text with backquotes around code, to reStructuredText."""
+    # Three parts per formula: preceding text, the line above, and the formula.
     parts = _FORMULA.split("\n".join(lines))
     parts[0::3] = [_inline(part) for part in parts[0::3]]
     parts[1::3] = [f"{_inline(part)}::\n\n" for part in parts[1::3]]
     lines[:] = "".join(parts).split("\n")
-    # In the docstring of a field, a colon is a colon.
+    # Field docstrings have no sections: keep colons.
     if what not in ("attribute", "data", "property"):
         lines[:] = GoogleDocstring(lines, _SECTIONS, what=what).lines()
 
 
 def _inline(text: str) -> str:
-    """Mark code, and let no other character be markup."""
+    """Mark code, and escape all other markup characters."""
     parts = _CODE.split(text)
     parts[0::2] = [re.sub(r"([|*])", r"\\\1", part) for part in parts[0::2]]
     parts[1::2] = [f"``{' '.join(part.split())}``" for part in parts[1::2]]
@@ -74,7 +74,7 @@ def _readable(
 ) -> tuple[str, str | None] | None:
     """Shorten the signatures of configs, and complete those of `field_term`."""
     if what == "class" and dataclasses.is_dataclass(obj):
-        # The fields are listed below, with their meanings.
+        # Fields are listed below, with their docstrings.
         return "", None
     if signature and "row.operation" in signature:
         return signature.replace("row.operation", repr(obj.row.operation)), returns
@@ -82,6 +82,6 @@ def _readable(
 
 
 def setup(app: Sphinx) -> None:
-    """Register what is done to docstrings and signatures."""
+    """Register the handlers of docstrings and signatures."""
     app.connect("autodoc-process-signature", _readable)
     app.connect("autodoc-process-docstring", _to_rst)

@@ -1,4 +1,4 @@
-"""Solves the cartpole swing-up with PPO of Stable-Baselines3.
+"""Cartpole swing-up solved by PPO of Stable-Baselines3.
 
     uv run --extra sb3 python examples/sb3_swing_up.py --seed 1
 
@@ -21,7 +21,7 @@ from mjlab.tasks.registry import load_env_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
 NUM_ENVS, STEPS = 512, 32
-# Of an evaluation, one in each of as many environments.
+# Episodes of an evaluation, one per environment.
 EPISODES = 100
 
 
@@ -51,7 +51,7 @@ def make_learner(env: ManagerBasedRlEnv, seed: int) -> PPO:
 
 def train(seed: int, device: str = "cpu", max_iterations: int = 300) -> tuple[float, float]:
     """Train until the task is solved; return the last evaluation's mean return, and seconds."""
-    # Networks this small lose more by waiting for other threads than they gain.
+    # For such small networks, thread synchronization costs more than it gains.
     torch.set_num_threads(1)
     env = make_env(seed, device)
     scored = RslRlVecEnvWrapper(make_env(seed + 1000, device, EPISODES))

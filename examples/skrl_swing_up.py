@@ -1,4 +1,4 @@
-"""Solves the cartpole swing-up with PPO of skrl.
+"""Cartpole swing-up solved by PPO of skrl.
 
     uv run --extra skrl python examples/skrl_swing_up.py --seed 1
 
@@ -28,7 +28,7 @@ from mjlab.tasks.registry import load_env_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
 NUM_ENVS, STEPS = 512, 32
-# Of an evaluation, one in each of as many environments.
+# Episodes of an evaluation, one per environment.
 EPISODES = 100
 
 
@@ -40,7 +40,7 @@ def network(inputs: int, outputs: int) -> nn.Module:
 
 
 class Policy(GaussianMixin, Model):
-    """Normal distribution of actions, with a deviation that does not depend on observations."""
+    """Gaussian policy with a state-independent standard deviation."""
 
     def __init__(self, **spaces: Any) -> None:
         Model.__init__(self, **spaces)
@@ -53,7 +53,7 @@ class Policy(GaussianMixin, Model):
 
 
 class Value(DeterministicMixin, Model):
-    """Value of an observation."""
+    """Value function."""
 
     def __init__(self, **spaces: Any) -> None:
         Model.__init__(self, **spaces)
@@ -111,7 +111,7 @@ def make_trainer(env: ManagerBasedRlEnv, folder: str) -> tuple[StepTrainer, Poli
 
 def train(seed: int, device: str = "cpu", max_iterations: int = 300) -> tuple[float, float]:
     """Train until the task is solved; return the last evaluation's mean return, and seconds."""
-    # Networks this small lose more by waiting for other threads than they gain.
+    # For such small networks, thread synchronization costs more than it gains.
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     env = make_env(seed, device)

@@ -27,11 +27,11 @@ from mjlab.tasks.velocity import mdp
 
 NAMES = [field.name for field in fields(mdp.SteppingGains)]
 SIZES = np.array(list(asdict(mdp.SteppingGains()).values()))
-"""Sizes of the gains, by which the search scales them."""
+"""Scales of the gains in the search."""
 
 
 def make_env(task: str, num_envs: int, frequency: float, pushes: float) -> ManagerBasedRlEnv:
-    """Return the task under its `cpu` profile, with a part of its pushes."""
+    """Return the task under its `cpu` profile, with reduced pushes."""
     cfg = load_env_cfg(task, profile="cpu")
     cfg.scene.num_envs, cfg.seed = num_envs, 0
     cfg.curriculum, cfg.rewards = {}, {}
@@ -47,7 +47,7 @@ def make_env(task: str, num_envs: int, frequency: float, pushes: float) -> Manag
 
 
 def scores(env: ManagerBasedRlEnv, tried: np.ndarray, seconds: float) -> np.ndarray:
-    """Return the score (sets,) of each set of gains (sets, gains): seconds until a fall, less drift."""
+    """Return the score (sets,) of each set of gains (sets, gains): seconds until a fall, minus drift."""
     each = env.num_envs // len(tried)
     table = torch.tensor(tried, dtype=torch.float32).repeat_interleave(each, dim=0)
     own: dict[str, Any] = {name: table[:, [i]] for i, name in enumerate(NAMES)}

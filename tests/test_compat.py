@@ -47,7 +47,7 @@ def test_a_name_that_never_was_is_an_attribute_error(module):
 def test_a_class_warns_once_with_todays_spelling():
     import mjlab.actuator
 
-    with pytest.warns(FutureWarning, match=r"today it is mjlab.actuator.xml_actuator") as seen:
+    with pytest.warns(FutureWarning, match=r"use mjlab.actuator.xml_actuator") as seen:
         cfg = mjlab.actuator.XmlMotorActuatorCfg
         assert mjlab.actuator.XmlMotorActuatorCfg is cfg
     assert len(seen) == 1
@@ -273,7 +273,7 @@ def test_the_demo_motion_ships_and_the_checkpoint_says_what_to_do():
 
 
 def test_passing_names_on_imports_nothing():
-    # Modules of the table that themselves load only a few others, in a process of their own.
+    # Modules of the table that themselves load only a few others, in a separate process.
     code = (
         "import sys, mjlab.compat, mjlab.tasks.registry, mjlab.scripts.gcs; "
         "print([name for name in ('torch', 'mujoco', 'mjlab.compat.older') if name in sys.modules])"

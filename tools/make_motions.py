@@ -1,17 +1,16 @@
-"""Make the motions that ship with the package, by inverse kinematics, from the descriptions below.
+"""Make the bundled motions by inverse kinematics, from the descriptions below.
 
     uv run --group dev python tools/make_motions.py
 
-A description says in plain words where the feet step, how far the body goes down or leans, and which
-joints move. From it follow, in this order:
+A description lists steps, pelvis drop, trunk lean and joint angles. Computed from it, in this order:
 
-1. the feet: they stand still on the ground, or swing on a smooth arc from one place to the next;
-2. the centre of pressure p: at the middle of the feet at the start and at the end, at the foot that
-   stands while the other one swings, and in between from one to the other while both stand;
-3. the centre of mass c, from the linear inverted pendulum, c - (h / g) c'' = p, with c at rest at both
-   ends: so p, and with it the force of the ground, stays within the soles;
-4. the joints: `mink` finds those that put the feet and the centre of mass there, and keep the trunk
-   upright and the rest near the described posture, within the soft limits.
+1. the feet: stationary on the ground, or swinging on a smooth arc to the next foothold;
+2. the center of pressure p: midway between the feet at the start and at the end, at the stance foot
+   during swings, and moving from one foot to the other in double support;
+3. the center of mass c, from the linear inverted pendulum, c - (h / g) c'' = p, with c at rest at both
+   ends: so p, the ground reaction point, stays within the soles;
+4. the joints: `mink` solves for the poses of the feet and the center of mass, with an upright trunk
+   and the rest near the described posture, within the soft limits.
 """
 
 from __future__ import annotations
@@ -34,59 +33,59 @@ from mjlab.tasks.tracking.motion_sources import SHIPPED
 FPS = 50.0
 _GRAVITY = 9.81
 _FEET = ("left", "right")
-# The middle of a sole, and its height, seen from the frame of its body (m).
+# Center of a sole, and its height, in the frame of its body (m).
 _SOLE_CENTRE = 0.035
 _SOLE_BELOW_ANKLE = 0.035
-# Height of the pelvis with knees a little bent.
+# Height of the pelvis with slightly bent knees.
 _PELVIS_HEIGHT = 0.735
-# Digits beyond these are noise to a controller, and the largest part of a compressed file.
+# Further digits are noise to a controller, and most of a compressed file.
 _ROUNDING = {"body_pos_w": 2.0**-17, "body_quat_w": 2.0**-17, "joint_pos": 2.0**-17}
 _VELOCITY_ROUNDING = 2.0**-13
 
 
 @dataclass(frozen=True)
 class Key:
-    """How the body is at a time; between two keys it moves smoothly from one to the next."""
+    """Keyframe of the body; motion between two keys is smooth."""
 
     time: float
     """Seconds from the start."""
     drop: float = 0.0
-    """How far the pelvis is lowered, in metres."""
+    """Drop of the pelvis (m)."""
     lean: float = 0.0
-    """How far the trunk leans forward, in rad."""
+    """Forward lean of the trunk (rad)."""
     joints: dict[str, float] = field(default_factory=dict)
-    """Angles of joints, in rad; others are as in the robot's default pose."""
+    """Joint angles (rad); other joints keep the default pose."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step, seen from the way the robot faces."""
+    """One step, in the heading frame of the robot."""
 
     foot: Literal["left", "right"]
     forward: float = 0.0
-    """How far the foot goes, in metres."""
+    """Displacement of the foot (m)."""
     left: float = 0.0
     turn: float = 0.0
-    """How far it turns to the left, in rad, and goes around the place where the robot started."""
+    """Rotation of the foot to the left, about the robot's start position (rad)."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """A motion in plain words."""
+    """Description of a motion."""
 
     name: str
     seconds: float
-    """Duration, without steps; steps take as long as they do."""
+    """Duration without steps (s)."""
     keys: tuple[Key, ...] = (Key(0.0),)
     steps: tuple[Step, ...] = ()
     swing_s: float = 0.8
-    """Time that a foot is in the air."""
+    """Swing time (s)."""
     shift_s: float = 0.9
-    """Time with both feet on the ground from one step to the next."""
+    """Double-support time between steps (s)."""
     lift: float = 0.05
-    """Height of the arc of a foot, in metres."""
+    """Height of the swing arc (m)."""
     stance: float = 0.11
-    """Distance of each foot from the middle at the start, in metres."""
+    """Initial lateral distance of each foot from the center (m)."""
 
 
 def _wave() -> tuple[Key, ...]:
@@ -123,7 +122,7 @@ DESCRIPTIONS = (
         keys=(Key(0.0), Key(0.2), Key(1.9, **_SQUATTED), Key(2.4, **_SQUATTED), Key(4.1), Key(4.4)),
     ),
     Description("wave", seconds=5.2, keys=_wave()),
-    # Narrow, because ankles that roll by 13 degrees at most let the legs spread no further.
+    # Narrow stance: the ankle roll limit of 13° allows no wider one.
     Description(
         "side_step",
         seconds=0.0,
@@ -156,25 +155,25 @@ DESCRIPTIONS = (
 
 @dataclass(frozen=True)
 class _Plan:
-    """Where feet and pressure are at each time."""
+    """Trajectories of feet and center of pressure."""
 
     times: np.ndarray
-    """(T,)."""
+    """Times, (T,)."""
     feet: dict[str, np.ndarray]
     """For each foot (T, 4): x, y, height of the sole, yaw."""
     pressure: np.ndarray
-    """(T, 2)."""
+    """Center of pressure, (T, 2)."""
 
 
 def _smooth(share: np.ndarray) -> np.ndarray:
-    """Go from 0 to 1 with the least jerk, at rest at both ends."""
+    """Return the minimum-jerk profile from 0 to 1, at rest at both ends."""
     s = np.clip(share, 0.0, 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 def _plan(description: Description) -> _Plan:
-    """Lay out the steps in time."""
-    # The centre of mass sets out before the pressure does, and comes to rest after it.
+    """Schedule the steps."""
+    # The center of mass starts before the center of pressure, and comes to rest after it.
     rest = 0.5
     period = description.shift_s + description.swing_s
     steps = description.steps
@@ -204,7 +203,7 @@ def _plan(description: Description) -> _Plan:
 
 
 def _swing(start: np.ndarray, end: np.ndarray, phase: np.ndarray, lift: float) -> np.ndarray:
-    """Return a foot on its way at phases from 0 to 1: up, over, and down, so that it never scrapes."""
+    """Return a swing foot at phases from 0 to 1: up, over, and down, with ground clearance."""
     over = _smooth((phase - 0.15) / 0.7)[:, None]
     poses = start + over * (end - start)
     poses[:, 2] = lift * np.minimum(_smooth(phase / 0.4), _smooth((1.0 - phase) / 0.4))
@@ -214,14 +213,14 @@ def _swing(start: np.ndarray, end: np.ndarray, phase: np.ndarray, lift: float) -
 def _go(
     values: np.ndarray, times: np.ndarray, begin: float, end: float, start: Any, goal: Any
 ) -> None:
-    """Let `values` go from `start` to `goal` between two times, and stay there."""
+    """Move `values` from `start` to `goal` between two times, constant afterwards."""
     share = _smooth((times - begin) / (end - begin))[:, None]
     moved = times >= begin
     values[moved] = (start + share * (goal - start))[moved]
 
 
 def _centre(pose: np.ndarray) -> np.ndarray:
-    """Return the middle of the sole of a foot at x, y, height, yaw."""
+    """Return the center of the sole of a foot at x, y, height, yaw."""
     x, y, _, yaw = pose
     return np.array([x + _SOLE_CENTRE * math.cos(yaw), y + _SOLE_CENTRE * math.sin(yaw)])
 
@@ -231,7 +230,7 @@ def _middle(pose: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _stepped(pose: np.ndarray, step: Step) -> np.ndarray:
-    """Return where a foot at x, y, height, yaw stands after a step."""
+    """Return x, y, height, yaw of a foot after a step."""
     x, y, _, yaw = pose
     x += step.forward * math.cos(yaw) - step.left * math.sin(yaw)
     y += step.forward * math.sin(yaw) + step.left * math.cos(yaw)
@@ -240,7 +239,7 @@ def _stepped(pose: np.ndarray, step: Step) -> np.ndarray:
 
 
 def _centre_of_mass(pressure: np.ndarray, height: float) -> np.ndarray:
-    """Return c (T, 2) with c - (h / g) c'' = p, which starts and ends at rest on p."""
+    """Return c (T, 2) with c - (h / g) c'' = p, starting and ending at rest on p."""
     count = len(pressure)
     stiffness = height / _GRAVITY * FPS**2
     bands = np.zeros((3, count))
@@ -251,7 +250,7 @@ def _centre_of_mass(pressure: np.ndarray, height: float) -> np.ndarray:
 
 
 class _Body:
-    """The keys of a description at any time."""
+    """Interpolation of the keys of a description."""
 
     def __init__(self, keys: tuple[Key, ...], default: dict[str, float]) -> None:
         self._times = np.array([key.time for key in keys])
@@ -277,7 +276,7 @@ class _Body:
 
 
 class _Solver:
-    """Finds the joints of a frame, from those of the frame before."""
+    """Inverse kinematics of a frame, starting from the previous frame."""
 
     def __init__(self, model: mujoco.MjModel, qpos: np.ndarray) -> None:
         import mink
@@ -309,7 +308,7 @@ class _Solver:
         lean: float,
         joints: dict[str, float],
     ) -> np.ndarray:
-        """Return qpos with the feet (x, y, height of the sole, yaw) and the rest as asked for."""
+        """Return qpos for target feet (x, y, height of the sole, yaw) and posture."""
         mink = self._mink
         for foot, (x, y, height, yaw) in feet.items():
             self._feet[foot].set_target(_pose(mink, (x, y, height + _SOLE_BELOW_ANKLE), yaw))
@@ -383,7 +382,7 @@ def _rounded(motion: Motion) -> Motion:
 
 
 def main() -> None:
-    """Write all motions, or those named on the command line."""
+    """Write all motions, or those given on the command line."""
     parser = argparse.ArgumentParser(description="Make the motions that ship with the package.")
     parser.add_argument("names", nargs="*", help="motions to make; all if none is named")
     parser.add_argument("--folder", type=Path, default=SHIPPED)

@@ -1,6 +1,6 @@
 """Draw the pictures of the documentation: `python tools/make_pictures.py`.
 
-It renders offscreen and needs no display. Run it again when a terrain preset or the example of
+Renders offscreen, without a display. Run again when a terrain preset or the example of
 `variants.md` changes.
 """
 
@@ -28,11 +28,11 @@ from mjlab.viewer.viser.camera_viewer import depth_colors, segmentation_colors
 _DOCS = Path(__file__).parents[1] / "docs"
 _IMAGES = _DOCS / "images"
 
-# Extent of one terrain, in metres, and how difficult those of a strip are.
+# Extent of one terrain (m), and difficulties of a strip.
 _SIZE = 8.0
 _DIFFICULTIES = (0.0, 0.5, 1.0)
 _STRIPS_PER_ROW = 2
-# Pixels of a strip and of its title. Strips are rendered larger, and shrunk to smooth edges.
+# Pixels of a strip and of its title. Strips are rendered larger and downsampled for antialiasing.
 _WIDTH, _HEIGHT, _TITLE, _OVERSAMPLING = 640, 168, 22, 2
 
 
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def draw_cameras(path: Path) -> None:
-    """Draw what cameras of both engines see of the arm that lifts a cube, one engine a row."""
+    """Draw camera images of the arm that lifts a cube, one engine per row."""
     figure = Figure(figsize=(9.6, 3.4), dpi=100)
     engines: tuple[Literal["native", "warp"], ...] = ("native", "warp")
     for row, engine in enumerate(engines):
@@ -63,13 +63,13 @@ def draw_cameras(path: Path) -> None:
 
 
 def camera_pictures(engine: Literal["native", "warp"]) -> dict[str, np.ndarray]:
-    """Return the images (H, W, 3) of two cameras, by what they show."""
+    """Return the images (H, W, 3) of two cameras, by content."""
     task = load_env_cfg("Mjlab-Lift-Cube-Yam-Rgb").scene
     kinds = ("rgb", "depth", "segmentation")
     common: dict[str, Any] = {"width": 144, "height": 144, "data_types": kinds}
     common["enabled_geom_groups"] = (0, 2)
     look = {
-        # The arm from the side, with shadows, and what its own camera sees.
+        # The arm from the side, with shadows, and its wrist camera.
         "side": CameraSensorCfg(
             name="side", pos=(0.2, -0.85, 0.3), quat=(0.75, 0.66, 0.0, 0.0), fovy=50.0,
             use_shadows=True, **common,
@@ -104,7 +104,7 @@ def camera_pictures(engine: Literal["native", "warp"]) -> dict[str, np.ndarray]:
 
 
 def draw_variants(path: Path) -> None:
-    """Draw the example of `variants.md` as it stands there, a while after it was dropped."""
+    """Draw the example of `variants.md`, some time after its release."""
     page = (_DOCS / "how-to" / "variants.md").read_text(encoding="utf-8")
     example: dict[str, Any] = {}
     exec(page.split("```python\n")[1].split("```")[0], example)
@@ -159,7 +159,7 @@ def draw_terrains(path: Path) -> None:
         ha="center", va="center", fontsize=13, color="0.3",
     )  # fmt: skip
     figure.savefig(path)
-    # A palette of 256 colours is a third of the size, and looks the same here.
+    # A palette of 256 colors is a third of the size, and looks the same here.
     image = Image.open(path).convert("RGB")
     image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size // 1024} kB, {image.size[0]} x {image.size[1]}")
@@ -215,7 +215,7 @@ def _strip_spec(sub: SubTerrainCfg) -> mujoco.MjSpec:
     visual.headlight.diffuse = (0.1, 0.1, 0.1)
     visual.headlight.specular = (0.0, 0.0, 0.0)
     visual.quality.shadowsize = 8192
-    # A narrow view from afar: all three look alike, wherever they are in the strip.
+    # A narrow field of view from afar: perspective is equal along the strip.
     visual.global_.fovy = 9.1
     visual.global_.offwidth = _WIDTH * _OVERSAMPLING
     visual.global_.offheight = _HEIGHT * _OVERSAMPLING

@@ -1,4 +1,4 @@
-"""Try task packages: import each, then build, step and train every task it registers.
+"""Test task packages: import each, then build, step and train every task it registers.
 
     python tools/packages.py [--engines native warp] [--json FILE] [FOLDER ...]
 
@@ -118,7 +118,7 @@ def _mjlab_requirement(dependencies: list[str]) -> str | None:
 
 def _parse(dependencies: list[str]) -> Iterator[Requirement]:
     for dependency in dependencies:
-        # Templates of project files are at times not filled in.
+        # Project files may be unfilled templates.
         with contextlib.suppress(InvalidRequirement):
             yield Requirement(dependency)
 
@@ -144,7 +144,7 @@ class Trial:
         return self.error is None and self.passed == list(STAGES)
 
 
-# The process that tries a package. It sends a message per event: ("tasks", names), ("start", task),
+# Child process that tests a package. It sends a message per event: ("tasks", names), ("start", task),
 # ("passed", stage), ("warned", message), ("failed", error) and ("end", seconds).
 
 
@@ -156,7 +156,7 @@ class _Worker:
         self._warned: set[str] = set()
 
     def run(self, done: list[str]) -> None:
-        """Import the package and try its tasks but those `done`."""
+        """Import the package and test its tasks except `done`."""
         warnings.simplefilter("always")
         warnings.showwarning = self._report_warning  # ty: ignore[invalid-assignment]
         try:
@@ -185,7 +185,7 @@ class _Worker:
 
         before = set(registry.list_tasks())
         sys.path[:0] = [str(root) for root in self._package.roots]
-        # As an installer would leave it, so that packages can ask for their own metadata.
+        # Metadata as written by an installer, because packages may query their own.
         sys.path.append(str(self._write_metadata()))
         importlib.invalidate_caches()
         for entry_point in entry_points(group=GROUP):
@@ -255,7 +255,7 @@ class _Worker:
 
 
 def _describe(error: BaseException, package: Package) -> str:
-    """Return the last line of the error, and the file of the package that it arose in."""
+    """Return the last line of the error, and the file of the package that raised it."""
     missing = _missing_dependency(error, package)
     text = missing or f"{type(error).__name__}: {str(error).strip() or 'no message'}"
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
@@ -266,7 +266,7 @@ def _describe(error: BaseException, package: Package) -> str:
 
 
 def _missing_dependency(error: BaseException | None, package: Package) -> str | None:
-    """Return a message if a third-party module is missing, and the extra of mjlab that has it."""
+    """Return a message if a third-party module is missing, with the mjlab extra that provides it."""
     while error is not None and not isinstance(error, ModuleNotFoundError):
         error = error.__cause__
     if error is None or error.name is None:
@@ -292,21 +292,21 @@ def _work(
     connection: Connection, package: Package, engine: Engine, done: list[str], folder: str
 ) -> None:
     os.chdir(folder)
-    # What packages print must not get between the lines of the table.
+    # Output of packages must not mix with the table.
     with open("output.txt", "a") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)
     _Worker(connection, package, engine).run(done)
 
 
-# The process that watches.
+# Parent process.
 
 
 def try_package(package: Package, engine: Engine, seconds: float) -> list[Trial]:
-    """Try all tasks of a package on an engine, each for at most `seconds`."""
+    """Test all tasks of a package on an engine, each for at most `seconds`."""
     trials: list[Trial] = []
     with tempfile.TemporaryDirectory() as folder:
-        # A task that crashes or hangs ends its process; another one takes up the remaining tasks.
+        # A crash or timeout ends the process; a new one runs the remaining tasks.
         while not _watch(package, engine, seconds, folder, trials):
             pass
     return trials
@@ -393,7 +393,7 @@ def _cells(trial: Trial) -> list[str]:
 
 
 def main() -> None:
-    """Try the packages of the command line; print the table."""
+    """Test the packages of the command line; print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER")
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))

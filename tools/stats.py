@@ -3,7 +3,7 @@
     python tools/stats.py [ROOT] [--json FILE] [--against FILE]
 
 ROOT is a checkout, by default the one of this script. `--json` writes the numbers to a file;
-`--against` reads such a file and prints its numbers beside those of ROOT, before and after.
+`--against` reads such a file and prints its numbers next to those of ROOT, before and after.
 
 Definitions:
 
@@ -95,10 +95,10 @@ PATTERNS = {
 PRONOUN_COMMENT = "comment opens with It, They, That ..."
 PRONOUN = r"#\s*(It|They|That|These|Those|Such)\b"
 
-# Decorators that leave how a function is called as it was.
+# Decorators that do not change the call of a function.
 PLAIN_DECORATORS = {"staticmethod", "classmethod", "contextmanager", "cache", "lru_cache"}
 
-# Rows to bring below a number.
+# Upper bounds of rows.
 TO_REACH = {
     "private functions per 1,000 lines": 18,
     "private functions called once": 200,
@@ -132,7 +132,7 @@ CIRCLES = {
     "with annotations and imports in functions": (True, True),
 }
 
-# Conditions of blocks that are read by type checkers only.
+# Conditions of blocks for type checkers only.
 TYPING_ONLY = ("TYPE_CHECKING", "typing.TYPE_CHECKING")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -571,7 +571,7 @@ def largest(sources: list[Source], modules: set[str]) -> dict[str, tuple[int, st
 
 
 def share(scale: int, part: int, whole: int) -> float:
-    """Return `scale * part / whole`, 0 if there is no whole."""
+    """Return `scale * part / whole`, or 0 if `whole` is 0."""
     return round(scale * part / whole, 2) if whole else 0
 
 
@@ -611,7 +611,7 @@ def report(root: Path) -> Report:
 
 
 def print_report(after: Report, before: Report | None) -> None:
-    """Print the tables, with the numbers of `before` beside those of `after` if there are any."""
+    """Print the tables, with the numbers of `before`, if any, next to those of `after`."""
     columns = [before, after] if before else [after]
     headings = ["before", "after"] if before else ["number"]
     rows = []
@@ -649,7 +649,7 @@ def print_circles(found: dict[str, list[list[str]]]) -> None:
 
 
 def package_rows(after: Report, before: Report | None) -> Iterator[list[str]]:
-    """Yield the rows of the table by package, with cells `before -> after` where they differ."""
+    """Yield the rows of the table by package, with cells `before -> after` for changed numbers."""
     old = before["packages"] if before else {}
     for name in sorted({*old, *after["packages"]}):
         cells = [name]

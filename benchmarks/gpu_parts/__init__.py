@@ -1,1 +1,1 @@
-"""Parts of the proof on a GPU. Each is a module with `measure(options)`, which yields rows."""
+"""Parts of the GPU validation. Each is a module with `measure(options)`, a generator of rows."""

@@ -1,4 +1,4 @@
-"""Images a second of Warp's cameras in the scene of lifting a cube, over bare `mujoco_warp.render`."""
+"""Images per second of Warp's cameras in the scene of lifting a cube, over bare `mujoco_warp.render`."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _row(
 
 
 def _bare(env: ManagerBasedRlEnv, views: tuple[CameraView, ...]) -> Callable[[], None]:
-    """Return what renders the same views by `mujoco_warp` alone."""
+    """Return a renderer of the same views by `mujoco_warp` alone."""
     device = wp.get_device(env.device)
     model, data = env.sim.wp_model, env.sim.wp_data
     context = env.sim.render_context(views, views[0])

@@ -1,4 +1,4 @@
-"""Questions to a GPU: has it finished, how often did the host wait for it, how much memory is taken."""
+"""GPU synchronization, count of host waits, and memory use."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _MIB = 2**20
 
 
 def wait(device: str) -> None:
-    """Wait until the device has done all its work; nothing on the CPU, which never lags behind."""
+    """Synchronize the device. No-op on the CPU."""
     if device.startswith("cuda"):
         torch.cuda.synchronize(device)
 
 
 @dataclass
 class Waits:
-    """Operations of torch that made the host wait for the GPU."""
+    """Count of torch operations that synchronize with the GPU."""
 
     places: Counter[str] = field(default_factory=Counter)
     """Number of host synchronizations by `file:line`."""
     is_known: bool = True
-    """False on the CPU, where torch does not tell."""
+    """False on the CPU: torch does not report them."""
 
     def per_step(self, steps: int) -> str:
-        """Return the number of a step, and the places that wait most."""
+        """Return the number per step, and the lines with the most waits."""
         if not self.is_known:
             return "-"
         most = ", ".join(f"{place} {n / steps:.2g}" for place, n in self.places.most_common(6))
@@ -46,7 +46,7 @@ class Waits:
 
 @contextlib.contextmanager
 def counted_waits(device: str) -> Generator[Waits]:
-    """Count, within the block, the operations of torch that wait for the GPU."""
+    """Count torch operations that synchronize with the GPU within the block."""
     waits = Waits(is_known=device.startswith("cuda"))
     if not waits.is_known:
         yield waits
@@ -65,14 +65,14 @@ def counted_waits(device: str) -> Generator[Waits]:
 
 
 class Memory:
-    """GPU memory taken since this was made, in MiB; None on the CPU."""
+    """GPU memory used since construction (MiB). None: CPU."""
 
     def __init__(self, device: str) -> None:
         self._device = device
         self._before = self._used()
 
     def taken(self) -> dict[str, float] | None:
-        """Return what torch and Warp hold now, and what the device has less."""
+        """Return the memory held by torch and Warp, and the decrease of free device memory."""
         if self._before is None:
             return None
         now = self._used()
@@ -98,7 +98,7 @@ class Memory:
         return {
             "device": total - free,
             "torch": torch.cuda.memory_allocated(self._device),
-            # Without a memory pool, Warp does not know.
+            # Without a memory pool, Warp reports no usage.
             "warp": wp.get_mempool_used_mem_current(device)
             if device.is_mempool_supported
             else math.nan,

@@ -1,4 +1,4 @@
-"""Warp's kernels for all tasks, compiled in processes side by side, so that later parts do not wait.
+"""Warp's kernels for all tasks, compiled in parallel processes, so that later parts do not wait.
 
 Warp keeps what it has compiled in a folder of the user. `python -m gpu_parts.kernels TASK DEVICE NUM`
 compiles those of one task and prints the seconds.
@@ -38,12 +38,12 @@ _TASKS = (GO1_FLAT, G1_ROUGH, LIFT_CUBE_RGB, TRACKING, G1_FLAT, GO1_ROUGH, LIFT_
 
 
 def measure(options: Options) -> Iterator[Row]:
-    """Compile; a row for each process, as it ends.
+    """Compile; yield a row per process, as it ends.
 
-    The first task is alone: it compiles what all have in common, which the others find.
+    The first task runs alone: it compiles the common kernels for the others.
 
     Raises:
-        RuntimeError: some of the processes failed; the others have ended then.
+        RuntimeError: some processes failed; all have ended.
     """
     failed: list[str] = []
     begin = time.monotonic()
@@ -55,7 +55,7 @@ def measure(options: Options) -> Iterator[Row]:
             most = max(1, available_cores() // 2) if has_compiled else 1
             while waiting and len(running) < most:
                 name = next(iter(waiting))
-                # Into a file: the output of processes that wait for a reader would stop them.
+                # Into a file: a full pipe would block the processes.
                 log = stack.enter_context(tempfile.TemporaryFile("w+"))
                 process = subprocess.Popen(
                     waiting.pop(name),
@@ -74,7 +74,7 @@ def measure(options: Options) -> Iterator[Row]:
                 process, log = running.pop(name)
                 log.seek(0)
                 said = log.read()
-                # Whether tests pass is another part's question.
+                # The part `tests` checks that tests pass.
                 if process.returncode != 0 and name != _TESTS:
                     failed.append(f"{name} ended with {process.returncode}:\n{said[-3000:]}")
                     continue
@@ -91,7 +91,7 @@ def measure(options: Options) -> Iterator[Row]:
 
 
 def _commands(options: Options) -> dict[str, list[str]]:
-    """Return a command for each task, and one that makes the steps of the tests."""
+    """Return a command per task, and one that makes the steps of the tests."""
     num_envs = str(options.sized(64, 2))
     commands = {
         task: [sys.executable, "-m", "gpu_parts.kernels", task, options.device, num_envs]

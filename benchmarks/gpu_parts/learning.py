@@ -1,6 +1,6 @@
-"""Go1 on flat ground, trained on Warp until it is solved, and scored on episodes of fresh seeds.
+"""Go1 on flat ground, trained on Warp until it is solved, and scored on episodes of unused seeds.
 
-`train` is given the task's `cpu` profile, whose evaluations stop it, so that the figures compare with
+`train` uses the task's `cpu` profile, whose evaluations stop it, so results are comparable with
 those of a few cores. The policy is then scored by `evaluate` on Warp, and on native MuJoCo, with
 seeds that no evaluation of the training used.
 """
@@ -28,12 +28,12 @@ from mjlab.tasks.registry import load_rl_cfg
 
 _PROFILE = "cpu"
 _TRAINING_SEED, _FRESH_SEED = 1, 90_210
-# Seconds of the part that are kept for scoring.
+# Seconds reserved for scoring.
 _FOR_SCORING = 60.0
 
 
 def measure(options: Options) -> Iterator[Row]:
-    """Train and score; two rows."""
+    """Train and score; yield two rows."""
     with tempfile.TemporaryDirectory() as folder:
         seconds, was_cut = _train(Path(folder), options)
         checkpoint = _newest_checkpoint(Path(folder))
@@ -74,10 +74,10 @@ def _train(log_root: Path, options: Options) -> tuple[float, bool]:
         try:
             process.wait(max(options.seconds - _FOR_SCORING, 0.5 * options.seconds))
         except subprocess.TimeoutExpired:
-            # It then saves what it has learned.
+            # `train` saves on this signal.
             was_cut = True
             process.send_signal(signal.SIGINT)
-            # If that takes too long, the newest of its regular checkpoints is scored.
+            # If saving takes too long, the newest regular checkpoint is scored.
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(min(30.0, 0.25 * options.seconds))
     finally:
@@ -96,7 +96,7 @@ def _newest_checkpoint(log_root: Path) -> Path:
 
 
 def _score(checkpoint: Path, engine: str, device: str, options: Options) -> EvaluationResult:
-    """Return what `evaluate` finds."""
+    """Return the result of `evaluate`."""
     episodes = options.sized({"warp": 1000, "native": 256}, {"warp": 2, "native": 2})[engine]
     flags = ["--checkpoint-file", str(checkpoint), "--profile", _PROFILE, "--engine", engine]
     flags += ["--device", device, "--seed", str(_FRESH_SEED), "--num-episodes", str(episodes)]
@@ -111,7 +111,7 @@ def _conditions() -> dict[str, float]:
 
 
 def _is_solved(result: EvaluationResult) -> bool:
-    # Judged as in training. Written so that NaN meets nothing.
+    # Judged as in training. Comparisons with NaN are False.
     return all(result.judged(name) <= most for name, most in _conditions().items())
 
 

@@ -1,4 +1,4 @@
-"""Machine, GPU and versions of libraries that the figures depend on."""
+"""Machine, GPU and library versions of a measurement."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mjlab.utils.processes import available_cores
 
 
 def described(device: str) -> dict[str, Any]:
-    """Return what the figures depend on."""
+    """Return machine, GPU and library versions."""
     found: dict[str, Any] = {
         "date": time.strftime("%Y-%m-%d %H:%M"),
         "device": device,

@@ -11,12 +11,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Options:
-    """Where and how a part is run."""
+    """Device, size, output and time limit of a part."""
 
     device: str
     """Torch device of the Warp engine."""
     tiny: bool
-    """Sizes of a few seconds on a CPU."""
+    """Use sizes of a few seconds on a CPU."""
     output: Path
     """Folder of results."""
     seconds: float
@@ -28,5 +28,5 @@ class Options:
         return self.device.startswith("cuda")
 
     def sized(self, full: T, tiny: T) -> T:
-        """Return the size to use, of the two."""
+        """Return the size to use."""
         return tiny if self.tiny else full

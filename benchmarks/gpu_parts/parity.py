@@ -1,8 +1,8 @@
-"""Both engines show a policy the same and reward it the same, from the same states.
+"""Parity of observations and rewards on both engines, from the same states.
 
-Native MuJoCo on the CPU leads: before every step Warp takes its state over, and both make the step
-with the same actions. So a motion with contacts, which is chaotic, does not drift apart, and every
-step is a comparison of its own. An error is relative to the largest value of its quantity.
+Native MuJoCo on the CPU is the reference: before every step Warp takes over its state, and both step
+with the same actions. So chaotic motions with contacts do not diverge, and every
+step is a separate comparison. An error is relative to the largest value of its quantity.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from gpu_parts.tasks import (
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
 STATE_TOLERANCE = 5e-3
-"""Error of observations of the same state. Contact forces, which critics see, are the least exact."""
+"""Error of observations of the same state. Contact forces (critic) are the least exact."""
 STEP_TOLERANCE = 2e-2
 """Error of observations and rewards after one step, in double and in single precision."""
 WITHIN = 0.99
 """Share of the environments' steps within these tolerances: a contact that begins in this substep on
-one engine and in the next on the other is beyond them."""
+one engine and in the next on the other exceeds them."""
 
 _STATE = (
     *("time", "qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied"),
@@ -42,7 +42,7 @@ _STATE = (
 
 @dataclass
 class _Errors:
-    """Relative errors of all environments in all steps, and where the largest was."""
+    """Relative errors of all environments in all steps, and the location of the largest."""
 
     values: list[torch.Tensor] = field(default_factory=list)
     largest: float = 0.0
@@ -52,7 +52,7 @@ class _Errors:
         """Return the error of each environment (N,) in `name`, whose values are (N, ...)."""
         native, warp = native.cpu().float().flatten(1), warp.cpu().float().flatten(1)
         scale = 1.0 + native.abs().amax(dim=0)
-        # NaN on one engine alone is as far away as anything can be.
+        # NaN on one engine alone is an infinite error.
         errors = ((native - warp).abs() / scale).nan_to_num(nan=torch.inf).amax(dim=1)
         if errors.max() > self.largest:
             self.largest, self.place = float(errors.max()), name
@@ -78,7 +78,7 @@ class _Errors:
 
 
 def measure(options: Options) -> Iterator[Row]:
-    """Compare one task of each family; two rows a task."""
+    """Compare one task of each family; yield two rows per task."""
     num_envs, steps = options.sized((128, 40), (4, 2))
     for task in options.sized((CARTPOLE, GO1_FLAT, LIFT_CUBE, TRACKING), (CARTPOLE, GO1_FLAT)):
         native, warp = both(task, num_envs, options.device)
@@ -94,7 +94,7 @@ def both(task: str, num_envs: int, device: str) -> tuple[ManagerBasedRlEnv, Mana
 
 
 def _without_chance(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Drop what draws random numbers within a step: the two devices draw different ones."""
+    """Remove terms that draw random numbers within a step: the devices draw different ones."""
     for group in cfg.observations.values():
         if group is not None:
             group.enable_corruption = False
@@ -106,7 +106,7 @@ def _without_chance(cfg: ManagerBasedRlEnvCfg) -> None:
 def compare(
     task: str, native: ManagerBasedRlEnv, warp: ManagerBasedRlEnv, steps: int
 ) -> Iterator[Row]:
-    """Make `steps` steps, each from the same states; two rows."""
+    """Run `steps` steps, each from the same states; return two rows."""
     generator = torch.Generator().manual_seed(0)
     seen, stepped = _Errors(), _Errors()
     ended_differently, count = 0, 0
@@ -116,7 +116,7 @@ def compare(
         actions = random_actions(native, generator)
         ended = [env.step(actions.to(env.device))[2:4] for env in (native, warp)]
         done = [(terminated | truncated).cpu() for terminated, truncated in ended]
-        # Where an episode has ended, a new one begins at random.
+        # Finished episodes restart at random states.
         going = ~(done[0] | done[1])
         errors = _observed(stepped, native, warp, going)
         rewards = [env.reward_manager._step_reward[going.to(env.device)] for env in (native, warp)]
@@ -157,9 +157,9 @@ def _observed(
 
 
 def follow(native: ManagerBasedRlEnv, warp: ManagerBasedRlEnv) -> None:
-    """Put the environments on Warp into the very state of those on native MuJoCo."""
+    """Copy the state of the environments on native MuJoCo to those on Warp."""
     state: dict[str, Any] = native.state_dict()
-    # Physics of another engine is not taken over as saved, but field by field.
+    # Saved physics states do not transfer between engines; copy the fields.
     state["sim"] = warp.sim.state_dict()
     warp.load_state_dict(state)
     for name in native.sim.expanded_fields & warp.sim.expanded_fields:
@@ -169,5 +169,5 @@ def follow(native: ManagerBasedRlEnv, warp: ManagerBasedRlEnv) -> None:
     for env in (native, warp):
         env.sim.forward()
         env.sim.sense()
-        # Anew: what was observed before came along with the state.
+        # Recompute: the copied state includes old observations.
         env.obs_buf = env.observation_manager.compute(update_history=True)

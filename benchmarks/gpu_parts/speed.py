@@ -1,8 +1,8 @@
-"""`env.step` on Warp over a bare `mujoco_warp` loop in a captured graph, in turns.
+"""`env.step` on Warp over a bare `mujoco_warp` loop in a captured graph, alternating.
 
-The bare loop steps the same models, those of the environments with what their events have
-randomized, makes each of its steps from the states in which the environments are, with the same
-controls, and casts the same rays. Everything that managers do is the difference.
+The bare loop steps the environments' models, including randomized fields, starts each step from
+the states of the environments, with the same controls, and casts the same rays. The difference is the
+overhead of managers.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class BareWarp:
         self._device = wp.get_device(env.device)
         with wp.ScopedDevice(self._device):
             self._model = mjw.put_model(sim.mj_model)
-            # All as the engine does it.
+            # Same order as the engine.
             self._model.opt.warn_overflow = 0
             if self._device.is_cuda:
                 self._model.opt.graph_conditional = wp.is_conditional_graph_supported()
@@ -74,7 +74,7 @@ class BareWarp:
                 inertia.copy_(engine.model_fields["stat.meaninertia"])
             self._rays = [_Rays(env, query) for query in _recorded_rays(env)]
             wait(env.device)
-            # Kernels are loaded by the first call. On a GPU the next ones replay a graph.
+            # The first call loads kernels. On a GPU the next ones replay a graph.
             self._work()
             self._replay: Callable[[], None] = self._work
             if self._device.is_cuda:
@@ -84,11 +84,11 @@ class BareWarp:
 
     @property
     def num_rays(self) -> int:
-        """Rays of an environment."""
+        """Number of rays per environment."""
         return sum(rays.count for rays in self._rays)
 
     def same_states(self) -> None:
-        """Take over states and controls of the environments."""
+        """Copy states and controls of the environments."""
         for name in _STATE:
             own = TorchArray(getattr(self._data, name)).tensor
             own.copy_(getattr(self._env.sim.data, name).view(own.shape))
@@ -106,7 +106,7 @@ class BareWarp:
 
 
 class _Rays:
-    """Rays of one query of the environments, as `mujoco_warp` takes them."""
+    """Rays of one query of the environments, as arguments of `mujoco_warp`."""
 
     def __init__(self, env: ManagerBasedRlEnv, query: RayQuery) -> None:
         origins, groups, excluded = query.origins, query.geom_groups, query.exclude_body_ids
@@ -114,7 +114,7 @@ class _Rays:
         self.count = shape[1]
         if excluded is None:
             excluded = torch.full(shape[1:], -1, device=device)
-        # Kept, because Warp's arrays do not keep the tensors whose memory they are.
+        # Keep references: Warp arrays do not own the memory of their tensors.
         self._tensors = (
             origins.contiguous().clone(),
             query.directions.contiguous().clone(),
@@ -141,7 +141,7 @@ class _Rays:
         self._all_groups = wp.types.vector(length=6, dtype=float)(*[-1.0] * 6)
 
     def cast(self, model: Any, data: Any) -> None:
-        """Cast them at the current poses."""
+        """Cast the rays at the current poses."""
         origins, directions, excluded, distances, geoms, normals = self._arrays
         mjw.refit_bvh(model, data, self._context)
         mjw.rays(
@@ -173,9 +173,9 @@ def _recorded_rays(env: ManagerBasedRlEnv) -> list[RayQuery]:
 
 
 def measure(options: Options) -> Iterator[Row]:
-    """Measure every task; three rows each."""
+    """Measure every task; yield three rows each."""
     tasks = options.sized((CARTPOLE, GO1_FLAT, G1_FLAT, GO1_ROUGH, G1_ROUGH), (CARTPOLE, GO1_ROUGH))
-    # Contexts of libraries on the GPU are no memory of environments.
+    # Exclude the GPU contexts of libraries.
     close(stepped_env(options.sized(GO1_FLAT, CARTPOLE), 2, options.device, 1)[0])
     for task in tasks:
         yield from _measure_task(task, options)

@@ -48,7 +48,7 @@ def random_actions(env: ManagerBasedRlEnv, generator: torch.Generator) -> torch.
 def stepped_env(
     task: str, num_envs: int, device: str, steps: int
 ) -> tuple[ManagerBasedRlEnv, torch.Tensor]:
-    """Return environments on Warp that have made `steps` steps, and the actions (N, A) of each."""
+    """Return environments on Warp after `steps` steps, and the actions (N, A) of each."""
     env = make_env(task, num_envs, device)
     actions = random_actions(env, torch.Generator().manual_seed(0)).to(env.device)
     for _ in range(steps):
@@ -57,6 +57,6 @@ def stepped_env(
 
 
 def close(env: Any) -> None:
-    """Close environments and let go of what refers to them in circles."""
+    """Close environments and collect reference cycles."""
     env.close()
     gc.collect()

@@ -23,10 +23,10 @@ _TINY = "cartpole and (derived or rays)"
 
 
 def measure(options: Options) -> Iterator[Row]:
-    """Run the tests in a process; one row, whose comparison names those that failed.
+    """Run the tests in a process; yield one row that names failures.
 
     Raises:
-        ModuleNotFoundError: what tests need is not installed.
+        ModuleNotFoundError: a dependency of the tests is not installed.
         RuntimeError: some tests failed, or pytest could not run; the message ends with its output.
     """
     missing = missing_for_tests()
@@ -45,10 +45,10 @@ def measure(options: Options) -> Iterator[Row]:
 
 
 def missing_for_tests() -> list[str]:
-    """Return the packages that the tests need and that are not installed."""
+    """Return missing packages of the tests."""
     missing = []
     for name in _NEEDED:
-        # Imported, because one of those that it needs itself may be missing.
+        # Import the package: one of its dependencies may be missing.
         try:
             importlib.import_module(name)
         except ImportError as error:

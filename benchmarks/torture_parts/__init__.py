@@ -1,1 +1,1 @@
-"""Families of trials of `make torture`, one a file; see `trials.py` for what a family has."""
+"""Families of trials of `make torture`, one per file; see `trials.py` for the contents of a family."""

@@ -26,7 +26,7 @@ _ODD = (
     "../../x", "./.", "/dev/null", "/proc/self/mem", "/nonexistent/x", "~", "~nobody/x", "file:///x",
     "cuda:9", "cuda:-1", "meta", "mps", "cpu:3", "os:system", "__import__", "torch.nn:Module",
 )  # fmt: skip
-# Flags whose large values ask for much work, rightly.
+# Flags whose large values require much work, as expected.
 _LONG = (
     "max-iterations",
     "num-steps",
@@ -54,7 +54,7 @@ _CALLS: dict[str, tuple[str, ...]] = {
     "verify": (TASK, "--device", "cpu", "--num-envs", "16", "--resume"),
     "csv_to_npz": ("--input-file", "RUN/run.json"),
 }
-# Calls that would be wrong in silence; nothing in them is random.
+# Deterministic calls that would fail silently.
 _MISTAKES: tuple[tuple[str, ...], ...] = (
     ("train", *_TRAIN, "--agent.algorithm.num-mini-batches", "1000"),
     ("train", *_TRAIN, "--agent.algorithm.num-mini-batches", "1000000000"),
@@ -112,7 +112,7 @@ _MISTAKES: tuple[tuple[str, ...], ...] = (
     ("demo", "nope"),
     ("verify", TASK, "--seed", "-5"),
 )
-# As many of ten trials are among the mistakes, until all of these have been tried.
+# Number of mistakes among ten trials, until all have been tried.
 _MISTAKES_OF_TEN = 4
 
 
@@ -136,7 +136,7 @@ def run(trial: Trial, prepared: dict[str, object]) -> None:
     else:
         script, argv = _fuzzed(trial.rng, prepared["flags"])
     argv = [word.replace("RUN", str(prepared["run"])) for word in argv]
-    # No argument of a process can hold a null, and a page may be served on any free port.
+    # Process arguments cannot contain a null, and a page may use any free port.
     shown = " ".join(repr(w) if not re.fullmatch(r"[\w./,:-]+", w) else w for w in argv)
     own = shown.replace(" ".join(SMALL), "").replace(str(prepared["run"]), "RUN")
     trial.trying(f"{script.replace('_', '-')} {own[:300]}")
@@ -147,9 +147,9 @@ def run(trial: Trial, prepared: dict[str, object]) -> None:
     ended = command(script, *argv, before=environment, patience=_PATIENCE)
     check_end(ended)
     if is_mistake and ended.status == 0:
-        raise Broken("was not refused: exit status 0")
+        raise Broken("was not rejected: exit status 0")
     if is_mistake and ended.was_asked:
-        raise Broken(f"was not refused within {_PATIENCE:.0f} s")
+        raise Broken(f"was not rejected within {_PATIENCE:.0f} s")
 
 
 def _fuzzed(rng: random.Random, flags: object) -> tuple[str, list[str]]:

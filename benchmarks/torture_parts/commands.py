@@ -1,4 +1,4 @@
-"""Command lines of mjlab, run in forked processes, and what counts as a good end of one."""
+"""Command lines of mjlab, run in forked processes, and the check of their exits."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mjlab.scripts import cli
 from torture_parts.trials import Broken, descendants
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -28,13 +29,13 @@ SMALL = (
 """Flags of a run of 0.05 s an iteration."""
 
 MEMORY = 3 << 30
-"""Bytes that a command may take: far more than any trial needs."""
+"""Memory limit of a command (bytes), far above the need of any trial."""
 PATIENCE = 25.0
-"""Seconds until a command that is still busy is asked to end."""
+"""Seconds until a busy command receives a signal to end."""
 _ANSWER = 10.0
 _OUTPUT = 100_000
 _KEPT = 1 << 20
-# What commands import late; forked processes should have it.
+# Late imports of commands, done before the fork.
 _IMPORTS = (
     "mjlab.envs", "mjlab.rl", "mjlab.rl.evaluation", "mjlab.rl.exporter_utils", "mjlab.rl.plot",
     "mjlab.rl.run_logger", "mjlab.rl.sac", "mjlab.scripts.play", "mjlab.scripts.display",
@@ -42,7 +43,7 @@ _IMPORTS = (
     "mjlab.scripts.profile_env", "mjlab.scripts.resume", "mjlab.scripts.train",
     "mjlab.scripts.verify", "mjlab.scripts.viz_nan", "mjlab.sim.native.engine",
     "mjlab.tasks.cartpole.cartpole_env_cfg", "mjlab.viewer.base", "matplotlib.figure",
-    "matplotlib.backends.backend_agg", "onnx", "tensorboard.backend.event_processing",
+    "matplotlib.backends.backend_agg", "onnx", "onnxruntime", "tensorboard.backend.event_processing",
     "tensorboard.backend.event_processing.event_accumulator", "torch.utils.tensorboard", "tyro",
     "yaml",
 )  # fmt: skip
@@ -51,7 +52,7 @@ _IMPORTS = (
 def preload() -> None:
     """Import what the commands do. One thread for torch, so that weights can be compared."""
     os.environ["OMP_NUM_THREADS"] = "1"
-    # Nothing is sent anywhere, and nothing asks for a login.
+    # No uploads and no login prompts.
     os.environ.pop("WANDB_API_KEY", None)
     for name in _IMPORTS:
         importlib.import_module(name)
@@ -59,7 +60,7 @@ def preload() -> None:
 
 @dataclass(frozen=True)
 class Ended:
-    """A command that has ended."""
+    """Result of a finished command."""
 
     status: int
     """Exit status; the negative signal if one ended it."""
@@ -68,9 +69,9 @@ class Ended:
     size: int
     """Bytes of output."""
     stuck: str | None
-    """Why it was killed by the trial, if it was."""
+    """Reason if the trial killed the command."""
     was_asked: bool
-    """True if it was busy for too long, and asked to end."""
+    """True if the command exceeded the time limit and received a signal to end."""
 
     @property
     def said(self) -> str:
@@ -78,12 +79,12 @@ class Ended:
         return f"{self.out}\n{self.err}"
 
 
-# Statuses of commands that end by SIGHUP, SIGINT and SIGTERM in good order.
+# Exit statuses after a handled SIGHUP, SIGINT and SIGTERM.
 _BY_SIGNAL = (129, 130, 143)
 
 
 class Command:
-    """A command that runs in a forked process."""
+    """Command in a forked process."""
 
     def __init__(
         self,
@@ -93,13 +94,13 @@ class Command:
         before: Callable[[], None] = lambda: None,
         is_fresh: bool = False,
     ) -> None:
-        """Start it in the working folder.
+        """Start the command in the working folder.
 
         Args:
-            script: Module in mjlab.scripts.
-            argv: Its arguments.
-            before: Called in its process before it.
-            is_fresh: Start Python instead of forking, so that imports are part of it.
+            script: Subcommand of mjlab.
+            argv: Arguments of the command.
+            before: Called in the process before the command.
+            is_fresh: Start Python instead of forking, to include imports.
         """
         self._pipes = [os.pipe(), os.pipe()]
         self._text = [bytearray(), bytearray()]
@@ -123,7 +124,7 @@ class Command:
             os.set_blocking(read, False)
 
     def watch(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Collect output until it ends or `until` is true; return False once `seconds` are over."""
+        """Collect output until the command ends or `until` is true; return False after `seconds`."""
         end = time.monotonic() + seconds
         while self.status is None:
             self._collect(0.01)
@@ -141,12 +142,12 @@ class Command:
         return True
 
     def signal(self, number: int) -> None:
-        """Send it a signal, as a terminal does: to all its processes."""
+        """Send a signal to all processes of the command, as a terminal does."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, number)
 
     def end(self, patience: float = PATIENCE) -> Ended:
-        """Wait for its end. One that is still busy after `patience` s is asked, then killed."""
+        """Wait for the command to end. After `patience` s it is interrupted, then killed."""
         if not self.watch(patience):
             self._asked = True
             self.signal(signal.SIGINT)
@@ -159,7 +160,7 @@ class Command:
                 os.close(read)
         out, err = (bytes(text).decode(errors="replace") for text in self._text)
         status = -signal.SIGKILL if self.status is None else self.status
-        # Seen with `--trial`.
+        # Shown with `--trial`.
         print(f"{out}{err}[exit status {status}]", flush=True)
         return Ended(status, out, err, self._size, self._stuck, self._asked)
 
@@ -175,11 +176,11 @@ class Command:
                         self._size += len(data)
                         text += data[: _KEPT - len(text)]
         if ready and not got:
-            # Closed, by a command that is about to end.
+            # The ending command closed the pipe.
             time.sleep(seconds)
 
     def _takes_too_much(self) -> bool:
-        """Return whether its processes have more memory of their own than they may, now and then."""
+        """Return True if its processes exceed the limit of private memory; checked at intervals."""
         if time.monotonic() < self._memory_due:
             return False
         self._memory_due = time.monotonic() + 0.2
@@ -202,7 +203,7 @@ def command(
 
 
 def check_end(ended: Ended, *, statuses: Sequence[int] = (0, 1, 2, *_BY_SIGNAL)) -> None:
-    """Raise Broken unless a command ended well or said in words why it did not."""
+    """Raise Broken unless a command succeeded or reported an error message."""
     if ended.stuck:
         raise Broken(ended.stuck)
     if "Traceback (most recent call last)" in ended.said:
@@ -219,7 +220,7 @@ def check_end(ended: Ended, *, statuses: Sequence[int] = (0, 1, 2, *_BY_SIGNAL))
 
 
 def free_port() -> int:
-    """Return a port of this machine that nobody listens on."""
+    """Return a free port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
@@ -232,13 +233,13 @@ def last_error(text: str) -> str:
 
 
 def last_line(text: str) -> str:
-    """Return the last line of `text` that says something."""
+    """Return the last nonempty line of `text`."""
     lines = [line for line in text.splitlines() if line.strip()]
     return lines[-1].strip()[:200] if lines else "nothing was said"
 
 
 def _become(script: str, argv: list[str], before: Callable[[], None], is_fresh: bool) -> None:
-    """Be the command, and end as Python does."""
+    """Run the command in this process and exit as Python does."""
     status = 1
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -249,10 +250,10 @@ def _become(script: str, argv: list[str], before: Callable[[], None], is_fresh: 
         sys.stderr = open(2, "w", closefd=False, buffering=1)  # noqa: SIM115
         before()
         if is_fresh:
-            os.execv(sys.executable, [sys.executable, "-m", f"mjlab.scripts.{script}", *argv])
-        sys.argv = [script.replace("_", "-"), *argv]
+            os.execv(sys.executable, [sys.executable, "-m", "mjlab.scripts.cli", script, *argv])
+        sys.argv = ["mjlab", script, *argv]
         try:
-            importlib.import_module(f"mjlab.scripts.{script}").main()
+            cli.main()
             status = 0
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -21,7 +21,7 @@ LIMIT = 90.0
 
 _ITERATIONS = 2
 _DEEP = 50_000
-# Values that no setting has, and some that point elsewhere.
+# Invalid values of settings, and some that refer elsewhere.
 _ODD: tuple[Any, ...] = (
     None, True, -1, 0, 10**30, 1e308, float("nan"), float("inf"), "", "None", "x" * 100_000,
     "os:system", "../../../../etc/passwd", "/etc/passwd", "\x00", "\U0001f916", [], {}, [[]],
@@ -145,7 +145,7 @@ def _not_a_file(trial: Trial, run: Path, mark: Path) -> None:
 
 
 def _replace_one(trial: Trial, content: Any) -> tuple[str, Any]:
-    """Put an odd value somewhere into nested dicts; return where, and the value."""
+    """Put an odd value into nested dicts; return its path and the value."""
     way: list[str] = []
     while True:
         key = trial.rng.choice(sorted(content))

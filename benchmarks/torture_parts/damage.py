@@ -26,7 +26,7 @@ _DEEP = 100_000
 
 
 def prepare(folder: Path) -> dict[str, Any]:
-    """Make one good file of each kind, and what its reader returns."""
+    """Make one good file of each kind, with the result of its reader."""
     run = trained(folder / "logs", _ITERATIONS)
     files = {
         "checkpoint": next(run.glob("model_1.pt")),
@@ -43,11 +43,11 @@ def prepare(folder: Path) -> dict[str, Any]:
     return {"run": str(run), "files": {kind: str(path) for kind, path in files.items()}}
 
 
-# Readers return content that can be compared, and raise `Refused` with the message of an error.
+# Readers return content that can be compared, and raise `Rejected` with the message of an error.
 
 
-class Refused(Exception):
-    """Raised where a reader says that it cannot use a file."""
+class Rejected(Exception):
+    """Raised if a reader rejects a file with a message."""
 
 
 def _read_checkpoint(path: Path) -> Any:
@@ -56,7 +56,7 @@ def _read_checkpoint(path: Path) -> Any:
     try:
         return load_checkpoint(path)
     except CheckpointError as error:
-        raise Refused(str(error)) from error
+        raise Rejected(str(error)) from error
 
 
 def _read_motion(path: Path) -> Any:
@@ -65,7 +65,7 @@ def _read_motion(path: Path) -> Any:
     try:
         return dict(vars(read_motion(path)))
     except MotionFileError as error:
-        raise Refused(str(error)) from error
+        raise Rejected(str(error)) from error
 
 
 def _read_dump(path: Path) -> Any:
@@ -78,7 +78,7 @@ def _read_dump(path: Path) -> Any:
     try:
         dump, model = load_dump(str(path))
     except (UserError, ValueError, OSError) as error:
-        raise Refused(str(error)) from error
+        raise Rejected(str(error)) from error
     buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return {"arrays": dump.arrays, "metadata": dump.metadata, "model": buffer}
@@ -97,17 +97,17 @@ def _read_events(path: Path) -> Any:
     try:
         curves = read_all_scalars(path.parent)
     except (ValueError, OSError) as error:
-        raise Refused(str(error)) from error
+        raise Rejected(str(error)) from error
     finally:
         logging.getLogger("mjlab").removeHandler(handler)
     if not curves:
-        # Everything that draws a curve says that the run does not have it.
-        raise Refused("no figures")
+        # Readers of curves report a run without one.
+        raise Rejected("no data")
     return curves, told.getvalue()
 
 
 def _score(path: Path) -> Ended:
-    """Score the policy of the run that `path` is of: its export if that is what is damaged."""
+    """Score the policy of the run of `path`: its export if `path` is one."""
     run = path.parent.parent if path.parent.name == "params" else path.parent
     policy = path if path.suffix == ".onnx" else run / "model_1.pt"
     flags = ("--num-episodes", "2", "--max-steps", "5", "--json", "True", "--device", "cpu")
@@ -118,9 +118,9 @@ def _read_by_evaluate(path: Path) -> Any:
     ended = _score(path)
     check_end(ended)
     if ended.status != 0:
-        raise Refused(ended.err)
-    figures = json.loads(ended.out)
-    return {k: v for k, v in figures.items() if k not in ("policy", "duration")}, ended.err
+        raise Rejected(ended.err)
+    values = json.loads(ended.out)
+    return {k: v for k, v in values.items() if k not in ("policy", "duration")}, ended.err
 
 
 def _read_by_resume(path: Path) -> Any:
@@ -129,7 +129,7 @@ def _read_by_resume(path: Path) -> Any:
     ended = command("train", *train_flags(root, _ITERATIONS + 1, "--agent.resume", "True"))
     check_end(ended)
     if ended.status != 0:
-        raise Refused(ended.err)
+        raise Rejected(ended.err)
     check_loadable(root)
     newest = max(run.parent.glob(f"*/model_{_ITERATIONS}.pt"))
     return learned(newest), ended.err
@@ -139,12 +139,12 @@ def _read_by_plot(path: Path) -> Any:
     ended = command("plot_seeds", str(path.parent), "--output", str(path.parent / "x.png"))
     check_end(ended)
     if ended.status != 0:
-        raise Refused(ended.err)
+        raise Rejected(ended.err)
     return (path.parent / "x.png").read_bytes(), ended.err
 
 
 def _read_by_page(path: Path) -> Any:
-    """Show a dump for a moment; what the page draws is not compared."""
+    """Show a dump briefly; drawings are not compared."""
     dump = path if path.suffix == ".npz" else path.parent / "nan_dump_latest.npz"
     process = Command("viz_nan", [str(dump), "--port", str(free_port())])
     process.watch(3.0)
@@ -154,7 +154,7 @@ def _read_by_page(path: Path) -> Any:
         return None
     ended = process.end()
     check_end(ended)
-    raise Refused(ended.err)
+    raise Rejected(ended.err)
 
 
 _READERS: dict[str, tuple[Callable[[Path], Any], ...]] = {
@@ -168,14 +168,14 @@ _READERS: dict[str, tuple[Callable[[Path], Any], ...]] = {
     "dump": (*[_read_dump] * 5, _read_by_page),
     "model of a dump": (_read_model_of_dump, _read_model_of_dump, _read_by_page),
 }
-# In turns of this length, kinds are tried as often as they stand here.
+# One turn of trials: kinds with their frequencies.
 _KINDS = (
     *["checkpoint"] * 8, *["onnx"] * 3, "events", "run.json", "agent.yaml", "env.yaml",
     *["motion"] * 3, *["dump"] * 2, "model of a dump",
 )  # fmt: skip
 
 
-# Damages take and return the bytes of a file, and say what they did.
+# Damage functions map the bytes of a file to damaged bytes and a description.
 
 
 def _flip(data: bytes, rng: random.Random) -> tuple[bytes, str]:
@@ -200,7 +200,7 @@ def _garbage(data: bytes, rng: random.Random) -> tuple[bytes, str]:
 
 def _zeros(data: bytes, rng: random.Random) -> tuple[bytes, str]:
     length = rng.randrange(len(data))
-    # As after a crash of a machine whose file system had not written the end.
+    # Simulates a machine crash before the file system wrote the end.
     return data[:length] + bytes(len(data) - length), f"zeros from byte {length} of {len(data)}"
 
 
@@ -211,7 +211,7 @@ def _hole(data: bytes, rng: random.Random) -> tuple[bytes, str]:
 
 
 def _absurd(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """Nest what the file's format can be read as."""
+    """Nest the content in the format of the file."""
     if data[:2] == b"PK":
         return _absurd_archive(data, rng)
     kind = rng.choice(("lists", "dicts", "flow", "aliases"))
@@ -224,7 +224,7 @@ def _absurd(data: bytes, rng: random.Random) -> tuple[bytes, str]:
 
 
 def _absurd_archive(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """Make entries of an archive claim an absurd size."""
+    """Set absurd sizes in the entries of an archive."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
     name = rng.choice(sorted(entries))
@@ -238,14 +238,14 @@ def _absurd_archive(data: bytes, rng: random.Random) -> tuple[bytes, str]:
 
 
 def _misfit(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """Put something that does not fit in the place of one part of a checkpoint, which stays whole."""
+    """Replace one part of a checkpoint by a value that does not fit; the file stays readable."""
     import torch
 
     content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     holder: Any = content
     way: list[Any] = []
     while True:
-        # Parts of all depths, and the whole as often as its parts.
+        # Parts of all depths with equal frequency, the whole included.
         way.append(rng.choice(list(holder) if isinstance(holder, dict) else range(len(holder))))
         value = holder[way[-1]]
         if not (isinstance(value, (dict, list)) and value) or rng.random() < 0.25:
@@ -283,26 +283,26 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
         damage, reader = _misfit, rng.choice((_read_by_resume, _read_by_resume, _read_by_evaluate))
     damaged, how = damage(good.read_bytes(), rng)
     trial.trying(f"{kind}, {how}, {name_of(reader)}")
-    # Read first as it was, by a copy of its own.
+    # Read the undamaged file first, from a separate copy.
     expected = reader(path)
     path = _copied(good, Path(prepared["run"]))
     path.write_bytes(damaged)
     try:
         found = reader(path)
-    except Refused as refusal:
-        if not str(refusal).strip():
-            raise Broken("refused without a word") from refusal
+    except Rejected as error:
+        if not str(error).strip():
+            raise Broken("rejected without a message") from error
         return
     if same(_content(found), _content(expected)) or _told(found, expected):
         return
     if kind == "events" and damage in (_cut, _zeros) and _is_start_of(found, expected):
-        # So ends the file of a run that was killed.
+        # Files of killed runs end like this.
         return
     raise Broken("read as something else, in silence")
 
 
 def _copied(good: Path, run: Path) -> Path:
-    """Return a fresh copy of `good`, with what its reader finds beside it."""
+    """Return a new copy of `good`, with the neighboring files of its reader."""
     here = Path("files").resolve()
     shutil.rmtree(here, ignore_errors=True)
     if good.is_relative_to(run):
@@ -317,19 +317,19 @@ def _copied(good: Path, run: Path) -> Path:
 
 
 def _content(read: Any) -> Any:
-    """Return what a reader read, without what its command said."""
+    """Return the content that a reader read, without the output of its command."""
     return read[0] if isinstance(read, tuple) and isinstance(read[1], str) else read
 
 
 def _told(found: Any, expected: Any) -> bool:
-    """Return whether a command said something that it does not say of a good file."""
+    """Return True if the output of a command differs from that for a good file."""
     if not (isinstance(found, tuple) and isinstance(found[1], str)):
         return False
     return not set(found[1].splitlines()) <= set(expected[1].splitlines())
 
 
 def _is_start_of(found: Any, expected: Any) -> bool:
-    """Return whether curves are those expected, but for missing ends; pictures cannot be compared."""
+    """Return True if curves equal the expected ones up to missing ends; images are not compared."""
     curves, whole = _content(found), _content(expected)
     return isinstance(curves, bytes) or all(
         same(tuple(axis[: len(curve[0])] for axis in whole[tag]), tuple(curve))

@@ -1,4 +1,4 @@
-"""Runs that are ended by signals at random moments, and resumed until they are finished."""
+"""Runs interrupted by signals at random moments, and resumed until finished."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _MOST_KILLS = 4
 # Every n-th chain starts Python each time, so that imports are interrupted, too.
 _FRESH = 8
-# Every n-th trial kills a process that has started another for the training.
+# Every n-th trial kills the launcher of a training process.
 _LAUNCHERS = 10
 
 
@@ -50,7 +50,7 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
     rng, root = trial.rng, Path("logs").resolve()
     is_fresh = trial.number % _FRESH == _FRESH - 1
     kinds = [_SIGNALS[(trial.number + k) % 4] for k in range(rng.randint(1, _MOST_KILLS))]
-    # Longer than a run on a quiet machine takes, so that its end is hit, too.
+    # Longer than a run on an idle machine, so that signals hit its end, too.
     delays = [rng.uniform(0.0, 1.1) for _ in kinds]
     longest = prepared["seconds"] + (4.0 if is_fresh else 0.0)
     what = (f"{kind.name} at {delay:.2f}" for kind, delay in zip(kinds, delays, strict=True))
@@ -86,7 +86,7 @@ def _kill_launcher(trial: Trial) -> None:
     trial.trying(f"{kind.name} to train-seeds alone, in its first training")
     root = Path("logs").resolve()
     flags = [*train_flags(root, 100_000), "--seeds", "2"]
-    # The command chooses seeds itself.
+    # The command sets the seeds.
     seed = flags.index("--agent.seed")
     del flags[seed : seed + 2]
     process = Command("train_seeds", flags)
@@ -105,14 +105,14 @@ def _start(root: Path, is_fresh: bool) -> Command:
 def _check_interrupted(
     ended: Ended, kind: signal.Signals, left: set[Path], run: Path | None
 ) -> None:
-    """Raise Broken unless a signal that can be answered was, by saving what was learned.
+    """Raise Broken unless a signal with a handler led to a saved checkpoint.
 
-    `left` are the folders that the process made, `run` is that of the run if it was in its iterations.
+    `left` are the folders made by the process, `run` is the run folder if iterations had begun.
     """
     if kind is signal.SIGKILL:
         return
     if ended.status < 0 and not ended.stuck:
-        # What the system does is right unless there is something to save.
+        # The default action is correct unless unsaved iterations exist.
         if run and not (run / f"model_{_ITERATIONS - 1}.pt").is_file():
             raise Broken(f"died of {kind.name} in training, without saving")
     else:

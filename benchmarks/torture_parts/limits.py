@@ -1,4 +1,4 @@
-"""Training where files, memory or the folder run out: full disks, few open files, read-only folders."""
+"""Resource limits of training: full disks, few open files, little memory, read-only folders."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ TRIALS = 112
 LIMIT = 90.0
 
 _ITERATIONS = 8
-# User with few rights, for whom folders of others are read-only.
+# Unprivileged user: folders of others are read-only.
 _NOBODY = 65534
-# Seconds after which processes should have said that they wait for others.
+# Seconds until processes should report that they wait for others.
 _WAIT = 20.0
 _VARIABLES = (
     ("MUJOCO_GL", "nonsense"), ("WORLD_SIZE", "2"), ("TMPDIR", "/nonexistent"), ("RANK", "5"),
@@ -32,12 +32,12 @@ _VARIABLES = (
     ("TORCHRUNX_LOG_DIR", "/dev/null"), ("WANDB_MODE", "nonsense"), ("DISPLAY", ":99"),
     ("PYTHONWARNINGS", "error"), ("PYTHONOPTIMIZE", "2"), ("PATH", ""),
 )  # fmt: skip
-# What is set along with a variable.
+# Settings that accompany a variable.
 _WITH = {"WORLD_SIZE": {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1"}}
 
 
 def prepare(folder: Path) -> None:
-    """Nothing is shared."""
+    """Return an empty dict: trials share no data."""
 
 
 def _limited(kind: int, value: int) -> Callable[[], None]:
@@ -49,7 +49,7 @@ def _train(root: Path, before: Callable[[], None] = lambda: None, *flags: str) -
 
 
 def _check(ended: Ended, root: Path, *, may_succeed: bool = True) -> None:
-    """Raise Broken unless it finished, or said why not and kept what it had."""
+    """Raise Broken unless training finished, or reported the reason and kept its files."""
     check_end(ended)
     check_loadable(root)
     complete = any(path.name == f"model_{_ITERATIONS - 1}.pt" for path in checkpoints(root))
@@ -140,7 +140,7 @@ def _turns_read_only(trial: Trial, root: Path) -> None:
 
 
 def _opened(trial: Trial) -> None:
-    """Let everybody pass through the folders above that of a trial."""
+    """Make the folders above that of a trial accessible to all users."""
     above = trial.folder
     while above.name and above != Path("/tmp") and os.stat(above).st_uid == os.getuid():
         above.chmod(0o755)
@@ -195,12 +195,12 @@ def _no_home(trial: Trial, root: Path) -> None:
 
 
 def _environment(trial: Trial, root: Path) -> None:
-    # In turn; another seed begins elsewhere.
+    # Cyclic; the seed sets the start.
     turn = trial.number // (len(_KINDS) // _KINDS.count(_environment)) + 7 * trial.seed
     name, value = _VARIABLES[turn % len(_VARIABLES)]
     trial.trying(f"{name}={value!r}")
     variables = {"MASTER_PORT": str(free_port()), name: value, **_WITH.get(name, {})}
-    # Much of the environment is read by imports.
+    # Imports read many environment variables.
     flags = train_flags(root, _ITERATIONS)
     process = Command("train", flags, before=lambda: os.environ.update(variables), is_fresh=True)
     ended = process.end(_WAIT if name == "WORLD_SIZE" else PATIENCE)

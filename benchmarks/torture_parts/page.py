@@ -1,4 +1,4 @@
-"""Strange clients of the page in the browser: it stays up, and serves the next one."""
+"""Malformed clients of the page: the page stays up and serves the next client."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def prepare(folder: Path) -> dict[str, str]:
 
 
 def run(trial: Trial, prepared: dict[str, str]) -> None:
-    """Play a policy with a page, attack the page, and look at it as a browser does."""
+    """Play a policy with a page, attack the page, and open it like a browser."""
     port = free_port()
     attack = _ATTACKS[trial.number % len(_ATTACKS)]
     trial.trying(name_of(attack))
@@ -61,13 +61,13 @@ def run(trial: Trial, prepared: dict[str, str]) -> None:
 
 
 class _Target:
-    """The page that is attacked."""
+    """Attacked page."""
 
     def __init__(self, process: Command, port: int, rng: random.Random) -> None:
         self.process, self.port, self.rng = process, port, rng
 
     def send(self, data: bytes, seconds: float = 1.0) -> bytes:
-        """Send bytes on a connection; return the answer until it closes or `seconds` are over."""
+        """Send bytes on a connection; return the response until it closes or `seconds` pass."""
         with self.connect() as connection, contextlib.suppress(OSError):
             connection.sendall(data)
             return _receive(self.process, connection, seconds)
@@ -89,7 +89,7 @@ def _can_connect(port: int) -> bool:
 
 
 def _receive(process: Command, connection: socket.socket, seconds: float = 5.0) -> bytes:
-    """Return what arrives first on a connection, while the command's output is collected."""
+    """Return the first data on a connection, while collecting the command's output."""
     end = time.monotonic() + seconds
     connection.settimeout(0.02)
     while time.monotonic() < end and process.status is None:
@@ -100,7 +100,7 @@ def _receive(process: Command, connection: socket.socket, seconds: float = 5.0) 
 
 
 def _answers(process: Command, port: int) -> bool:
-    """Return whether the page is sent."""
+    """Return True if the page is served."""
     end = time.monotonic() + 10.0
     while time.monotonic() < end and process.status is None:
         address = (_HOST, port)
@@ -136,7 +136,7 @@ def _websocket(process: Command, port: int) -> Any:
 
 
 def _frame(opcode: int, payload: bytes, *, length: int | None = None, first: int = 0x80) -> bytes:
-    """Return a masked frame of a websocket, which may claim another length than it has."""
+    """Return a masked websocket frame, with a declared length that may be wrong."""
     size = len(payload) if length is None else length
     if size < 126:
         head = bytes([first | opcode, 0x80 | size])
@@ -147,7 +147,7 @@ def _frame(opcode: int, payload: bytes, *, length: int | None = None, first: int
     return head + bytes(4) + payload
 
 
-# Attacks. Each returns what is to be reported, if anything.
+# Attacks. Each returns an optional remark for the report.
 
 
 def _malformed_http(target: _Target) -> str | None:
@@ -263,7 +263,7 @@ def _many_connections(target: _Target) -> str | None:
     with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
         for _ in range(150):
             connection = stack.enter_context(target.connect())
-            # Half of them ask for something, and never read the answer.
+            # Half of them send a request and never read the response.
             if target.rng.random() < 0.5:
                 connection.sendall(_handshake(target.port))
         target.process.watch(2.0)

@@ -1,4 +1,4 @@
-"""Physics that breaks, in training on both engines: it must be told, and may not look like success."""
+"""Broken physics in training on both engines: must be reported, and must not look like success."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ _BROKEN_TASK = "Torture-Cartpole"
 _ITERATIONS = 4
 _PATIENCE = 400.0
 _TOLD = re.compile(r"diverg|unstable|\bnan\b|not finite|infinit|\binf\b|bad state|too large", re.I)
-# Beyond this, figures of a run do not describe a cartpole.
+# Limit of plausible values of a cartpole run.
 _SANE = 1e8
 
 Edit = Callable[[Any, random.Random], str]
 
 
 def preload() -> None:
-    """Import Warp where it is installed."""
+    """Import Warp if installed."""
     if _has_warp():
         importlib.import_module("mjlab.sim.warp.engine")
 
 
 def prepare(folder: Path) -> None:
-    """Compile Warp's kernels once, which takes minutes on a machine that has not done so."""
+    """Compile Warp's kernels once, in minutes on a new machine."""
     if _has_warp():
         engine = ("--engine", "warp", "--agent.max-iterations", "1")
         ended = command("train", TASK, *SMALL, *engine, patience=_PATIENCE)
@@ -80,7 +80,7 @@ def run(trial: Trial, prepared: Any) -> None:
 
 
 def _check_sane(root: Path) -> None:
-    """Raise Broken if figures or weights of a run that said nothing are absurd."""
+    """Raise Broken if values or weights of a run without a report are absurd."""
     import torch
     from torch.utils._pytree import tree_leaves
 
@@ -112,7 +112,7 @@ def _edited(edit: Edit, rng: random.Random) -> Any:
     return cfg
 
 
-# Edits of the task's config. Each returns what it did.
+# Edits of the task's config. Each returns a description.
 
 
 def _long_step(cfg: Any, rng: random.Random) -> str:
@@ -134,13 +134,13 @@ def _gravity(cfg: Any, rng: random.Random) -> str:
 
 
 def _action_scale(cfg: Any, rng: random.Random) -> str:
-    # Infinite ones are clipped to the range of the motor.
+    # Infinite actions are clipped to the motor's range.
     cfg.actions["effort"].scale = float("nan")
     return "actions scaled by nan"
 
 
 def _with_spec(cfg: Any, change: Callable[[Any], None]) -> None:
-    """Change the robot's spec, after it was read."""
+    """Change the robot's spec after loading."""
     entity = cfg.scene.entities["cartpole"]
     read = entity.spec_fn
 
@@ -161,7 +161,7 @@ def _stiff(cfg: Any, rng: random.Random) -> str:
         motor.biastype, motor.ctrllimited, motor.forcelimited = 1, 0, 0
 
     _with_spec(cfg, change)
-    # Without this, damping is implicit, and stable.
+    # Otherwise damping is implicit, and stable.
     cfg.sim.mujoco.integrator = "euler"
     return f"servo with a gain of {gain:g}"
 
@@ -311,5 +311,5 @@ _EDITS: tuple[Edit, ...] = (
     _negative_damping, _massless, _nan_mass, _longish_step, _rarely, _reward_of_one, _odd_reward,
     _state_event, _stiff,
 )  # fmt: skip
-# What cannot go well.
+# Invalid edits.
 _CERTAIN = (_long_step, _gravity, _action_scale, _reward, _termination, _state_event, _odd_reward)

@@ -1,4 +1,4 @@
-"""Training runs that the trials damage, interrupt and compare."""
+"""Runs that trials damage, interrupt and compare."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def trained(log_root: Path, iterations: int, *flags: str) -> Path:
 
 
 def checkpoints(log_root: Path) -> list[Path]:
-    """Return all checkpoints below a folder, in the order in which they were written."""
+    """Return all checkpoints below a folder, in order of creation."""
     return sorted(log_root.glob("**/model_*.pt"), key=lambda path: path.stat().st_mtime_ns)
 
 
@@ -45,7 +45,7 @@ def check_loadable(log_root: Path) -> None:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Return whether two nested contents of files are equal, numbers to the bit."""
+    """Return True if two nested contents of files are equal, numbers bit for bit."""
     import numpy as np
     import torch
 
@@ -66,7 +66,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def learned(checkpoint: Path) -> dict[str, Any]:
-    """Return what training has learned: networks and optimizers, without clocks."""
+    """Return the learned state: networks and optimizers, without clocks."""
     from mjlab.rl.checkpoint import load_checkpoint
 
     content = load_checkpoint(checkpoint)

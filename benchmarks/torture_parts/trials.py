@@ -1,15 +1,15 @@
-"""Trials: what a family consists of, and running each in a process of its own.
+"""Trials: the interface of a family, and execution in separate processes.
 
 A family is a module with
 
-- `WHAT`: what is tried, for people,
+- `WHAT`: description of the trials,
 - `TRIALS`: number of trials in 15 minutes,
-- `LIMIT`: seconds for one,
+- `LIMIT`: seconds per trial,
 - `preload()`, if it needs more imports than `commands.preload`,
-- `prepare(folder)`: what all its trials share, as plain data; files go to `folder`,
-- `run(trial, prepared)`: one trial, which raises `Broken` if the contract was.
+- `prepare(folder)`: returns data shared by all trials, as plain data; files go to `folder`,
+- `run(trial, prepared)`: one trial; raises `Broken` if the contract is violated.
 
-What a trial does follows from its family, its number and the seed alone, so that each can be repeated.
+Family, number and seed determine a trial, so each can be repeated.
 Processes are forked from one that has imported everything, because an import takes longer than most
 trials.
 """
@@ -33,12 +33,12 @@ from types import ModuleType
 from typing import Any
 
 _SET_CHILD_SUBREAPER = 36
-# Seconds that processes which a command started have to end after it.
+# Seconds for child processes of a command to end after it.
 _GRACE = 2.0
 
 
 class Broken(Exception):
-    """Raised by a trial where the contract is broken; the text says how, in one line."""
+    """Raised by a trial if the contract is violated; the text explains it in one line."""
 
 
 @dataclass
@@ -49,18 +49,18 @@ class Trial:
     number: int
     seed: int
     folder: Path
-    """Folder of its own, which is the working folder, and is removed afterwards."""
+    """Working folder of the trial, removed afterwards."""
     what: str = ""
     """Description of the trial, for the line of a failure; see `trying`."""
     notes: list[str] = field(default_factory=list)
-    """Observations that are no failures."""
+    """Remarks that are not failures."""
     rng: random.Random = field(init=False)
 
     def __post_init__(self) -> None:
         self.rng = random.Random(f"{self.seed}/{self.family}/{self.number}")
 
     def trying(self, what: str) -> None:
-        """Say what is tried, also for a trial that does not come to its end."""
+        """Set the description of the trial, also for trials that do not finish."""
         self.what = what
         (self.folder.parents[3] / "what").write_text(what, "utf-8", "replace")
 
@@ -93,10 +93,10 @@ def run_trials(
     workers: int = 2,
     show: bool = False,
 ) -> Iterator[Verdict]:
-    """Run the trials of a family, `workers` at a time, and yield how each ended, in any order.
+    """Run the trials of a family, `workers` at a time, and yield their outcomes, in any order.
 
     Raises:
-        RuntimeError: what the trials share could not be prepared.
+        RuntimeError: preparation of shared data failed.
     """
     become_reaper()
     shared = folder / "shared"
@@ -172,7 +172,7 @@ def _fork_trial(trial: Trial, module: ModuleType, prepared: Any, show: bool) -> 
 
 
 def _prepared(module: ModuleType, folder: Path) -> Any:
-    """Return what `module.prepare` does, in a process of its own: threads do not survive a fork."""
+    """Return the result of `module.prepare`, run in a separate process: threads do not survive a fork."""
     answer = folder.parent / "prepared"
 
     def prepare() -> None:
@@ -210,12 +210,12 @@ def in_fork(function: Callable[[], None], output: Path) -> int:
 
 
 def become_reaper() -> None:
-    """Adopt processes whose parents end, so that they can be found."""
+    """Adopt orphaned processes, so that they can be found."""
     ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the processes that `pid` and those that it started have started, zombies aside."""
+    """Return the descendants of `pid`, without zombies."""
     children: dict[int, list[int]] = {}
     for entry in os.listdir("/proc"):
         if entry.isdigit():
@@ -243,14 +243,14 @@ def end_descendants(pid: int) -> list[int]:
 
 
 def _reap(pids: Iterable[int]) -> None:
-    """Let go of processes that were killed, as far as they are children of this one."""
+    """Reap killed processes that are children of this one."""
     for pid in pids:
         with contextlib.suppress(ChildProcessError):
             os.waitpid(pid, 0)
 
 
 def _left_over() -> list[str]:
-    """Return the names of processes that are there after a while, though all commands have ended."""
+    """Return the names of processes still running some time after all commands have ended."""
     end = time.monotonic() + _GRACE
     while (there := descendants(os.getpid())) and time.monotonic() < end:
         time.sleep(0.02)

@@ -1,8 +1,8 @@
-"""Robot learning from small composable pieces, on MuJoCo's CPU threads or on NVIDIA GPUs.
+"""Robot learning with MuJoCo, on CPU threads or NVIDIA GPUs.
 
-Importing this package does one thing beyond defining names: on Linux, where the EGL library is
-installed and the variable is not set already, it sets `MUJOCO_GL=egl`, so that MuJoCo renders
-without a display. A library in that variable that MuJoCo could not be imported with is switched off.
+Importing this package has one side effect: on Linux with the EGL library, it sets `MUJOCO_GL=egl` if
+the variable is unset, so that MuJoCo renders without a display. If the variable names a library with
+which MuJoCo cannot be imported, rendering is disabled.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ choose_graphics_library()
 
 
 def __getattr__(name: str) -> Any:
-    # The command-line flags are made on demand, because importing tyro costs time that
-    # `import mjlab` should not.
+    # Command-line flags are created on demand, because importing tyro is slow.
     if name == "TYRO_FLAGS":
         import tyro
 

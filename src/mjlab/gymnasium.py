@@ -1,4 +1,4 @@
-"""Tasks in Gymnasium's registry: importing this registers each as `mjlab/NAME`.
+"""Gymnasium registration: importing this module registers each task as `mjlab/NAME`.
 
 ```python
 import gymnasium
@@ -7,8 +7,8 @@ import mjlab.gymnasium
 envs = gymnasium.make_vec("mjlab/Mjlab-Velocity-Flat-Unitree-Go1", num_envs=512)
 ```
 
-Without the second import, `make_vec("mjlab.gymnasium:mjlab/Mjlab-Velocity-Flat-Unitree-Go1")` does the same.
-Needs Gymnasium (`pip install "mjlab[gymnasium]"`).
+Equivalent without the second import: `make_vec("mjlab.gymnasium:mjlab/Mjlab-Velocity-Flat-Unitree-Go1")`.
+Requires Gymnasium (`pip install "mjlab[gymnasium]"`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NAMESPACE = "mjlab"
 
 
 def register_tasks() -> None:
-    """Register all tasks that are not registered yet, such as those registered since the import."""
+    """Register all tasks that are not yet in Gymnasium's registry."""
     for task in list_tasks():
         name = f"{NAMESPACE}/{task}"
         if name in gymnasium.registry:
@@ -41,7 +41,7 @@ def register_tasks() -> None:
                 name, vector_entry_point="mjlab.gymnasium:make_vec_env", kwargs={"task": task}
             )
         except gymnasium.error.Error as error:
-            logger.warning("Task %r is not in Gymnasium's registry: %s", task, error)
+            logger.warning("Task %r not added to Gymnasium's registry: %s", task, error)
 
 
 def make_vec_env(
@@ -58,25 +58,25 @@ def make_vec_env(
     tensors: bool = False,
     edit: Callable[[ManagerBasedRlEnvCfg], None] | None = None,
 ) -> GymnasiumVectorEnv:
-    """Make the environments of a task; what `gymnasium.make_vec` calls, with its keyword arguments.
+    """Create the vector environment of a task. Entry point of `gymnasium.make_vec`.
 
     Args:
-        task: Name of the task.
+        task: Task name.
         num_envs: Number of environments.
-        play: Take the config to play with instead of the one to train with.
-        profile: One of the task's profiles.
-        device: Torch device; None: a GPU where there is one.
-        seed: Seed of the environment; `reset(seed=...)` sets another.
+        play: Use the play config instead of the training config.
+        profile: Profile of the task.
+        device: Torch device. None: a GPU if available.
+        seed: Seed of the environment; `reset(seed=...)` changes it.
         render_mode: `rgb_array`, or None.
         group: See `mjlab.rl.gymnasium_env`.
         clip_actions: See `mjlab.rl.gymnasium_env`.
         tensors: See `mjlab.rl.gymnasium_env`.
-        edit: Function that changes the task's config before the environments are built.
+        edit: Function that modifies the task's config before the environments are built.
 
     Raises:
-        UnknownTaskError: no such task.
-        UnknownProfileError: no such profile.
-        ValueError: something is wrong with the config, the device or the group.
+        UnknownTaskError: unknown task.
+        UnknownProfileError: unknown profile.
+        ValueError: invalid config, device or group.
     """
     import torch
 

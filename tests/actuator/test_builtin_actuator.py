@@ -220,7 +220,7 @@ def test_muscle_reads_the_effort_target_as_excitation(make_world):
         world.sim.step()
     activation = world.sim.data.act[:, 0]
     assert activation[0] == 0.0 < activation[1] < activation[2]
-    assert world.sim.data.actuator_force[2, 0] < -1.0  # It pulls.
+    assert world.sim.data.actuator_force[2, 0] < -1.0  # Muscles pull.
 
 
 MUSCLE = BuiltinMuscleActuatorCfg(

@@ -1,4 +1,4 @@
-"""Comparing how large a robot is drawn with the extents in the table of its figures."""
+"""Comparison of a robot's drawn size with the extents in the table of its parameters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def drawing_differences(
     """Return, one line each, bodies that are not drawn about as large as the table says.
 
     The box around what is drawn, in the frame of the body, must not reach more than `beyond`
-    metres out of the box around the table's extents, and be at least `share` as long along each
+    meters out of the box around the table's extents, and be at least `share` as long along each
     axis. The table's extents are rough: they are boxes around tilted boxes, and some are mirrored.
     """
     model = spec.compile()

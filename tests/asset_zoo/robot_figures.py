@@ -1,4 +1,4 @@
-"""Comparing a robot's compiled model with a table of its figures.
+"""Comparison of a robot's compiled model with a table of its parameters.
 
 A table is a YAML file in `figures/`: bodies with their joints, geoms, sites and cameras, then
 sensors, equalities, contact excludes and totals. What it leaves out has MuJoCo's default. The geoms of a table
@@ -24,11 +24,11 @@ RELATIVE, ABSOLUTE = 2e-6, 2e-7
 VISUAL_GROUP, SITE_GROUP = 2, 5
 _IDENTITY = [1.0, 0.0, 0.0, 0.0]
 _ZERO = [0.0, 0.0, 0.0]
-# How many sizes a geom of each type has; MuJoCo keeps three, and fills the rest.
+# Number of sizes by geom type; MuJoCo stores three, and fills the rest.
 _NUM_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
-# What a body weighs for which the table says nothing of it.
+# Mass of bodies without a mass in the table.
 _MASSLESS = {"mass": 0.0, "inertia": _ZERO}
-# How many numbers the coupling of two joints takes: the coefficients of a polynomial.
+# Number of polynomial coefficients of a joint equality constraint.
 _NUM_COEFFICIENTS = 5
 _NOT_FIGURES = {"source_of_figures", "conventions"}
 
@@ -45,7 +45,7 @@ def differences(spec: mujoco.MjSpec, table: dict[str, Any]) -> list[str]:
 
 
 def compare(figures: dict[str, Any], table: dict[str, Any]) -> list[str]:
-    """Return, one line each, where the figures of a model differ from the table."""
+    """Return differences between the parameters of a model and the table, one line each."""
     expected = {key: value for key, value in table.items() if key not in _NOT_FIGURES}
     expected["bodies"] = [_completed(body) for body in table["bodies"]]
     for kind in ("sensors", "equalities", "contact_excludes"):
@@ -54,7 +54,7 @@ def compare(figures: dict[str, Any], table: dict[str, Any]) -> list[str]:
 
 
 def figures_of(model: mujoco.MjModel) -> dict[str, Any]:
-    """Return the figures of a model in the form of a table, with nothing left out."""
+    """Return all parameters of a model in the form of a table."""
     return {
         "bodies": [_body(model, index) for index in range(1, model.nbody)],
         "sensors": [_sensor(model, index) for index in range(model.nsensor)],

@@ -35,7 +35,7 @@ def scene_of(cfg: EntityCfg, options: MujocoCfg, num_envs: int = 1) -> tuple[Sce
 
 
 def place(scene: Scene, lift: float | torch.Tensor = 0.0) -> Entity:
-    """Put the robot into its initial state, `lift` metres higher, and let it hold it; return it."""
+    """Put the robot into its initial state, `lift` meters higher, and let it hold it; return it."""
     robot: Entity = scene["robot"]
     robot.set_joint_position_target(robot.data.default_joint_pos)
     root = robot.data.default_root_state.clone()
@@ -54,7 +54,7 @@ def turn_on_its_side(sim: Simulation) -> None:
 
 
 def check_light(model: mujoco.MjModel) -> None:
-    """Check the one light of a robot: a spot above it that follows its centre of mass."""
+    """Check the one light of a robot: a spot above it that follows its center of mass."""
     assert model.light_mode.tolist() == [mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM]
     light = model.light(0)
     assert light.type[0] == mujoco.mjtLightType.mjLIGHT_SPOT

@@ -1,4 +1,4 @@
-"""The Unitree G1 has the figures of its tables, stands, and is drawn without changing a thing."""
+"""Unitree G1: parameters equal the tables, the robot stands, and drawing changes nothing."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_every_body_is_drawn_about_as_large_as_in_the_table():
     assert drawing_differences(g1.get_spec(), TABLE) == []
 
 
-def test_the_light_and_the_camera_follow_the_centre_of_mass():
+def test_the_light_and_the_camera_follow_the_center_of_mass():
     model = g1.get_spec().compile()
     assert model.cam_mode.tolist() == [mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM]
     assert not model.light(0).castshadow[0]
@@ -254,7 +254,7 @@ def test_a_config_that_a_task_changes_leaves_the_next_one_as_it_was():
 
 @pytest.mark.parametrize("keyframe", KEYFRAMES)
 def test_it_stands_for_a_second_at_its_pose(keyframe):
-    # Nobody balances it: the springs of the ankles are softer than gravity, so that it leans ever
+    # No balance controller: the ankle stiffness is below that of gravity, so that it leans ever
     # further, but slowly.
     cfg = get_g1_robot_cfg()
     cfg.init_state = KEYFRAMES[keyframe]
@@ -288,7 +288,7 @@ def test_its_sensors_work_inside_a_scene():
 
     assert_close("imu_upvector", [0.0, 1.0, 0.0])
     assert_close("imu_ang_vel", [0.5, 0.0, 0.0])
-    # The velocity w x r of the site, which is 83.39 mm below the turning axis.
+    # The velocity w x r of the site, 83.39 mm below the rotation axis.
     assert_close("imu_lin_vel", [0.0, 0.5 * 0.08339, 0.0])
     # The robot turns about x as one body: a few kg m^2 times half a rad/s.
     assert 1.0 < float(reading("root_angmom")[0]) < 3.0

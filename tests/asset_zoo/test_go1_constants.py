@@ -1,4 +1,4 @@
-"""The Unitree Go1 has the figures of its tables, stands, and is drawn without changing a thing."""
+"""Unitree Go1: parameters equal the tables, the robot stands, and drawing changes nothing."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_body_is_drawn_about_as_large_as_in_the_table():
     assert drawing_differences(go1.get_spec(), TABLE) == []
 
 
-def test_the_light_and_the_cameras_follow_the_centre_of_mass():
+def test_the_light_and_the_cameras_follow_the_center_of_mass():
     model = go1.get_spec().compile()
     assert model.cam_mode.tolist() == [mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM] * 4
     check_light(model)
@@ -143,7 +143,7 @@ def test_a_config_that_a_task_changes_leaves_the_next_one_as_it_was():
 
 def test_it_stands_for_two_seconds_at_its_home_pose():
     scene, sim = scene_of(get_go1_robot_cfg(), MUJOCO, num_envs=2)
-    # At heights at which resets of the velocity tasks put it.
+    # At heights used by resets of the velocity tasks.
     robot = place(scene, lift=torch.tensor([0.01, 0.05]))
     for step in range(400):
         sim.step()

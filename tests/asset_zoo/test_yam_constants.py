@@ -1,4 +1,4 @@
-"""The I2RT YAM has the figures of its tables, holds its pose, and is drawn without changing a thing."""
+"""I2RT YAM: parameters equal the tables, the robot holds its pose, and drawing changes nothing."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_the_spotlight_follows_the_gripper():
     assert (light.cutoff[0], light.exponent[0]) == (45, 10)
 
 
-def test_the_cameras_are_those_of_the_behaviour_page():
+def test_the_cameras_are_those_of_the_behavior_page():
     model = yam.get_spec().compile()
     front, wrist = model.camera("front_cam"), model.camera("camera_d405").id
     assert front.bodyid[0] == 0

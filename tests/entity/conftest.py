@@ -56,7 +56,7 @@ ARM = """
 </mujoco>
 """
 
-# Two trees under the world: MuJoCo refers velocities to the centre of mass of each tree.
+# Two trees under the world: MuJoCo refers velocities to the center of mass of each tree.
 TWO_TREES = """
 <mujoco model="two_trees">
   <worldbody>

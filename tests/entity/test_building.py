@@ -1,4 +1,4 @@
-"""Building an entity's spec from its config."""
+"""Entity spec construction from the config."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_two_free_joints_are_refused(kit):
     xml = """<mujoco model="pair"><worldbody>
       <body name="a"><freejoint/><geom size=".1"/></body>
       <body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
-    with pytest.raises(ValueError, match=r"'pair' has 2 free joints, of the bodies \['a', 'b'\]"):
+    with pytest.raises(ValueError, match=r"'pair'.*free joint.* 2, .*\['a', 'b'\]"):
         kit.cfg(xml).build()
 
 
@@ -96,7 +96,7 @@ def test_an_actuator_on_a_joint_that_has_one_already_is_refused(kit, actuators, 
     for order in (actuators, actuators[::-1]):
         for sort in (False, True):
             cfg = kit.cfg(xml, sort_actuators=sort, articulation=actuated(*order))
-            with pytest.raises(ValueError, match="that have an actuator already") as caught:
+            with pytest.raises(ValueError, match="already have an actuator") as caught:
                 cfg.build()
             if order is actuators:
                 assert re.search(said, str(caught.value))
@@ -113,7 +113,7 @@ def test_an_actuator_beside_one_of_the_xml_is_accepted_with_a_warning_and_both_a
         sort_actuators=sort,
         articulation=actuated(*actuators),
     )
-    with pytest.warns(UserWarning, match="'knee' has the actuator 'drive' of the XML. Both act"):
+    with pytest.warns(UserWarning, match="'knee' has the XML actuator 'drive'"):
         sim, scene = kit.make(1, robot=cfg)
     robot = scene["robot"]
     robot.set_joint_position_target(torch.tensor([[0.0, 0.5]]))
@@ -134,7 +134,7 @@ def test_an_actuator_with_the_name_of_one_of_the_xml_is_refused(kit, names):
     motors = "".join(f'<motor name="{name}" joint="knee"/>' for name in names)
     motors = motors.replace('name="" ', "")
     xml = kit.ROBOT.replace("</mujoco>", f"<actuator>{motors}</actuator></mujoco>")
-    with pytest.raises(ValueError, match="'knee' has the actuator .*'knee' of the XML"):
+    with pytest.raises(ValueError, match="'knee' has the XML actuator .*'knee'"):
         kit.cfg(xml, articulation=actuated(SERVO)).build()
 
 
@@ -148,7 +148,7 @@ def test_an_actuator_with_the_name_of_one_on_another_joint_is_refused(kit):
 def test_every_actuator_of_the_xml_on_a_joint_is_named_in_the_warning(kit):
     both = '<actuator><motor name="drive" joint="knee"/><motor name="assist" joint="knee"/>'
     xml = kit.ROBOT.replace("</mujoco>", f"{both}</actuator></mujoco>")
-    with pytest.warns(UserWarning, match="'drive' of the XML and the actuator 'assist' of the XML"):
+    with pytest.warns(UserWarning, match="XML actuator 'drive' and the XML actuator 'assist'"):
         kit.cfg(xml, articulation=actuated(MOTOR)).build()
 
 
@@ -175,7 +175,7 @@ def test_a_free_joint_that_is_not_first_is_refused(kit):
 def test_ball_joints_are_refused(kit):
     xml = """<mujoco><worldbody><body><joint name="socket" type="ball"/><geom size=".1"/>
       </body></worldbody></mujoco>"""
-    with pytest.raises(ValueError, match=r"ball joints: \['socket'\].*three hinges"):
+    with pytest.raises(ValueError, match=r"ball joints.*\['socket'\].*three hinges"):
         kit.cfg(xml).build()
 
 
@@ -192,7 +192,7 @@ def test_joints_without_a_name_work(kit):
 
 
 def test_a_spec_fn_that_returns_no_spec_is_reported():
-    with pytest.raises(ValueError, match="returned str; it must return a mujoco.MjSpec"):
+    with pytest.raises(ValueError, match="EntityCfg.spec_fn.*mujoco.MjSpec, got str"):
         EntityCfg(spec_fn=lambda: "robot.xml").build()
 
 
@@ -252,7 +252,7 @@ def test_the_default_initial_state_of_an_entity_without_joints_is_not_reported(c
 
 
 def test_a_vector_of_the_wrong_length_is_reported(kit):
-    with pytest.raises(ValueError, match=r"init_state.rot has 3 values.*it needs 4"):
+    with pytest.raises(ValueError, match="init_state.rot: expected 4 values, got 3"):
         kit.cfg(kit.ARM, init_state=InitialState(rot=(0.0, 0.0, 0.0))).build()
 
 
@@ -299,13 +299,13 @@ def test_several_keyframes_are_reported(kit):
 
 
 def test_joint_pos_none_without_a_keyframe_says_what_to_do(kit):
-    with pytest.raises(ValueError, match="'arm' has no keyframe.*give joint_pos as a dict"):
+    with pytest.raises(ValueError, match="'arm' has no keyframe.*joint_pos to a dict"):
         kit.cfg(kit.ARM, init_state=InitialState(joint_pos=None)).build()
 
 
 def test_joint_pos_none_with_a_keyframe_that_does_not_fit(kit):
     xml = WITH_KEY.replace("9 9 9 0 1 0 0 .7 -.7", "1 2 3")
-    with pytest.raises(ValueError, match="'home', but that has 3 values.*needs 9"):
+    with pytest.raises(ValueError, match="'home' to have 9 values.*got 3"):
         kit.cfg(xml, init_state=InitialState(joint_pos=None)).build()
 
 
@@ -323,7 +323,7 @@ def test_an_actuator_pattern_that_matches_nothing_lists_the_candidates(kit):
 
 def test_an_actuator_pattern_that_matches_elsewhere_says_where(kit):
     cfg = BuiltinMotorActuatorCfg(target_names_expr=("cable",), effort_limit=1.0)
-    with pytest.raises(ValueError, match=r"do match: tendons \['cable'\].*TransmissionType.TENDON"):
+    with pytest.raises(ValueError, match=r"tendons \['cable'\].*TransmissionType.TENDON"):
         kit.cfg(kit.ARM, articulation=actuated(cfg)).build()
 
 
@@ -344,7 +344,7 @@ def test_patterns_that_also_match_another_namespace_warn(kit):
 def test_an_unnamed_target_is_refused_by_name(kit):
     xml = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
     cfg = BuiltinMotorActuatorCfg(target_names_expr=(".*",), effort_limit=1.0)
-    with pytest.raises(ValueError, match="joint without a name"):
+    with pytest.raises(ValueError, match="unnamed joint"):
         kit.cfg(xml, articulation=actuated(cfg)).build()
 
 
@@ -498,5 +498,5 @@ def test_a_spec_fn_may_return_one_spec_for_two_entities_and_two_scenes(kit, xml)
         assert (model.nq, model.nu, model.ncam) == (2 * once.nq, 2, 2)
         assert scene["two"].joint_names == scene["one"].joint_names
         assert model.opt.density == 3.0
-    # The user's own spec stays as it was.
+    # The user's spec is unchanged.
     assert spec.to_xml() == written

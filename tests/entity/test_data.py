@@ -93,7 +93,7 @@ def test_joint_and_force_fields_agree_with_mujoco(world):
         rtol=1e-3,
         atol=1e-2,
     )
-    # What the applied wrenches do to the joints, computed from Jacobians.
+    # Generalized forces of the applied wrenches, computed from Jacobians.
     expected = []
     for reference in references:
         force = np.zeros(model.nv)
@@ -139,8 +139,8 @@ def test_tendons_agree_with_mujoco(kit):
     check(scene["arm"].data.tendon_vel, [d.ten_velocity[index] for d in references])
 
 
-def test_each_tree_has_its_own_centre_of_mass(kit):
-    """Reading all velocities about the first body's centre would be off by metres per second."""
+def test_each_tree_has_its_own_center_of_mass(kit):
+    """Velocities about the first body's center of mass would be off by meters per second."""
     sim, scene = kit.make(num_envs=1, pair=kit.cfg(kit.TWO_TREES))
     sim.data.qpos[0, 0] = 5.0
     sim.data.qvel[:] = 0.0
@@ -207,7 +207,7 @@ def test_only_fields_that_are_read_are_asked_for(kit):
     assert set(recorder.asked) == {"qpos", "cvel"}
 
 
-def test_fields_of_neighbouring_elements_are_views(kit):
+def test_fields_of_neighboring_elements_are_views(kit):
     sim, scene = kit.make(robot=kit.cfg(kit.ROBOT))
     data = scene["robot"].data
     for view, source in (

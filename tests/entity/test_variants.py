@@ -1,4 +1,4 @@
-"""Building entities that are another thing in each environment."""
+"""Construction of variant entities."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ def test_assignment_is_equal_weighted_or_chosen() -> None:
     ("assignment", "message"),
     [
         ({"huge": 1.0}, r"assignment 'huge'.*\['small', 'large'\]"),
-        ({"small": -1.0}, r"\{'small': -1.0\}.*none negative"),
+        ({"small": -1.0}, r"\{'small': -1.0\}.*>= 0"),
         ({"small": 0.0, "large": 0.0}, "not all zero"),
-        ({"small": float("nan")}, "must be finite"),
+        ({"small": float("nan")}, "finite.*nan"),
     ],
 )
 def test_weights_that_make_no_sense_are_refused(assignment, message: str) -> None:
@@ -80,9 +80,9 @@ def test_weights_that_make_no_sense_are_refused(assignment, message: str) -> Non
 @pytest.mark.parametrize(
     ("found", "message"),
     [
-        (lambda n: [0] * (n - 1), r"called with 4 and returned an array of shape \(3,\)"),
-        (lambda n: [0, 1, 2, -1], r"indices \[-1, 2\].*have the indices 0 to 1"),
-        (lambda n: [0.5] * n, "whole numbers"),
+        (lambda n: [0] * (n - 1), r"expected 4 integers.*shape \(3,\)"),
+        (lambda n: [0, 1, 2, -1], r"indices 0 to 1 .*\[-1, 2\]"),
+        (lambda n: [0.5] * n, "expected 4 integers.*float64"),
     ],
 )
 def test_functions_that_assign_nonsense_are_refused(found, message: str) -> None:
@@ -95,11 +95,11 @@ def test_functions_that_assign_nonsense_are_refused(found, message: str) -> None
 
 
 def test_a_config_takes_its_specs_from_variants_alone() -> None:
-    with pytest.raises(ValueError, match="spec_fn is set.*`variants`"):
+    with pytest.raises(ValueError, match="spec_fn.*`variants`"):
         VariantEntityCfg(spec_fn=BOX, variants={"box": BOX})
-    with pytest.raises(ValueError, match="variants is empty"):
+    with pytest.raises(ValueError, match="VariantEntityCfg.variants.*at least one"):
         VariantEntityCfg().build()
-    with pytest.raises(ValueError, match=r"variants\['a'\] returned int"):
+    with pytest.raises(ValueError, match=r"variants\['a'\].*mujoco.MjSpec, got int"):
         VariantEntityCfg(variants={"a": lambda: 3}).build()  # ty: ignore[invalid-argument-type]
     with pytest.raises(ValueError, match=re.escape("cfg.build()")):
         Entity(VariantEntityCfg(variants=BEADS))
@@ -107,20 +107,20 @@ def test_a_config_takes_its_specs_from_variants_alone() -> None:
 
 HINGE = '<joint name="hinge"'
 BAD_SIBLINGS = {
-    "joints": ({HINGE: '<joint name="door"'}, "other joints.*'door'.*'hinge'"),
-    "types of joints": ({HINGE: '<joint type="slide" name="hinge"'}, "other joints.*mjJNT_SLIDE"),
-    "bodies": ({'<body name="lid"': '<body name="cap"'}, "other bodies.*/thing/cap.*/thing/lid"),
-    "sites": ({'name="grip"': 'name="handle"'}, "other sites"),
+    "joints": ({HINGE: '<joint name="door"'}, "the same joints.*'door'.*'hinge'"),
+    "types of joints": ({HINGE: '<joint type="slide" name="hinge"'}, "the same joints.*mjJNT_SLIDE"),
+    "bodies": ({'<body name="lid"': '<body name="cap"'}, "the same bodies.*/thing/cap.*/thing/lid"),
+    "sites": ({'name="grip"': 'name="handle"'}, "the same sites"),
     "inertials": (
         {'<site name="grip"': '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><site name="grip"'},
-        "other kinds of inertial.*diaginertia.*derived from geoms",
+        "the same kinds of inertial.*diaginertia.*derived from geoms",
     ),
     "actuators": (
         {"</worldbody>": '</worldbody><actuator><motor name="m" joint="hinge"/></actuator>'},
-        "other actuators.*'m'",
+        "the same actuators.*'m'",
     ),
-    "a fixed base": ({'<freejoint name="root"/>': ""}, "'odd' has no free joint.*<freejoint/>"),
-    "two roots": ({"</worldbody>": '<body name="more"/></worldbody>'}, "2 top-level bodies"),
+    "a fixed base": ({'<freejoint name="root"/>': ""}, "'odd'.*free joint.*<freejoint/>"),
+    "two roots": ({"</worldbody>": '<body name="more"/></worldbody>'}, "top-level body, got 2"),
 }  # fmt: skip
 
 
@@ -135,7 +135,7 @@ def test_a_variant_with_another_structure_than_its_siblings_is_refused_by_name(w
 
 def test_reserved_names_and_references_to_geoms_that_differ_are_refused() -> None:
     reserved = thing("reserved", '<geom name="mjlab/pad/x" size=".1"/>')
-    with pytest.raises(ValueError, match="'b' uses the names.*reserved.*rename"):
+    with pytest.raises(ValueError, match="'b'.*mjlab/pad/.*reserved.*rename"):
         VariantEntityCfg(variants={"a": BOX, "b": reserved}).build()
     sensor = {
         "</worldbody>": '</worldbody><sensor><framepos name="s" objtype="geom" objname="shell"/>'
@@ -143,7 +143,7 @@ def test_reserved_names_and_references_to_geoms_that_differ_are_refused() -> Non
     }
     shell = '<geom name="shell" type="{}" size=".1 .1 .1"/>'
     box, ball = (thing(t, shell.format(t), **sensor) for t in ("box", "sphere"))
-    with pytest.raises(ValueError, match="sensor 's' of variant 'a' refers to the geom 'shell'"):
+    with pytest.raises(ValueError, match="'a': sensor 's' refers to geom 'shell'"):
         VariantEntityCfg(variants={"a": box, "b": ball}).build()
 
 

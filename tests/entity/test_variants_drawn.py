@@ -24,7 +24,7 @@ def of_all_things() -> Simulation:
 
 
 def drawn(model: mujoco.MjModel, data: mujoco.MjData) -> list[tuple]:
-    """Return what of things MuJoCo draws: type, size, colour and place."""
+    """Return what of things MuJoCo draws: type, size, color and place."""
     scene, option = mujoco.MjvScene(model, maxgeom=100), mujoco.MjvOption()
     everything = int(mujoco.mjtCatBit.mjCAT_ALL)
     mujoco.mjv_updateScene(model, data, option, None, mujoco.MjvCamera(), everything, scene)
@@ -96,7 +96,7 @@ def test_the_page_draws_each_environment_with_its_own_shapes(viser_server) -> No
     shapes = scene._variants._shapes.values()
     body, lid = sim.mj_model.body("thing/thing").id, sim.mj_model.body("thing/lid").id
     of_things = sorted(tuple(shape.envs) for shape in shapes if body in shape.bodies)
-    # The visual meshes of the fourth and the fifth thing are in groups of their own.
+    # The visual meshes of the fourth and the fifth variant are in separate groups.
     assert of_things == [(0,), (1,), (2,), (3,), (3,), (4,), (4,)]
     lids = sorted(tuple(shape.envs) for shape in shapes if lid in shape.bodies)
     assert lids == [(0, 1, 3, 4), (2,)]
@@ -147,7 +147,7 @@ TEXTURED = """<mujoco><asset>{files}<texture name="plain" type="2d" builtin="fla
 
 @pytest.mark.parametrize("in_memory", [False, True])
 def test_meshes_of_each_variant_keep_their_textures(tmp_path, in_memory) -> None:
-    """Each variant has files of its own, under the same names."""
+    """Each variant has separate files under the same names."""
     from matplotlib import image
 
     def make(name: str) -> mujoco.MjSpec:

@@ -1,4 +1,4 @@
-"""One environment step: its order, its resets, its seeds, and what it refuses."""
+"""One environment step: order, resets, seeds, and errors."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def joint_pos(env: Any) -> torch.Tensor:
 
 
 def cart_pos(env: Any) -> torch.Tensor:
-    """The cart's place along the rail, which is derived from the joint's."""
+    """Cart position along the rail, derived from the joint position."""
     body = env.sim.mj_model.body("cartpole/cart").id
     return env.sim.data.xpos[:, body, 0].clone()
 
@@ -178,7 +178,7 @@ def test_a_metric_that_looks_between_substeps_changes_nothing_else(make):
     seen.clear()
     assert torch.equal(run(env, 3), plain)
     assert len(seen) == 3 * env.cfg.decimation
-    assert len(set(seen)) == len(seen), "every call has to see another substep"
+    assert len(set(seen)) == len(seen), "every call must see a different substep"
 
 
 def test_targets_that_are_the_same_in_all_substeps_are_written_once(make, monkeypatch):
@@ -192,7 +192,7 @@ def test_targets_that_are_the_same_in_all_substeps_are_written_once(make, monkey
         )
     run(env, 1)
     assert calls == ["apply_action", "write_data_to_sim"]
-    # An actuator or an action that changes between substeps is asked before each of them.
+    # An actuator or action that changes between substeps is called before each substep.
     env._acts_between_substeps = True
     calls.clear()
     run(env, 1)
@@ -236,7 +236,7 @@ def test_an_environment_that_is_done_starts_anew_in_the_same_step(make):
     observations, _, _, truncated, extras = env.step(actions(1)[0])
     assert truncated.tolist() == [False] * 3 + [True] + [False] * 2
     assert env.episode_length_buf.tolist() == [6, 6, 6, 0, 6, 6]
-    # What is observed belongs to the new episode: the cart near the middle, the pole hanging.
+    # Observations belong to the new episode: the cart near the middle, the pole hanging.
     assert abs(observations["actor"][3, 0]) <= 0.1
     assert observations["actor"][3, 1].item() == pytest.approx(-1.0, abs=1e-3)
     assert any(name.startswith("Episode_") for name in extras["log"])
@@ -251,7 +251,7 @@ def test_without_auto_reset_an_environment_that_is_done_has_to_be_reset_by_hand(
     assert env.episode_length_buf[3] == env.max_episode_length
     assert not torch.equal(env.sim.data.qpos[3], before), "its last state is there to be read"
     with pytest.raises(
-        RuntimeError, match=r"Environments \[3\] are done .*reset\(env_ids=\.\.\.\)"
+        RuntimeError, match=r"environments \[3\].*reset\(env_ids=\.\.\.\).*auto_reset=True"
     ):
         env.step(actions(1)[0])
     env.reset(env_ids=torch.tensor([3]))
@@ -330,7 +330,7 @@ def test_an_environment_alone_moves_as_among_others(make):
         assert torch.equal(many[:1], one)
 
 
-# What is refused, and what is described.
+# Errors and descriptions.
 
 
 @pytest.mark.parametrize(
@@ -385,5 +385,5 @@ def test_without_a_render_mode_there_is_no_image_and_an_unknown_one_is_refused(m
 def test_the_state_of_another_number_of_environments_is_refused(make):
     state = make().state_dict()
     other = make(lambda cfg: setattr(cfg.scene, "num_envs", 2))
-    with pytest.raises(ValueError, match=f"of {NUM_ENVS} environments; this run has 2"):
+    with pytest.raises(ValueError, match=f"expected 2 .*got {NUM_ENVS}.*--num-envs {NUM_ENVS}"):
         other.load_state_dict(state)

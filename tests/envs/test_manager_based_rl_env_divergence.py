@@ -199,7 +199,7 @@ def walkers():
     cfg.sim.mujoco.cone = "pyramidal"
     cfg.scene.terrain.terrain_generator.num_rows = 2
     cfg.scene.terrain.terrain_generator.num_cols = 2
-    # A reset draws random numbers, which must not reach the other environments.
+    # Random numbers of a reset must not affect the other environments.
     for group in cfg.observations.values():
         group.enable_corruption = False
     cfg.events.pop("push_robot", None)

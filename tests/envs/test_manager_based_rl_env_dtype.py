@@ -1,4 +1,4 @@
-"""Everything stays float32, whatever torch's default type is and whatever numbers come in."""
+"""All tensors stay float32, whatever torch's default dtype and the dtype of the inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Observations in which episodes run out of time: what they are, and that they leave no trace."""
+"""Final observations of truncated episodes: values, and absence of side effects."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def rows(values: Any, ids: Any) -> list[torch.Tensor]:
     return [values[ids]]
 
 
-# What they are.
+# Values.
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_what_an_event_placed_in_the_step_is_seen(make):
 
 
 def read_everything(env: Any, env_ids: Any, seen: list[torch.Tensor]) -> torch.Tensor:
-    """A curriculum that reads what is derived from the state in which episodes ended."""
+    """Curriculum that reads quantities derived from the final state of episodes."""
     values = [pole_place(env), env.sim.data.cvel, env.sim.data.qacc]
     if "rays" in env.scene.sensors:
         values += [env.scene["rays"].data.hit_pos_w.flatten(1), env.scene["eye"].data.depth]

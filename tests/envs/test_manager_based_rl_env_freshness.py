@@ -242,7 +242,7 @@ def test_observations_have_the_forces_of_the_last_substep_and_the_motion_of_now(
     touching = observed["contact"][:, 0] > 0
     assert touching.any(), "a test of contact forces needs contacts"
     old, new = reference.of_last_substep("contact"), reference.of_forward("contact")
-    assert not torch.allclose(old, new, rtol=1e-3), "they have to differ to be told apart"
+    assert not torch.allclose(old, new, rtol=1e-3), "old and new must differ"
 
 
 def test_rewards_read_what_the_last_substep_computed(make):
@@ -430,7 +430,7 @@ def build_go1() -> ManagerBasedRlEnv:
 
 
 def walk(env: ManagerBasedRlEnv, steps: int) -> list[dict[str, torch.Tensor]]:
-    """Return the observations of random steps, in which one environment is reset."""
+    """Return the observations of random steps; environment 3 resets at step 2."""
     generator = torch.Generator().manual_seed(steps)
     size = (env.num_envs, env.action_manager.total_action_dim)
     seen = []

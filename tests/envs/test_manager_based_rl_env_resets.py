@@ -1,4 +1,4 @@
-"""What a reset or a step must not spoil: caches, targets, recordings, neighbours, timers."""
+"""State that resets and steps must preserve: caches, targets, recordings, neighbors, timers."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class PlaceCfg(SensorCfg):
 
 
 class Place(Sensor[torch.Tensor]):
-    """Copies where the bodies are, unlike a view, which would be fresh in any case."""
+    """Copies body positions; a view would always be up to date."""
 
     def initialize(self, mj_model: Any, model: Any, data: Any, device: str) -> None:
         self._sim_data = data
@@ -164,7 +164,7 @@ def test_episodes_cut_short_by_hand_are_recorded_and_those_not_begun_are_not(mak
     end = env.sim.data.qpos.clone()
     env.reset(env_ids=torch.tensor([1]))
     assert [ids for ids, _ in recorded] == [[1]]
-    assert torch.equal(recorded[0][1], end[[1]]), "it is the state in which the episode ended"
+    assert torch.equal(recorded[0][1], end[[1]]), "the final state of the episode"
     env.reset(env_ids=torch.tensor([1, 2]))
     assert [ids for ids, _ in recorded] == [[1], [2]]
     env.reset()

@@ -1,4 +1,4 @@
-"""Where the time of a step goes: sums that add up, and an environment that is left as it was."""
+"""Profile of a step: consistent sums, and an unchanged environment."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Slow(ManagerTermBase):
 
 
 class Forwarding(CommandTerm):
-    """A command that asks for derived quantities of its own, and for another manager's term."""
+    """Command that calls `forward` itself, and calls another manager's term."""
 
     @property
     def command(self) -> torch.Tensor:
@@ -139,7 +139,7 @@ def test_time_is_that_of_who_spent_it(measured):
     _, profile = measured
     for manager, term in (("rewards", "slow"), ("commands", "forwarding")):
         assert STEPS * NAP <= profile.terms[manager][term] <= profile.phases[manager]
-    # What a command asks for is time of the command.
+    # Calls made by a command count as time of the command.
     assert profile.phases["forward"] < STEPS * NAP
     assert profile.terms["rewards"]["smooth_reward"] < STEPS * NAP
     assert profile.milliseconds(profile.step_time) == pytest.approx(1e3 * profile.step_time / STEPS)

@@ -49,7 +49,7 @@ class FakeScene(dict):
 
 
 class FakeSim:
-    """Notes the levels at which constants were recomputed."""
+    """Records the levels of recomputed constants."""
 
     def __init__(self) -> None:
         self.recomputed: list[int] = []

@@ -242,7 +242,7 @@ def test_viewer_hooks_reach_every_term(env):
         term = manager.get_term(name)
         assert term.gui == (name, "server", 3, "change", "action")
         assert term.paused is True
-        assert term.gui_reset is ids, "all terms are asked, also after one has answered"
+        assert term.gui_reset is ids, "all terms are called, even after one wrote a state"
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

@@ -66,7 +66,7 @@ class Update(Play):
 
 
 class Keywords(Update):
-    """Has keyword arguments of its own."""
+    """Command term with custom keyword arguments."""
 
     def _update_command(self, again=False, *, faster=0.0):
         super()._update_command()
@@ -218,10 +218,12 @@ def test_each_older_method_warns_once_when_it_is_first_called_and_not_before():
                 pass
 
         env, _ = make(Quiet)
-    with pytest.warns(FutureWarning, match=r"Quiet\._update_command takes no env_ids") as seen:
+    with pytest.warns(
+        FutureWarning, match=r"Quiet\._update_command without argument env_ids"
+    ) as seen:
         env.reset()
         step(env)
-    assert len([w for w in seen if "takes no" in str(w.message)]) == 1
+    assert len([w for w in seen if "without argument" in str(w.message)]) == 1
     env.close()
 
 

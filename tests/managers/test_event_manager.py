@@ -12,7 +12,7 @@ from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
 
 
 class Calls:
-    """Notes for which environments it was called."""
+    """Event that records the environments of its calls."""
 
     def __init__(self):
         self.ids = []

@@ -1,4 +1,4 @@
-"""Look-ups ahead of time: ids are given out only where they are what a look-up would find now."""
+"""Planned lookups return ids only if an immediate lookup would find the same ids."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all managers share, shown on the manager of metrics, and contracts of all of them."""
+"""Base class of managers, tested on the metrics manager, and contracts of all managers."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_selections_in_params_are_resolved(env, kind):
     asset_cfg = SceneEntityCfg("robot", joint_names="joint_b")
     manager = manager_class({"a": make(with_asset, params={"asset_cfg": asset_cfg})}, env)
     assert manager.get_term_cfg("a").params["asset_cfg"].joint_ids == [1]
-    assert asset_cfg.joint_ids == slice(None), "the caller's config must stay as it was"
+    assert asset_cfg.joint_ids == slice(None), "the caller's config must be unchanged"
 
 
 def test_selections_nested_in_containers_are_left_alone(env):
@@ -146,7 +146,7 @@ def test_a_wrong_shape_names_manager_term_and_both_shapes(env, kind):
     manager_class, make = kind
     manager = manager_class({"wide": make(lambda env: torch.zeros(4, 1))}, env)
     arguments = {"dt": 0.1} if manager_class is RewardManager else {}
-    with pytest.raises(ValueError, match=rf"{manager_class.__name__}.*'wide'.*\(4, 1\).*\(4,\)"):
+    with pytest.raises(ValueError, match=rf"{manager_class.__name__}.*'wide'.*\(4,\).*\(4, 1\)"):
         manager.compute(**arguments)
 
 

@@ -95,9 +95,9 @@ def test_a_termination_that_returns_floats_is_named_once(make_env, caplog):
     env = make_env(termination=lambda env: (env.episode_length_buf >= 3).float())
     ends = [env.step(torch.zeros(NUM_ENVS, 1))[2].all().item() for _ in range(6)]
     assert ends == [False, False, True] * 2
-    (told,) = messages(caplog, "returned float32")
-    assert "'mine'" in told
-    assert "expected bool" in told
+    (message,) = messages(caplog, "float32")
+    assert "'mine'" in message
+    assert "expected bool" in message
 
 
 def test_environments_that_diverged_are_not_blamed_on_terms(make_env, caplog):

@@ -54,7 +54,7 @@ def test_without_corruption_there_is_no_noise_but_the_rest(env):
     manager = make(env, term)
     torch.testing.assert_close(manager.compute()["g"], env.state * 2.0)
     assert manager.get_term_cfg("g", "t").noise is None
-    assert term.noise is noise, "the caller's config must stay as it was"
+    assert term.noise is noise, "the caller's config must be unchanged"
 
 
 def test_a_term_in_two_groups_is_two_terms(env):
@@ -89,7 +89,7 @@ def test_a_class_in_two_groups_is_two_instances(env):
 
 
 class InPlace(NoiseModel):
-    """Noise as a client may write it: into what it is given."""
+    """Custom noise that modifies its input in place."""
 
     def __call__(self, data):
         return data.add_(1.0)
@@ -162,7 +162,7 @@ def test_a_bias_is_kept_for_an_episode_and_does_not_wander(env):
         biases.append(first)
         manager.reset(torch.tensor([0, 1]))
     for before, after in zip(biases, biases[1:], strict=False):
-        assert (before[:2] != after[:2]).all(), "drawn anew in environments that reset"
+        assert (before[:2] != after[:2]).all(), "resampled in environments that reset"
         torch.testing.assert_close(before[2:], after[2:])
     assert all(bool(((b >= 0.5 - 1e-5) & (b <= 1.0 + 1e-5)).all()) for b in biases)
 
@@ -176,7 +176,7 @@ def test_a_term_of_one_dimension_names_group_and_term(env):
 
 
 def test_a_wrong_number_of_rows_names_group_and_term(env):
-    with pytest.raises(ValueError, match=r"'g/t'.*\(3, 2\).*\(4, "):
+    with pytest.raises(ValueError, match=r"'g/t'.*\(4, .*got \(3, 2\)"):
         make(env, ObservationTermCfg(func=lambda env: env.state[:3]))
 
 
@@ -188,7 +188,7 @@ def test_a_result_that_is_no_tensor_names_group_and_term(env):
 def test_a_shape_that_changes_later_names_group_and_term(env):
     manager = make(env)
     env.state = torch.zeros(4, 3)
-    with pytest.raises(ValueError, match=r"'g/t'.*\(4, 3\).*\(4, 2\)"):
+    with pytest.raises(ValueError, match=r"'g/t'.*\(4, 2\).*got \(4, 3\)"):
         manager.compute(update_history=True)
 
 
@@ -453,7 +453,7 @@ def test_saved_state_continues_as_if_nothing_had_happened(env):
     assert torch.equal(other.compute(update_history=True)["g"], wanted)
 
 
-# What is refused when a term is built.
+# Errors when a term is built.
 
 
 @pytest.mark.parametrize(
@@ -531,7 +531,7 @@ def test_errors_of_the_first_call_and_of_the_constructor_name_the_term(env, erro
 
 def test_errors_of_other_kinds_pass_unchanged(env):
     def call(env):
-        raise ZeroDivisionError("as it was")
+        raise ZeroDivisionError("unchanged")
 
-    with pytest.raises(ZeroDivisionError, match="^as it was$"):
+    with pytest.raises(ZeroDivisionError, match="^unchanged$"):
         make(env, ObservationTermCfg(func=call))

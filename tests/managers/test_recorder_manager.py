@@ -76,5 +76,5 @@ def test_an_error_while_a_recorder_is_built_names_it(env):
 
 
 def test_a_recorder_that_is_called_says_what_to_override(env):
-    with pytest.raises(NotImplementedError, match="Notes is not called; override its hooks"):
+    with pytest.raises(NotImplementedError, match="Notes: .*override.*record_post_step"):
         Notes(RecorderTermCfg(func=Notes), env)()

@@ -167,5 +167,5 @@ def test_terms_that_draw_can_be_switched_off(env):
 
 @pytest.mark.parametrize("weight", [None, "1", (1.0,), float("nan"), float("inf")])
 def test_a_weight_that_is_no_number_is_refused_by_name(env, weight):
-    with pytest.raises(ValueError, match="RewardManager term 'a': weight is .*number"):
+    with pytest.raises(ValueError, match="RewardManager term 'a' weight: .*number"):
         RewardManager({"a": term("a", weight)}, env)

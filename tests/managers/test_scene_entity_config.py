@@ -106,7 +106,7 @@ def test_names_and_indices_that_agree_are_kept(env):
 @pytest.mark.parametrize("names", [("joint_a",), ("joint_[b]",)])
 def test_names_and_indices_that_differ_are_refused(env, names):
     cfg = SceneEntityCfg("robot", joint_names=names, joint_ids=[1])
-    with pytest.raises(ValueError, match="do not agree"):
+    with pytest.raises(ValueError, match="joint_names=.*joint_ids=.*disagree"):
         cfg.resolve(env.scene)
 
 
@@ -117,7 +117,7 @@ def test_a_pattern_that_matches_nothing_lists_the_names(env):
 
 
 def test_an_index_out_of_range_is_refused(env):
-    with pytest.raises(ValueError, match=r"joint_ids \[3\] do not exist"):
+    with pytest.raises(ValueError, match=r"joint_ids: .*got \[3\]"):
         SceneEntityCfg("robot", joint_ids=[0, 3]).resolve(env.scene)
 
 
@@ -128,5 +128,5 @@ def test_an_unknown_entity_lists_what_there_is(env):
 
 def test_a_sensor_can_be_named_but_not_selected_from(env):
     SceneEntityCfg("camera").resolve(env.scene)
-    with pytest.raises(ValueError, match="no joint"):
+    with pytest.raises(ValueError, match="'camera': .*joint, got SimpleNamespace"):
         SceneEntityCfg("camera", joint_names="a").resolve(env.scene)

@@ -1,4 +1,4 @@
-"""Tensors of complex numbers or without data are refused with the name of the term."""
+"""Complex tensors and tensors without data raise errors that name the term."""
 
 from __future__ import annotations
 

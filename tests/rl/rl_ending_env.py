@@ -31,7 +31,7 @@ def ends(cfg: Any, failed: Sequence[int], time_out: Sequence[int]) -> None:
 def ending_env(
     failed: Sequence[int], time_out: Sequence[int], auto_reset: bool = True
 ) -> ManagerBasedRlEnv:
-    """Return an environment of which each episode ends as `ends` says."""
+    """Return an environment with the episode ends of `ends`."""
     cfg = load_env_cfg(TASK)
     cfg.scene.num_envs, cfg.seed, cfg.sim.engine = len(failed), 5, "native"
     cfg.auto_reset = auto_reset

@@ -28,7 +28,7 @@ def one_of_two(monkeypatch):
     return launch
 
 
-@pytest.mark.parametrize(("rank", "whom"), [(0, "1 of 2 have come"), (1, "process 0 at")])
+@pytest.mark.parametrize(("rank", "whom"), [(0, "1 of 2 have joined"), (1, "process 0 at")])
 def test_a_process_alone_says_for_whom_it_waits_and_gives_up(one_of_two, caplog, rank, whom):
     address = one_of_two(rank)
     with pytest.raises(TimeoutError, match=f"Process {rank} of 2.*{address}"):

@@ -1,4 +1,4 @@
-"""Starting several processes: their numbers, their signals, their end, their output."""
+"""Launcher of several processes: ranks, signals, exit status, output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scoring a policy."""
+"""Evaluation of a policy."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_episodes_are_cut_off_and_counted_as_unfinished():
     result = evaluate_policy(counting(), still, max_steps=3)
     assert result.returns == (1.0, 3.0, 6.0, 6.0)
     assert result.num_unfinished == 1
-    assert "1 of 4 episodes were cut off" in result.notes[0]
+    assert "1 of 4 episodes were truncated" in result.notes[0]
     assert result.to_dict()["notes"] == list(result.notes)
 
 
@@ -135,7 +135,7 @@ def test_one_episode_has_no_interval_and_says_so():
     env = counting(num_envs=1)
     result = evaluate_policy(env, still, metrics={"one": lambda env: torch.ones(1)})
     assert result.return_interval is result.std_return is result.metrics["one"].interval is None
-    assert "One episode gives no interval" in " ".join(result.notes)
+    assert "one episode has no confidence interval" in " ".join(result.notes)
     assert json.loads(result.to_json())["return_interval"] is None
 
 
@@ -243,11 +243,11 @@ def test_a_figure_is_found_by_name_and_an_unknown_one_is_refused():
 
 
 def test_json_has_the_figures_without_the_single_returns():
-    figures = json.loads(evaluate_policy(counting(), still, success_return=6.0).to_json())
-    assert figures["mean_return"] == 5.0
-    assert figures["success_rate"] == 0.5
-    assert len(figures["return_interval"]) == 2
-    assert "returns" not in figures
+    values = json.loads(evaluate_policy(counting(), still, success_return=6.0).to_json())
+    assert values["mean_return"] == 5.0
+    assert values["success_rate"] == 0.5
+    assert len(values["return_interval"]) == 2
+    assert "returns" not in values
 
 
 def test_the_same_seed_gives_the_same_figures():
@@ -313,7 +313,7 @@ def test_a_policy_with_memory_is_reset_with_its_environments():
 
 def test_endless_episodes_and_no_episodes_are_refused():
     endless = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg(episode_steps=10**9)))
-    with pytest.raises(ValueError, match="episode_length_s, or give max_steps"):
+    with pytest.raises(ValueError, match="max_steps: .*episode_length_s"):
         evaluate_policy(endless, still)
     with pytest.raises(ValueError, match="num_episodes.*got 0"):
         evaluate_policy(counting(), still, 0)

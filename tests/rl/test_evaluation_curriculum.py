@@ -1,4 +1,4 @@
-"""Evaluations are of the step at which the policy was saved, whatever its curricula would do next."""
+"""Evaluations use the training step of the saved policy; curricula do not advance."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NUM_STEPS = 20
 def staged_env(step: int | None, num_envs: int = 2) -> RslRlVecEnvWrapper:
     """Return environments at step `step`, whose rewards cost at `CHANGE` what they earned before.
 
-    With `step` None there is no curriculum.
+    No curriculum if `step` is None.
     """
     cfg = load_env_cfg(TASK)
     cfg.scene.num_envs, cfg.seed, cfg.episode_length_s = num_envs, 1, NUM_STEPS * 0.02

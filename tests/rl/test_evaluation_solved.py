@@ -1,4 +1,4 @@
-"""Solved or not: what a policy has to pass before training stops, in which episodes, and what is told."""
+"""Solved check: conditions that stop training, episodes of evaluations, reports."""
 
 from __future__ import annotations
 

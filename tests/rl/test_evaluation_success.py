@@ -1,4 +1,4 @@
-"""What counts as a success, in words."""
+"""Description of the success criterion."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def unexplained(env: Any) -> torch.Tensor:
         ),
         (
             {"success_func": placed_at_goal},
-            "the object was at its goal, or, where time ran out on one too new, at the last "
+            "the object is at its goal, or was at the last one if time ran out on a new one "
             "(placed_at_goal), one step before the end",
         ),
         (
             {"success_is_survival": True},
-            "no termination ended the episode before its time was over",
+            "no termination before the time limit",
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""The exported policy: same numbers as the torch policy, and what a deployment has to know."""
+"""Exported policy: same actions as the torch policy, deployment metadata."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def test_a_policy_that_cannot_be_exported_does_not_lose_the_run(make_runner, tmp
 
 
 def test_training_and_export_import_no_exporters_plots_and_runtimes(tmp_path: Path):
-    # In a process of its own, because other tests may have imported them.
+    # In a separate process, because other tests may have imported them.
     program = f"""
 import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})

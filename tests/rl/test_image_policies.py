@@ -232,7 +232,7 @@ def test_a_critic_that_shares_needs_no_encoder_settings(env: RslRlVecEnvWrapper)
     assert runner.alg.critic.cnns is runner.alg.actor.cnns
 
 
-# What an encoder may be made of.
+# Encoder configs.
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_a_spatial_softmax_of_a_moving_spot_follows_it() -> None:
     assert math.isclose(float(features[:, 0].abs().max()), 0.0, abs_tol=0.1)
 
 
-# What is refused when the run is built.
+# Errors when the run is built.
 
 
 def edited(**changes: Any) -> dict[str, Any]:
@@ -305,19 +305,19 @@ def edited(**changes: Any) -> dict[str, Any]:
     [
         (
             {"actor__class_name": "MLPModel"},
-            r"The actor \(class_name 'MLPModel'\) takes flat observations only.*'camera' holds "
-            r"images of shape \(2, 16, 16\).*SpatialSoftmaxCNNModel.*obs_groups\['actor'\]",
+            r"agent.actor class_name 'MLPModel': expected flat observations, .*'camera'.*"
+            r"\(2, 16, 16\).*SpatialSoftmaxCNNModel.*obs_groups\['actor'\]",
         ),
-        ({"critic__class_name": "MLPModel"}, "The critic .* takes flat observations only"),
-        ({"actor__class_name": "RNNModel"}, "The actor .* takes flat observations only"),
+        ({"critic__class_name": "MLPModel"}, "agent.critic .* expected flat observations"),
+        ({"actor__class_name": "RNNModel"}, "agent.actor .* expected flat observations"),
         ({"actor__cnn_cfg": None}, r"agent.actor cnn_cfg.*\['camera'\].*None"),
         (
             {"settings": {"actor": ("actor",)}},
-            r"The actor has image encoders .* groups \['actor'\] have no images",
+            r"agent.actor .*: expected images .* groups \['actor'\]",
         ),
         (
             {"actor__cnn_cfg": {"depth": CNN_CFG}},
-            r"agent.actor cnn_cfg.*\['depth'\].*\['camera'\]",
+            r"agent.actor cnn_cfg: expected .*\['camera'\].*got .*\['depth'\]",
         ),
         (
             {"critic__cnn_cfg": {**CNN_CFG, "kernel_size": (5, 33), "padding": "none"}},
@@ -325,7 +325,7 @@ def edited(**changes: Any) -> dict[str, Any]:
         ),
         (
             {"settings": {"actor": ("actor", "camra")}},
-            r"obs_groups\['actor'\] names \['camra'\], and .*'camera'",
+            r"obs_groups\['actor'\]: .*\['camra'\].*'camera'",
         ),
         ({"actor__cnn_cfg": "resnet"}, "agent.actor cnn_cfg.*'resnet'"),
         (
@@ -342,11 +342,11 @@ def edited(**changes: Any) -> dict[str, Any]:
         ({"actor__cnn_cfg": {**CNN_CFG, "kernels": 3}}, "unexpected keyword argument 'kernels'"),
         (
             {"settings": {"critic": ("critic", "depth"), "share": True}},
-            r"actor has them for \['camera'\], the critic for \['depth'\]",
+            r"share_cnn_encoders: .*\['camera'\] for the actor and \['depth'\] for the critic",
         ),
         (
             {"settings": {"share": True, "critic": ("critic",)}, "critic__class_name": "MLPModel"},
-            "the critic for none",
+            "share_cnn_encoders: .*none for the critic",
         ),
     ],
 )
@@ -360,9 +360,12 @@ def test_networks_that_cannot_take_their_observations_are_refused(
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (torch.zeros(4, 3, 5), r"'camera' has shape \(3, 5\)"),
-        (torch.zeros(4, 1, 16, 16, dtype=torch.uint8), "'camera' is of torch.uint8"),
-        (TensorDict({"a": torch.zeros(4, 2)}, batch_size=[4]), r"is a dict of \['a'\]"),
+        (torch.zeros(4, 3, 5), r"'camera': .*shape \(3, 5\)"),
+        (torch.zeros(4, 1, 16, 16, dtype=torch.uint8), "'camera': .*torch.uint8"),
+        (
+            TensorDict({"a": torch.zeros(4, 2)}, batch_size=[4]),
+            r"'camera': .*got a dict of \['a'\]",
+        ),
     ],
 )
 def test_groups_that_no_network_can_take_are_refused(value: Any, message: str) -> None:

@@ -23,7 +23,7 @@ MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 
 
 def ppo() -> RslRlOnPolicyRunnerCfg:
-    """Return a config in which no field of the base has its default."""
+    """Return a config with non-default values in all fields of the base."""
     cfg = RslRlOnPolicyRunnerCfg(evaluation=EvaluationCfg(num_episodes=7))
     for field in fields(RslRlBaseRunnerCfg):
         value = getattr(cfg, field.name)

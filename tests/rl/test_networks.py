@@ -1,4 +1,4 @@
-"""Mini-batches without data are refused before anything is learned."""
+"""Checks of mini-batches and image encoders before training."""
 
 from __future__ import annotations
 

@@ -22,14 +22,14 @@ NUM_ENVS, STEPS = 3, 4
 
 
 class Writer:
-    """Keeps figures as (tag, step)."""
+    """Writer that keeps scalars by (tag, step)."""
 
     def __init__(self) -> None:
-        self.figures: dict[tuple[str, int], float] = {}
+        self.scalars: dict[tuple[str, int], float] = {}
 
     def add_scalar(self, tag: str, value: Any, step: int) -> None:
-        assert (tag, step) not in self.figures
-        self.figures[tag, step] = float(value)
+        assert (tag, step) not in self.scalars
+        self.scalars[tag, step] = float(value)
 
 
 def make_logger(kind: type[Logger], rnd: bool) -> Any:
@@ -73,7 +73,7 @@ def test_every_tag_of_rsl_rl_is_written_with_its_value_and_step(rnd, entry, caps
             iteration=it, first_iteration=0, total_iterations=3, losses=losses,
             collection_time=0.8, learning_time=0.7, **report,
         )  # fmt: skip
-    expected, written = theirs.writer.figures, ours.writer.figures
+    expected, written = theirs.writer.scalars, ours.writer.scalars
     own = {("Train/mean_step_reward", it) for it in range(3)}
     # rsl_rl leaves the weight of the curiosity out until an episode has ended.
     extra = {("Rnd/weight", 0)} if rnd and entry == "finish_iteration" else set()
@@ -105,7 +105,7 @@ def test_a_resumed_run_goes_on_with_both_parts_of_the_reward():
     for it in (3, 4):
         for part in ("mean_reward", "mean_extrinsic_reward", "mean_intrinsic_reward"):
             key = ("Train" if part == "mean_reward" else "Rnd") + f"/{part}", it
-            assert resumed.writer.figures[key] == whole.writer.figures[key]
+            assert resumed.writer.scalars[key] == whole.writer.scalars[key]
 
 
 @pytest.mark.parametrize("saved_with_rnd", [False, True])
@@ -123,8 +123,8 @@ def test_checkpoints_without_the_parts_of_the_reward_are_resumed(saved_with_rnd,
             resumed.log(it, 0, 9, 0.8, 0.7, {}, rnd_weight=0.1, **REPORT)
         else:
             finish(resumed, it)
-    assert ("Train/mean_step_reward", 0) in resumed.writer.figures
-    assert ("Rnd/mean_extrinsic_reward", 2) in resumed.writer.figures
+    assert ("Train/mean_step_reward", 0) in resumed.writer.scalars
+    assert ("Rnd/mean_extrinsic_reward", 2) in resumed.writer.scalars
 
 
 def test_the_type_is_known_once_there_is_a_writer(make_runner, tmp_path: Path):
@@ -194,12 +194,12 @@ def test_weights_and_biases_is_known_by_its_name_and_the_config_stays(
 
 
 class OwnLoop(MjlabOnPolicyRunner):
-    """Has a training loop of its own, here rsl_rl's."""
+    """Runner with a custom training loop, here rsl_rl's."""
 
     learn = OnPolicyRunner.learn
 
 
-def test_a_runner_with_a_loop_of_its_own_leaves_checkpoints_and_figures(
+def test_a_runner_with_a_loop_of_its_own_leaves_checkpoints_and_scalars(
     make_runner, tmp_path: Path, capsys
 ):
     run = tmp_path / "run"

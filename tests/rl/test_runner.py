@@ -1,4 +1,4 @@
-"""The training loop: exact resume, signals, stopping when solved, what is told and written."""
+"""Training loop: exact resume, signals, stop when solved, reports and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values at time-outs: those of the observations in which episodes ended."""
+"""Bootstrapped values at time-outs: those of the final observations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GAMMA = 0.99
 
 
 class ObservingEnv(FakeEnv):
-    """The fake environment, able to return the observations in which episodes run out of time."""
+    """Fake environment that can return the final observations of episodes that time out."""
 
     observes_ends = False
 
@@ -58,7 +58,7 @@ class Log:
             process(rewards, *args)
 
         runner.logger.process_env_step = log
-        # The weights with which the data is collected.
+        # The weights used for data collection.
         runner.alg.update = self.look
 
     def act(self, observations: Any) -> torch.Tensor:

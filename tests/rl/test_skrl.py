@@ -22,7 +22,7 @@ NUM_ENVS = 3
 
 
 def make_env(auto_reset: bool = True) -> ManagerBasedRlEnv:
-    """Return environments of which 2 runs out of time as it fails."""
+    """Return environments; number 2 times out in the step in which it terminates."""
     return ending_env(failed=[2, 99, 4], time_out=[99, 3, 4], auto_reset=auto_reset)
 
 
@@ -42,7 +42,7 @@ def test_results_are_columns_and_states_those_of_the_critic(env):
         last = env.step(torch.zeros(NUM_ENVS, 1))
     assert [value.shape for value in last[1:4]] == [(NUM_ENVS, 1)] * 3
     assert last[3].flatten().tolist() == [False, True, False]
-    # What fails as its time is over has no future to bootstrap from. (Environment 0 fails again.)
+    # A termination at the time limit has no future to bootstrap from. (Environment 0 fails again.)
     _, _, terminated, truncated, _ = env.step(torch.zeros(NUM_ENVS, 1))
     assert terminated.flatten().tolist() == [True, False, True]
     assert not truncated.any()

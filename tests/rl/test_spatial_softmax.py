@@ -87,7 +87,7 @@ def test_encoders_are_shared_or_configured_by_name():
     first = model({"camera": CNN_CFG})
     second = model(cnns=first.cnns)
     assert second.cnns["camera"] is first.cnns["camera"]
-    with pytest.raises(ValueError, match=r"configs for \['other'\].*\['camera'\]"):
+    with pytest.raises(ValueError, match=r"\['camera'\].*got configs for \['other'\]"):
         model({"other": CNN_CFG})
     with pytest.raises(ValueError, match="2D observations"):
         model(cnns=torch.nn.ModuleDict({"other": first.cnns["camera"]}))

@@ -99,7 +99,7 @@ class NoMode(Walk):
 
 
 class ByMask(Walk):
-    """Resets where it is told to."""
+    """Environment that resets on request."""
 
     metadata = {"autoreset_mode": AutoresetMode.DISABLED}
 
@@ -220,15 +220,15 @@ FAULTS: dict[str, tuple[type[Walk], str]] = {
         SaysNextStepSilently,
         "final_obs: expected none with AutoresetMode",
     ),
-    "reset of all": (ResetsAll, "reset_mask: expected a reset where it is true, got one where"),
+    "reset of all": (ResetsAll, "reset_mask: expected resets only of environments"),
     "reset of none": (ResetsNone, "reset: observations after an end are those before the reset"),
-    "one buffer of rewards": (OwnRewards, "aliasing: what was returned is changed by the next"),
+    "one buffer of rewards": (OwnRewards, "aliasing: the next step modifies returned"),
     "no reset": (ResetsTimeOutsOnly, "reset: observations after an end are those before the reset"),
     "stale final observation": (StaleFinal, "stale final_obs: it is the observation before"),
     "no final observation": (NoFinal, r"final_obs: expected infos\['_final_obs'\] to be true"),
-    "one buffer": (OwnMemory, "aliasing: what was returned is changed by the next step"),
+    "one buffer": (OwnMemory, "aliasing: the next step modifies returned arrays"),
     "seed": (IgnoresSeed, "seed: two runs with seed 0 differ from step 0 on"),
-    "bounds": (Narrow, "observations: observations: values are outside of the bounds"),
+    "bounds": (Narrow, "observations: observations: values are outside the bounds"),
     "batched space": (Unbatched, r"observation_space: expected batch_space\(single_obs"),
     "type of observations": (
         changed(observations=lambda value: value.astype(float)),

@@ -205,14 +205,14 @@ def test_two_sensors_of_one_name_are_refused(kit):
         def build(self):
             return Quiet()
 
-    with pytest.raises(ValueError, match="Two sensors are called 'eye'"):
+    with pytest.raises(ValueError, match="SceneCfg.sensors.*'eye'"):
         build(sensors=(QuietCfg(name="eye"), QuietCfg(name="eye")))
-    with pytest.raises(ValueError, match="Two sensors are called 'box/height'"):
+    with pytest.raises(ValueError, match="SceneCfg.sensors.*'box/height'"):
         build(entities={"box": kit.cfg(kit.BOX)}, sensors=(height("height"), height("height")))
 
 
 def test_a_sensor_that_the_xml_has_already_is_refused(kit):
-    with pytest.raises(ValueError, match="'box/spin' exists already in entity 'box'"):
+    with pytest.raises(ValueError, match="'box/spin' .*entity 'box'"):
         build(entities={"box": kit.cfg(kit.BOX)}, sensors=(height("spin"),))
 
 
@@ -320,7 +320,7 @@ def test_only_what_acts_between_substeps_asks_for_them(kit):
 
 def test_an_unknown_key_lists_what_there_is(kit):
     scene = build(entities={"box": kit.cfg(kit.BOX)})
-    with pytest.raises(KeyError, match=r"no 'bx'. Entities: \['box'\]. Sensors: \['box/spin'\]"):
+    with pytest.raises(KeyError, match=r"'bx'.* Entities: \['box'\]. Sensors: \['box/spin'\]"):
         _ = scene["bx"]
 
 
@@ -371,7 +371,7 @@ def test_state_of_a_scene_is_captured_and_restored(kit):
     assert (again["c"].data.joint_pos_target == 0.7).all()
     assert (again["c"].data.encoder_bias == 0.2).all()
     assert torch.equal(again.env_origins, scene.env_origins)
-    assert again["c"].data.joint_pos is views, "views of the simulation are no state"
+    assert again["c"].data.joint_pos is views, "views of the simulation are not state"
 
 
 # Files.

@@ -1,4 +1,4 @@
-"""Simulation options in the XML of entities: decided by `MujocoCfg`, or applied to the scene."""
+"""Simulation options in the XML of entities: overridden by `MujocoCfg`, or applied to the scene."""
 
 from __future__ import annotations
 
@@ -160,10 +160,10 @@ def test_flags_of_an_xml_are_reported_as_applying_with_the_assignment(kit, xml, 
     lines = reports(scene, sim.mujoco, caplog)
     assert lines == [
         "Option disableflags is ('gravity',), from MujocoCfg, plus ('contact',), from the XML of "
-        "'robot' and the XML of 'other', which applies to the whole scene; to state it in the "
-        "config, set sim.mujoco.disableflags = ('gravity', 'contact')",
-        "Option enableflags is (), from MujocoCfg, plus ('energy',), from the XML of 'robot', "
-        "which applies to the whole scene; to state it in the config, "
+        "'robot' and the XML of 'other' (applied to the whole scene); to configure it, "
+        "set sim.mujoco.disableflags = ('gravity', 'contact')",
+        "Option enableflags is (), from MujocoCfg, plus ('energy',), from the XML of 'robot' "
+        "(applied to the whole scene); to configure it, "
         "set sim.mujoco.enableflags = ('energy',)",
     ]
     for line in lines:
@@ -179,7 +179,7 @@ def test_entities_that_disagree_beyond_the_config_are_reported_and_neither_wins(
         )
     text = str(caught[0].message)
     assert "viscosity: 1.0 (one), 2.0 (two)" in text
-    # The config decides this one, whatever they say.
+    # MujocoCfg overrides the timestep.
     assert "timestep" not in text
     assert "density" not in text
     assert scene.compile().opt.density == 7.0
@@ -205,7 +205,7 @@ def test_the_scenes_own_edits_win_and_are_reported(kit):
     def spec_fn(spec):
         spec.option.density = 5.0
 
-    with pytest.warns(UserWarning, match="density: 5.0, not 7.0 as robot"):
+    with pytest.warns(UserWarning, match=r"density: 5.0 .* 7.0 \(robot\)"):
         scene = build(spec_fn, robot=kit.cfg(kit.BOX, 'density="7" viscosity="1"/>'))
     assert scene.compile().opt.density == 5.0
     assert scene.compile().opt.viscosity == 1.0

@@ -1,4 +1,4 @@
-"""Running the commands within the test's own process."""
+"""Commands run within the test process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Running `train` in several processes at once, each forked from one that has torch imported."""
+"""Parallel runs of `train`, in processes forked from one that has torch imported."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CONTEXT.set_forkserver_preload(
 
 @dataclasses.dataclass
 class Ended:
-    """How one of the processes ended."""
+    """Result of one process."""
 
     status: int
     out: str

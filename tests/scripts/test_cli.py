@@ -1,4 +1,4 @@
-"""What the command lines share: arguments, flags, errors, devices."""
+"""Command lines: arguments, flags, errors, devices."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_an_error_that_a_user_can_mend_is_one_message_and_status_1(failing, kind
     status, out, err = failing(kind("Do this instead."))
     assert (status, out) == (1, "")
     assert err == (
-        f"error: Do this instead.\n(Set {cli.TRACEBACK_VARIABLE}=1 for where it came from.)\n"
+        f"error: Do this instead.\n(Set {cli.TRACEBACK_VARIABLE}=1 for the traceback.)\n"
     )
 
 
@@ -84,7 +84,7 @@ def test_an_error_of_any_kind_that_this_package_raises_on_purpose_is_a_message(c
 
     status, _, err = ended(unknown_entity, capsys)
     assert status == 1
-    assert err.startswith("error: The scene has no 'robot'.")
+    assert err.startswith("error: Unknown entity or sensor 'robot'.")
     with pytest.raises(TypeError, match="no_such_field"):
         ended(wrong_arguments, capsys)
 

@@ -1,4 +1,4 @@
-"""Everything that can be asked for wrongly: one clear message, status 1, and nothing lost."""
+"""Invalid requests: one clear message, status 1, and no data lost."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def task_with(monkeypatch) -> Callable[[Callable[[ManagerBasedRlEnvCfg], None]],
     return register
 
 
-# Where pages are served.
+# Addresses of pages.
 
 
 @pytest.mark.parametrize("host", ["300.1.2.3", "203.0.113.7"])
@@ -89,7 +89,7 @@ def test_a_page_on_an_address_of_another_machine_is_refused_at_once(
     assert not list(tmp_path.iterdir())
 
 
-# What is asked for by name.
+# Unknown names.
 
 
 @pytest.mark.parametrize("script", ["train", "play", "evaluate"])
@@ -102,7 +102,9 @@ def test_an_unknown_task_is_answered_with_the_nearest_names(run, script):
 
 
 def test_a_name_like_no_task_is_answered_with_where_to_look(run):
-    assert "`list-envs` shows all" in run("train", "zzz").message
+    message = run("train", "zzz").message
+    assert "list-envs" in message
+    assert TASK in message
 
 
 @pytest.mark.parametrize("script", ["train", "play", "evaluate"])
@@ -135,7 +137,7 @@ def test_an_entity_that_is_not_there_lists_those_that_are(attempt, task_with):
     assert "cartpole" in message
 
 
-# What a task does wrong.
+# Errors in tasks.
 
 
 def _too_long(env):
@@ -275,7 +277,7 @@ def spoil(checkpoint: Path, how: str) -> None:
 
 @pytest.mark.parametrize(
     ("how", "words"),
-    [("truncated", "corrupt"), ("hostile", "refused"), ("plain pickle", "refused")],
+    [("truncated", "corrupt"), ("hostile", "rejected"), ("plain pickle", "rejected")],
 )
 @pytest.mark.parametrize("script", ["train", "play", "evaluate"])
 def test_a_spoilt_checkpoint_is_refused_and_not_run(run, resumable, tmp_path, script, how, words):
@@ -353,7 +355,7 @@ def test_a_log_folder_that_cannot_be_written_is_told_before_training(run, tmp_pa
 def test_a_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
     replacing, write_text = checkpoint_module.replacing, Path.write_text
 
-    def refuse_if_full():
+    def raise_if_full():
         if list(tmp_path.rglob("model_0.pt")):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -361,10 +363,10 @@ def test_a_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
     def write_checkpoint(path, **kwargs):
         with replacing(path, **kwargs) as file:
             yield file
-            refuse_if_full()
+            raise_if_full()
 
     def write_small_file(self, text):
-        refuse_if_full()
+        raise_if_full()
         return write_text(self, text)
 
     monkeypatch.setattr(checkpoint_module, "replacing", write_checkpoint)

@@ -111,7 +111,7 @@ def test_exported_policies_are_played_and_evaluated_like_checkpoints(run, traine
 def test_a_policy_of_another_task_is_refused(run, go1_policy):
     outcome = run("play", "Mjlab-Cartpole-Swingup", "--checkpoint-file", str(go1_policy), *HEADLESS)
     assert outcome.status == 1
-    assert "trained for another environment" in outcome.message
+    assert "trained in a different environment" in outcome.message
     assert "base_lin_vel" in outcome.message
 
 

@@ -105,9 +105,9 @@ def test_the_device_of_each_process(gpus, visible, changes, rank, device, egl):
 @pytest.mark.parametrize(
     ("changes", "rank", "message"),
     [
-        ({}, (2, 3, 2, 3), "3 processes of the run and 2 GPUs"),
-        ({"device": "cuda:1"}, (0, 2, 0, 2), "--device cuda:1 is one GPU"),
-        ({"gpu_ids": [0, 1]}, (0, 1, 0, 1), "this is one process"),
+        ({}, (2, 3, 2, 3), "at most 2 processes .* got 3"),
+        ({"device": "cuda:1"}, (0, 2, 0, 2), "--device cuda:1: expected one GPU for each of the 2"),
+        ({"gpu_ids": [0, 1]}, (0, 1, 0, 1), "--gpu-ids: expected one GPU"),
     ],
 )
 def test_processes_without_a_gpu_each_are_refused(gpus, changes, rank, message):

@@ -64,7 +64,7 @@ def test_an_archive_of_the_folder_above_holds_the_scene_only(
     (tmp_path / "above" / "here").mkdir(parents=True)
     (tmp_path / "above" / "thesis.txt").write_text("years of work")
     monkeypatch.chdir(tmp_path / "above" / "here")
-    # Packed from a folder of temporary files, of which this is all that there is.
+    # Packed from a folder of temporary files, with no other content.
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "above"))
     result = run_export_scene("go1", ExportSceneConfig(output_dir="..", zip=True))
     assert result.resolve() == tmp_path / "above.zip"
@@ -74,7 +74,7 @@ def test_an_archive_of_the_folder_above_holds_the_scene_only(
     assert here.resolve() == tmp_path / "above" / "here.zip"
     named = run_export_scene("go1", ExportSceneConfig(output_dir="robot.zip", zip=True))
     assert named == Path("robot.zip")
-    with pytest.raises(UserError, match="no name that an archive could have"):
+    with pytest.raises(UserError, match="--output-dir: expected a path with a name"):
         run_export_scene("go1", ExportSceneConfig(output_dir="/", zip=True))
 
 
@@ -91,7 +91,7 @@ def test_a_folder_with_files_is_left_alone(run, tmp_path: Path) -> None:
 def test_a_file_in_the_folders_place_is_left_alone(overwrite: bool, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("years of work")
     cfg = ExportSceneConfig(output_dir=str(tmp_path / "out"), overwrite=overwrite)
-    with pytest.raises(UserError, match="out is a file"):
+    with pytest.raises(UserError, match="got the file .*out"):
         run_export_scene("go1", cfg)
     assert (tmp_path / "out").read_text() == "years of work"
 
@@ -131,9 +131,9 @@ def test_a_function_of_another_module_makes_the_entity(
     assert model.body(1).name == "robot/ball"
     assert [p.name for p in (tmp_path / "out" / "assets").rglob("*.obj")] == ["m.obj"]
     wrong = run("export_scene", "my_robot_7:NOTHING", "--output-dir", "other")
-    assert "made a int" in wrong.message
+    assert "got int" in wrong.message
     asking = run("export_scene", "os:chdir", "--output-dir", "other")
-    assert "takes arguments" in asking.message
+    assert "without required arguments" in asking.message
     missing = run("export_scene", "my_robot_7:absent", "--output-dir", "other")
     assert "cannot be imported" in missing.message
     assert not (tmp_path / "other").exists()

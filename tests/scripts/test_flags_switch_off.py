@@ -69,7 +69,7 @@ def test_every_kind_of_term_can_be_switched_off(config, path, term):
     edited, remaining = switch_terms_off(config, [f"--env.{path}", "None"])
     assert term(edited.env) is None
     assert remaining == []
-    assert term(config.env) is not None, "the config given has to stay as it was"
+    assert term(config.env) is not None, "the input config must be unchanged"
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ def test_overrides_of_observations_reach_the_config():
     ]  # fmt: skip
     assert terms["base_lin_vel"].noise.n_max == 0.3
     assert terms["base_lin_vel"].clip == (-5.0, 5.0)
-    # The same function of the critic has a config of its own.
+    # The same function of the critic has a separate config.
     assert cfg.env.observations["critic"].terms["joint_vel"].scale is None
 
 

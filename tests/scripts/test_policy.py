@@ -1,4 +1,4 @@
-"""What a run's own files may say about its policy."""
+"""Policy settings read from the files of a run."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ def test_evaluation_prints_a_table_for_people(run, trained):
     outcome = run("evaluate", TASK, *SHORT, "--log-root", str(trained.parents[1]))
     assert outcome.status == 0, outcome.err
     for part in ("4 in 4 environments", "Mean return", "95 % interval", "Success      0.0%",
-                 "at least 900", "native", "Note         4 of 4 episodes were cut off", "rare failures"):  # fmt: skip
+                 "at least 900", "native", "Note         4 of 4 episodes were truncated", "rare failures"):  # fmt: skip
         assert part in outcome.out
 
 
@@ -248,7 +248,7 @@ def test_a_policy_that_sees_images_trains_plays_and_is_scored(run, with_images, 
         "--agent.run-name", "wrong",
     )  # fmt: skip
     assert wrong.status == 1
-    assert "takes flat observations only" in wrong.message
+    assert "expected flat observations" in wrong.message
 
 
 def _truncate(model) -> bytes:

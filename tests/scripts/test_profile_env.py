@@ -7,7 +7,7 @@ import json
 import pytest
 from commands import TASK
 
-from mjlab.scripts.profile_env import StepProfile, _text, profile_rows
+from mjlab.scripts.profile_env import StepProfile, _format_times, profile_rows
 from mjlab.tasks.registry import list_tasks
 
 SMALL = ("--num-envs", "4", "--steps", "3", "--warm-up", "1", "--device", "cpu")
@@ -64,7 +64,7 @@ def test_terms_that_take_much_are_named(much):
     if not much:
         one.step_time = 100.0
     head = {"task": "T", "num_envs": 8, "physics": "p", "steps": 10, "step_ms": 2.0}
-    last = _text({**head, **profile_rows(one)}).splitlines()[-1]
+    last = _format_times({**head, **profile_rows(one)}).splitlines()[-1]
     if much:
         assert last == (
             "More than 5 % of the step: observations/actor/x (25.0 %), rewards/b (6.2 %)."

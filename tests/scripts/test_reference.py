@@ -175,7 +175,7 @@ HEALTHY = [run_record(RISING + offset, ended="finished") for offset in (-2.0, 0.
         (RISING + 5.0, True),
         (RISING + 40.0, False),
         (np.zeros(20), False),
-        # It breaks down in the end only, or was slow in the beginning only.
+        # Breakdown at the end only, or slow start only.
         (np.where(RISING < 90.0, RISING, 0.0), False),
         (np.where(RISING > 30.0, RISING, -50.0), True),
         (np.full(20, np.nan), False),
@@ -291,7 +291,7 @@ def test_a_resumed_run_has_the_curve_of_an_uninterrupted_one(
 ):
     first = train(tmp_path, 3 if is_killed else 2, *EVALUATED)
     if is_killed:
-        # It was killed before this checkpoint: the third iteration is trained twice.
+        # Killed before this checkpoint: the third iteration is trained twice.
         (first / "model_2.pt").unlink()
     second = train(tmp_path, 3, *EVALUATED, "--agent.resume", "True")
     third = train(tmp_path, 4, *EVALUATED, "--agent.resume", "True")
@@ -300,7 +300,7 @@ def test_a_resumed_run_has_the_curve_of_an_uninterrupted_one(
     resumed, whole = read_run(third), read_run(uninterrupted)
     assert times_dropped(resumed) == times_dropped(whole)
     assert resumed.seconds > read_run(first).seconds_at[1]
-    # A folder may be moved, and what is gone is told.
+    # A folder may be moved; a missing folder raises.
     moved = shutil.copytree(tmp_path, tmp_path.with_name(f"{tmp_path.name}_moved")) / "cartpole"
     assert read_run(moved / third.name) == resumed
     shutil.rmtree(moved / first.name)

@@ -113,10 +113,10 @@ def test_a_run_that_was_interrupted_does_not_stand_in(tmp_path):
     run_dir = make_run(tmp_path, "run", 5, 41, task=TASK, ended="interrupted")
     with pytest.raises(UserError) as caught:
         resolve_checkpoint(tmp_path / "model_500.pt", TASK)
-    assert f"no checkpoint {tmp_path / 'model_500.pt'}" in str(caught.value)
+    assert f"Checkpoint {tmp_path / 'model_500.pt'}" in str(caught.value)
     assert str(run_dir / "model_41.pt") in str(caught.value)
 
 
 def test_where_there_are_no_checkpoints_the_message_says_how_to_make_some(tmp_path):
-    with pytest.raises(UserError, match=f"`train {TASK}` makes some"):
+    with pytest.raises(UserError, match=f"`train {TASK}` first"):
         resolve_checkpoint(tmp_path / "model_0.pt", TASK)

@@ -210,7 +210,7 @@ def test_a_state_that_turns_nan_is_counted_and_the_run_goes_on(run, tmp_path, mo
 
 def test_physics_that_diverges_nearly_everywhere_ends_training(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    # Other libraries of this process set one, dm_control as it is imported.
+    # Other libraries in this process set one: dm_control at import.
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(None)
     outcome = run(

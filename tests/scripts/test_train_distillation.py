@@ -59,7 +59,7 @@ def test_flags_that_would_teach_nothing_are_refused(run, student, tmp_path):
     logs = ["--log-root", str(student[1].parents[1]), "--agent.resume", "True"]
     argv = [TASK, *SMALL, *logs, *STUDENT, "--agent.load-run", student[1].name]
     outcome = run("train", *argv, "--agent.teacher-checkpoint", "another.pt")
-    assert f"expected that of the resumed run, {teacher}, got another.pt" in outcome.message
+    assert f"expected {teacher} of the resumed run, got another.pt" in outcome.message
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ def test_a_terminal_that_is_closed_leaves_a_checkpoint(tmp_path):
     child, terminal = pty.fork()
     if child == 0:
         os.execv(sys.executable, endless_run(log_root))
-    # What is not read from a terminal stops the one who writes.
+    # A writer blocks if its terminal is not read.
     reader = threading.Thread(target=read_until_closed, args=(terminal,), daemon=True)
     reader.start()
     end = time.monotonic() + PATIENCE

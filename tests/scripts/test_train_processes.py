@@ -56,7 +56,7 @@ def test_observation_normalizers_have_seen_the_data_of_both(pair):
 def test_every_process_draws_random_numbers_of_its_own(pair):
     run, _ = pair
     first, second = run.probe(0), run.probe(1)
-    # Not 8 in the second, which would be the first of a run with that seed.
+    # Not 8 in the second process: 8 is the first seed of a run with seed 8.
     seeds = (7, process_seed(7, 1))
     assert (first["seed"], second["seed"]) == seeds
     assert (first["env_seed"], second["env_seed"]) == seeds

@@ -1,4 +1,4 @@
-"""Resuming takes the right run, with as many environments, and only where there is more to do."""
+"""Resume: selection of the run, number of environments, finished runs."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_it_has_the_environments_of_the_run_that_it_resumes(first, resume):
     assert outcome.status == 0, outcome.err
     assert "Resuming with 16 environments" in outcome.out
     assert num_envs(new_run(first)) == 16
-    assert "start anew" not in outcome.err
+    assert "random numbers restart" not in outcome.err
 
 
 @pytest.mark.parametrize("is_known", [True, False])
@@ -90,7 +90,7 @@ def test_where_nothing_says_how_many_environments_there_were_this_is_told(first,
     shutil.rmtree(first / "params")
     outcome = resume()
     assert outcome.status == 0
-    assert "does not say how many environments" in outcome.err
+    assert "does not record the number of environments" in outcome.err
     assert "--num-envs" in outcome.err
 
 
@@ -126,7 +126,7 @@ def test_the_run_that_was_changed_last_is_resumed(first, resume):
     outcome = resume()
     assert outcome.status == 0, outcome.err
     assert f"Resumed: {first / 'model_1.pt'}" in outcome.out
-    # A name that is given wins, and so does a checkpoint that only one of them has.
+    # An explicit name takes precedence, and so does a checkpoint that only one run has.
     shutil.copy2(other / "model_0.pt", other / "model_7.pt")
     outcome = resume("--agent.load-checkpoint", "model_7.pt", iterations=1)
     assert f"{other / 'model_7.pt'} has finished" in outcome.out

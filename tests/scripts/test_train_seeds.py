@@ -1,4 +1,4 @@
-"""`train-seeds` and `plot-seeds`: one task over several seeds, and their figure."""
+"""`train-seeds` and `plot-seeds`: one task over several seeds, and their plot."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_each_seed_trains_once_and_to_the_end(run, commands):
         }
 
 
-# What every policy reaches.
+# Return that every policy reaches.
 CONDITIONS = {
     "return": {"solved_return": -1.0, "trigger_return": -9.0},
     "below": {"solved_below": {"mean_length": 99.0}},
@@ -84,7 +84,7 @@ def test_a_solved_seed_goes_on_to_its_last_iteration_and_is_evaluated(
 
 
 def _run_here(run):
-    """Return what runs a training command in this process, which is faster than in another."""
+    """Return a runner of training commands in this process, faster than a subprocess."""
 
     def run_here(command):
         outcome = run("train", *command[3:])

@@ -35,7 +35,7 @@ XML = """
 
 @pytest.fixture
 def dump_file(tmp_path: Path) -> Path:
-    """A dump of three substeps of environments 1 and 3, of which 3 has a larger arm."""
+    """A dump of three substeps of environments 1 and 3. Environment 3 has a larger arm."""
     model = mujoco.MjModel.from_xml_string(XML)
     sizes = torch.tensor(model.geom_size).float().expand(4, -1, -1).clone()
     sizes[3, 1] = 0.3
@@ -112,11 +112,11 @@ def test_a_single_state_of_a_single_environment_is_shown(viser_server, dump_file
 def test_what_cannot_be_shown_is_one_message(run, dump_file: Path, tmp_path: Path) -> None:
     missing = run("viz_nan", str(tmp_path / "nothing.npz"))
     assert missing.status == 1
-    assert "There is no dump" in missing.message
+    assert "nothing.npz not found" in missing.message
     assert "--enable-nan-guard" in missing.message
     (tmp_path / "text.npz").write_text("no dump")
     assert "is not a NaN dump" in run("viz_nan", str(tmp_path / "text.npz")).message
-    with pytest.raises(ValueError, match="--port is 0"):
+    with pytest.raises(ValueError, match="port.*0"):
         run_viz_nan(str(dump_file), VizNanConfig(port=0))
 
 
@@ -138,10 +138,10 @@ def test_a_model_that_is_missing_damaged_or_another_is_told(dump_file: Path) -> 
         load_dump(str(dump_file))
     # Dumps of before do not say which model is theirs.
     dump = without_digest(dump_file)
-    with pytest.raises(UserError, match="not of the same simulation"):
+    with pytest.raises(UserError, match="another simulation"):
         load_dump(str(dump))
     model_file.write_bytes(content[:100])
-    with pytest.raises(UserError, match="cannot be read by MuJoCo"):
+    with pytest.raises(UserError, match="written by MuJoCo"):
         load_dump(str(dump))
     flipped = bytearray(content)
     flipped[len(content) // 2] ^= 1
@@ -149,7 +149,7 @@ def test_a_model_that_is_missing_damaged_or_another_is_told(dump_file: Path) -> 
     with pytest.raises(UserError, match="changed or damaged"):
         load_dump(str(dump_file))
     model_file.unlink()
-    with pytest.raises(UserError, match=r"needs its model, model_.*\.mjb"):
+    with pytest.raises(UserError, match=r"expected its model model_.*\.mjb"):
         load_dump(str(dump_file))
 
 
@@ -161,14 +161,14 @@ def test_a_dump_that_is_damaged_or_says_too_little_is_told(dump_file: Path, tmp_
         load_dump(str(dump_file))
     metadata = {name: dump.metadata[name] for name in ("model_file", "state_spec")}
     np.savez(dump_file, _metadata=np.array(json.dumps(metadata)), **dump.arrays)
-    with pytest.raises(UserError, match=r"has no .*'state_size'"):
+    with pytest.raises(UserError, match=r"metadata .*'state_size'.* not found"):
         load_dump(str(dump_file))
 
 
 def test_a_dump_without_states_is_told(dump_file: Path) -> None:
     dump, _ = load_dump(str(dump_file))
     np.savez(dump_file, _metadata=np.array(json.dumps(dump.metadata)))
-    with pytest.raises(UserError, match="holds no states"):
+    with pytest.raises(UserError, match="expected recorded states"):
         load_dump(str(dump_file))
 
 
@@ -177,14 +177,14 @@ def test_a_dump_without_states_is_told(dump_file: Path) -> None:
     [
         (
             {"ctrl_step_000002": np.array([{}], dtype=object)},
-            "ctrl_step_000002 holds Python objects",
+            "ctrl_step_000002: Python objects",
         ),
-        ({"states_step_000002": np.zeros((2, 3))}, "not of the same simulation"),
-        ({"states_step_000002": np.zeros((5, 4))}, "states_step_000002.* not of 2 environments"),
-        ({"ctrl_step_000002": np.zeros((2, 7))}, "not of the same simulation"),
-        ({"model_no_field": np.zeros((2, 7))}, "not of the same simulation"),
+        ({"states_step_000002": np.zeros((2, 3))}, "another simulation"),
+        ({"states_step_000002": np.zeros((5, 4))}, "states_step_000002.* expected 2 rows"),
+        ({"ctrl_step_000002": np.zeros((2, 7))}, "another simulation"),
+        ({"model_no_field": np.zeros((2, 7))}, "another simulation"),
         ({"states_step_x": np.zeros((2, 4))}, "'x'"),
-        ({"_metadata": np.array("[1, 2]")}, "it has no"),
+        ({"_metadata": np.array("[1, 2]")}, "not found"),
         ({"_metadata": np.array("[" * 100_000)}, "is not a NaN dump"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Tying a scene to a simulation, for tests of sensors."""
+"""Scenes bound to a simulation, for tests of sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What camera sensors see, how they are attached, and when they look."""
+"""Tests of camera sensors: images, attachment and rendering times."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def views(request):
     return model, dict(zip((*names, "wide"), data, strict=True))
 
 
-# What is seen.
+# Images.
 
 
 def test_depth_is_measured_along_the_optical_axis(views):
@@ -60,7 +60,7 @@ def test_segmentation_names_geoms(views):
     assert segmentation[0, 0].tolist() == [model.geom("room/floor").id, GEOM]
 
 
-def test_colour_is_that_of_the_geom_under_the_lights_that_shine(views):
+def test_color_is_that_of_the_geom_under_the_lights_that_shine(views):
     _, data = views
     # The headlight of a scene: 0.3 ambient and 0.6 diffuse. The floor is a sideways glance off.
     assert data["map"].rgb[0, 0, 0].tolist() == [229, 114, 0]
@@ -144,7 +144,7 @@ def test_a_camera_in_a_geom_looks_through_it(views):
 
 
 def test_a_sensor_is_cropped_to_the_shape_of_the_image():
-    # 2.14 mm of the 3.896 mm are used, which is a field of view of 58 degrees both ways.
+    # 2.14 mm of the 3.896 mm are used: a field of view of 58 deg both ways.
     fovy = 2 * math.degrees(math.atan(0.00214 / 2 / 0.00193))
     same = camera("same", None, pos=(0.0, 0.0, 3.0), fovy=fovy, width=32, height=32)
     lens = camera("lens", "room/lens", width=32, height=32)
@@ -168,7 +168,7 @@ def test_a_principal_point_shifts_the_image():
     assert row.float().mean() == pytest.approx(31.5 - 8, abs=0.5)
 
 
-# How cameras are attached.
+# Attachment.
 
 
 def test_a_camera_without_a_name_is_added_to_the_world_or_to_a_body():
@@ -199,11 +199,9 @@ def test_an_existing_camera_can_be_made_orthographic():
 
 
 def test_two_sensors_that_want_one_camera_otherwise_are_refused():
-    with pytest.raises(
-        ValueError, match=r"'a' and 'b' look through the camera 'room/down', but fovy"
-    ):
+    with pytest.raises(ValueError, match=r"'a' and 'b'.*'room/down'.*fovy.* 30.0 and 40.0"):
         scene_with(camera("a", fovy=30.0), camera("b", fovy=40.0))
-    with pytest.raises(ValueError, match="orthographic is True for the one and False"):
+    with pytest.raises(ValueError, match="orthographic.* True and False"):
         scene_with(camera("a", orthographic=True), camera("b"))
 
 
@@ -221,7 +219,7 @@ def test_a_ray_sensor_in_the_scene_leaves_the_groups_of_a_camera_alone(engine):
     assert (scene["cam"].data.segmentation[..., 0] != sim.mj_model.geom("room/ball").id).all()
 
 
-# When they look.
+# Rendering times.
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -306,7 +304,7 @@ def test_the_context_gives_images_by_camera():
     assert context.get_depth(index).data_ptr() == scene["small"].data.depth.data_ptr()
     assert context.get_rgb(index).shape == (1, 6, 7, 3)
     assert context.get_segmentation(index).shape == (1, 6, 7, 2)
-    with pytest.raises(ValueError, match=r"No camera sensor measures 'depth' .* 0 \(small\)"):
+    with pytest.raises(ValueError, match=r"'depth'.* 0 \(small\)"):
         context.get_depth(index + 1)
 
 
@@ -317,7 +315,7 @@ def test_the_render_context_is_that_of_warp():
     sense(sim)
     assert scene.sensor_context.render_context.nrender == 1
     sim, scene = scene_with(camera())
-    with pytest.raises(AttributeError, match="warp engine only"):
+    with pytest.raises(AttributeError, match="render_context.*native"):
         _ = scene.sensor_context.render_context
 
 
@@ -333,8 +331,8 @@ def test_the_render_context_is_that_of_warp():
         ({"data_types": ()}, r"data_types.*rgb, depth, segmentation.*\(\)"),
         ({"data_types": ("rgb", "normals")}, r"data_types.*'rgb'.*'normals'"),
         ({"data_types": "rgb"}, r"data_types.*tuple.*'rgb'"),
-        ({"data_types": ("rgb", "rgb")}, r"twice"),
-        ({"enabled_geom_groups": ()}, r"enabled_geom_groups is empty.*\[0, 1, 2, 3, 4, 5\]"),
+        ({"data_types": ("rgb", "rgb")}, r"data_types.*\('rgb', 'rgb'\)"),
+        ({"enabled_geom_groups": ()}, r"enabled_geom_groups.*\[0, 1, 2, 3, 4, 5\].*\(\)"),
         ({"enabled_geom_groups": (0, 6)}, r"enabled_geom_groups.*\[0, 1, 2, 3, 4, 5\].* 6"),
         ({"fovy": -1.0}, r"fovy.* -1.0"),
         ({"camera_name": None, "fovy": 180.0}, r"fovy.*\(0, 180\).* 180.0"),
@@ -357,13 +355,11 @@ def test_a_camera_that_does_not_exist_is_refused_with_those_that_do():
 
 
 def test_a_body_that_does_not_exist_and_a_name_that_is_taken_are_refused():
-    with pytest.raises(ValueError, match="body 'ball' .*Available: .*ball/ball"):
+    with pytest.raises(ValueError, match="body 'ball' .*vailable: .*ball/ball"):
         scene_with(camera(camera_name=None, parent_body="ball"), ball=BALL)
-    with pytest.raises(
-        ValueError, match="has a camera 'room/down' already.*camera_name='room/down'"
-    ):
+    with pytest.raises(ValueError, match="camera 'room/down'.*camera_name='room/down'"):
         scene_with(camera("room/down", None))
-    with pytest.raises(ValueError, match="parent_body='ball/ball' is for a camera that the sensor"):
+    with pytest.raises(ValueError, match="parent_body='ball/ball'.*camera_name='room/down'"):
         scene_with(camera(parent_body="ball/ball"), ball=BALL)
 
 
@@ -403,7 +399,7 @@ def test_a_sky_is_seen_where_there_is_nothing():
     assert (data.rgb[missed].sum(dim=-1) > 0).all()
 
 
-# What could go wrong in a run.
+# Run-time behavior.
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -16,7 +16,7 @@ from mjlab.sim import Simulation, SimulationCfg
 
 from .camera_scenes import BALL, ENGINES, ROOM, scene_with, sense
 
-# What was measured here is: depths 0.00002 m near by, no pixel of another object, colours 0.0002
+# Measured here: depths 0.00002 m near by, no pixel of another object, colors 0.0002
 # to 0.08 of 255 on average. Single pixels differ where a texture is finer than they are.
 DEPTH = 1e-3
 MEAN_COLOUR, SINGLE_COLOUR, SINGLE_PIXELS = 0.5, 3, 0.01
@@ -42,7 +42,7 @@ SENSORS = tuple(
         ("top", 20, 10, ("segmentation",), False, (0,)),
     )
 )
-# What is randomized, and in which environment: element, values.
+# Randomized fields by environment: element, values.
 RANDOMIZED = {
     "cam_fovy": (2, "camera", "room/front", 80.0),
     "cam_pos": (1, "camera", "room/top", [0.317, 0.123, 1.5]),
@@ -119,7 +119,7 @@ def test_depth_is_the_same_to_a_millimetre(pair):
         assert native.depth.max() > 1.0
 
 
-def test_colours_are_the_same_to_a_few_grey_levels(pair):
+def test_colors_are_the_same_to_a_few_gray_levels(pair):
     native, warp = pair
     if native.rgb is not None:
         difference = (native.rgb.int() - warp.rgb.int()).abs()

@@ -1,4 +1,4 @@
-"""What contact sensors report, against plain MuJoCo and against what is known by hand."""
+"""Tests of contact data against plain MuJoCo and against values computed by hand."""
 
 from __future__ import annotations
 
@@ -246,7 +246,7 @@ def test_columns_are_primary_by_primary_and_slot_by_slot(slots):
     assert_close(data.dist[0, slots], -0.01)
 
 
-def test_helper_elements_are_there_and_nobody_who_does_not_ask_pays_for_them():
+def test_helper_elements_are_there_and_cost_nothing_unless_requested():
     cfg = sense(geom(".*_foot", "robot"), TERRAIN, fields=("force", "found"), num_slots=2)
     sim, scene = build(cfg, robot=LEGS)
     names = ["touch_left_foot", "touch_right_foot"]
@@ -280,7 +280,7 @@ def test_history_keeps_the_newest_substep_first():
                 assert torch.equal(history[:, :, age], expected), (name, step, age)
     assert seen["force"][0].any()
     sim.forward()
-    assert not torch.equal(scene["touch"].data.force, seen["force"][0]), "forward computes anew"
+    assert not torch.equal(scene["touch"].data.force, seen["force"][0]), "forward recomputes"
     assert torch.equal(scene["touch"].data.force_history[:, :, 0], seen["force"][0])
 
 

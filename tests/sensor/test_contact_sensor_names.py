@@ -1,4 +1,4 @@
-"""What contact sensors are on: patterns, secondaries, and mistakes that are named at build time."""
+"""Tests of contact sensor patterns, secondaries, and errors at build time."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_without_an_entity_names_are_literal_and_in_the_order_given():
     assert scene["touch"].primary_names == ["robot/right_foot", "robot/left_foot"]
     with pytest.raises(ValueError, match=r"'robot/.\*_foot'.*literal"):
         robot(geom("robot/.*_foot", None))
-    with pytest.raises(ValueError, match="twice"):
+    with pytest.raises(ValueError, match=r"distinct.*'robot/left_foot', 'robot/left_foot'"):
         robot(geom(("robot/left_foot", "robot/left_foot"), None))
 
 
@@ -100,7 +100,7 @@ def test_elements_without_a_name_are_not_passed_over_in_silence(caplog):
     xml = BOX.replace("</body>", "<geom size='.1'/></body>")
     with caplog.at_level(logging.WARNING):
         assert compose(sense(geom(".*")), box=xml)["touch"].primary_names == ["box"]
-    assert "1 geoms of entity 'box' have no name" in caplog.text
+    assert "1 unnamed geoms of entity 'box'" in caplog.text
 
 
 # Secondaries.
@@ -111,7 +111,7 @@ def test_the_policy_decides_about_several_secondaries():
     primary = geom("trunk_collision", "robot")
     assert elements(robot(primary, feet))[0][1] == "robot/left_foot"
     assert elements(robot(primary, feet, secondary_policy="any"))[0][1] == ""
-    with pytest.raises(ValueError, match=r"matches \['left_foot', 'right_foot'\]. Narrow it"):
+    with pytest.raises(ValueError, match=r"secondary.*\['left_foot', 'right_foot'\]"):
         robot(primary, feet, secondary_policy="error")
     assert elements(robot(primary, geom("left_foot", "robot"), secondary_policy="error"))
 
@@ -121,7 +121,7 @@ def test_a_secondary_may_have_several_patterns():
     feet = geom(("right_foot", "left_foot"), "robot")
     assert elements(robot(primary, feet))[0][1] == "robot/left_foot"
     assert elements(robot(primary, feet, secondary_policy="any"))[0][1] == ""
-    with pytest.raises(ValueError, match=r"matches \['left_foot', 'right_foot'\]. Narrow it"):
+    with pytest.raises(ValueError, match=r"secondary.*\['left_foot', 'right_foot'\]"):
         robot(primary, feet, secondary_policy="error")
 
 
@@ -140,7 +140,7 @@ def test_a_secondary_subtree_is_named_in_its_entity():
         (body("left_foot", "robot"), r"none of the bodies .*\['trunk', 'left', 'right'\]"),
         (geom("left_foot", "robt"), "entity 'robt'.*mean 'robot'.*'terrain'"),
         (geom("robot/left_fot", None), "'robot/left_fot' .* mean 'robot/left_foot'"),
-        (geom(".*", "robot", exclude=(".*",)), "leaves nothing"),
+        (geom(".*", "robot", exclude=(".*",)), r"exclude=.*'\.\*'"),
         (geom("(", "robot"), "not a valid regular expression"),
     ],
 )
@@ -154,7 +154,7 @@ def test_a_sensor_that_matches_nothing_is_refused_with_close_names(match, messag
 def test_every_pattern_has_to_match_and_no_name_twice():
     with pytest.raises(ValueError, match="'hand' matches none of the geoms of entity 'robot'"):
         robot(geom(("left_foot", "hand"), "robot"))
-    with pytest.raises(ValueError, match="'left_foot' is matched by both 'left_.*' and '.*_foot'"):
+    with pytest.raises(ValueError, match="'left_.*' and '.*_foot' both match 'left_foot'"):
         robot(geom(("left_.*", ".*_foot"), "robot"))
 
 
@@ -204,7 +204,7 @@ def test_an_empty_pattern_may_be_filled_in_until_the_scene_is_built(pattern):
 
 
 def test_two_sensors_of_one_name_are_refused():
-    with pytest.raises(ValueError, match="Two sensors are called 'touch'"):
+    with pytest.raises(ValueError, match="SceneCfg.sensors.*'touch'"):
         compose(sense(geom("box")), sense(body("box")), box=BOX)
 
 

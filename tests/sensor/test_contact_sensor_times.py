@@ -28,7 +28,7 @@ ROBOT = """
 
 
 class Fed:
-    """A sensor whose contacts are told instead of simulated."""
+    """Contact sensor with prescribed instead of simulated contacts."""
 
     def __init__(self) -> None:
         scene = compose(CFG, robot=ROBOT, num_envs=ENVS)
@@ -54,7 +54,7 @@ class Fed:
 
 @dataclass
 class CountedFoot:
-    """What the page says, in whole substeps."""
+    """Rules of the documentation page, in whole substeps."""
 
     air: int = 0
     contact: int = 0

@@ -64,7 +64,7 @@ def both(*edits):
     return edit
 
 
-# What is measured.
+# Measurements.
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -143,7 +143,7 @@ def test_the_body_of_the_frame_is_left_out_but_not_its_children(engine):
     ]
     sim, scene = scene_with(*cfgs, engine=engine)
     sense(sim)
-    # From the centre of its own shell, and past it to the foot below.
+    # From inside the shell of the body, and past it to the foot below.
     assert scene["with"].data.distances.item() == pytest.approx(0.2, abs=1e-5)
     assert scene["without"].data.distances.item() == pytest.approx(0.35, abs=1e-5)
 
@@ -285,7 +285,7 @@ def test_the_orientation_reported_is_that_of_the_frame_whatever_the_alignment(al
         torch.testing.assert_close(matrix_from_quat(quat), rotation, atol=1e-5, rtol=0)
 
 
-# When.
+# Times of ray casts.
 
 
 def test_data_is_zero_before_the_first_sense_and_then_that_of_the_last_one():
@@ -416,13 +416,13 @@ def test_an_environment_that_has_diverged_does_not_disturb_the_others():
             {"frame": ObjRef("joint", "knee", "robot")},
             "'knee' type.*'body', 'site', 'geom'.*'joint'",
         ),
-        ({"frame": ()}, "frame is empty"),
+        ({"frame": ()}, r"frame.*\(\)"),
         ({"pattern": GridPatternCfg(resolution=0.0)}, "resolution.* 0.0"),
-        ({"pattern": RingPatternCfg((), include_center=False)}, "no rays"),
+        ({"pattern": RingPatternCfg((), include_center=False)}, "at least one ring"),
         ({"ray_alignment": "gravity"}, "ray_alignment.*'base', 'yaw', 'world'.*'gravity'"),
         ({"include_geom_groups": (0, 6)}, r"include_geom_groups.*\[0, 1, 2, 3, 4, 5\].* 6"),
         ({"include_geom_groups": (-1,)}, r"include_geom_groups.* -1"),
-        ({"include_geom_groups": ()}, "is empty"),
+        ({"include_geom_groups": ()}, r"include_geom_groups.*\(\)"),
         ({"max_distance": 0.0}, "max_distance.* 0.0"),
         ({"max_distance": math.inf}, "max_distance.* inf"),
         ({"pattern": PinholeCameraPatternCfg.from_mujoco_camera("eye")}, "robot/eye"),

@@ -1,4 +1,4 @@
-"""Which elements of the scene a sensor's frames are found to be."""
+"""Tests of the elements a sensor's frames resolve to."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def test_below_a_plane_and_below_a_height_field_the_height_is_zero(engine):
         sim,
         # At x = 1 the ramp is 0.75 high.
         *([1.0, 0.0, 1.0], [1.0, 0.0, 0.5], [1.0, 0.0, -0.2]),
-        # Below its base, and beyond its edge, where there is nothing.
+        # Below its base, and beyond its edge.
         *([1.0, 0.0, -3.0], [9.0, 0.0, 0.5]),
     )
     sense(sim)

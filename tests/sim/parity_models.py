@@ -1,4 +1,4 @@
-"""Small models on which both engines have to agree, each with every kind of field it can have."""
+"""Small models for engine parity tests, each with every kind of field it can have."""
 
 from __future__ import annotations
 

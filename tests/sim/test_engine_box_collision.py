@@ -1,8 +1,8 @@
-"""Boxes against boxes, where the engines collide by different algorithms, on bare MuJoCo and Warp.
+"""Box-box collisions of bare MuJoCo and Warp, which use different algorithms.
 
 A cube, a finger and a fingertip as in the lifting task. MuJoCo clips box against box in closed form and
 keeps up to 8 points; Warp searches the deepest penetration by iteration (GJK and EPA) and keeps up
-to 4. Everything else about contacts is the same, so the difference is bounded here.
+to 4. Other contact parameters are equal, and these tests bound the difference.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Contact(NamedTuple):
     pos: np.ndarray
     normal: np.ndarray
     parameters: np.ndarray
-    """Dimension, friction, solref and solimp."""
+    """Contact dimension, friction, solref and solimp."""
 
 
 def contacts_of_mujoco(states: np.ndarray) -> list[list[Contact]]:
@@ -122,12 +122,12 @@ def distance_to_finger(data: mujoco.MjData, state: np.ndarray) -> tuple[float, n
 
 
 def pressed_states(depth: float) -> np.ndarray:
-    """Return poses of the cube that touches the finger in any way, pressed in by `depth` (m)."""
+    """Return cube poses with arbitrary contact with the finger at penetration `depth` (m)."""
     rng, data, states = np.random.default_rng(0), mujoco.MjData(MODEL), []
     for _ in range(NUM_STATES):
         quat, direction = (rng.normal(size=n) for n in (4, 3))
         quat, direction = quat / np.linalg.norm(quat), direction / np.linalg.norm(direction)
-        # From where it is surely apart, go nearer until it just touches.
+        # Start separated, then approach until contact.
         far = 0.2
         for _ in range(20):
             gap, towards = distance_to_finger(data, np.hstack((far * direction, quat)))
@@ -194,7 +194,7 @@ def test_boxes_in_any_pose_are_pressed_apart_by_the_same_depth_and_nearly_the_sa
         np.testing.assert_allclose(one.parameters, two.parameters, rtol=1e-6)
         angles.append(np.degrees(np.arccos(np.clip(one.normal @ two.normal, -1.0, 1.0))))
         differs += len(mine) != len(theirs)
-    # Where an edge and a face are nearly as deep, they may choose differently.
+    # If an edge and a face are almost equally deep, the engines may choose differently.
     assert np.median(angles) < 0.1
     assert np.quantile(angles, 0.9) < 5.0
     assert max(angles) < 30.0

@@ -1,4 +1,4 @@
-"""Engines stay in their folders: who imports their libraries, and who names their modules."""
+"""Import rule: engine libraries and modules are used only within their folders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import mjlab
 
 SOURCES = Path(mjlab.__file__).parent
 
-# Modules, and the folders of `mjlab` from which they may be named.
+# Allowed folders of `mjlab` by module name.
 RULES = {
     "mujoco.batch": ("sim/native",),
     "warp": ("sim/warp",),
@@ -39,7 +39,7 @@ def named_modules(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def breaches(path: str, source: str) -> list[str]:
-    # Parsing is slow, and most files name none of these.
+    # Parsing is slow, and most files do not contain these names.
     if not re.search(r"\b(batch|native|warp|mujoco_warp)\b", source):
         return []
     found = set()

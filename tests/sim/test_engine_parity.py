@@ -1,8 +1,7 @@
-"""Both engines compute the same, on every field that a task may read.
+"""Engine parity: both engines compute equal values for every field that a task may read.
 
-One tolerance holds everywhere. An error is measured against the largest value of its field, because
-Warp computes in single precision and a small component next to a large one carries the large one's
-rounding.
+One tolerance for all fields. Errors are relative to the largest value of the field, because Warp
+computes in float32, and small components next to large ones have the rounding error of the large.
 """
 
 from __future__ import annotations
@@ -46,9 +45,9 @@ DERIVED_FIELDS = (
     *("actuator_force", "actuator_length", "actuator_velocity", "ten_length", "ten_velocity"),
     *("cacc", "cfrc_int", "cfrc_ext", "sensordata"),
 )
-# MuJoCo computes these for sensors, and of the models here only the landing box has those.
+# MuJoCo computes these for sensors only, and only the landing box has such sensors.
 SENSOR_FED = ("cacc", "cfrc_int", "cfrc_ext", "subtree_linvel", "subtree_angmom")
-# The difference of forces that nearly cancel carries their rounding.
+# Differences of nearly canceling forces carry rounding errors of the forces.
 DIFFERENCE_OF = {"cfrc_int": "cfrc_ext"}
 CONSTANTS = (
     *("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_length0"),
@@ -92,7 +91,7 @@ def build(name: str, device: str) -> Pair:
     return pair
 
 
-# Each model with Warp on the CPU and, where there is one, on a GPU.
+# Each model with Warp on the CPU and, if available, on a GPU.
 CASES = [
     *(pytest.param((name, False), id=name) for name in MODELS),
     *(pytest.param((name, True), id=f"{name}-cuda", marks=pytest.mark.cuda) for name in MODELS),
@@ -107,13 +106,13 @@ def pair(request: pytest.FixtureRequest, cuda_device: str) -> Pair:
 
 @pytest.fixture(scope="module", params=CASES)
 def changed(request: pytest.FixtureRequest, cuda_device: str) -> Pair:
-    """A pair whose environments differ in their model parameters, with constants recomputed."""
+    """Pair with per-environment model parameters and recomputed constants."""
     name, on_cuda = request.param
     return randomize_models(build(name, cuda_device if on_cuda else "cpu"))
 
 
 def set_same_state(pair: Pair, seed: int = 0) -> None:
-    """Put both engines into the same state, a different one in every environment."""
+    """Set both engines to the same state, different in every environment."""
     generator = torch.Generator().manual_seed(seed)
     native, warp = pair.both()
     for sim in pair.both():
@@ -149,9 +148,9 @@ def copy_state(source: Simulation, target: Simulation) -> None:
 
 
 def poison(sim: Simulation, pair: Pair) -> None:
-    """Fill outputs with NaN, so that one that is not written cannot pass by luck.
+    """Fill outputs with NaN, so that unwritten outputs cannot pass by chance.
 
-    Left alone is what Warp writes once and for all: the world's frame and geoms welded to it.
+    Except outputs that Warp writes only once: the world frame and geoms welded to the world.
     """
     moving_geoms = torch.as_tensor(sim.mj_model.body_weldid[sim.mj_model.geom_bodyid] != 0)
     moving_geoms |= torch.as_tensor(sim.mj_model.body_mocapid[sim.mj_model.geom_bodyid] >= 0)
@@ -285,7 +284,7 @@ def test_several_steps_in_one_call_are_single_steps(pair: Pair) -> None:
         for field, value in together.items():
             once = getattr(sim.data, field)
             if sim.device.startswith("cuda"):
-                # Contacts are in no fixed order there, and sums depend on it.
+                # The contact order varies, and rounding of sums depends on it.
                 scale = 1.0 + value.float().abs().max() if value.numel() else 1.0
                 assert ((once.float() - value.float()).abs() <= PARITY_TOLERANCE * scale).all(), (
                     field
@@ -297,7 +296,7 @@ def test_several_steps_in_one_call_are_single_steps(pair: Pair) -> None:
 
 
 def randomize_models(pair: Pair) -> Pair:
-    """Change model parameters, by a different factor in every environment, and recompute."""
+    """Scale model parameters by a different factor in every environment, and recompute."""
     scaled = ("body_mass", "body_inertia", "dof_damping", "dof_armature", "geom_friction")
     moved = ("body_ipos", "body_pos", "geom_pos", "site_pos", "qpos0")
     factors = torch.tensor([0.8, 1.0, 1.7])
@@ -326,7 +325,7 @@ def test_recomputed_constants_are_the_same(changed: Pair) -> None:
     for sim in changed.both():
         assert set(fields) <= sim.expanded_fields
     assert_same(changed, fields, struct="model")
-    # The environments differ: one that kept the shared value would have passed otherwise.
+    # Environments must differ: otherwise shared values would pass.
     assert not torch.allclose(
         changed.warp.model.dof_invweight0[0], changed.warp.model.dof_invweight0[2]
     )

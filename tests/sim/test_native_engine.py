@@ -1,4 +1,4 @@
-"""Laws of the native engine: what crosses the seam, recorded substeps, sleep."""
+"""Native engine: writes, recorded substeps, stages, late reads, sleep, exact resume."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ ONE_WRITE = st.tuples(
 
 
 def write(field: torch.Tensor, kind: str, env: int, value: float) -> None:
-    """Write `value` into some elements of a field (N, ...), in one of many ways."""
+    """Write `value` to some elements of a field, (N, ...), in one of several ways."""
     flat = field.view(NUM_ENVS, -1)
     if kind == "element":
         flat[env, -1] = value
@@ -81,14 +81,14 @@ def write(field: torch.Tensor, kind: str, env: int, value: float) -> None:
         with torch.inference_mode():
             field.select(0, env).fill_(value)
     elif kind == "same":
-        # Not a change: the double in the row must survive it.
+        # Not a change: the double in the row must be kept.
         field.copy_(field.clone())
 
 
 @settings(max_examples=30, deadline=None)
 @given(script=st.lists(st.lists(ONE_WRITE, max_size=4), min_size=1, max_size=4))
 def test_only_written_elements_reach_the_rows(script) -> None:
-    """The engine equals a loop over `MjData` that gets the written elements and nothing else."""
+    """The engine equals a loop over `MjData` that receives only the written elements."""
     sim = build()
     model = copy.copy(sim.mj_model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -152,26 +152,26 @@ def test_recorded_substeps_are_those_of_single_steps(engine: str, guarded: bool,
 
 
 def test_an_environment_that_warns_goes_on_while_its_substeps_are_recorded() -> None:
-    """`Batch.rollout` would leave it where MuJoCo warned."""
+    """`Batch.rollout` would stop it at the warning."""
     together, one_by_one = build(), build()
     for sim in (together, one_by_one):
         sim.data.ctrl[1] = float("nan")
     recorded = together.step(4, ("qpos",))["qpos"]
     one_by_one.step(4)
     assert together._engine._batch.warning[1, int(mujoco.mjtWarning.mjWARN_BADCTRL)].any()
-    assert (recorded[1:, 1, 2] < recorded[:-1, 1, 2]).all(), "the trunk has to keep falling"
+    assert (recorded[1:, 1, 2] < recorded[:-1, 1, 2]).all(), "the trunk must keep falling"
     assert torch.equal(together.data.qpos, one_by_one.data.qpos)
 
 
 def test_an_environment_in_which_mujoco_raises_does_not_touch_those_recorded_beside_it(
     monkeypatch,
 ) -> None:
-    """The rollout has to be told that MuJoCo raised; single steps then find out for themselves."""
+    """An error is simulated for the rollout only; single steps then raise by themselves."""
     together, one_by_one = build(), build()
     batch, failed = together._engine._batch, []
 
     def rollout(nstep: int, record: tuple[str, ...]) -> None:
-        batch.state[:] += 0.1  # What it left behind must not count.
+        batch.state[:] += 0.1  # Leftover state must be discarded.
         failed.append(nstep)
         raise SimulationError(np.array([1]), "mj_stackAlloc: out of memory")
 
@@ -219,7 +219,7 @@ def test_an_earlier_stage_leaves_quantities_of_the_acceleration_stage() -> None:
 @pytest.mark.parametrize("stage", ["pos", "vel"])
 @pytest.mark.parametrize("name", ["landing_box", "tendons", "hinge_chain"])
 def test_a_stage_computes_its_fields_and_leaves_those_of_later_ones(name: str, stage: str) -> None:
-    """One `MjData` serves all environments: nothing of another one may be seen."""
+    """Environments share one `MjData`: values must not leak between them."""
     sim = build(scene=MODELS[name])
     generator = torch.Generator().manual_seed(0)
     for field in (sim.data.qpos, sim.data.qvel):
@@ -240,7 +240,7 @@ def test_a_stage_computes_its_fields_and_leaves_those_of_later_ones(name: str, s
             assert torch.equal(staged[field], expected), field
 
 
-# Fields that are read late.
+# Late reads.
 
 READ_LATE = ("xpos", "cvel", "qfrc_bias", "qacc", "qfrc_constraint", "actuator_force", "sensordata")
 
@@ -293,7 +293,7 @@ BOX = """
 
 
 def test_a_batch_that_keeps_the_data_of_its_simulations_gives_the_same_bits(monkeypatch) -> None:
-    """Models with sleep have such a batch, which goes on from stages that are already there."""
+    """Models with sleep have a persistent batch that continues from computed stages."""
     plain = build()
     with monkeypatch.context() as patched:
         patched.setattr(
@@ -328,7 +328,7 @@ def test_a_model_with_sleep_steps_as_plain_mujoco_does() -> None:
     for _ in range(20):
         sim.step(50)
         mujoco.mj_step(sim.mj_model, host, 50)
-    assert not host.tree_awake.any(), "the box has to fall asleep"
+    assert not host.tree_awake.any(), "the box must fall asleep"
     assert np.array_equal(sim.copy_to_host(1).qpos, host.qpos)
     # The push wakes up one of them.
     asleep = sim.data.qpos.clone()
@@ -337,7 +337,7 @@ def test_a_model_with_sleep_steps_as_plain_mujoco_does() -> None:
     mujoco.mj_step(sim.mj_model, host, 20)
     assert np.array_equal(sim.copy_to_host(1).qpos, host.qpos)
     assert torch.equal(sim.data.qpos[[0, 2]], asleep[[0, 2]])
-    # Which trees are asleep is not in the state rows.
+    # State rows do not include sleep states.
     with pytest.raises(ValueError, match="sleep"):
         sim.load_state_dict(sim.state_dict())
 
@@ -378,9 +378,9 @@ def test_a_run_with_its_own_constants_continues_bit_for_bit() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"library": None}, r"before mujoco.batch, .* weights"),
-        ({"engine": "warp"}, r"warp engine; this one is native. Use --engine warp"),
-        ({"state": torch.zeros(2, 5)}, r"expected \(3, \d+\) .*got \(2, 5\)"),
+        ({"library": None}, r"before mujoco.batch.* weights"),
+        ({"engine": "warp"}, r"'native'.*'warp'.*--engine warp"),
+        ({"state": torch.zeros(2, 5)}, r"expected .*\(3, \d+\).*got \(2, 5\)"),
     ],
 )
 def test_a_state_of_another_engine_or_size_is_refused_and_changes_nothing(change, message) -> None:

@@ -1,4 +1,4 @@
-"""Bodies of several geoms, randomized per environment, touch what they would touch if compiled so."""
+"""Midphase with randomized geoms: contacts equal those of a model compiled with the values."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def build(*disabled: str, fields: tuple[str, ...] = FIELDS) -> Simulation:
 
 @pytest.fixture(scope="module")
 def sims() -> tuple[Simulation, Simulation]:
-    """The scene as it is, and one in which MuJoCo compares all pairs of geoms."""
+    """Default scene, and scene without midphase, so that MuJoCo tests all geom pairs."""
     return build(), build("midphase")
 
 
@@ -72,7 +72,7 @@ def randomize(sim: Simulation, generator: torch.Generator, size: float) -> None:
         values = getattr(sim.model, field)
         values[:] = torch.nn.functional.normalize(values + 5.0 * noise(field), dim=-1)
     sim.model.geom_margin[:] += noise("geom_margin").abs()
-    # Spheres only: what a larger box or capsule does is the same to the search for pairs.
+    # Spheres only: larger boxes and capsules are equivalent for pair detection.
     growth = noise("geom_size")[..., 0].abs()
     for name in ("head", "foot"):
         geom = model.geom(name).id

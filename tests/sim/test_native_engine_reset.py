@@ -1,4 +1,4 @@
-"""What a reset on the native engine clears, and what a simulation remembers of its model."""
+"""Reset on the native engine, and defaults of model fields."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mjlab.sim import Simulation, SimulationCfg
 NUM_ENVS = 3
 
 # Each DC motor has two activations, current and temperature, so there are more activations than
-# actuators; the plain motor, which comes first, has none, so no index of one is that of the other.
+# actuators. The plain motor, listed first, has none, so indices of the two never coincide.
 MOTORS = """
 <mujoco>
   <worldbody>
@@ -40,7 +40,7 @@ MOTORS = """
 def sim() -> Simulation:
     spec = mujoco.MjSpec.from_string(MOTORS)
     sim = Simulation(NUM_ENVS, SimulationCfg(engine="native"), spec=spec, device="cpu")
-    assert sim.mj_model.na > sim.mj_model.nu, "the model has to have activations beyond nu"
+    assert sim.mj_model.na > sim.mj_model.nu, "the model must have activations beyond nu"
     assert sim.mj_model.actuator_actnum.max() == 2
     return sim
 
@@ -62,7 +62,7 @@ def test_a_reset_clears_every_activation_of_the_chosen_environment_only(sim, ids
     for _ in range(2):
         assert (sim.data.act[1] == 0).all()
         assert torch.equal(sim.data.act[[0, 2]], moved[[0, 2]])
-        # What was written has to have reached the engine, not only the tensor.
+        # Writes must reach the engine, not only the tensor.
         sim.forward()
 
 
@@ -110,7 +110,7 @@ def test_an_environment_that_was_reset_moves_as_a_new_one(sim):
 
 @pytest.mark.parametrize("field", ["body_mass", "actuator_gainprm", "gravity"])
 def test_defaults_are_those_of_construction_whatever_is_written_into_the_host_model(sim, field):
-    # Viewers write an environment's own values there, before anybody has asked for the default.
+    # Viewers write per-environment values there, before the first read of the default.
     owner = sim.mj_model.opt if field == "gravity" else sim.mj_model
     expected = np.array(getattr(owner, field), dtype=np.float32)
     assert field not in sim.default_model_fields

@@ -1,4 +1,4 @@
-"""That tiles, slots and shares of environments change nothing in what the native engine renders."""
+"""Native renderer: images do not depend on tiles, slots or the split of environments."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ALL = ("rgb", "depth", "segmentation")
 
 
 def random_world(seed: int) -> mujoco.MjModel:
-    """Return a world of shapes strewn around a camera that sees some of them."""
+    """Return a world of shapes scattered around a camera that sees some of them."""
     rng = np.random.default_rng(seed)
     spec = mujoco.MjSpec()
     spec.add_mesh(
@@ -30,7 +30,7 @@ def random_world(seed: int) -> mujoco.MjModel:
     for shape in rng.choice(SHAPES, size=12):
         kind = getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}")
         direction = rng.normal(size=3)
-        # Far enough from the camera that it is in none of them.
+        # Far enough that no shape contains the camera.
         pos = direction / np.linalg.norm(direction) * rng.uniform(1.2, 3.0)
         geom = spec.worldbody.add_geom(type=kind, pos=pos, quat=rng.normal(size=4))
         geom.size = rng.uniform(0.1, 0.5, size=3)
@@ -45,7 +45,7 @@ def random_world(seed: int) -> mujoco.MjModel:
 
 
 def cast_pixel_by_pixel(model: mujoco.MjModel, width: int, height: int):
-    """Return depths and geoms (height, width) by one `mj_ray` a pixel, from the definition."""
+    """Return depths and geom ids, (height, width), from one `mj_ray` per pixel."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     half_height = np.tan(np.radians(model.cam_fovy[0]) / 2)
@@ -110,7 +110,7 @@ def render_arms(qpos: torch.Tensor, width: int = 16, height: int = 12):
 def test_environments_are_rendered_alike_however_many_there_are(monkeypatch):
     qpos = torch.rand(11, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
     together = render_arms(qpos)
-    # Four at a time, and three at last.
+    # Four at a time, then the last three.
     monkeypatch.setattr(native_render, "_RAYS_AT_A_TIME", 4 * 16 * 12)
     in_parts = render_arms(qpos)
     for name in ALL:

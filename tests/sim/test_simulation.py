@@ -1,4 +1,4 @@
-"""The facade, on the native engine: state, freshness, shared and own model fields, resume."""
+"""`Simulation` on the native engine: state, derived fields, model fields, resume."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_field_first_read_in_the_first_step_is_as_old_as_one_that_was_read_bef
         for nstep in substeps:
             sim.data.ctrl[:] += 0.1
             sim.step(nstep)
-        # Writes are pending while the fields are read: to inputs known before and to new ones.
+        # Writes to known and to new inputs are pending while fields are read.
         sim.reset(torch.tensor([2]))
         sim.data.xfrc_applied[1, 1, 0] = 5.0
     for name, values in bound.items():
@@ -258,7 +258,7 @@ def test_recomputing_constants_keeps_the_state():
 
 
 def test_a_moved_centre_of_mass_acts_as_if_compiled_so():
-    # The compiler takes shortcuts for free bodies whose frames coincide, which must not survive.
+    # The compiler simplifies free bodies with coinciding frames; expansion must undo this.
     sim = make_sim(mujoco=MujocoCfg(disableflags=("contact",)))
     sim.expand_model_fields(("body_ipos",))
     offset = [0.03, -0.02, 0.05]
@@ -284,7 +284,7 @@ def test_a_moved_centre_of_mass_acts_as_if_compiled_so():
 
 @pytest.mark.parametrize("field", ["geom_pos", "site_pos", "body_ipos"])
 def test_frames_can_be_moved_after_constants_were_recomputed(field):
-    """mj_setConst marks frames that coincide, and MuJoCo then skips what is between them."""
+    """mj_setConst marks coinciding frames, and MuJoCo then skips their transforms."""
     xml = """<mujoco><worldbody><body name="b"><joint axis="0 1 0"/><geom size=".1"/>
       <site name="s"/></body></worldbody></mujoco>"""
     sim = Simulation(2, SimulationCfg(), spec=mujoco.MjSpec.from_string(xml), device="cpu")
@@ -385,7 +385,7 @@ def test_unknown_fields_name_close_ones():
     for name in ("contact", "nacon"):
         with pytest.raises(AttributeError, match=f"native .*{name}; use a contact sensor"):
             getattr(sim.data, name)
-    with pytest.raises(ValueError, match="no field 'body_masses'"):
+    with pytest.raises(ValueError, match="MjModel field 'body_masses'"):
         sim.expand_model_fields(("body_masses",))
     with pytest.raises(AttributeError, match="write into it in place"):
         sim.data.qpos = torch.zeros(4, 8)
@@ -452,7 +452,7 @@ def test_an_older_flag_is_accepted_with_a_warning():
     compat._warn_once.cache_clear()
     with pytest.warns(FutureWarning, match="multiccd"):
         on = MujocoCfg(multiccd=True)  # ty: ignore
-    # MuJoCo has it on by default today, so only False has an effect.
+    # MuJoCo enables it by default, so only False has an effect.
     assert (on.enableflags, on.disableflags) == ((), ())
     off = MujocoCfg(multiccd=False, disableflags=("contact",))  # ty: ignore
     assert off.disableflags == ("contact", "multiccd")

@@ -1,4 +1,4 @@
-"""Model fields that environments share cannot be written by any way that torch offers."""
+"""Shared model fields cannot be written by any torch operation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WRITES: dict[str, Callable[[torch.Tensor], object]] = {
 }
 
 
-# With one environment the tensor has no repeated memory, so that torch itself would let it pass.
+# With one environment the tensor has no repeated memory, so torch itself would allow the write.
 @pytest.mark.parametrize("nworld", [1, 3])
 @pytest.mark.parametrize("write", WRITES.values(), ids=WRITES)
 def test_a_write_is_refused_by_name(write, nworld):
@@ -43,7 +43,7 @@ def test_results_go_into_tensors_of_others():
 
 
 def test_results_without_elements_are_plain_tensors():
-    # As the limits of joints in a model without joints: no memory, so all addresses are equal.
+    # E.g. joint limits of a model without joints: no memory, so all addresses are equal.
     field = SharedField.make(torch.empty(0, 2), 3, "jnt_range")
     limits = field.clone()
     assert type(limits) is torch.Tensor

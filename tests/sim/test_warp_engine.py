@@ -1,4 +1,4 @@
-"""What is particular to the MuJoCo Warp engine. That it computes the same is in the parity tests."""
+"""Warp engine specifics. Equality with the native engine is tested in the parity tests."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def on_the_floor(engine: WarpEngine) -> WarpEngine:
     return engine
 
 
-# What cannot be done is refused by name.
+# Unsupported features.
 
 
 @pytest.mark.parametrize(
@@ -109,13 +109,13 @@ def test_too_small_a_capacity_is_refused_at_construction() -> None:
 def test_contacts_of_a_reference_pose_that_no_episode_starts_in_are_no_reason_to_refuse(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """At the origin of the world a robot may be deep inside a generated terrain."""
+    """At the world origin a robot may be deep inside generated terrain."""
     xml = LANDING_BOX.replace('pos="0 0 .4"', 'pos="0 0 .04"')
     engine = make_engine(xml, nconmax=1)
     assert "4 contacts, more than SimulationCfg.nconmax=1" in caplog.text
     native = make_engine(LANDING_BOX, nconmax=8)
     moved = native.data_field("xpos") - torch.tensor([0.0, 0.0, 0.36])
-    # Everything else is that of the reference pose, and contacts work as soon as there are fewer.
+    # Other fields are those of the reference pose, and contacts work once they fit.
     torch.testing.assert_close(engine.data_field("xpos")[:, 1], moved[:, 1])
     assert not engine.wp_model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
 
@@ -127,7 +127,7 @@ def test_expanding_a_field_that_warp_shares_is_refused_by_name(field: str) -> No
 
 
 def test_an_unknown_model_field_names_close_ones() -> None:
-    with pytest.raises(ValueError, match="Available: .*body_mass"):
+    with pytest.raises(ValueError, match="vailable: .*body_mass"):
         make_engine(TWO_JOINTS).expand(("body_mas",))
 
 
@@ -136,8 +136,8 @@ def test_an_unknown_model_field_names_close_ones() -> None:
     [
         ("ncon", "sim.data.nacon"),
         ("efc_force", "contact sensor"),
-        ("qpso", r"Available: .*'qpos'"),
-        ("nworld", "no per-environment MjData field"),
+        ("qpso", r"vailable: .*'qpos'"),
+        ("nworld", "per-environment MjData field 'nworld'"),
         ("cfrc_ext", "accelerometer, force"),
         ("subtree_angmom", "subtreeangmom"),
         ("qfrc_inverse", "qfrc_actuator"),
@@ -226,7 +226,7 @@ def test_expanding_again_keeps_values_and_the_tensor() -> None:
 
 
 def test_a_step_uses_fields_expanded_after_earlier_steps() -> None:
-    # A captured graph would go on with the shared array.
+    # A captured graph would continue to use the shared array.
     engine = make_engine(LANDING_BOX)
     engine.step(1)
     engine.forward(None)
@@ -531,7 +531,7 @@ def test_rays_hit_only_the_groups_and_bodies_asked_for() -> None:
     assert not normals.any()
 
 
-# Names for packages that hold Warp arrays themselves.
+# Public names for packages that hold Warp arrays.
 
 
 def test_a_torch_array_is_indexed_and_computed_with_as_a_tensor() -> None:
@@ -585,12 +585,12 @@ def test_warp_is_quiet_unless_asked_otherwise(
     assert (wp.config.log_level > wp.LOG_INFO) is quiet
 
 
-# Order of work. Warp's stream waits for what torch has queued when `ordered` is entered: what torch
-# queued within, Warp might read before it is there.
+# Order of work. On entry of `ordered`, Warp's stream waits for torch's queued work. Warp might read
+# results of work that torch queues within the block too early.
 
 
 class _WorkOfTorch(TorchFunctionMode):
-    """Notes the functions of torch that compute while an engine is within `ordered`."""
+    """Recorder of torch functions that run while an engine is within `ordered`."""
 
     LOOKING = frozenset(
         {
@@ -631,7 +631,7 @@ def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
             work.is_ordered = False
 
     engine.ordered = noted
-    # Not contiguous and of other types, so that they have to be copied.
+    # Not contiguous and of different dtypes, so the engine must copy.
     rays = torch.zeros(3, 4, 2).permute(2, 1, 0)
     with work:
         engine.raycast(RayQuery(rays, rays - 1.0, None, torch.ones(8, dtype=torch.int64)[::2]))
@@ -640,11 +640,11 @@ def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
         engine.reset(torch.tensor([0]))
         engine.expand(("body_mass",))
         engine.recompute_constants(3, torch.tensor([0]))
-    # What `expand` copies is queued on Warp's stream.
+    # Copies of `expand` are queued on Warp's stream.
     assert set(work.found) <= {"copy_"}
 
 
-# What differs on CUDA, with an engine on the CPU that takes itself for one on CUDA.
+# CUDA code paths, tested by an engine on the CPU that is patched to act as on CUDA.
 
 
 @pytest.fixture
@@ -661,7 +661,7 @@ def as_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_graphs_are_captured_at_construction_without_a_trace(
     as_on_cuda: None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    # The box lies on the floor, with more contacts than there is room for.
+    # The box lies on the floor, with more contacts than the capacity.
     engine = make_engine(LANDING_BOX.replace('pos="0 0 .4"', 'pos="0 0 .04"'), nconmax=1)
     caplog.clear()
     assert engine._graphs.keys() == {"step", "pos", "vel", "acc"}
@@ -692,7 +692,7 @@ def test_capturing_again_in_a_run_keeps_state_results_and_overflow_flags(
     caplog.clear()
     engine.close()
     assert "height-field cells" in caplog.text
-    # A forward would compute others.
+    # A forward pass would compute different values.
     engine.forward(None)
     assert not torch.equal(engine.data_field("qacc"), before["qacc"])
 
@@ -774,7 +774,7 @@ def test_where_capturing_is_refused_kernels_are_launched_one_by_one(
     assert torch.equal(replayed.data_field("qpos"), plain.data_field("qpos"))
 
 
-# On a GPU, the captured graphs. These do not run where there is none.
+# Captured graphs on a GPU. Skipped without a GPU.
 
 
 @pytest.mark.cuda

@@ -1,4 +1,4 @@
-"""What does not fit into the memory that Warp allocated is reported, with the size to set."""
+"""Overflow of Warp's capacities is reported with the size to set."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mjlab.sim.config import SimulationCfg
 from mjlab.sim.warp.engine import WarpEngine
 from mjlab.sim.warp.overflow import SIZES
 
-# Twelve contacts in each environment, four a box.
+# Twelve contacts per environment, four per box.
 BOXES = """
 <mujoco>
   <worldbody>
@@ -43,7 +43,7 @@ def test_the_case_has_twelve_contacts() -> None:
     assert engine.data_field("sensordata")[0, 0] == 12
 
 
-# Each size is too small for what happens after the landing; the others are ample.
+# One size is too small for the contacts after landing; the others are ample.
 @pytest.mark.parametrize("option", SIZES)
 def test_an_overflow_names_a_size_that_is_enough(
     option: str, caplog: pytest.LogCaptureFixture
@@ -73,8 +73,8 @@ def test_an_overflow_that_is_over_is_still_reported(caplog: pytest.LogCaptureFix
     land(engine)
     engine.data_field("qpos")[:, 2::7] = 0.5
     engine.step(1)
-    assert not caplog.records, "it is looked at now and then only"
+    assert not caplog.records, "flags are checked only periodically"
     with caplog.at_level(logging.WARNING):
         engine.close()
-    # What was needed is not known any more.
-    assert "SimulationCfg.contact_sensor_maxmatch to 8, and to more if" in caplog.text
+    # The size needed at the overflow is no longer known.
+    assert "SimulationCfg.contact_sensor_maxmatch to 8, and more if" in caplog.text

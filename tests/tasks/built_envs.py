@@ -1,4 +1,4 @@
-"""Real environments that tests build, closed in the end."""
+"""Factory of real environments that closes them after the test."""
 
 from __future__ import annotations
 

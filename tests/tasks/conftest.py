@@ -1,4 +1,4 @@
-"""Lets the tests of tasks import the modules beside them."""
+"""Import path of the helper modules of task tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stand-in for a page of the browser viewer, on which tests do what a person does."""
+"""Stand-in for a page of the browser viewer that simulates user input."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 
 class Widget:
-    """A control or handle of a page."""
+    """Control or handle of a page."""
 
     def __init__(self, value=None, low=None, high=None, disabled=False):
         self.value, self.min, self.max, self.disabled = value, low, high, disabled
@@ -20,7 +20,7 @@ class Widget:
     on_click = on_update
 
     def by_person(self, **values) -> None:
-        """Do what a person in a browser does."""
+        """Simulate user input in the browser."""
         for name, value in values.items():
             setattr(self, name, value)
         for callback in self.callbacks:
@@ -31,7 +31,7 @@ class Widget:
 
 
 class Page:
-    """A page that keeps its widgets by label."""
+    """Page that stores its widgets by label."""
 
     def __init__(self):
         self.gui = self.scene = self

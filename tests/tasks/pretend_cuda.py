@@ -1,9 +1,8 @@
 """CUDA's rules about devices, without a GPU.
 
-`PretendCuda` is a mode of torch in which tensors that are made on `cuda:0` live on the CPU and are
-marked. It keeps the rules that torch keeps on a GPU: operands on two devices are refused, NumPy does
-not read a marked tensor, and whatever makes the host wait for the device is counted with the line
-that asked for it.
+`PretendCuda` is a torch function mode: tensors created on `cuda:0` live on the CPU and are marked. The mode
+enforces torch's rules for GPUs: operations with operands on two devices raise, NumPy does not read
+marked tensors, and host synchronizations are counted by the line that causes them.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ DEVICE = "cuda:0"
 _SOURCES = str(Path(mjlab.__file__).parent)
 _MARK = "_is_on_pretended_cuda"
 
-# Each waits until the device has computed what it returns, or how long that is.
+# Functions that synchronize: their result, or its shape, must be known on the host.
 _WAITING = frozenset(
     {"item", "tolist", "nonzero", "masked_select", "unique", "unique_consecutive", "equal"}
     | {"allclose", "is_nonzero", "__bool__", "__float__", "__int__", "__index__", "__contains__"}
     | {"argwhere", "bincount", "new_tensor", "__format__", "__repr__"}
 )
-# Make a tensor of host data, so that with a device they copy it there and wait.
+# Functions that create tensors from host data: with a device, they copy and synchronize.
 _FROM_HOST = frozenset({"tensor", "as_tensor", "asarray"})
 _FACTORIES = (
     frozenset(
@@ -54,26 +53,26 @@ _FACTORIES = (
     )
     | _FROM_HOST
 )
-# On a GPU, TF32 may round what goes into these to ten bits: 8 mm at 10 m from the origin.
+# Functions whose inputs TF32 may round to ten bits on a GPU: 8 mm at 10 m from the origin.
 _ROUNDED = frozenset(
     {"matmul", "__matmul__", "__rmatmul__", "mm", "bmm", "mv", "einsum", "addmm", "baddbmm"}
     | {"addmv", "addbmm", "tensordot", "inner", "cdist"}
 )
-# These take tensors of both devices.
+# Functions that accept tensors of both devices.
 _CROSSING = frozenset(
     {"copy_", "tensor", "as_tensor", "asarray", "_has_compatible_shallow_copy_type"}
 )
-# These refuse a number on the CPU too, where arithmetic takes it.
+# Functions that, unlike arithmetic, reject 0-dim CPU tensors too.
 _STRICT = frozenset({"cat", "stack", "concat", "concatenate", "hstack", "vstack", "column_stack"})
 
 
 def is_marked(value: Any) -> bool:
-    """Return whether `value` is a tensor on the pretended device."""
+    """Return True for tensors on the simulated device."""
     return getattr(value, _MARK, False) is True
 
 
 def mark(value: Any) -> Any:
-    """Put all tensors in `value` on the pretended device."""
+    """Move all tensors in `value` to the simulated device."""
     for tensor in _tensors(value):
         setattr(tensor, _MARK, True)
     return value
@@ -107,19 +106,19 @@ def _is_device(value: Any) -> bool:
 
 
 class PretendCuda(TorchFunctionMode):
-    """Torch with a CUDA device, `cuda:0`, that it does not have."""
+    """Torch function mode that simulates the CUDA device `cuda:0`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.waits: Counter[str] = Counter()
         """Number of host synchronizations by `file:line function` of the innermost line of mjlab."""
         self.rounded: Counter[str] = Counter()
-        """Number of matrix products in single precision, which TF32 may round; likewise."""
+        """Number of float32 matrix products, subject to TF32 rounding, by `file:line function`."""
         self._is_paused = False
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """Let what is marked be used as the CPU tensor that it is."""
+        """Allow marked tensors to be used as CPU tensors."""
         before, self._is_paused = self._is_paused, True
         yield
         self._is_paused = before
@@ -187,7 +186,7 @@ class PretendCuda(TorchFunctionMode):
             return mark(result) if goes else result
         if not (goes and kwargs.get("non_blocking")):
             self._wait(name)
-        # Another device is other memory.
+        # A copy to another device does not share memory.
         copy = result.clone() if result is source else result
         return mark(copy) if goes else _unmark(copy)
 
@@ -209,7 +208,7 @@ class PretendCuda(TorchFunctionMode):
         return mark(result)
 
     def _check(self, name: str, func: Any, args: tuple, kwargs: dict) -> tuple[bool, bool]:
-        """Return whether there are tensors on the device, and on the host; refuse a mixture."""
+        """Return whether operands are on the device, and on the host. Raises for a mixture."""
         operands = list(_tensors([args, kwargs]))
         marked = [tensor for tensor in operands if is_marked(tensor)]
         others = [tensor for tensor in operands if not is_marked(tensor)]
@@ -217,7 +216,7 @@ class PretendCuda(TorchFunctionMode):
             return bool(marked), bool(others)
         if name in ("__getitem__", "__setitem__") and is_marked(args[0]):
             index = list(_tensors([args[1]]))
-            # The device fetches an index from the host, and a value too if no index is a tensor.
+            # Torch copies indices from the host, and the value too if no index is a tensor.
             if any(not is_marked(tensor) and tensor.dim() for tensor in index):
                 self._wait(f"{name} with an index on the host")
             value = [tensor for tensor in _tensors(list(args[2:])) if not is_marked(tensor)]
@@ -243,7 +242,7 @@ class PretendCuda(TorchFunctionMode):
             if any(isinstance(part, list) for part in index):
                 self._wait(f"{name} with a list")
             masks = [t for t in _tensors([args[1]]) if t.dtype == torch.bool and t.dim()]
-            # A number is written where the mask says without looking at the mask.
+            # Writing a scalar through a mask does not synchronize.
             if masks and not (name == "__setitem__" and not isinstance(args[2], torch.Tensor)):
                 self._wait(f"{name} with a mask")
         elif name == "repeat_interleave" and len(args) > 1 and is_marked(args[1]):
@@ -265,7 +264,7 @@ class PretendCuda(TorchFunctionMode):
 
 
 class PretendEngine(Engine):
-    """An engine on the CPU whose fields seem to be on the pretended device."""
+    """CPU engine whose fields appear to be on the simulated device."""
 
     def __init__(self, engine: Engine, mode: PretendCuda) -> None:
         self._hosted, self._mode = engine, mode
@@ -311,7 +310,7 @@ PretendEngine.__abstractmethods__ = frozenset()
 
 
 class _Event:
-    """An event of a device that is always done."""
+    """Device event that is always complete."""
 
     def record(self, *_: Any) -> None:
         pass
@@ -321,7 +320,7 @@ class _Event:
 
 
 def install(monkeypatch: pytest.MonkeyPatch, mode: PretendCuda) -> None:
-    """Let torch say that there is a GPU, and simulations run on it by native MuJoCo."""
+    """Make torch report a GPU, and simulations run on it with native MuJoCo."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "Event", _Event)
@@ -335,7 +334,7 @@ def install(monkeypatch: pytest.MonkeyPatch, mode: PretendCuda) -> None:
         return PretendEngine(engine, mode) if _is_cuda(device) else engine
 
     def make_marked(value: torch.Tensor, nworld: int, name: str) -> SharedField:
-        # Made by a function that modes of torch do not see.
+        # Created by a function that torch function modes do not intercept.
         field = make(value, nworld, name)
         return mark(field) if is_marked(value) else field
 

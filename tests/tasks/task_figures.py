@@ -1,8 +1,8 @@
-"""Comparing a task's configs with a table of its figures, term for term.
+"""Comparison of task configs with tables of their parameters, term for term.
 
 A table is a YAML file with the entries `task`, `env`, `rl` and `play_differs`. It names the class
 of a config as `_`, functions as `module:name` below `mjlab`, and leaves out what equals the
-default of its field. `play_differs` lists, by path, where the config to play with differs.
+default of its field. `play_differs` lists, by path, the deviations of the play config.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ REMOVED = "(removed or default)"
 
 
 def tables() -> dict[str, dict[str, Any]]:
-    """Return all tables by the name of their task."""
+    """Return all tables by task name."""
     loaded = [yaml.safe_load(path.read_text()) for path in sorted(FIGURES.glob("*.yaml"))]
     return {table["task"]: table for table in loaded}
 
 
 def differences(table: dict[str, Any]) -> list[str]:
-    """Return, one line each, where the registered task and its table differ."""
+    """Return the differences between the registered task and its table, one line each."""
     task = table["task"]
     env, rl = load_env_cfg(task), load_rl_cfg(task)
     found = [f"env.{line}" for line in _compare(table["env"], figures_of(env))]
@@ -41,14 +41,13 @@ def differences(table: dict[str, Any]) -> list[str]:
 
 
 def figures_of(value: Any) -> Any:
-    """Return a config as a table shows it: plain values, without what is left at its default."""
+    """Return a config in the format of tables: plain values, without defaults."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return _figures_of_dataclass(value)
     if isinstance(value, enum.Enum):
         return value.name
     if isinstance(value, Mapping):
-        # A term that is None is switched off, which is the same as a term that is not there.
-        # Tables have keys that are numbers as text.
+        # A term that is None is disabled and equals a missing one. Tables store integer keys as text.
         return {str(key): figures_of(item) for key, item in value.items() if item is not None}
     if isinstance(value, (list, tuple)):
         return [figures_of(item) for item in value]
@@ -65,7 +64,7 @@ def _figures_of_dataclass(value: Any) -> dict[str, Any]:
     for field in dataclasses.fields(value):
         current = getattr(value, field.name)
         figures = figures_of(current)
-        # Some required fields have a default that only packages of earlier releases rely on.
+        # Some required fields have a default for packages of earlier releases.
         required = field.init and parameters[field.name].default is inspect.Parameter.empty
         is_default = not required and _is_default(field, figures)
         if not is_default and not field.name.startswith("_"):
@@ -106,10 +105,10 @@ def _same(expected: Any, found: Any) -> bool:
 
 
 def _both_functions(expected: str, found: str) -> bool:
-    """Return whether two names may be of one function.
+    """Return True if two names may refer to the same function.
 
-    Functions without a name of their own have no other identity, and where in `mjlab` a function
-    is written is our own affair as long as it is the one at the public path.
+    Lambdas have no other identity. The module that defines a function may differ as long as the public
+    path leads to the same function.
     """
     if ":" not in expected or ":" not in found:
         return False
@@ -124,7 +123,7 @@ def _both_functions(expected: str, found: str) -> bool:
 
 
 def _compare(expected: Any, found: Any, path: str = "") -> list[str]:
-    """Return the paths at which two figures differ, with both values."""
+    """Return the paths of differing values, with both values."""
     if isinstance(expected, dict) and isinstance(found, dict):
         lines: list[str] = []
         for key in [*expected, *(key for key in found if key not in expected)]:
@@ -159,7 +158,7 @@ def _flat(figures: Any, path: str = "") -> dict[str, Any]:
 
 
 def _compare_play(table: dict[str, Any], train: dict, play: dict) -> list[str]:
-    """Return where the play config differs from the training config and should not, or not so."""
+    """Return unexpected differences between the play config and the training config."""
     stated: dict[str, Any] = table["play_differs"]
     lines = []
     for path, expected in stated.items():

@@ -1,4 +1,4 @@
-"""The cartpole tasks against the control suite's own cartpole (dm_control)."""
+"""Cartpole tasks against the cartpole of dm_control."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def physics():
 
 
 def suite_reward(physics, qpos, qvel, control) -> float:
-    """Return the reward that the control suite gives in a state, for a control."""
+    """Return the reward of dm_control for a state and a control."""
     with physics.reset_context():
         physics.data.qpos[:], physics.data.qvel[:] = qpos, qvel
     physics.data.ctrl[:] = control

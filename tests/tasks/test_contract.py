@@ -1,4 +1,4 @@
-"""What every registered task has to keep, whoever wrote it."""
+"""Contract of all registered tasks."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def making(
     if generator and not whole_terrain:
         # Two levels take a fifth of the time of ten.
         generator.num_rows = 2
-        # Terrain is part of the model: what goes on in another environment needs the same.
+        # Terrain is part of the model: states transfer only between equal terrains.
         generator.seed = 3
     if not noisy:
         for group in cfg.observations.values():
@@ -56,7 +56,7 @@ def making(
 
 
 def actions(env: ManagerBasedRlEnv, steps: int) -> list[torch.Tensor]:
-    """Return actions from a generator of their own, so that they disturb no other."""
+    """Return random actions from a separate generator, leaving the global ones unchanged."""
     generator = torch.Generator().manual_seed(0)
     shape = (env.num_envs, env.action_manager.total_action_dim)
     return [2.0 * torch.rand(shape, generator=generator) - 1.0 for _ in range(steps)]
@@ -79,7 +79,7 @@ def copied(value: Any) -> dict[str, torch.Tensor]:
 
 
 def trajectory(env: ManagerBasedRlEnv, steps: int) -> list[dict[str, torch.Tensor]]:
-    """Step `env` and return copies of all it returned."""
+    """Step `env` and return copies of the results."""
     result = []
     for action in actions(env, steps):
         result.append(copied(list(env.step(action)[:4])))
@@ -176,7 +176,7 @@ def test_a_reset_with_a_seed_starts_the_same_episode_again(task):
 
 
 def test_resetting_some_environments_leaves_the_others_alone(task):
-    # All environments are observed anew, so that noise would be drawn anew too.
+    # A partial reset recomputes the observations of all environments and would resample their noise.
     with making(task, noisy=False) as env:
         env.reset()
         trajectory(env, 4)

@@ -1,4 +1,4 @@
-"""`cpu_profile` makes a profile for any task, which evaluations undo."""
+"""`cpu_profile` returns profiles for any task, and evaluations undo them."""
 
 from __future__ import annotations
 

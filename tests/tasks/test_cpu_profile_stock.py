@@ -1,4 +1,4 @@
-"""What a `cpu` profile makes easier for learning, evaluations, `evaluate` and `play` undo."""
+"""Evaluations, `evaluate` and `play` undo the simplifications of `cpu` profiles."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def test_evaluations_are_those_of_the_task_without_the_profile(task, play, tmp_p
         prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
         if prepare is not None:
             prepare(cfg)
-    # How many there are makes nothing easier.
+    # The number of environments does not affect the difficulty.
     eased.scene.num_envs = plain.scene.num_envs
     if task in CLOCKED:
-        # What the policy learned to act by, and to see: the task's models, pushes and ends stay.
+        # Action and observation spaces of the policy stay; models, pushes and terminations are the task's.
         assert type(eased.actions["joint_pos"]) is type(plain.actions["joint_pos"])
         eased.actions = plain.actions
         del eased.commands["gait"], eased.observations["teacher"]

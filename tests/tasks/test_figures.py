@@ -1,4 +1,4 @@
-"""The figures of the registered tasks are those of their tables, term for term."""
+"""Parameters of registered tasks equal those of their tables, term for term."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from task_figures import differences, tables
 
 TABLES = tables()
 
-# What we add to or change in a table on purpose, as the lines that the comparison then gives.
+# Intended deviations from the tables, as lines of the comparison.
 DEVIATIONS: dict[str, set[str]] = {
     task: {
-        # What counts as solved is ours: the interface of 1.6 has no such thing.
+        # Success criterion: not part of the 1.6 interface.
         "rl.evaluation is default in the table, and "
         "{'_': 'EvaluationCfg', 'solved_return': 900.0} here",
-        # So is a camera that keeps the whole rail in the picture.
+        # Camera that keeps the whole rail in view: not part of the 1.6 interface.
         "env.viewer.camera is default in the table, and 'cartpole/side' here",
     }
     for task in ("Mjlab-Cartpole-Balance", "Mjlab-Cartpole-Swingup")
 }
-# What evaluations measure is ours, too. Sensors of collisions report the strongest contact, where
-# the tables have them report any.
+# Evaluation metrics are not part of the 1.6 interface. Collision sensors report the strongest contact
+# instead of an arbitrary one.
 _TRACKING_ERRORS = {
     name: f"tasks.velocity.rl.ppo:{name}" for name in ("lin_vel_error", "ang_vel_error")
 }
@@ -67,8 +67,8 @@ DEVIATIONS["Mjlab-Multi-Cube-Seg-Yam"] |= {
         ("cube_2", [0.17999999999999997, 0.17999999999999997, 0.9, 1.0]),
     )
 }
-# Motion tracking works without naming a motion, ends episodes where the motion does, and plays without
-# noise in the joints. What evaluations measure, and how, is ours.
+# Motion tracking works without a motion name, ends episodes at the end of the motion, and plays without
+# joint noise. Evaluation metrics are not part of the 1.6 interface.
 _MOTION_ERRORS = {
     name: f"tasks.tracking.mdp.metrics:{name}"
     for name in ("mpkpe", "r_mpkpe", "joint_vel_error", "ee_pos_error", "ee_ori_error")

@@ -1,6 +1,6 @@
-"""Every task runs on a CUDA device: no tensor is left behind on the host, or fetched from there.
+"""All tasks run on a CUDA device: no tensor stays on the host or is fetched from there.
 
-There is no GPU in these tests; `pretend_cuda` keeps the rules of one.
+The tests need no GPU; `pretend_cuda` enforces the rules of one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LOOKED_UP = "managers/lookup.py look_up: cpu"
 MOST_WAITS_OF_RESETS = 5
 # With mirror images, and with what the runner of tracking does besides.
 LEARNED = ("Mjlab-Velocity-Flat-Unitree-Go1", "Mjlab-Tracking-Flat-Unitree-G1")
-# With an interval event, a command that places objects, and one with a clock of its own.
+# With an interval event, a command that places objects, and a command with a separate clock.
 COMPARED = (
     "Mjlab-Velocity-Flat-Unitree-Go1",
     "Mjlab-Lift-Cube-Yam",
@@ -84,7 +84,7 @@ def counted(cuda: PretendCuda) -> Counter[str]:
     return waits
 
 
-# The pretended device.
+# Simulated device.
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Tasks of other installed packages: found by their entry points, whatever their shape or age."""
+"""Tasks of other installed packages, discovered through entry points."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_a_package_that_misses_a_module_of_the_extra_is_told_the_extra(
 
 
 def test_a_part_that_an_installed_module_lacks_is_no_missing_module(install, caplog, monkeypatch):
-    """As `moviepy.editor`, which moviepy 2 has no more."""
+    """As for `moviepy.editor`, removed in moviepy 2."""
     package = types.ModuleType("moviepy")
     package.__path__ = []
     monkeypatch.setitem(sys.modules, "moviepy", package)
@@ -338,7 +338,7 @@ OLD_STYLE = {
 
 @pytest.fixture
 def old_style(install) -> list[str]:
-    """Install a package written for release 1.1; return what it was warned about."""
+    """Install a package written for release 1.1; return the warnings."""
     install("old-style", {"old_style": "old_style.tasks"}, OLD_STYLE)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

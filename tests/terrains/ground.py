@@ -1,4 +1,4 @@
-"""Building one sub-terrain and feeling its ground by rays from above, for tests."""
+"""Single sub-terrains, and ground heights measured by rays from above, for tests."""
 
 from __future__ import annotations
 

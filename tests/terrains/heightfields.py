@@ -1,4 +1,4 @@
-"""Building one height field, and measuring it, for tests."""
+"""Single height fields and their measurement, for tests."""
 
 from __future__ import annotations
 

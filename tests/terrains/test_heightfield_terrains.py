@@ -129,7 +129,7 @@ def test_perlin_noise_is_smooth_spans_its_height_and_leaves_the_border_flat():
 
 
 def test_perlin_noise_is_that_of_the_reference():
-    """At the centre the reference measures 0.14 m with the preset at full height."""
+    """At the center the reference measures 0.14 m with the preset at full height."""
     assert build(perlin(), 1.0).height_at(4.0, 4.0) == pytest.approx(0.1363, abs=1e-3)
 
 
@@ -141,7 +141,7 @@ def test_more_octaves_add_finer_detail():
     assert roughness(1) < roughness(2) < roughness(4)
 
 
-# What the reference measures.
+# Measurements of the reference.
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_the_elevations_of_the_rough_tasks_slope():
     assert found == pytest.approx([0.685, 1.375, 2.065])
 
 
-# Where robots start.
+# Spawn points.
 
 
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
@@ -297,10 +297,10 @@ def test_two_fields_in_one_spec_keep_apart():
     assert sorted(model.geom_dataid.tolist()) == [0, 1, 2]
 
 
-# Colours.
+# Colors.
 
 
-def test_colours_follow_height_on_one_scale():
+def test_colors_follow_height_on_one_scale():
     """Green at z = 0, red above, blue below; rows of the texture go down while y goes up."""
     heights = np.tile(np.linspace(-0.9, 0.9, 50)[:, None], (1, 30))
     spec = mujoco.MjSpec()
@@ -317,7 +317,7 @@ def test_colours_follow_height_on_one_scale():
         np.testing.assert_allclose(pixels[row, 10], expected, atol=1)
 
 
-# Refusals.
+# Invalid configs.
 
 
 @pytest.mark.parametrize(
@@ -328,9 +328,9 @@ def test_colours_follow_height_on_one_scale():
         (rough(downsampled_scale=0.05), "downsampled_scale: .*horizontal_scale = 0.1 .*got 0.05"),
         (rough(downsampled_scale=5.0), r"downsampled_scale: expected .*got 5.0"),
         (rough(noise_range=(0.1, 0.0)), r"noise_range: expected .*got \(0.1, 0.0\)"),
-        (rough(border_width=0.05), "border_width: .*at least one pixel.*got 0.05"),
+        (rough(border_width=0.05), "border_width: .*horizontal_scale = 0.1.*got 0.05"),
         (rough(border_width=-0.2), r"border_width: expected .*got -0.2"),
-        (rough(border_width=4.0), r"size: .*2 x 2 pixels of ground.*got \(8.0, 8.0\)"),
+        (rough(border_width=4.0), r"size: .*2 x 2 pixels.*got \(8.0, 8.0\)"),
         (rough(horizontal_scale=0.0), r"horizontal_scale: expected .*got 0.0"),
         (rough(horizontal_scale=float("nan")), r"horizontal_scale: expected .*got nan"),
         (rough(vertical_scale=-0.005), r"vertical_scale: expected .*got -0.005"),
@@ -340,16 +340,16 @@ def test_colours_follow_height_on_one_scale():
         (wave(amplitude_range=(0.2, 0.1)), r"amplitude_range: expected .*got \(0.2, 0.1\)"),
         (wave(amplitude_range=(-0.2, 0.1)), r"amplitude_range: .* 0 <= low <= high, got \(-0.2, 0.1\)"),
         (slope(slope_range=(0.5, 0.1)), r"slope_range: expected .*got \(0.5, 0.1\)"),
-        (slope(platform_width=7.6), "platform_width: .*from 0 to 7.5 m.*got 7.6"),
+        (slope(platform_width=7.6), "platform_width: .*7.5.*.*got 7.6"),
         (slope(platform_width=-1.0), r"platform_width: expected .*got -1.0"),
-        (obstacles(platform_width=9.0), "platform_width: .*from 0 to 7.5 m.*got 9.0"),
+        (obstacles(platform_width=9.0), "platform_width: .*7.5.*.*got 9.0"),
         (obstacles(obstacle_width_range=(1.0, 0.3)), "obstacle_width_range"),
         (obstacles(obstacle_width_range=(0.01, 0.3)), "obstacle_width_range: .* 0.1 <= low"),
         (obstacles(obstacle_height_range=(0.3, 0.1)), "obstacle_height_range"),
         (obstacles(num_obstacles=-1), r"num_obstacles: expected .*got -1"),
         (obstacles(obstacle_height_mode="tall"), "obstacle_height_mode: .*'choice', 'fixed'.*got 'tall'"),
         (wave(num_waves=39), "num_waves: .*38 waves.*76 pixels.*got 39"),
-        (perlin(scale=300.0), "scale: .*140 pixels.*makes 150.*got 300.0"),
+        (perlin(scale=300.0), "scale: .*140 pixels.* 150.*got 300.0"),
         (rough(horizontal_scale=1e-320), "horizontal_scale: .*at most 10,000,000 pixels.*got 1e-320"),
         (rough(horizontal_scale=1e-3), "horizontal_scale: .*64,000,000.*got 0.001"),
         (perlin(octaves=0), r"octaves: expected .*got 0"),
@@ -357,7 +357,7 @@ def test_colours_follow_height_on_one_scale():
         (perlin(lacunarity=-2.0), r"lacunarity: expected .*got -2.0"),
         (perlin(persistence=-0.1), r"persistence: expected .*got -0.1"),
         (perlin(resolution=0.0), r"resolution: expected .*got 0.0"),
-        (perlin(border_width=0.01), "at least one pixel .resolution = 0.05 m"),
+        (perlin(border_width=0.01), "border_width: .*resolution = 0.05 m.*got 0.01"),
         (perlin(height_range=(1.0, 0.5)), "height_range"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -43,7 +43,7 @@ def test_a_ball_lands_at_the_same_height_on_both_engines(x, y):
         landed[engine] = 1.5 + sim.data.qpos[0, 0].item()
     assert landed["warp"] == pytest.approx(landed["native"], abs=1e-4)
     ground = build(slope(slope_range=(0.0, 0.3))).height_at(x, y)
-    # The plane of the slope is one radius away from the centre, which is more than that above it.
+    # The slope's plane is one radius away from the center: more than one radius vertically.
     above = landed["native"] - ground
     assert RADIUS - 0.003 < above < RADIUS * 1.1
 

@@ -1,4 +1,4 @@
-"""The ground, and where the environments are on it."""
+"""Tests of the terrain entity and its environment origins."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ def test_debug_sites_show_the_origins():
 def test_configs_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="terrain_type: .*'plane', 'generator'.*got 'hills'"):
         terrain(terrain_type="hills")
-    with pytest.raises(ValueError, match="env_spacing is None"):
+    with pytest.raises(ValueError, match="env_spacing: .*got None"):
         terrain(env_spacing=None)
-    with pytest.raises(ValueError, match="'generator', but terrain_generator is None"):
+    with pytest.raises(ValueError, match="terrain_generator: .*'generator', got None"):
         terrain(terrain_type="generator")
-    with pytest.raises(ValueError, match="max_init_terrain_level is -1; it must be 0 or more"):
+    with pytest.raises(ValueError, match="max_init_terrain_level: .*>= 0.* -1"):
         terrain(max_init_terrain_level=-1)
     with pytest.raises(TypeError, match=r"TerrainEntity\(cfg, device\)"):
         TerrainEntityCfg().build()
@@ -146,7 +146,7 @@ def test_a_split_is_complete_and_close_to_the_proportions(total, shares):
 
 @pytest.mark.parametrize("shares", [[-0.1, 1.0], [0.0, 0.0]])
 def test_impossible_proportions_are_refused(shares):
-    with pytest.raises(ValueError, match="must not be negative, and not all zero"):
+    with pytest.raises(ValueError, match=r"got \[(-0\.1, 1\.0|0\.0, 0\.0)\]"):
         split_by_proportion(4, np.array(shares))
 
 
@@ -221,7 +221,7 @@ def test_randomized_origins_cover_all_cells_and_spare_other_environments():
 
 @pytest.mark.parametrize("shape", [(4, 3), (2, 2, 2), (0, 2, 3)])
 def test_origins_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match="must be \\(levels, columns, 3\\)"):
+    with pytest.raises(ValueError, match="origins: .*\\(levels, columns, 3\\)"):
         terrain().configure_env_origins(torch.zeros(shape))
 
 

@@ -1,4 +1,4 @@
-"""The grid of sub-terrains: where each is, of which kind and difficulty, and what is around it."""
+"""Tests of the sub-terrain grid: positions, types and difficulties of cells, and the border."""
 
 from __future__ import annotations
 
@@ -184,16 +184,16 @@ def test_the_ground_weighs_nothing():
     assert built.model.body_mass.tolist() == [0.0, 0.0]
 
 
-# Colours, border and light.
+# Colors, border and light.
 
 
 @pytest.mark.parametrize(("scheme", "expected"), [("height", RED), ("none", (0.5, 0.5, 0.5, 1.0))])
-def test_a_scheme_colours_the_ground(scheme, expected):
+def test_a_scheme_colors_the_ground(scheme, expected):
     _, built = build(num_rows=2, color_scheme=scheme)
     assert built.model.geom_rgba == pytest.approx(np.tile(expected, (2, 1)), abs=1e-6)
 
 
-def test_random_colours_are_drawn_from_the_terrains_own_generator():
+def test_random_colors_are_drawn_from_the_terrains_own_generator():
     _, built = build(num_rows=2, color_scheme="random", seed=3, border_width=1.0)
     rng = np.random.default_rng(3)
     for k in range(2):
@@ -269,35 +269,35 @@ def test_flat_patches_are_moved_to_their_cells_and_gaps_hold_the_spawn_point():
         assert (patches[row, 1] == generator.terrain_origins[row, 1]).all()
 
 
-def test_flat_patches_that_nobody_asked_for_are_refused():
-    with pytest.raises(ValueError, match=r"Sub-terrain 'a' .* returned flat patches 'spawn'"):
+def test_unrequested_flat_patches_are_refused():
+    with pytest.raises(ValueError, match=r"Sub-terrain 'a' .* flat patches 'spawn'"):
         build(sub_terrains={"a": Recorder(patches=2)})
 
 
-# What cannot be built.
+# Invalid configs.
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"sub_terrains": {}}, "sub_terrains: expected at least one"),
-        ({"size": (8.0, 0.0)}, r"size: .*two positive lengths.*got \(8.0, 0.0\)"),
-        ({"size": (-8.0, 8.0)}, "two positive lengths"),
+        ({"size": (8.0, 0.0)}, r"size: .*got \(8.0, 0.0\)"),
+        ({"size": (-8.0, 8.0)}, r"size: .*got \(-8.0, 8.0\)"),
         ({"num_rows": 0}, r"num_rows: expected .*got 0"),
         ({"num_cols": -1}, r"num_cols: expected .*got -1"),
         ({"difficulty_range": (0.8, 0.2)}, r"difficulty_range: expected .*got \(0.8, 0.2\)"),
-        ({"difficulty_range": (0.0, 1.5)}, "both from 0 to 1"),
-        ({"difficulty_range": (-0.1, 1.0)}, "both from 0 to 1"),
+        ({"difficulty_range": (0.0, 1.5)}, r"difficulty_range: .*got \(0.0, 1.5\)"),
+        ({"difficulty_range": (-0.1, 1.0)}, r"difficulty_range: .*got \(-0.1, 1.0\)"),
         ({"color_scheme": "rainbow"}, "color_scheme: .*'height', 'random', 'none'.*got 'rainbow'"),
         ({"sub_terrains": {"a": BoxFlatTerrainCfg(proportion=-1.0), "b": BoxFlatTerrainCfg()}},
          "'a' .*proportion: .*got -1.0"),
-        ({"sub_terrains": {"a": BoxFlatTerrainCfg(proportion=0.0)}}, r"proportion is 0 for all of \['a'\]"),
+        ({"sub_terrains": {"a": BoxFlatTerrainCfg(proportion=0.0)}}, r"proportion: .*\['a'\]"),
         ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
             step_height_range=(0, 0.1), step_width=0.3, platform_width=5.0)}},
          r"'a' \(BoxPyramidStairsTerrainCfg\) platform_width: .*4.0\], got 5.0"),
         ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
             step_height_range=(0, 0.1), step_width=0.3, border_width=2.0)}},
-         "border_width: .* 2.0.*half the sub-terrain, got 2.0"),
+         r"border_width: .* 2.0\).*got 2.0"),
         ({"sub_terrains": {"a": BoxFlatTerrainCfg(flat_patch_sampling=sampling(0, 0.5))}},
          r"flat_patch_sampling\['spawn'\] num_patches: .*got 0"),
     ],

@@ -1,4 +1,4 @@
-"""What every kind of sub-terrain holds to, at every difficulty."""
+"""Laws of every sub-terrain type, at every difficulty."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .ground import SIZE, Ground, ground
 
 PRESETS = sorted(ALL_TERRAIN_PRESETS)
 DIFFICULTIES = (0.0, 0.5, 1.0)
-# Nothing in them is drawn.
+# Presets without random numbers.
 WITHOUT_CHANCE = {
     "flat", "pyramid_stairs", "pyramid_stairs_inv", "hf_pyramid_slope", "hf_pyramid_slope_inv",
     "wave_terrain", "open_stairs", "narrow_beams", "nested_rings",
 }  # fmt: skip
-# What a robot's feet may touch where it starts, in metres from the spawn point.
+# Radius of the area around the spawn point that a robot's feet may touch (m).
 FEET = 0.45
 
 
@@ -72,7 +72,7 @@ def test_a_sub_terrain_is_sound(name, difficulty, seed):
     assert (corners[:, :2] >= -1e-6).all()
     assert (corners[:, :2] <= np.array(SIZE) + 1e-6).all()
     assert_nothing_degenerate(cfg, built.model)
-    # What the generator will paint and move is all that there is.
+    # The output lists all geoms of the spec: the generator colors and moves only those.
     assert len(built.output.geometries) == built.model.ngeom
 
 
@@ -80,7 +80,7 @@ def assert_nothing_degenerate(cfg: SubTerrainCfg, model: mujoco.MjModel) -> None
     boxes = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
     fields = model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD
     assert (model.geom_size[boxes] >= 0.02).all()
-    # No thin sheets, except where slabs are asked for; those of the frame are solid all the same.
+    # No thin sheets, except slabs of open stairs; their border is solid too.
     thinnest = 2.0 * model.geom_size[boxes, 2].min(initial=np.inf)
     slabs = getattr(cfg, "step_thickness", None)
     assert thinnest == pytest.approx(slabs) if slabs else thinnest >= 0.5 - 1e-6
@@ -122,6 +122,6 @@ def test_all_kinds_stand_in_one_grid_where_the_generator_says(curriculum):
     built = Ground(spec, model, data)
     around = np.linspace(-FEET, FEET, 3)
     for x, y, z in generator.terrain_origins.reshape(-1, 3):
-        # Whatever stands there is the ground of this cell: no neighbour reaches over.
+        # Whatever stands there is the ground of this cell: no neighbor reaches over.
         assert built.heights(x + around, y + around).max() <= z + 1e-6
         assert built.height(x, y) >= z - 0.7

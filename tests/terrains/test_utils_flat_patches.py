@@ -41,7 +41,7 @@ def test_flat_patches_are_flat_and_on_the_ground(kind, radius, limit, size, seed
     found = built.output.flat_patches["spots"]
     assert found.shape == (8, 3)
     if spread_around(built, *found[0, :2], radius) > limit + 1e-6:
-        # There is no such spot.
+        # No vertex qualifies.
         middle = built.surface[built.surface.shape[0] // 2, built.surface.shape[1] // 2]
         np.testing.assert_allclose(found, np.tile([*np.array(size) / 2, middle], (8, 1)), atol=1e-6)
         return
@@ -121,7 +121,7 @@ def test_a_height_range_chooses_the_top_of_a_hill():
     assert found[:, 2] == pytest.approx(1.445)
 
 
-def test_without_a_flat_spot_all_patches_are_the_centre():
+def test_without_a_flat_spot_all_patches_are_the_center():
     cfg = patch(num_patches=4, patch_radius=0.5, max_height_diff=0.001)
     built = build(rough(flat_patch_sampling={"none": cfg}))
     found = built.output.flat_patches["none"]

@@ -1,4 +1,4 @@
-"""Colours."""
+"""Colors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_saturation_changes_alone(rgb, factor):
 
 @settings(deadline=None)
 @given(rgbs, unit, unit)
-def test_darker_and_lighter_colours_keep_their_opacity(rgb, alpha, factor):
+def test_darker_and_lighter_colors_keep_their_opacity(rgb, alpha, factor):
     rgba = (*rgb, alpha)
     dark, light = darken_rgba(rgba, factor), lighten_rgba(rgba, factor)
     assert dark[3] == light[3] == alpha
@@ -67,7 +67,7 @@ def test_a_ramp_ends(t):
         brand_ramp((1, 0, 0), t)
 
 
-def test_random_colours_repeat_with_their_generator():
+def test_random_colors_repeat_with_their_generator():
     first = RGBA.random(np.random.default_rng(1), alpha=0.5)
     rgb = RGB.random(np.random.default_rng(1))
     assert first == RGBA.from_rgb(rgb, 0.5)

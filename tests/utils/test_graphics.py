@@ -50,7 +50,7 @@ def test_a_library_that_is_not_installed_is_told_to_those_who_draw():
 def test_rendering_that_is_switched_off_is_told_as_that():
     told = python("import mjlab\n" + DRAW, "off")
     assert "MUJOCO_GL=off" in told
-    assert "switches rendering off" in told
+    assert "disables rendering" in told
 
 
 def test_other_values_are_left_alone():

@@ -60,7 +60,7 @@ def test_each_kind_is_told_from_the_others(element, field, kind):
     ],
 )
 def test_an_unknown_kind_is_named(element):
-    with pytest.raises(ValueError, match=r"cannot be detected .*mjBIAS_AFFINE.*state the command"):
+    with pytest.raises(ValueError, match=r"mjBIAS_AFFINE.*command_field"):
         detect_command_field(_actuator(element))
 
 
@@ -79,5 +79,5 @@ def test_widths_are_those_of_a_compiled_model(kind, widths):
 
 
 def test_an_unknown_joint_type_is_refused():
-    with pytest.raises(ValueError, match="9 is no joint type"):
+    with pytest.raises(ValueError, match="joint type 9"):
         qpos_width(9)

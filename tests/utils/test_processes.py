@@ -1,4 +1,4 @@
-"""Which process of a run this one is, as launchers say by environment variables."""
+"""Process ranks from environment variables, and CPU cores per process."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def test_a_launcher_that_says_no_local_numbers_is_on_one_machine(launched):
         ((2, 2, 0, 2), "RANK=2"),
         ((0, 2, 3, 2), "LOCAL_RANK=3"),
         ((0, 2, 0, 4), "LOCAL_WORLD_SIZE=4"),
-        (("one", 2, 0, 2), "RANK is 'one'"),
-        ((0, 0, 0, 1), "WORLD_SIZE is '0'"),
-        ((0, -2, 0, 1), "WORLD_SIZE is '-2'"),
+        (("one", 2, 0, 2), "RANK: .*'one'"),
+        ((0, 0, 0, 1), "WORLD_SIZE: .*'0'"),
+        ((0, -2, 0, 1), "WORLD_SIZE: .*'-2'"),
     ],
 )
 def test_variables_that_make_no_sense_are_named(launched, values, named):
@@ -72,7 +72,7 @@ def test_processes_share_the_cores_of_their_machine(launched, monkeypatch, proce
 
 @pytest.fixture
 def cgroups(tmp_path, monkeypatch):
-    """Return a function that puts this process, which may use 16 cores, into control groups."""
+    """Return a function that puts this process, with 16 cores, into control groups."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(16)), raising=False)
     monkeypatch.setattr(processes, "_OWN_CGROUPS", tmp_path / "own")
     monkeypatch.setattr(processes, "_CGROUP_ROOT", tmp_path / "fs")

@@ -1,4 +1,4 @@
-"""Seeding."""
+"""Seeds."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ def test_only_motors_act_on_sites(spec):
         lambda: create_velocity_actuator(spec, "site", damping=1.0, transmission_type=site),
         lambda: create_muscle_actuator(spec, "site", transmission_type=site),
     ):
-        with pytest.raises(ValueError, match="Only motors can act on a site"):
+        with pytest.raises(ValueError, match="'site': expected a motor"):
             create()
     with pytest.raises(ValueError, match=r"Site 'site'.*armature 0.5"):
         create_motor_actuator(spec, "site", effort_limit=1.0, armature=0.5, transmission_type=site)

@@ -1,4 +1,4 @@
-"""Capturing and restoring run-time state."""
+"""Capture and restore of run-time state."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_an_object_that_does_not_exist_yet_is_reported_and_left(caplog):
     fresh = Owner()
     restore_state(fresh, capture_state(owner))
     assert fresh.nothing is None
-    assert "Owner.nothing is not restored: it was a Buffer" in caplog.text
+    assert "Owner.nothing not restored: expected a Buffer" in caplog.text
 
 
 @stateful
@@ -151,7 +151,5 @@ def test_values_of_other_libraries_become_plain_and_come_back():
 def test_shapes_that_differ_are_named():
     saved, current = capture_state(Owner()), capture_state(Owner())
     saved["buffers"]["a"]["values"] = torch.zeros(7)
-    assert shape_differences(saved, current) == [
-        "buffers.a.values has shape (7,) there and (4,) here"
-    ]
+    assert shape_differences(saved, current) == ["buffers.a.values: expected shape (4,), got (7,)"]
     assert shape_differences(current, current) == []

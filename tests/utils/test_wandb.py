@@ -46,7 +46,7 @@ def test_a_run_may_have_no_tags_and_wandb_need_not_be_imported(wandb, monkeypatc
 
 @pytest.mark.parametrize("present", [None, ""])
 def test_without_tags_the_variable_is_not_left_empty(monkeypatch, present):
-    # An empty variable is one empty tag to wandb, which refuses to start a run with it.
+    # wandb reads an empty variable as one empty tag, and rejects runs with empty tags.
     if present is None:
         monkeypatch.delenv("WANDB_TAGS")
     add_wandb_tags([])

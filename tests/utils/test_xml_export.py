@@ -1,4 +1,4 @@
-"""Writing a spec with its files."""
+"""Export of a spec with its files."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_an_archive_leaves_folders_alone(tmp_path):
 def test_a_missing_file_is_named_and_nothing_is_written(tmp_path):
     spec = mujoco.MjSpec()
     spec.add_mesh(name="gone", file="gone.obj")
-    with pytest.raises(ValueError, match=r"'gone' refers to the file 'gone.obj'"):
+    with pytest.raises(ValueError, match=r"'gone': file 'gone.obj'"):
         export_spec(spec, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -96,7 +96,7 @@ def test_a_missing_file_is_named_and_nothing_is_written(tmp_path):
 def test_a_spec_that_is_part_of_another_is_refused(tmp_path):
     part, whole = mujoco.MjSpec(), mujoco.MjSpec()
     whole.attach(part, prefix="", frame=whole.worldbody.add_frame())
-    with pytest.raises(ValueError, match="attached to another one"):
+    with pytest.raises(ValueError, match="attached to another"):
         export_spec(part, tmp_path / "out")
     export_spec(whole, tmp_path / "out")
 

@@ -1,4 +1,4 @@
-"""Lets the viewer tests import the modules beside them."""
+"""Import path for the helper modules of the viewer tests."""
 
 from __future__ import annotations
 

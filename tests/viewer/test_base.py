@@ -1,4 +1,4 @@
-"""The loop that all interactive viewers share."""
+"""Loop shared by interactive viewers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 import torch
 from viewer_fakes import FakeEnv, push
 
-from mjlab.viewer.base import BaseViewer, TermHistory, VerbosityLevel, ViewerAction, forget
+from mjlab.viewer.base import BaseViewer, TermHistory, VerbosityLevel, ViewerAction, reset_policy
 
 
 class ListViewer(BaseViewer):
-    """Keeps a list of what happens."""
+    """Viewer that records its events in a list."""
 
     def __init__(self, env, policy, **kwargs):
         super().__init__(env, policy, **kwargs)
@@ -108,7 +108,7 @@ def test_a_display_that_fails_at_every_frame_is_logged_once_and_does_not_end_the
 
 
 def test_single_steps_count_only_while_paused(viewer) -> None:
-    viewer._last_tick = float("inf")  # No time passes, so nothing steps by itself.
+    viewer._last_tick = float("inf")  # Stop time, so that only the actions step.
     viewer.request_single_step()
     viewer._process_actions()
     assert viewer.env.num_steps == 0
@@ -152,7 +152,7 @@ def test_a_policy_with_memory_forgets_what_ended(viewer) -> None:
     viewer.env.step = lambda actions: (None, None, dones, {})
     viewer.step_simulation()
     assert seen == [dones]
-    # An environment without a wrapper.
+    # Environment without a wrapper.
     viewer.env.step = lambda actions: (None, None, dones == 0, dones == 1, {})
     viewer.step_simulation()
     assert seen[1].tolist() == [True]
@@ -160,7 +160,7 @@ def test_a_policy_with_memory_forgets_what_ended(viewer) -> None:
 
 @pytest.mark.parametrize("reset", [lambda: 1 / 0, lambda env_ids=None: 1 / 0, iter, None])
 def test_policies_that_know_nothing_of_ends_are_left_alone(reset) -> None:
-    forget(SimpleNamespace(reset=reset), torch.tensor([1]))
+    reset_policy(SimpleNamespace(reset=reset), torch.tensor([1]))
 
 
 def test_a_reset_that_fails_is_shown_and_ends_nothing(viewer) -> None:
@@ -193,8 +193,8 @@ def test_pausing_twice_says_so_once(viewer) -> None:
 def test_the_first_interrupt_ends_the_loop_and_the_old_handler_comes_back(viewer) -> None:
     before = signal.getsignal(signal.SIGINT)
     viewer.after_env_step = lambda: os.kill(os.getpid(), signal.SIGINT)
-    # Behind its schedule, so that more steps than one are due when the interrupt comes; a second
-    # interrupt, which a further step would send, ends the program.
+    # Let the viewer lag, so that several steps are due at the interrupt. A further step would send
+    # a second interrupt and end the program.
     viewer._pacer.add(1.0)
     viewer.run(num_steps=1000)
     assert viewer.env.num_steps == 1
@@ -210,7 +210,7 @@ def test_rates_are_logged_for_those_who_ask_for_detail(caplog) -> None:
     assert "steps/s" in caplog.text
 
 
-def test_a_frame_rate_that_is_not_positive_is_refused() -> None:
+def test_a_frame_rate_that_is_not_positive_is_rejected() -> None:
     with pytest.raises(ValueError, match="frame_rate.*0"):
         ListViewer(FakeEnv(1), push(), frame_rate=0)
 

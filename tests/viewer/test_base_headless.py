@@ -1,4 +1,4 @@
-"""Playing without looking."""
+"""Headless runs of a policy."""
 
 from __future__ import annotations
 
@@ -38,6 +38,6 @@ def test_it_takes_the_four_results_of_the_learning_wrapper() -> None:
     assert run_headless(env, push(), 4).num_episodes == 8
 
 
-def test_a_negative_number_of_steps_is_refused() -> None:
+def test_a_negative_number_of_steps_is_rejected() -> None:
     with pytest.raises(ValueError, match="num_steps.*-1"):
         run_headless(FakeEnv(1), push(), -1)

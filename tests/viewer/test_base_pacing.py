@@ -1,4 +1,4 @@
-"""The budget of simulated time, and the rates."""
+"""Pacing of simulated time, and step and frame rates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One resolver finds the camera of all viewers."""
+"""Camera resolution shared by all viewers."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_entity_may_be_left_out_where_the_scene_has_exactly_one() -> None:
         ({}, r"body_name.*ASSET_BODY.*'cart', 'pole'"),
     ],
 )
-def test_unknown_names_are_refused_with_the_names_there_are(fields, message) -> None:
+def test_unknown_names_raise_with_the_available_names(fields, message) -> None:
     with pytest.raises(ValueError, match=message):
         resolve(origin_type=OriginType.ASSET_BODY, **fields)
 
@@ -91,10 +91,10 @@ def test_the_offset_is_where_mujoco_puts_its_own_camera(azimuth, elevation, dist
     assert (view.offset()[2] > 0) == (elevation < 0) or abs(elevation) < 1e-6
 
 
-def test_neighbours_are_the_nearest_by_origin_without_the_environment_itself() -> None:
+def test_neighbors_are_the_nearest_by_origin_without_the_environment_itself() -> None:
     origins = np.array([[0, 0, 0], [5, 0, 0], [1, 0, 0], [-2, 0, 0]], dtype=float)
     assert nearest_envs(origins, 0, 2) == [2, 3]
     assert nearest_envs(origins, 0, 99) == [2, 3, 1]
     assert nearest_envs(origins[:1], 0, 2) == []
-    # Origins may all be the same, as they are without a terrain.
+    # All origins are equal without a terrain.
     assert nearest_envs(np.zeros((4, 3)), 1, 3) == [0, 2, 3]

@@ -1,4 +1,4 @@
-"""Debug drawing in MuJoCo scenes and in the browser."""
+"""Debug visualizers of MuJoCo scenes and of the browser."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_null_board_takes_every_call() -> None:
     assert {name for name in dir(DebugVisualizer) if name.startswith("add_")} <= set(dir(board))
 
 
-def test_native_items_have_their_own_colour_and_opacity() -> None:
+def test_native_items_have_their_own_color_and_opacity() -> None:
     board = native()
     draw_everything(board)
     assert board.scn.ngeom == 8
@@ -100,13 +100,13 @@ def test_browser_arrows_reach_from_start_to_end_whatever_their_direction(viser_s
         np.testing.assert_allclose(head.batched_scales[i][:2], 0.2)
 
 
-def test_a_full_native_scene_is_said_once_and_breaks_nothing(caplog) -> None:
+def test_a_full_native_scene_warns_once_and_breaks_nothing(caplog) -> None:
     board = native(maxgeom=2)
     with caplog.at_level(logging.WARNING):
         draw_everything(board)
         board.add_ghost_mesh(MODEL.qpos0, MODEL)
     assert board.scn.ngeom == 2
-    assert caplog.text.count("holds 2 geoms") == 1
+    assert caplog.text.count("2 geoms") == 1
 
 
 def test_native_ghosts_have_the_opacity_asked_for_and_stand_where_asked() -> None:

@@ -1,4 +1,4 @@
-"""What viewers copy from a simulation to the host."""
+"""Copies of model fields and state from a simulation to the host."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images without a window."""
+"""Offscreen rendering."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def differs(a: np.ndarray, b: np.ndarray) -> bool:
     return bool((np.abs(a - b).max(axis=-1) > 20).sum() > 10)
 
 
-def test_wrong_order_of_calls_is_refused_with_what_to_do(monkeypatch) -> None:
+def test_wrong_order_of_calls_raises_with_what_to_do(monkeypatch) -> None:
     renderer = make(FakeEnv(1))
     with pytest.raises(RuntimeError, match=r"call initialize\(\) first"):
         renderer.render()
@@ -53,7 +53,7 @@ def test_wrong_order_of_calls_is_refused_with_what_to_do(monkeypatch) -> None:
     ("fields", "message"),
     [({"max_extra_envs": -1}, "max_extra_envs.*-1"), ({"entity_name": "x"}, "entity_name 'x'")],
 )
-def test_bad_configurations_are_refused_before_any_drawing(fields, message) -> None:
+def test_bad_configurations_raise_before_any_drawing(fields, message) -> None:
     with pytest.raises(ValueError, match=message):
         make(FakeEnv(1), origin_type=OriginType.ASSET_ROOT, **fields)
 
@@ -80,7 +80,7 @@ def test_a_machine_that_cannot_render_gives_one_error_that_says_what_to_install(
 
 
 def test_a_mujoco_without_renderer_gives_that_error_too(monkeypatch) -> None:
-    # This is how MuJoCo looks after it was imported with a graphics library that failed.
+    # State of the mujoco module after importing a graphics library failed.
     monkeypatch.delattr(mujoco, "Renderer")
     with pytest.raises(RenderingUnavailableError):
         make(FakeEnv(1)).initialize()
@@ -129,25 +129,25 @@ def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab(
 
 
 @pytest.mark.usefixtures("gl")
-def test_an_image_larger_than_the_machine_can_draw_is_told_as_that() -> None:
+def test_an_image_larger_than_the_machine_can_render_is_reported() -> None:
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     model.vis.global_.offwidth = 100_000
     with pytest.raises(RenderingUnavailableError, match="100000 x 64 pixels") as caught:
         open_renderer(model, 64, 100_000)
-    assert "at most" in str(caught.value)
+    assert "limit is" in str(caught.value)
     assert "--video-width" in str(caught.value)
     assert "install" not in str(caught.value)
 
 
 @pytest.mark.usefixtures("gl")
 class TestPictures:
-    """What the images show."""
+    """Content of the images."""
 
     def test_an_image_has_the_size_asked_for_and_shows_the_robot(self) -> None:
         image = picture(FakeEnv(1), elevation=-15.0, distance=3.0)
         assert image.shape == (64, 96, 3)
         red = (image[..., 0] > 1.5 * image[..., 2]) & (image[..., 0] > 60)
-        assert red[16:48, 32:64].sum() > 30  # The cart, which the camera follows.
+        assert red[16:48, 32:64].sum() > 30  # The followed cart.
 
     def test_the_camera_follows_the_body(self) -> None:
         env = FakeEnv(1)
@@ -164,7 +164,7 @@ class TestPictures:
         with pytest.raises(ValueError, match=r"camera 'top'.*\['side'\]"):
             picture(env, camera="top")
 
-    def test_neighbours_are_drawn_with_their_own_state(self) -> None:
+    def test_neighbors_are_drawn_with_their_own_state(self) -> None:
         env = FakeEnv(2)
         env.sim.datas[1].qpos[0] = -1.0
         env.sim.forward()
@@ -175,7 +175,7 @@ class TestPictures:
         last = picture(env, env_idx=1, max_extra_envs=0)
         assert not differs(last, picture(env, env_idx=99, max_extra_envs=0))
 
-    def test_randomised_colours_are_drawn_although_expanded_after_construction(self) -> None:
+    def test_randomized_colors_are_drawn_although_expanded_after_construction(self) -> None:
         env = FakeEnv(1)
         plain = picture(env, distance=3.0)
         renderer = make(env, distance=3.0)

@@ -36,7 +36,7 @@ def model(assets: str = "") -> mujoco.MjModel:
 
 
 def painted(scene: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return the image that the camera sees, 60 x 60, before and after the sky is painted."""
+    """Return the camera's image, 60 x 60 pixels, before and after painting the sky."""
     data = mujoco.MjData(scene)
     mujoco.mj_forward(scene, data)
     try:
@@ -75,10 +75,10 @@ def test_what_is_seen_through_stays_before_the_sky() -> None:
     )
     before, pixels = painted(scene)
     red, green, blue = pixels[18, 30].astype(int)
-    # It is drawn over black.
+    # Before painting, the ghost is blended over black.
     assert before[18, 30, 1] > 30
     assert before[18, 30, ::2].max() < 5
-    # Greener than the sky beside it, which shines through.
+    # The ghost is greener than the sky beside it, and the sky shines through.
     assert green - blue > pixels[18, 2].astype(int)[1] - pixels[18, 2].astype(int)[2] + 20
     assert 0 < red < pixels[18, 2, 0]
 

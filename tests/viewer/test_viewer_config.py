@@ -1,4 +1,4 @@
-"""The viewer's configuration is part of every task config, so importing it must stay cheap."""
+"""Viewer configuration. All task configs contain one, so importing it must stay cheap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An environment small enough to test viewers with: plain MuJoCo, two swinging carts."""
+"""Small environment for viewer tests: plain MuJoCo, two carts with poles."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ XML = """
 
 
 class FakeSim:
-    """Steps one MjData an environment and offers what `Simulation` offers to viewers."""
+    """Simulation with one MjData per environment and the interface that viewers use."""
 
     def __init__(self, num_envs: int, xml: str = XML):
         self.mj_model = mujoco.MjModel.from_xml_string(xml)
@@ -80,7 +80,7 @@ class FakeSim:
 
 
 class FakeTerms:
-    """A reward, metrics or command manager."""
+    """Reward, metrics or command manager."""
 
     def __init__(self, values: dict[str, float]):
         self.values = values
@@ -106,7 +106,7 @@ class FakeTerms:
 
 
 class FakeSensor:
-    """A sensor that draws one sphere, or none."""
+    """Sensor that draws one sphere, or none."""
 
     def __init__(self, draws: bool = True):
         self.draws = draws
@@ -116,7 +116,7 @@ class FakeSensor:
 
 
 class FakeEnv:
-    """Two carts 3 m apart (in origin only); fails at steps listed in `fail_at`."""
+    """Carts with origins 3 m apart; raises at the steps in `fail_at`."""
 
     device = "cpu"
     step_dt = 0.02
@@ -191,5 +191,5 @@ class FakeEnv:
 
 
 def push(amount: float = 0.3):
-    """A policy that pushes every cart alike."""
+    """Return a policy with the same action for every cart."""
     return lambda obs: torch.full((len(obs), 1), amount)

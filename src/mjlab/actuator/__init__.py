@@ -1,4 +1,4 @@
-"""Actuators: what turns commands for joints, tendons and sites into controls of the simulation."""
+"""Actuators: convert joint, tendon and site targets into `ctrl`."""
 
 from mjlab.actuator.actuator import Actuator as Actuator
 from mjlab.actuator.actuator import ActuatorCfg as ActuatorCfg

@@ -1,11 +1,11 @@
-"""What all actuators share: config, command, delay, and the life of an actuator.
+"""Base classes of actuators: config, command, delay, life cycle.
 
-An `Actuator` object stands for one `ActuatorCfg` of an entity, and so for all joints, tendons or
-sites (its *targets*) that the config's patterns match. It adds MuJoCo actuators (*elements*) to the
-spec, and in every physics substep turns the entity's commands into their controls.
+An `Actuator` implements one `ActuatorCfg` of an entity for all joints, tendons or sites (its
+*targets*) matched by the config's patterns. It adds MuJoCo actuators (*elements*) to the spec, and
+at every physics substep converts the entity's commands to their controls.
 
-An environment step runs `decimation` physics substeps. If no actuator and no sensor acts between
-them, the engine runs all of them in one dispatch, which makes CPU runs several times as fast.
+An environment step runs `decimation` physics substeps. If no actuator or sensor acts between
+substeps, the engine runs all of them in one dispatch. This makes CPU runs several times faster.
 `constant_within_step` marks methods that allow this.
 """
 
@@ -42,52 +42,50 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class ActuatorCfg(ABC):
-    """What every actuator config has. Delays count physics substeps.
+    """Base actuator configuration. Delays are in physics substeps.
 
-    Raises `ValueError`, when it is made and again when the actuator is built, for figures that make
-    no sense.
+    Raises `ValueError` for invalid values, at construction and when the actuator is built.
     """
 
     target_names_expr: tuple[str, ...]
-    """Regular expressions for the names of the targets; each must match a whole name."""
+    """Regular expressions for target names; each must match a whole name."""
     transmission_type: TransmissionType = TransmissionType.JOINT
-    """Whether the targets are joints, tendons or sites."""
+    """Type of the targets: joints, tendons or sites."""
     armature: float | None = None
-    """Reflected rotor inertia written to the targets (kg m^2, or kg); None keeps theirs."""
+    """Reflected rotor inertia of the targets (kg m^2 or kg). None: unchanged."""
     frictionloss: float | None = None
-    """Dry friction written to the targets (N m, or N); None keeps theirs."""
+    """Dry friction of the targets (N m or N). None: unchanged."""
     viscous_damping: float | None = None
-    """Passive linear damping written to the targets (N m s/rad, or N s/m); None keeps theirs."""
+    """Passive linear damping of the targets (N m s/rad or N s/m). None: unchanged."""
     delay_min_lag: int = 0
-    """Smallest delay of a command, in physics substeps."""
+    """Minimum command delay, in physics substeps."""
     delay_max_lag: int = 0
-    """Largest delay of a command, in physics substeps; 0 for none."""
+    """Maximum command delay, in physics substeps. 0: no delay."""
     delay_hold_prob: float = 0.0
-    """Probability to keep the old lag when a new one would be drawn."""
+    """Probability of keeping the current lag when a lag is due for resampling."""
     delay_update_period: int = 0
-    """Substeps between draws of the lag; 0 draws at every substep."""
+    """Substeps between lag samples. 0: resample at every substep."""
     delay_per_env_phase: bool = True
-    """Whether environments draw their lags at different substeps of the period."""
+    """Resample lags of different environments at different substeps of the period."""
 
-    # Kinds that read a position or velocity cannot act on a site, which has none.
+    # False for actuators that read a position or velocity: sites have neither.
     _accepts_site: ClassVar[bool] = True
-    # Fields that must be above 0 where they are not None.
+    # Fields that must be > 0 unless None.
     _positive: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if isinstance(self.target_names_expr, str):
             raise ValueError(
-                f"{type(self).__name__}.target_names_expr is the string "
-                f"{self.target_names_expr!r}; give a tuple of patterns, "
-                f"({self.target_names_expr!r},)."
+                f"{type(self).__name__}.target_names_expr: expected a tuple of patterns, got the "
+                f"string {self.target_names_expr!r}; use ({self.target_names_expr!r},)."
             )
         self.validate()
 
     def validate(self) -> None:
-        """Check the figures; see the class. Subclasses extend it."""
+        """Check the field values; see the class. Subclasses extend this method."""
         kinds = [kind.value for kind in TransmissionType]
         check_one_of(self._label("transmission_type"), self.transmission_type, kinds)
-        # Configs may also say "joint".
+        # Configs may use the string "joint".
         self.transmission_type = TransmissionType(self.transmission_type)
         on_site = self.transmission_type == TransmissionType.SITE
         if on_site and not self._accepts_site:
@@ -114,10 +112,10 @@ class ActuatorCfg(ABC):
 
     @abstractmethod
     def build(self, entity: Entity, target_ids: list[int], target_names: list[str]) -> Actuator:
-        """Return the actuator for these targets (indices and names within the entity)."""
+        """Build the actuator for these targets (ids and names within the entity)."""
 
     def _label(self, field: str) -> str:
-        """Return how errors name a field."""
+        """Return the label of a field in error messages."""
         return f"{type(self).__name__} for {self.target_names_expr}: {field}"
 
 
@@ -126,12 +124,12 @@ ActuatorCfgT = TypeVar("ActuatorCfgT", bound=ActuatorCfg)
 
 @stateful
 class Actuator(ABC, Generic[ActuatorCfgT]):
-    """Turns commands for its targets into controls of MuJoCo actuators.
+    """Converts commands for its targets to controls of MuJoCo actuators.
 
-    To write your own: in `edit_spec` add one element a target and append it to
-    `self._mjs_actuators`, and in `compute` return the controls, (N, number of controls). Keep what
-    changes at run time in tensor attributes, so that a resumed run finds it again. A `compute` that
-    remembers earlier calls also overrides `compute_after_reset`.
+    Custom actuators: in `edit_spec`, add one element per target and append it to
+    `self._mjs_actuators`; in `compute`, return the controls, (N, number of controls). Keep run-time
+    state in tensor attributes, so that checkpoints contain it. If `compute` keeps state between
+    calls, also override `compute_after_reset`.
     """
 
     _transient = {
@@ -146,8 +144,8 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         target_ids: list[int],
         target_names: list[str],
     ) -> None:
-        """Store what the actuator is for. `target_ids` and `target_names` are the entity's."""
-        # A config may have been changed since it was made.
+        """Store config, entity and targets. Target ids and names count within the entity."""
+        # The config may have changed since construction.
         cfg.validate()
         self.cfg = cfg
         self.entity = entity
@@ -162,30 +160,29 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         self._in_group = False
         self._resets_delay = True
 
-    # What it acts on.
+    # Targets and ids.
 
     @property
     def target_names(self) -> list[str]:
-        """Names of the targets within the entity."""
+        """Target names within the entity."""
         return self._target_names
 
     @property
     def transmission_type(self) -> TransmissionType:
-        """Whether the targets are joints, tendons or sites."""
+        """Type of the targets: joints, tendons or sites."""
         return self.cfg.transmission_type
 
     @property
     def target_ids(self) -> torch.Tensor:
-        """(n,) int64 indices of the targets within the entity. Set by `initialize`."""
+        """(n,) int64 target indices within the entity. Set by `initialize`."""
         return self._initialized(self._target_ids)
 
     @property
     def ctrl_ids(self) -> torch.Tensor:
-        """(number of elements,) int64 ids of the elements in the entity, as `find_actuators` counts.
+        """(number of elements,) int64 element ids within the entity, as in `find_actuators`.
 
-        `EntityData.write_ctrl` takes them, with the controls of each element in turn. `compute`
-        gives controls in the order of `global_ctrl_ids`; both orders agree for elements with one
-        control.
+        `EntityData.write_ctrl` takes these ids, with controls grouped by element. `compute` returns
+        controls in the order of `global_ctrl_ids`; both orders agree for elements with one control.
         """
         return self._initialized(self._ctrl_ids)
 
@@ -193,43 +190,44 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     def global_ctrl_ids(self) -> torch.Tensor:
         """(number of controls,) int64 columns of `ctrl` in the simulation.
 
-        Most elements have one control. Of those with several, come all first ones, then all second.
+        Most elements have one control. For elements with several: all first controls, then all second
+        controls, and so on.
         """
         return self._initialized(self._global_ctrl_ids)
 
     @property
     def global_element_ids(self) -> torch.Tensor:
-        """(number of elements,) int64 ids of the elements in the model: rows of `actuator_gainprm`."""
+        """(number of elements,) int64 element ids in the model: rows of `actuator_gainprm`."""
         return self._initialized(self._global_element_ids)
 
     @property
     def has_delay(self) -> bool:
-        """Whether commands are delayed."""
+        """True if commands are delayed."""
         return self.cfg.delay_max_lag > 0
 
     @property
     def needs_substep(self) -> bool:
-        """Whether it has to act at every physics substep, not just once per environment step."""
+        """True if the actuator must act at every physics substep, not once per environment step."""
         overrides_update = type(self).update is not Actuator.update
         return self.has_delay or overrides_update or not is_constant_within_step(type(self).compute)
 
-    # Building.
+    # Construction.
 
     @abstractmethod
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add the elements for `target_names`, names in `spec`, to it.
+        """Add the elements for `target_names` (names in `spec`) to `spec`.
 
-        Called once with all targets, or, where the entity sorts its actuators, once for each.
+        Called once with all targets, or once per target if the entity sorts its actuators.
         """
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Find ids in the compiled model and allocate for `data.nworld` environments.
+        """Resolve ids in the compiled model and allocate buffers for `data.nworld` environments.
 
         Args:
-            mj_model: The compiled model.
-            model: The simulation's model fields.
-            data: The simulation's data fields.
-            device: Where tensors live.
+            mj_model: Compiled model.
+            model: Model fields of the simulation.
+            data: Data fields of the simulation.
+            device: Torch device.
 
         Raises:
             RuntimeError: `edit_spec` added no elements.
@@ -237,11 +235,11 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         elements = self._ordered_elements()
         if not elements:
             raise WrongStateError(
-                f"{type(self).__name__} for {self._target_names} has no MuJoCo actuators: its "
-                "edit_spec must append what it adds to self._mjs_actuators, and run before the "
-                "model is compiled."
+                f"{type(self).__name__} for {self._target_names} has no MuJoCo actuators; edit_spec "
+                "must append the elements it adds to self._mjs_actuators, and run before the model "
+                "is compiled."
             )
-        # Actuators without a name can only be found by their place in the spec.
+        # Unnamed actuators can only be identified by their position in the spec.
         own = [actuator.id for actuator in self.entity.spec.actuators]
         element_ids = [actuator.id for actuator in elements]
         by_element = [control_columns(mj_model, (i,)) for i in element_ids]
@@ -260,7 +258,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
             self._delay_buffer = self.make_delay_buffer(data.nworld, device)
 
     def make_delay_buffer(self, num_envs: int, device: str) -> DelayBuffer:
-        """Return a new delay line with the config's settings."""
+        """Return a new delay buffer with the config's settings."""
         cfg = self.cfg
         return DelayBuffer(
             min_lag=cfg.delay_min_lag,
@@ -273,29 +271,30 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         )
 
     def join_group(self, delay_buffer: DelayBuffer | None, resets_delay: bool) -> None:
-        """Leave writing controls, and the delay, to a group of actuators.
+        """Delegate the delay and writing of controls to a group of actuators.
 
-        Exactly one of the actuators that share a line resets it.
+        Exactly one of the actuators that share a delay buffer resets it.
         """
         self._in_group = True
         self._resets_delay = resets_delay
         self._delay_buffer = delay_buffer
 
     def _ordered_elements(self) -> list[mujoco.MjsActuator]:
-        """Return the elements in the order of the columns that `compute` returns."""
+        """Return the elements in the column order of `compute`."""
         return self._mjs_actuators
 
-    # Acting.
+    # Control.
 
     def get_command(self, data: EntityData) -> ActuatorCmd:
-        """Return copies of the commands and the feedback of the targets, (N, n) each."""
+        """Return copies of commands and feedback of the targets, each (N, n)."""
         return read_command(data, self.transmission_type, self.target_ids)
 
     def apply_delay(self, cmd: ActuatorCmd) -> ActuatorCmd:
-        """Append the command to the delay line and return the delayed one; feedback stays.
+        """Append the command to the delay buffer and return the delayed command. Feedback is unchanged.
 
         Raises:
-            RuntimeError: a group runs this actuator's delay line, which a second call would spoil.
+            RuntimeError: a group advances this actuator's delay buffer; a second call would advance
+                it twice.
         """
         return self._delayed(cmd, None)
 
@@ -304,24 +303,25 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         """Return the controls of the elements, (N, number of controls)."""
 
     def compute_after_reset(self, cmd: ActuatorCmd, env_ids: torch.Tensor | slice) -> torch.Tensor:
-        """As `compute`, but only the rows `env_ids`, which were just reset, are of interest.
+        """Compute controls after a reset of `env_ids`. Only the rows `env_ids` of the result are used.
 
-        A `compute` that changes state must override this and change only the state of `env_ids`.
+        Actuators whose `compute` changes state must override this and change only the state of
+        `env_ids`.
         """
         return self.compute(cmd)
 
     @staticmethod
     def control_law(params: dict[str, torch.Tensor], cmd: ActuatorCmd) -> torch.Tensor:
-        """Return the controls as a function of parameters and command alone.
+        """Return the controls as a function of only parameters and command.
 
-        Only kinds that can be evaluated together have one; see `FusedActuatorGroup`.
+        Defined for actuators that can be evaluated together; see `FusedActuatorGroup`.
         """
-        raise UnsupportedError("This kind of actuator has only `compute`, no control law.")
+        raise UnsupportedError("control_law is not defined for this actuator; use compute.")
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
         """Compute the controls of this actuator and write them to the simulation.
 
-        With `env_ids`, which must just have been reset, nothing of any other environment changes.
+        With `env_ids` (environments just reset), other environments are unchanged.
         """
         if env_ids is None:
             ctrl = self.compute(self.apply_delay(self.get_command(data)))
@@ -330,18 +330,18 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         write_columns(data.data.ctrl, self.global_ctrl_ids, ctrl, env_ids)
 
     def update(self, dt: float) -> None:
-        """Called after every substep of `dt` seconds. Overriding it makes it run in each."""
+        """Hook called after every substep of `dt` seconds. An override sets `needs_substep`."""
 
     def reset(self, env_ids: EnvIds = None) -> None:
-        """Forget the past of these environments: the delay line starts anew with a new lag."""
+        """Reset the delay buffer of `env_ids` and resample their lags."""
         if self._delay_buffer is not None and self._resets_delay:
             self._delay_buffer.reset(env_ids)
 
     def set_lags(self, lags: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Set the lags, (k,) integers, of environments until the next draw.
+        """Set the lags of `env_ids`, (k,) integers, until the next resampling.
 
-        They are clamped to the configured range. Actuators of one delay line share the lag.
-        Without a configured delay the range is 0 to 0, so nothing changes.
+        Lags are clamped to the configured range. Actuators that share a delay buffer share the lag.
+        Without a configured delay the range is [0, 0], so the call has no effect.
         """
         if self._delay_buffer is not None:
             self._delay_buffer.set_lags(lags, env_ids)
@@ -351,9 +351,8 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
             return cmd
         if self._in_group:
             raise WrongStateError(
-                f"The delay of {type(self).__name__} for {self._target_names} is run by its group, "
-                "together with that of like actuators. Write controls through "
-                "Entity.write_data_to_sim()."
+                f"The delay of {type(self).__name__} for {self._target_names} is advanced by its "
+                "actuator group; write controls with Entity.write_data_to_sim()."
             )
         targets = (cmd.position_target, cmd.velocity_target, cmd.effort_target)
         return ActuatorCmd(*delay_rows(self._delay_buffer, targets, env_ids), cmd.pos, cmd.vel)
@@ -361,13 +360,13 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     def _initialized(self, value: torch.Tensor | None) -> torch.Tensor:
         if value is None:
             raise WrongStateError(
-                f"{type(self).__name__} for {self._target_names} is not initialized yet. Its ids "
-                "are known after Scene.initialize()."
+                f"{type(self).__name__} for {self._target_names} is not initialized; its ids are "
+                "available after Scene.initialize()."
             )
         return value
 
 
-# Work whose effect is the same at every substep of an environment step.
+# Functions with the same effect at every substep of an environment step.
 
 F = TypeVar("F", bound=Callable[..., Any])
 _MARK = "_constant_within_step"
@@ -383,33 +382,33 @@ def constant_within_step(function: F) -> F:
 
 
 def is_constant_within_step(function: Callable[..., Any]) -> bool:
-    """Return whether `function` (plain or bound) carries the mark of `constant_within_step`."""
+    """Return True if `function` (plain or bound) is marked by `constant_within_step`."""
     return bool(getattr(function, _MARK, False))
 
 
 class DirectActuator(Actuator[ActuatorCfgT]):
-    """An actuator whose controls are the commands in `command_fields`, one block of columns each.
+    """Actuator whose controls are the commands `command_fields`, one block of columns each.
 
-    Many of them are written to the simulation at once, by `BuiltinActuatorGroup`. A subclass
-    defines `command_fields`, and what it adds to the spec: `_add_element`, or all of `edit_spec`.
+    `BuiltinActuatorGroup` writes many direct actuators to the simulation at once. Subclasses define
+    `command_fields`, and `_add_element` or `edit_spec`.
     """
 
     shares_delay: ClassVar[bool] = False
-    """Whether actuators of this class with equal delay settings have one lag per environment."""
+    """Share one lag per environment among actuators of this class with equal delay settings."""
 
     @property
     def command_fields(self) -> tuple[CommandField, ...]:
-        """Which commands the elements read."""
+        """Commands that the elements read."""
         raise NotImplementedError(f"{type(self).__name__} must define command_fields.")
 
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add one element for each target, and write the config's properties to the target."""
+        """Add one element per target, and write the config's passive properties to the target."""
         for name in target_names:
             self._mjs_actuators.append(self._add_element(spec, name))
             self._override_target(spec, name)
 
     def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
-        """Add the element of one target to `spec` and return it."""
+        """Add an element for one target to `spec` and return it."""
         raise NotImplementedError(
             f"{type(self).__name__} must define _add_element(spec, target_name), or edit_spec."
         )
@@ -421,7 +420,7 @@ class DirectActuator(Actuator[ActuatorCfgT]):
         return commands[0] if len(commands) == 1 else torch.cat(commands, dim=1)
 
     def _override_target(self, spec: mujoco.MjSpec, target_name: str) -> None:
-        """Write the config's armature, friction loss and damping to a target in `spec`."""
+        """Write the config's armature, frictionloss and damping to a target in `spec`."""
         apply_target_overrides(
             spec,
             target_name,
@@ -437,21 +436,21 @@ class DirectActuator(Actuator[ActuatorCfgT]):
 
 @dataclass
 class ActuatorCmd:
-    """Commands and feedback of one actuator's targets, (N, number of targets) each."""
+    """Commands and feedback of an actuator's targets, each (N, number of targets)."""
 
     position_target: torch.Tensor
-    """Joint position (rad or m) or tendon length (m) to reach."""
+    """Desired joint position (rad or m) or tendon length (m)."""
     velocity_target: torch.Tensor
-    """Velocity to reach (rad/s or m/s)."""
+    """Desired velocity (rad/s or m/s)."""
     effort_target: torch.Tensor
-    """Force to add (N m or N), or another input, such as a voltage."""
+    """Feedforward force (N m or N), or another input such as a voltage."""
     pos: torch.Tensor
-    """Current position. It is never delayed."""
+    """Current position, never delayed."""
     vel: torch.Tensor
-    """Current velocity. It is never delayed."""
+    """Current velocity, never delayed."""
 
 
-# Fields of EntityData: three targets, position, velocity. None reads as zero.
+# Fields of EntityData: position, velocity and effort targets, position, velocity. None reads as zero.
 _FIELDS = {
     TransmissionType.JOINT: (
         "joint_pos_target", "joint_vel_target", "joint_effort_target", "joint_pos", "joint_vel",
@@ -466,12 +465,12 @@ _POSITIONS = {"position": 0, "velocity": 1, "effort": 2}
 
 
 def target_field(transmission: TransmissionType, command: CommandField) -> str | None:
-    """Return the field of EntityData that holds one kind of target."""
+    """Return the EntityData field of a kind of target, or None."""
     return _FIELDS[transmission][_POSITIONS[command]]
 
 
 def read_command(data: EntityData, transmission: TransmissionType, columns: Columns) -> ActuatorCmd:
-    """Return the command and feedback in some columns; views of live data if they are a slice."""
+    """Return command and feedback of `columns`; views of live data if `columns` is a slice."""
     names = _FIELDS[transmission]
     values = [
         None if name is None else read_columns(getattr(data, name), columns) for name in names
@@ -490,9 +489,9 @@ def delay_command(
     velocity_target: torch.Tensor,
     effort_target: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Append a command, (N, n) three times, to a delay line, and return the delayed command.
+    """Append three targets, each (N, n), to a delay buffer, and return the delayed targets.
 
-    One line for all three keeps them together: they are always of the same age.
+    One buffer for all three targets gives all of them the same lag.
     """
     position, velocity, effort = delay_rows(
         buffer, (position_target, velocity_target, effort_target), None
@@ -503,11 +502,10 @@ def delay_command(
 def delay_rows(
     buffer: DelayBuffer, values: tuple[torch.Tensor, ...], env_ids: EnvIds
 ) -> tuple[torch.Tensor, ...]:
-    """Return `values`, each (N, n_i), delayed together by one line.
+    """Return `values`, each (N, n_i), delayed together by one buffer.
 
-    With `env_ids` these environments have just been reset: their lines start anew, filled with
-    what they are given, and all other lines stay as they are. Only the rows `env_ids` of the
-    result mean something then.
+    With `env_ids` (environments just reset), the rows `env_ids` of the buffer are filled with `values`,
+    and other rows are unchanged. Only the rows `env_ids` of the result are valid then.
     """
     widths = [value.shape[1] for value in values]
     together = torch.cat(values, dim=1) if len(values) > 1 else values[0]
@@ -515,25 +513,25 @@ def delay_rows(
         buffer.append(together)
         return buffer.compute().split(widths, dim=1)
     if not buffer.is_initialized:
-        # A line takes its shape from what is appended first; then all environments are new to it.
+        # The first append allocates the buffer; the reset marks all rows as empty.
         buffer.append(torch.zeros_like(together))
         buffer.reset()
     buffer.backfill(together, env_ids)
     return buffer.peek().split(widths, dim=1)
 
 
-# Groups of actuators, written to the simulation together.
+# Actuator groups.
 
 _METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
 
 
 def acts_like(actuator: Actuator, base: type[Actuator]) -> bool:
-    """Return whether the actuator's class left alone what a group does in place of a `base`."""
+    """Return True if the actuator's class does not override the methods that groups bypass."""
     return all(getattr(type(actuator), name) is getattr(base, name) for name in _METHODS)
 
 
 def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
-    """Return what has to agree for actuators to share a delay line."""
+    """Return the settings that must agree for actuators to share a delay buffer."""
     cfg = actuator.cfg
     return (
         type(actuator),
@@ -547,7 +545,7 @@ def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
 
 
 def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> DelayBuffer:
-    """Make one delay line for actuators with equal settings, and have the first one reset it."""
+    """Create one delay buffer for actuators with equal settings. The first actuator resets it."""
     line = members[0].make_delay_buffer(num_envs, device)
     for k, actuator in enumerate(members):
         actuator.join_group(line, resets_delay=k == 0)

@@ -1,4 +1,4 @@
-"""Actuators that MuJoCo itself simulates: position and velocity servos, motors, PD, muscles, DC motors."""
+"""MuJoCo built-in actuators: position and velocity servos, motors, PD, muscles, DC motors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class BuiltinPositionActuatorCfg(ActuatorCfg):
     damping: float
     """Gain kd on the velocity (N m s/rad or N s/m)."""
     effort_limit: float | None = None
-    """Largest force E (N m or N); None for no limit."""
+    """Maximum force E (N m or N). None: no limit."""
 
     _accepts_site: ClassVar[bool] = False
     _positive: ClassVar[tuple[str, ...]] = ("effort_limit",)
@@ -51,7 +51,7 @@ class BuiltinPositionActuatorCfg(ActuatorCfg):
 
 
 class BuiltinPositionActuator(DirectActuator[BuiltinPositionActuatorCfg]):
-    """MuJoCo position servo: force = clamp(kp (u - l) - kd l', -E, E), u the position target."""
+    """MuJoCo position servo: force = clamp(kp (u - l) - kd l', -E, E), position target u."""
 
     shares_delay: ClassVar[bool] = True
 
@@ -78,7 +78,7 @@ class BuiltinVelocityActuatorCfg(ActuatorCfg):
     damping: float
     """Gain kd on the velocity error (N m s/rad or N s/m)."""
     effort_limit: float | None = None
-    """Largest force E (N m or N); None for no limit."""
+    """Maximum force E (N m or N). None: no limit."""
 
     _accepts_site: ClassVar[bool] = False
     _positive: ClassVar[tuple[str, ...]] = ("effort_limit",)
@@ -91,7 +91,7 @@ class BuiltinVelocityActuatorCfg(ActuatorCfg):
 
 
 class BuiltinVelocityActuator(DirectActuator[BuiltinVelocityActuatorCfg]):
-    """MuJoCo velocity servo: force = clamp(kd (u - l'), -E, E), u the velocity target."""
+    """MuJoCo velocity servo: force = clamp(kd (u - l'), -E, E), velocity target u."""
 
     shares_delay: ClassVar[bool] = True
 
@@ -115,9 +115,9 @@ class BuiltinMotorActuatorCfg(ActuatorCfg):
     """Motor, see `BuiltinMotorActuator`."""
 
     effort_limit: float
-    """Largest control E (N m or N, before the gear); may be infinite."""
+    """Maximum control E (N m or N, before the gear). May be infinite."""
     gear: float = 1.0
-    """Force on the target per unit of control, g."""
+    """Force on the target per unit of control g."""
 
     _positive: ClassVar[tuple[str, ...]] = ("effort_limit",)
 
@@ -129,9 +129,9 @@ class BuiltinMotorActuatorCfg(ActuatorCfg):
 
 
 class BuiltinMotorActuator(DirectActuator[BuiltinMotorActuatorCfg]):
-    """MuJoCo motor: force on the target = g clamp(u, -E, E), u the effort target.
+    """MuJoCo motor: force on the target = g clamp(u, -E, E), effort target u.
 
-    On a site it acts along the first axis of the gear, the site's x axis.
+    On a site, the force acts along the first axis of the gear, the site's x axis.
     """
 
     shares_delay: ClassVar[bool] = True
@@ -153,14 +153,14 @@ class BuiltinMotorActuator(DirectActuator[BuiltinMotorActuatorCfg]):
 
 @dataclass(kw_only=True)
 class BuiltinPdActuatorCfg(ActuatorCfg):
-    """PD control inside MuJoCo, see `BuiltinPdActuator`."""
+    """PD control by MuJoCo servos, see `BuiltinPdActuator`."""
 
     stiffness: float
     """Gain kp on the position error (N m/rad or N/m)."""
     damping: float
     """Gain kd on the velocity error (N m s/rad or N s/m)."""
     effort_limit: float | None = None
-    """Largest sum of forces of all actuators on a target (N m or N); None for no limit."""
+    """Maximum sum E of the forces of all actuators on a target (N m or N). None: no limit."""
 
     _accepts_site: ClassVar[bool] = False
     _positive: ClassVar[tuple[str, ...]] = ("effort_limit",)
@@ -173,14 +173,14 @@ class BuiltinPdActuatorCfg(ActuatorCfg):
 
 
 class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
-    """Two servos a target: force = clamp(kp (p* - l) + kd (v* - l'), -E, E).
+    """PD control with two servos per target: force = clamp(kp (p* - l) + kd (v* - l'), -E, E).
 
-    Controls, and `ctrl_ids`, are all position targets p*, then all velocity targets v*, in whatever
-    order the elements were added. E is a limit of the joint or tendon, so it holds for the sum of
-    all actuators there.
+    Controls and `ctrl_ids` are ordered as all position targets p*, then all velocity targets v*,
+    independent of the order of elements. E is a limit of the joint or tendon, so it applies to the
+    sum of all actuators on the target.
     """
 
-    # Kept in step with _mjs_actuators, which has them in the order of adding.
+    # Same elements as in _mjs_actuators, where the order is that of adding.
     _transient = {"_position_elements", "_velocity_elements"}
 
     def __init__(
@@ -197,7 +197,7 @@ class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
 
     @property
     def num_targets(self) -> int:
-        """Number of joints or tendons, half the number of controls."""
+        """Number of joints or tendons: half the number of controls."""
         return len(self._target_ids_list)
 
     @property
@@ -206,7 +206,7 @@ class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
         return ("position", "velocity")
 
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add `<target>_pd_pos` for each target, then `<target>_pd_vel` for each."""
+        """Add `<target>_pd_pos` for each target, then `<target>_pd_vel` for each target."""
         limit, on_joint = self.cfg.effort_limit, self.transmission_type == TransmissionType.JOINT
         for name in target_names:
             element = create_position_actuator(
@@ -241,20 +241,20 @@ class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
 
 @dataclass(kw_only=True)
 class BuiltinMuscleActuatorCfg(ActuatorCfg):
-    """MuJoCo muscle; the figures are those of MJCF's `<muscle>`, see `BuiltinMuscleActuator`."""
+    """MuJoCo muscle with the parameters of MJCF `<muscle>`, see `BuiltinMuscleActuator`."""
 
     length_range: tuple[float, float] = (0.0, 0.0)
-    """Shortest and longest length of the actuator (m or rad); (0, 0) lets MuJoCo find them."""
+    """Minimum and maximum actuator length (m or rad). (0, 0): computed by MuJoCo."""
     gear: float = 1.0
-    """Scale of the force, and of the length, on the target."""
+    """Scale of the force and the length on the target."""
     timeconst: tuple[float, float] = (0.01, 0.04)
     """Time constants of activation and deactivation (s)."""
     tausmooth: float = 0.0
-    """Width of the smooth change between the two time constants."""
+    """Width of the smooth transition between the two time constants."""
     range: tuple[float, float] = (0.75, 1.05)
-    """Operating range of lengths, in units of the optimal fibre length."""
+    """Operating range of lengths, in units of the optimal fiber length."""
     force: float = -1.0
-    """Peak force at rest (N); negative takes `scale` over the actuator's acceleration."""
+    """Peak force at rest (N). Negative: `scale` divided by the actuator's acceleration."""
     scale: float = 200.0
     """Numerator of the peak force if `force` is negative."""
     lmin: float = 0.5
@@ -262,11 +262,11 @@ class BuiltinMuscleActuatorCfg(ActuatorCfg):
     lmax: float = 1.6
     """Upper end of the force-length curve."""
     vmax: float = 1.5
-    """Shortening velocity at which the force is zero, in optimal lengths a second."""
+    """Shortening velocity at zero force, in optimal lengths per second."""
     fpmax: float = 1.3
     """Passive force at `lmax`, relative to the peak force."""
     fvmax: float = 1.2
-    """Active force at the fastest lengthening, relative to the peak force."""
+    """Active force at saturating lengthening velocity, relative to the peak force."""
 
     _accepts_site: ClassVar[bool] = False
 
@@ -278,7 +278,7 @@ class BuiltinMuscleActuatorCfg(ActuatorCfg):
 
 
 class BuiltinMuscleActuator(DirectActuator[BuiltinMuscleActuatorCfg]):
-    """MuJoCo muscle. The effort target is its excitation, from 0 to 1."""
+    """MuJoCo muscle. The effort target is its excitation, in [0, 1]."""
 
     shares_delay: ClassVar[bool] = True
 
@@ -309,7 +309,7 @@ class BuiltinMuscleActuator(DirectActuator[BuiltinMuscleActuatorCfg]):
 
 
 class DcMotorInputMode(IntEnum):
-    """What the control of a DC motor is."""
+    """Command of a DC motor."""
 
     VOLTAGE = 0
     POSITION = 1
@@ -318,19 +318,19 @@ class DcMotorInputMode(IntEnum):
 
 @dataclass
 class DcMotorDatasheetParams:
-    """A DC motor by the figures of its data sheet."""
+    """Datasheet parameters of a DC motor."""
 
     nominal_voltage: float
-    """Voltage at which the other figures hold (V)."""
+    """Voltage of the other parameters (V)."""
     stall_torque: float
-    """Torque at standstill (N m)."""
+    """Stall torque (N m)."""
     no_load_speed: float
-    """Speed without load (rad/s)."""
+    """No-load speed (rad/s)."""
 
 
 @dataclass
 class DcMotorPhysicalParams:
-    """A DC motor by its physical constants."""
+    """Physical constants of a DC motor."""
 
     kt: float
     """Torque constant (N m/A)."""
@@ -345,35 +345,35 @@ class BuiltinDcMotorActuatorCfg(ActuatorCfg):
     """MuJoCo DC motor, see `BuiltinDcMotorActuator`."""
 
     motor_params: DcMotorDatasheetParams | DcMotorPhysicalParams
-    """The motor itself."""
+    """Motor parameters."""
     mode: DcMotorInputMode = DcMotorInputMode.POSITION
-    """Command that the motor follows: a voltage, or a position or velocity by a controller."""
+    """Command type: voltage, or position or velocity tracked by a controller."""
     stiffness: float = 0.0
     """Gain kp of the controller (V/rad; V s/rad in mode VELOCITY)."""
     damping: float = 0.0
-    """Gain kd of the controller (V s/rad). Mode POSITION only; without effect in mode VELOCITY."""
+    """Gain kd of the controller (V s/rad). Mode POSITION only; no effect in mode VELOCITY."""
     voltage_limit: float = 0.0
-    """Largest voltage at the terminals (V); 0 in mode VOLTAGE for no limit."""
+    """Maximum terminal voltage (V). 0 in mode VOLTAGE: no limit."""
     integral_gain: float = 0.0
     """Gain ki of the controller (V/(rad s)). Mode POSITION only."""
     integral_limit: float = 0.0
-    """Largest time integral of the position error (rad s); 0 for no limit."""
+    """Maximum time integral of the position error (rad s). 0: no limit."""
     slew_rate: float = 0.0
-    """Largest change of the command per second, from 0 after a reset; 0 for no limit."""
+    """Maximum change of the command per second, starting at 0 after a reset. 0: no limit."""
     effort_limit: float | None = None
-    """Largest electromagnetic torque (N m); cogging and friction act after it."""
+    """Maximum electromagnetic torque (N m), before cogging and friction."""
     gear: float = 1.0
     """Gear ratio from motor to target."""
     inductance: float = 0.0
-    """Winding inductance (H); 0 neglects it."""
+    """Winding inductance (H). 0: neglected."""
     electrical_time_constant: float = 0.0
-    """Inductance over resistance (s), in place of the inductance."""
+    """Inductance divided by resistance (s), instead of the inductance."""
     thermal: tuple[float, float, float, float, float, float] | None = None
-    """MuJoCo's six thermal figures; None neglects heating."""
+    """MuJoCo's six thermal parameters. None: no heating."""
     cogging: tuple[float, float, float] | None = None
-    """MuJoCo's three figures of cogging torque; None for none."""
+    """MuJoCo's three cogging torque parameters. None: no cogging."""
     lugre: tuple[float, float, float, float, float] | None = None
-    """MuJoCo's five figures of LuGre friction; None for none."""
+    """MuJoCo's five LuGre friction parameters. None: no LuGre friction."""
 
     _accepts_site: ClassVar[bool] = False
     _positive: ClassVar[tuple[str, ...]] = ("effort_limit",)
@@ -398,7 +398,7 @@ class BuiltinDcMotorActuatorCfg(ActuatorCfg):
         for name in unused[mode]:
             if getattr(self, name) != 0.0:
                 raise ValueError(
-                    f"{self._label(name)}: mode {mode.name} does not use it; expected 0, got "
+                    f"{self._label(name)}: expected 0 in mode {mode.name}, got "
                     f"{getattr(self, name)}; use mode POSITION."
                 )
 
@@ -410,28 +410,28 @@ class BuiltinDcMotorActuatorCfg(ActuatorCfg):
 
 
 class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
-    """MuJoCo DC motor, driven by the position or velocity target, or by the effort target in volts.
+    """MuJoCo DC motor, driven by a position target, a velocity target, or an effort target (V).
 
-    Torque = K (V - K w) / R at speed w, with constant K, resistance R and terminal voltage V, before
-    cogging and friction. For a target u the controller applies, up to the limit,
+    Torque = K (V - K w) / R at speed w, with motor constant K, resistance R and terminal voltage V,
+    before cogging and friction. For a target u the controller applies, up to the voltage limit,
 
         V = kp (u - l) + ki x - kd w    in mode POSITION, with x the time integral of u - l,
         V = kp (u - w)                  in mode VELOCITY,
         V = u                           in mode VOLTAGE.
 
-    Without a load, mode VELOCITY settles at u kp / (kp + K).
+    Without load, mode VELOCITY settles at u kp / (kp + K).
 
-    From a data sheet with voltage V, stall torque T and no-load speed w MuJoCo takes both constants
-    as K = V / w and the resistance as R = K V / T.
+    From datasheet voltage V, stall torque T and no-load speed w, MuJoCo computes K = V / w (both
+    constants) and R = K V / T.
 
-    MuJoCo's own controller turns gains (p, i, d) in torque space and controls c into
+    MuJoCo's controller computes, from gains (p, i, d) in torque space and controls c,
 
         V = R/K (p (c_pos - l) + i x + d (c_vel - w)) + K w.
 
     Mode POSITION is p = kp K/R, i = ki K/R, d = (kd + K) K/R with control u. With d = (s + K) K/R
     and control g u / (s + K), the velocity input alone gives V = g u - s w: this is mode VELOCITY
-    with s = g = kp, and a voltage limited in size or slew with s = 0, g = 1. MuJoCo limits neither
-    on its plain voltage input, which serves the rest.
+    with s = g = kp, and mode VOLTAGE with a voltage limit or slew rate with s = 0, g = 1. MuJoCo's
+    voltage input has no limits; it is used for mode VOLTAGE without limits.
     """
 
     _transient = {"_model"}
@@ -454,16 +454,16 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
 
     @property
     def command_fields(self) -> tuple[CommandField, ...]:
-        """What the mode reads; a voltage is given as effort target."""
+        """Command of the mode; a voltage is an effort target."""
         return (_COMMAND_OF_MODE[DcMotorInputMode(self.cfg.mode)],)
 
     @constant_within_step
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
-        """Return the controls: the command in the units of MuJoCo's input, (N, n)."""
+        """Return the controls, (N, n): the command in the units of MuJoCo's input."""
         command = super().compute(cmd)
         if self._input() != _INPUT_VELOCITY:
             return command
-        # Read at each call, because the gain may be randomized.
+        # Read at each call, because gains may be randomized.
         gainprm = self._model.actuator_gainprm[:, self.global_element_ids]
         resistance, constant, damping = gainprm[..., 0], gainprm[..., 1], gainprm[..., 6]
         total = damping * resistance / constant  # s + K
@@ -471,7 +471,7 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
         return command * (gain / total)
 
     def _input(self) -> int:
-        """Return which input of MuJoCo's motor carries the command."""
+        """Return the MuJoCo motor input that receives the command."""
         if self.cfg.mode == DcMotorInputMode.POSITION:
             return _INPUT_POSITION
         limited = self.cfg.voltage_limit > 0.0 or self.cfg.slew_rate > 0.0
@@ -489,7 +489,7 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
         return element
 
     def _controller(self, constant: float, resistance: float) -> tuple[float, ...]:
-        """Return MuJoCo's kp, ki, kd, slew rate, integral limit and voltage limit."""
+        """Return MuJoCo's (kp, ki, kd, slew rate, integral limit, voltage limit)."""
         cfg, torque_per_volt = self.cfg, constant / resistance
         kp = ki = kd = 0.0
         slew_rate = cfg.slew_rate
@@ -524,7 +524,7 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
             )
         except ValueError as error:
             raise ValueError(
-                f"BuiltinDcMotorActuatorCfg for {cfg.target_names_expr}: MuJoCo refuses the motor "
+                f"BuiltinDcMotorActuatorCfg for {cfg.target_names_expr}: MuJoCo rejects motor_params "
                 f"{motor}: {error}."
             ) from error
 

@@ -1,4 +1,4 @@
-"""Writing the controls of all actuators that only pass commands through, as few as possible."""
+"""Batched control writes of actuators that pass commands through."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 BuiltinActuatorType = (
     BuiltinMotorActuator | BuiltinMuscleActuator | BuiltinPositionActuator | BuiltinVelocityActuator
 )
-"""Actuators whose control is one target."""
+"""Actuators with one target as control."""
 
 
 @dataclass
 class BuiltinActuatorGroup:
-    """All actuators of an entity whose control is a command, passed through.
+    """Actuators of an entity whose controls are commands, passed through unchanged.
 
-    Those without delay make one copy for each target field they read. Those with a delay that may
-    share one (`DirectActuator.shares_delay`) have one delay line, and one lag in each environment,
-    for all with the same class, transmission and delay settings; others have one each.
+    Actuators without delay are written with one copy per target field. Delayed actuators with
+    `DirectActuator.shares_delay` share one delay buffer, hence one lag per environment, among
+    actuators with the same class, transmission and delay settings; others have separate buffers.
 
-    An actuator whose class has a `compute` of its own is left to it.
+    Actuators whose class overrides `compute` are not grouped.
     """
 
     _actuators: list[DirectActuator] = field(default_factory=list)
@@ -52,13 +52,13 @@ class BuiltinActuatorGroup:
     def process(
         actuators: Sequence[Actuator],
     ) -> tuple[BuiltinActuatorGroup, tuple[Actuator, ...]]:
-        """Return a group of the actuators that need nothing computed, and all others in order."""
+        """Return a group of the actuators without computation, and all other actuators in order."""
         members = [actuator for actuator in actuators if _passes_commands(actuator)]
         others = tuple(actuator for actuator in actuators if not _passes_commands(actuator))
         return BuiltinActuatorGroup(_actuators=members), others
 
     def initialize(self, num_envs: int, device: str) -> None:
-        """Plan the copies and make the delay lines. The actuators must be initialized already."""
+        """Plan the copies and create delay buffers. The actuators must be initialized."""
         direct = [actuator for actuator in self._actuators if not actuator.has_delay]
         for actuator in direct:
             actuator.join_group(None, resets_delay=False)
@@ -74,9 +74,9 @@ class BuiltinActuatorGroup:
         ]
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
-        """Write the controls of all actuators of the group.
+        """Write the controls of all actuators in the group.
 
-        With `env_ids`, which must just have been reset, nothing of any other environment changes.
+        With `env_ids` (environments just reset), other environments are unchanged.
         """
         if not self._actuators:
             return
@@ -96,7 +96,7 @@ class BuiltinActuatorGroup:
 
 @dataclass
 class _Route:
-    """Targets that go to controls: columns `source` of a target field to columns `ctrl`."""
+    """Copy of columns `source` of a target field to columns `ctrl` of the controls."""
 
     field: str
     source: Columns
@@ -105,14 +105,14 @@ class _Route:
 
 @dataclass
 class _DelayedRoutes:
-    """Routes whose commands are delayed together."""
+    """Routes that share a delay buffer."""
 
     routes: list[_Route]
     line: DelayBuffer
 
 
 def _passes_commands(actuator: Actuator) -> TypeGuard[DirectActuator]:
-    # A site has no position or velocity target; where one is asked for, `compute` gives zeros.
+    # Sites have no position or velocity targets; `compute` returns zeros for these.
     return (
         isinstance(actuator, DirectActuator)
         and acts_like(actuator, DirectActuator)
@@ -121,7 +121,7 @@ def _passes_commands(actuator: Actuator) -> TypeGuard[DirectActuator]:
 
 
 def _plan(actuators: Sequence[DirectActuator], device: str) -> list[_Route]:
-    """Merge what the actuators read into one route for each target field."""
+    """Merge the commands of the actuators into one route per target field."""
     pairs: dict[str, list[tuple[int, int]]] = {}
     for actuator in actuators:
         sources = actuator.target_ids.tolist()
@@ -132,7 +132,7 @@ def _plan(actuators: Sequence[DirectActuator], device: str) -> list[_Route]:
             pairs.setdefault(name, []).extend(zip(ctrl_ids, sources, strict=True))
     routes = []
     for name, both in pairs.items():
-        # In the order of controls, these are usually neighbours, and often the targets too.
+        # In control order, columns of controls are usually contiguous, and often those of targets too.
         both.sort()
         ctrl_ids, sources = [ctrl for ctrl, _ in both], [source for _, source in both]
         routes.append(_Route(name, as_columns(sources, device), as_columns(ctrl_ids, device)))

@@ -1,4 +1,4 @@
-"""PD control through a motor whose torque falls with speed."""
+"""PD control with the torque-speed curve of a DC motor."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class DcMotorActuatorCfg(IdealPdActuatorCfg):
     """PD control with a torque-speed curve, see `DcMotorActuator`."""
 
     saturation_effort: float
-    """Torque at standstill S (N m or N)."""
+    """Stall torque S (N m or N)."""
     velocity_limit: float
-    """Speed without load w (rad/s or m/s)."""
+    """No-load speed w (rad/s or m/s)."""
 
     _positive: ClassVar[tuple[str, ...]] = (
         "effort_limit", "saturation_effort", "velocity_limit",
@@ -42,9 +42,9 @@ DcMotorCfgT = TypeVar("DcMotorCfgT", bound=DcMotorActuatorCfg)
 
 
 class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
-    """The force of `IdealPdActuator`, clamped by `dc_motor_clip` instead of by the limit alone.
+    """Force of `IdealPdActuator`, clamped by `dc_motor_clip` instead of by the effort limit only.
 
-    `saturation_effort` and `velocity_limit` are tensors (N, n) too.
+    `saturation_effort` and `velocity_limit` are also tensors, (N, n).
     """
 
     param_names: ClassVar[tuple[str, ...]] = (
@@ -57,12 +57,12 @@ class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
     def __init__(
         self, cfg: DcMotorCfgT, entity: Entity, target_ids: list[int], target_names: list[str]
     ) -> None:
-        """See `Actuator`. Warns about an effort limit that leaves the curve without effect."""
+        """See `Actuator`. Warns if the effort limit exceeds the stall torque."""
         super().__init__(cfg, entity, target_ids, target_names)
         if math.isinf(cfg.effort_limit) or cfg.effort_limit > cfg.saturation_effort:
             warnings.warn(
                 f"{type(cfg).__name__} for {cfg.target_names_expr}: effort_limit="
-                f"{cfg.effort_limit} is above saturation_effort={cfg.saturation_effort}, so only "
+                f"{cfg.effort_limit} exceeds saturation_effort={cfg.saturation_effort}, so only "
                 "the torque-speed curve limits the force. Set effort_limit to the motor's peak "
                 "continuous effort.",
                 UserWarning,
@@ -70,7 +70,7 @@ class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
             )
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """See `IdealPdActuator`; also makes the figures of the curve for every environment."""
+        """See `IdealPdActuator`; also allocates the per-environment parameters of the curve."""
         super().initialize(mj_model, model, data, device)
         self.saturation_effort = torch.full_like(self.stiffness, self.cfg.saturation_effort)
         self.velocity_limit = torch.full_like(self.stiffness, self.cfg.velocity_limit)
@@ -94,11 +94,11 @@ def dc_motor_clip(
     force_limit: torch.Tensor,
     vel: torch.Tensor,
 ) -> torch.Tensor:
-    """Return `effort` clamped to what a motor gives at speed `vel`; all (N, n).
+    """Return `effort` clamped to the torque-speed curve at speed `vel`; all tensors are (N, n).
 
     With S = saturation_effort, w = velocity_limit, F = force_limit and v = vel, the bounds are
-    S (1 - v / w) above and S (-1 - v / w) below, both brought into [-F, F]. Faster than w the upper
-    bound is negative: the motor brakes.
+    S (1 - v / w) above and S (-1 - v / w) below, both clamped to [-F, F]. For v > w the upper bound
+    is negative: the motor brakes.
     """
     speed = vel / velocity_limit
     upper = torch.clamp(saturation_effort * (1.0 - speed), -force_limit, force_limit)

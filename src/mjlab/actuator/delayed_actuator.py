@@ -1,4 +1,4 @@
-"""The module where releases 1.1 and 1.2 had delayed actuators; today any actuator can be."""
+"""Legacy path of delayed actuators (releases 1.1 and 1.2). Any actuator config takes a delay."""
 
 from mjlab.compat import older_names
 

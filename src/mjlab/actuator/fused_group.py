@@ -1,4 +1,4 @@
-"""Evaluating PD-like actuators of a kind together instead of one by one."""
+"""Fused evaluation of PD-like actuators."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class FusedActuatorGroup:
-    """Actuators with the law of `IdealPdActuator`, or a subclass's own `control_law`.
+    """Actuators with the control law of `IdealPdActuator`, or a `control_law` override.
 
-    Those of one class, transmission and delay settings are evaluated at once, and share one delay
-    line, hence one lag in each environment. Their parameters become parts of one tensor: change
-    them in place (assigning to them does that too). An actuator whose class has a `compute` of its
-    own is left to it.
+    Actuators with the same class, transmission and delay settings are evaluated at once, and share
+    one delay buffer, hence one lag per environment. Their parameters become parts of one tensor:
+    change them in place (assignment copies in place too). Actuators whose class overrides `compute`
+    are not fused.
     """
 
     _groups: list[_FusedGroup] = field(default_factory=list)
@@ -42,7 +42,7 @@ class FusedActuatorGroup:
     def process(
         actuators: Sequence[Actuator],
     ) -> tuple[FusedActuatorGroup, tuple[Actuator, ...]]:
-        """Return the groups of the actuators that can be fused, and all others in order."""
+        """Return groups of the actuators that can be fused, and all other actuators in order."""
         groups: dict[Any, _FusedGroup] = {}
         others = []
         for actuator in actuators:
@@ -58,14 +58,14 @@ class FusedActuatorGroup:
         return FusedActuatorGroup(list(groups.values())), tuple(others)
 
     def initialize(self, num_envs: int, device: str) -> None:
-        """Join the parameters and make the delay lines. The actuators must be initialized."""
+        """Concatenate parameters and create delay buffers. The actuators must be initialized."""
         for group in self._groups:
             group.initialize(num_envs, device)
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
-        """Compute and write the controls of all actuators of the groups.
+        """Compute and write the controls of all actuators in the groups.
 
-        With `env_ids`, which must just have been reset, nothing of any other environment changes.
+        With `env_ids` (environments just reset), other environments are unchanged.
         """
         for group in self._groups:
             group.apply_controls(data, env_ids)
@@ -73,7 +73,7 @@ class FusedActuatorGroup:
 
 @dataclass
 class _FusedGroup:
-    """Actuators of one class, transmission and delay, with their columns side by side."""
+    """Actuators with the same class, transmission and delay, with concatenated columns."""
 
     actuators: list[IdealPdActuator]
     source: Columns = field(default_factory=lambda: slice(0))
@@ -82,7 +82,7 @@ class _FusedGroup:
     line: DelayBuffer | None = None
 
     def initialize(self, num_envs: int, device: str) -> None:
-        # In the order of controls, so that they are neighbours wherever possible.
+        # In control order, so that columns are contiguous if possible.
         self.actuators.sort(key=lambda actuator: int(actuator.global_ctrl_ids.min()))
         sources = torch.cat([actuator.target_ids for actuator in self.actuators])
         ctrl_ids = torch.cat([actuator.global_ctrl_ids for actuator in self.actuators])
@@ -113,12 +113,12 @@ class _FusedGroup:
 
 
 def _parameter(actuator: IdealPdActuator, name: str) -> torch.Tensor:
-    """Return a parameter; raise `ValueError` unless it is a tensor (N, n)."""
+    """Return a parameter; raise `ValueError` unless it is a tensor, (N, n)."""
     value, shape = getattr(actuator, name, None), actuator.stiffness.shape
     if not isinstance(value, torch.Tensor) or value.shape != shape:
         found = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
         raise ValueError(
-            f"{type(actuator).__name__} for {actuator.target_names}: param_names lists {name!r}, "
-            f"which must be a tensor of shape {tuple(shape)} after initialize, but is {found}."
+            f"{type(actuator).__name__} for {actuator.target_names}: expected parameter {name!r} (of "
+            f"param_names) to be a tensor of shape {tuple(shape)} after initialize, got {found}."
         )
     return value

@@ -1,4 +1,4 @@
-"""Actuators whose force a neural network predicts."""
+"""Neural network actuators."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LearnedMlpActuatorCfg(DcMotorActuatorCfg):
     """Network actuator, see `LearnedMlpActuator`."""
 
     stiffness: float = 0.0
-    """Not used: the network stands for the controller too."""
+    """Not used: the network includes the controller."""
     damping: float = 0.0
     """Not used."""
     network_file: str
@@ -38,9 +38,9 @@ class LearnedMlpActuatorCfg(DcMotorActuatorCfg):
     torque_scale: float
     """Factor on the network's output, giving a force (N m or N)."""
     input_order: Literal["pos_vel", "vel_pos"] = "pos_vel"
-    """Which block of inputs comes first."""
+    """Order of the input blocks."""
     history_length: int = 3
-    """Number H of substeps, the current one included, that the network sees."""
+    """Number H of substeps in the network input, including the current one."""
 
     def validate(self) -> None:
         """See `ActuatorCfg`."""
@@ -58,10 +58,10 @@ class LearnedMlpActuatorCfg(DcMotorActuatorCfg):
 class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
     """Force = dc_motor_clip(torque_scale * network(inputs)).
 
-    With e = p* - l the inputs of a joint are [pos_scale (e_t, .., e_{t-H+1}), vel_scale (l'_t, ..,
-    l'_{t-H+1})], newest first, with blocks swapped for `input_order="vel_pos"`. The network sees
-    every joint of every environment as one row, (N n, 2 H), and returns (N n, 1). The first values
-    after a reset fill the whole history. Velocity and effort targets are not used.
+    With e = p* - l, the inputs of a joint are [pos_scale (e_t, .., e_{t-H+1}), vel_scale (l'_t, ..,
+    l'_{t-H+1})], newest first, with blocks swapped for `input_order="vel_pos"`. The network input has
+    one row per joint and environment, (N n, 2 H); its output is (N n, 1). The first values after a
+    reset fill the whole history. Velocity and effort targets are not used.
     """
 
     _transient = {"_network"}
@@ -73,55 +73,56 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
         target_ids: list[int],
         target_names: list[str],
     ) -> None:
-        """See `Actuator`. Raises `FileNotFoundError` if the network's file does not exist."""
+        """See `Actuator`. Raises `FileNotFoundError` if the network file does not exist."""
         super().__init__(cfg, entity, target_ids, target_names)
         if not Path(cfg.network_file).is_file():
             raise FileNotFoundError(
-                f"{type(cfg).__name__} for {cfg.target_names_expr}: there is no network file "
-                f"{cfg.network_file!r}. Save one with torch.jit.script(network).save(path)."
+                f"{type(cfg).__name__} for {cfg.target_names_expr}: network_file "
+                f"{cfg.network_file!r} not found; save one with "
+                "torch.jit.script(network).save(path)."
             )
         self._network: Any = None
         self._history: CircularBuffer | None = None
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """See `DcMotorActuator`; also loads the network and tries it.
+        """See `DcMotorActuator`; also loads the network and checks its shapes.
 
         Raises:
-            ValueError: the file is no TorchScript, or the network does not take (N n, 2 H) inputs
-                and return (N n, 1).
+            ValueError: the file is not TorchScript, or the network does not map (N n, 2 H) to
+                (N n, 1).
         """
         super().initialize(mj_model, model, data, device)
         try:
             with warnings.catch_warnings():
-                # Torch would rather have other formats, but TorchScript is what these files are.
+                # Torch deprecates TorchScript, but existing network files use it.
                 warnings.simplefilter("ignore", DeprecationWarning)
                 self._network = torch.jit.load(self.cfg.network_file, map_location=device).eval()
         except RuntimeError as error:
             raise ValueError(
-                f"{self.cfg.network_file!r} is no TorchScript file that can be loaded. Save the "
-                f"network with torch.jit.script(network).save(path). ({error})"
+                f"network_file: expected a TorchScript file, got {self.cfg.network_file!r}; save "
+                f"the network with torch.jit.script(network).save(path). ({error})"
             ) from error
         self._check_network()
         num_envs, num_targets = self.stiffness.shape
         self._history = CircularBuffer(self.cfg.history_length, num_envs, device)
-        # The first frame makes the buffer's memory; after the reset no environment has a history.
+        # The first append allocates the buffer; the reset marks all histories as empty.
         self._history.append(
             torch.zeros(num_envs, 2, num_targets, dtype=torch.float32, device=device)
         )
         self._history.reset()
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
-        """Add the command and feedback to the histories and return the forces, (N, n)."""
+        """Append command and feedback to the histories and return the forces, (N, n)."""
         self._buffer.append(self._frame(cmd))
         return self._force(cmd)
 
     def compute_after_reset(self, cmd: ActuatorCmd, env_ids: torch.Tensor | slice) -> torch.Tensor:
-        """As `compute`, but start the histories of `env_ids` and leave all others alone."""
+        """See `Actuator`. Fills the histories of `env_ids`; other histories are unchanged."""
         self._buffer.backfill(self._frame(cmd), env_ids)
         return self._force(cmd)
 
     def reset(self, env_ids: EnvIds = None) -> None:
-        """Forget the delay line and the histories of these environments."""
+        """Reset delay buffers and histories of `env_ids`."""
         super().reset(env_ids)
         self._buffer.reset(env_ids)
 
@@ -144,7 +145,7 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
         return torch.stack(blocks, dim=1)
 
     def _force(self, cmd: ActuatorCmd) -> torch.Tensor:
-        # (N, H, 2, n), oldest first, to one row a joint, newest first.
+        # (N, H, 2, n), oldest first, to one row per joint, newest first.
         frames = self._buffer.buffer.flip(1).permute(0, 3, 2, 1)
         inputs = frames.reshape(-1, 2 * self.cfg.history_length)
         with torch.no_grad():
@@ -155,19 +156,19 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
         )
 
     def _check_network(self) -> None:
-        """Raise `ValueError` if the network does not take (N n, 2 H) inputs and return (N n, 1)."""
+        """Raise `ValueError` unless the network maps (N n, 2 H) to (N n, 1)."""
         num_rows, num_inputs = self.stiffness.numel(), 2 * self.cfg.history_length
         inputs = torch.zeros(
             num_rows, num_inputs, dtype=torch.float32, device=self.stiffness.device
         )
         message = (
-            f"The network {self.cfg.network_file!r} must take ({num_rows}, {num_inputs}) inputs (2 x "
-            f"history_length={self.cfg.history_length}, a row a joint) and return ({num_rows}, 1), but"
+            f"Network {self.cfg.network_file!r}: expected inputs ({num_rows}, {num_inputs}) (one row "
+            f"per joint, 2 x history_length={self.cfg.history_length}) and outputs ({num_rows}, 1), got"
         )
         try:
             with torch.no_grad():
                 output = self._network(inputs)
         except RuntimeError as error:
-            raise ValueError(f"{message} fails: {error}") from error
+            raise ValueError(f"{message} an error: {error}") from error
         if output.shape != (num_rows, 1):
-            raise ValueError(f"{message} returns {tuple(output.shape)}.")
+            raise ValueError(f"{message} outputs {tuple(output.shape)}.")

@@ -1,4 +1,4 @@
-"""PD control computed in torch, with gains and limits of their own for every environment."""
+"""PD control in torch, with per-environment gains and limits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class IdealPdActuatorCfg(ActuatorCfg):
     damping: float
     """Gain kd on the velocity error (N m s/rad or N s/m)."""
     effort_limit: float = float("inf")
-    """Largest force E (N m or N)."""
+    """Maximum force E (N m or N)."""
 
     _positive: ClassVar[tuple[str, ...]] = ("effort_limit",)
 
@@ -41,14 +41,15 @@ IdealPdCfgT = TypeVar("IdealPdCfgT", bound=IdealPdActuatorCfg)
 
 
 class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
-    """Force = clamp(kp (p* - l) + kd (v* - l') + f*, -E, E), one force motor a target.
+    """Force = clamp(kp (p* - l) + kd (v* - l') + f*, -E, E), applied by one motor per target.
 
-    Gains and limit are the tensors `stiffness`, `damping` and `force_limit`, (N, n), which may be
-    changed in place; `default_stiffness` and so on keep the configured values.
+    Gains and limit are the tensors `stiffness`, `damping` and `force_limit`, (N, n). They may be
+    changed in place; `default_stiffness`, `default_damping` and `default_force_limit` keep the
+    configured values.
 
-    A subclass that only has another force law overrides `control_law`, adds the names of its
-    parameters, tensors (N, n), to `param_names`, and makes them in `initialize`. Like actuators are
-    then computed together.
+    Subclasses with a different force law override `control_law`, add the names of their parameters
+    to `param_names`, and create them in `initialize` as tensors, (N, n). Actuators of such a class
+    are then evaluated together.
     """
 
     _transient = {"default_stiffness", "default_damping", "default_force_limit", "_model", "_fused"}
@@ -72,23 +73,23 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         self._fused = False
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # Actuators computed together hold their parameters in one tensor. An assignment that put
-        # another tensor in place of this actuator's part would silently have no effect.
+        # Fused actuators hold their parameters in one tensor. Replacing this actuator's part by
+        # another tensor would silently have no effect.
         if name in self.param_names and self.__dict__.get("_fused"):
             self.__dict__[name].copy_(value)
         else:
             super().__setattr__(name, value)
 
     def share_parameters(self, parts: dict[str, torch.Tensor]) -> None:
-        """Take parts of larger tensors, which hold the same values, as parameters from now on."""
+        """Replace the parameters by views of larger tensors with the same values."""
         self.__dict__.update(parts)
         self._fused = True
 
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Add one motor for each target.
+        """Add one motor per target.
 
-        Its force and control ranges tell the configured limit but are not enforced: the limit in
-        force is `force_limit`, which may be raised, in each environment by itself.
+        Force and control ranges hold the configured limit but are not enforced: `force_limit`
+        applies instead, and may be raised per environment.
         """
         cfg = self.cfg
         for name in target_names:
@@ -106,7 +107,7 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             self._mjs_actuators.append(element)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """See `Actuator`; also makes gains and limits for every environment."""
+        """See `Actuator`; also allocates per-environment gains and limits."""
         super().initialize(mj_model, model, data, device)
         self._model, self._fused = model, False
         shape = (data.nworld, len(self._target_ids_list))
@@ -120,12 +121,12 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
                 setattr(self, attribute, full)
 
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
-        """Return the forces, (N, n), by the class's control law."""
+        """Return the forces of the control law, (N, n)."""
         return self.control_law({name: getattr(self, name) for name in self.param_names}, cmd)
 
     @staticmethod
     def control_law(params: dict[str, torch.Tensor], cmd: ActuatorCmd) -> torch.Tensor:
-        """Return the PD force clamped to the limit, (N, n)."""
+        """Return the PD force, clamped to the limit, (N, n)."""
         limit = params["force_limit"]
         return torch.clamp(pd_torque(params["stiffness"], params["damping"], cmd), -limit, limit)
 
@@ -135,29 +136,29 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         kp: torch.Tensor | None = None,
         kd: torch.Tensor | None = None,
     ) -> None:
-        """Set stiffness and damping of environments; None leaves one alone.
+        """Set stiffness and damping of environments. None: unchanged.
 
         Args:
             env_ids: k environments; None for all.
-            kp: (k,), the same for all targets, or (k, n).
-            kd: Likewise.
+            kp: Stiffness, (k,) for all targets alike, or (k, n).
+            kd: Damping, (k,) for all targets alike, or (k, n).
 
         Raises:
-            ValueError: a tensor of another shape.
+            ValueError: a tensor has a wrong shape.
         """
-        for parameter, value, what in ((self.stiffness, kp, "kp"), (self.damping, kd, "kd")):
+        for parameter, value, name in ((self.stiffness, kp, "kp"), (self.damping, kd, "kd")):
             if value is not None:
                 rows = as_ids(env_ids, len(parameter), parameter.device)
-                parameter[rows] = _per_target(value, (len(rows), parameter.shape[1]), what)
+                parameter[rows] = _per_target(value, (len(rows), parameter.shape[1]), name)
 
     def set_effort_limit(self, env_ids: EnvIds, effort_limit: torch.Tensor) -> None:
-        """Set the force limit of environments, (k,) or (k, n); it may exceed the configured one.
+        """Set the force limit of environments, (k,) or (k, n). May exceed the configured limit.
 
-        Where the model's `actuator_forcerange` and `actuator_ctrlrange` are kept per environment
-        (`Simulation.expand_model_fields`), these, which only inform, follow.
+        If `actuator_forcerange` and `actuator_ctrlrange` are per-environment fields
+        (`Simulation.expand_model_fields`), they are updated for information; they are not enforced.
 
         Raises:
-            ValueError: a tensor of another shape.
+            ValueError: a tensor has a wrong shape.
         """
         rows = as_ids(env_ids, len(self.force_limit), self.force_limit.device)
         shape = (len(rows), self.force_limit.shape[1])
@@ -168,7 +169,7 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
             ("actuator_ctrlrange", self.global_ctrl_ids),
         ):
             values = getattr(self._model, field)
-            # One row that stands for all environments cannot hold a limit of one of them.
+            # A shared row cannot hold the limit of a single environment.
             if not isinstance(values, SharedField):
                 ranges = torch.stack((-limit, limit), dim=-1).to(values.dtype)
                 values[rows[:, None], columns] = ranges
@@ -183,14 +184,14 @@ def pd_torque(stiffness: torch.Tensor, damping: torch.Tensor, cmd: ActuatorCmd) 
     )
 
 
-def _per_target(value: torch.Tensor, shape: tuple[int, int], what: str) -> torch.Tensor:
-    """Return `value` as a tensor of this shape (number of environments, targets)."""
+def _per_target(value: torch.Tensor, shape: tuple[int, int], name: str) -> torch.Tensor:
+    """Broadcast `value` to `shape` (number of environments, number of targets)."""
     value = torch.as_tensor(value, dtype=torch.float32)
     if value.shape == shape or value.ndim == 0:
         return value.expand(shape)
     if value.shape == shape[:1]:
         return value.unsqueeze(-1).expand(shape)
     raise ValueError(
-        f"{what} has shape {tuple(value.shape)}; for {shape[0]} environments and {shape[1]} "
-        f"targets it must be ({shape[0]},) or {shape}."
+        f"{name}: expected shape ({shape[0]},) or {shape} for {shape[0]} environments and "
+        f"{shape[1]} targets, got {tuple(value.shape)}."
     )

@@ -1,4 +1,4 @@
-"""Actuators that the XML of an entity already has."""
+"""Actuators defined in the XML of an entity."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class XmlActuatorCfg(ActuatorCfg):
-    """Take over actuators of the XML, see `XmlActuator`."""
+    """XML actuator configuration, see `XmlActuator`."""
 
     command_field: CommandField | None = None
-    """Target that the control reads: position, velocity or effort. None: detected from each
-    actuator; actuators with several controls need None."""
+    """Target that the control reads: position, velocity or effort. None: detect from each
+    actuator; required for actuators with several controls."""
 
     def validate(self) -> None:
         """See `ActuatorCfg`."""
@@ -38,11 +38,11 @@ class XmlActuatorCfg(ActuatorCfg):
 
 
 class XmlActuator(DirectActuator[XmlActuatorCfg]):
-    """The first actuator of the XML on each target, passed the commands that its kind reads.
+    """First XML actuator on each target, driven by the commands that its kind reads.
 
     `<pid>` and `<dcmotor>` may read several: position, velocity, and an effort or voltage. Targets
-    without an actuator are left out. Armature, friction loss and damping of the config are
-    written to the others, as for every kind.
+    without an actuator are skipped. The config's armature, frictionloss and damping are written to
+    the remaining targets.
     """
 
     _transient = {"_command_fields"}
@@ -61,28 +61,28 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
 
     @property
     def command_field(self) -> CommandField:
-        """The first of `command_fields`, and the only one of most kinds."""
+        """First of `command_fields`; for most kinds, the only one."""
         return self.command_fields[0]
 
     @property
     def command_fields(self) -> tuple[CommandField, ...]:
-        """Commands that every element reads: "position", "velocity", "effort".
+        """Commands that each element reads: "position", "velocity", "effort".
 
-        Raises `RuntimeError` before `edit_spec`, unless the config states it.
+        Raises `RuntimeError` before `edit_spec`, unless the config sets `command_field`.
         """
         if not self._command_fields:
             raise WrongStateError(
-                f"The kind of the XML actuators on {self._target_names} is not known yet; it is "
-                "detected when the entity is built."
+                f"XmlActuator for {self._target_names}: command_fields are not available before the "
+                "entity is built."
             )
         return self._command_fields
 
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
-        """Find the elements for `target_names`; all targets have to be given at once.
+        """Find the elements for `target_names`. Must be called once, with all targets.
 
         Raises:
             ValueError: no target has an actuator, the actuators are of several kinds, or
-                `command_field` contradicts what they are.
+                `command_field` contradicts the detected kind.
         """
         found: dict[str, mujoco.MjsActuator] = {}
         for element in spec.actuators:
@@ -96,18 +96,18 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
                 for element in spec.actuators
             ]
             raise ValueError(
-                f"XmlActuatorCfg for {self.cfg.target_names_expr} matches the "
-                f"{self.transmission_type.value}s {target_names}, but the XML has no actuator on any "
-                f"of them. It has: {existing or 'no actuators'}. Add one to the XML, or use a config "
-                "that makes actuators, such as BuiltinPositionActuatorCfg."
+                f"XmlActuatorCfg for {self.cfg.target_names_expr}: expected XML actuators on the "
+                f"{self.transmission_type.value}s {target_names}, got none. Available: "
+                f"{existing or 'no actuators'}. Add an actuator to the XML, or use a config that "
+                "adds actuators, such as BuiltinPositionActuatorCfg."
             )
         self._mjs_actuators = [found[target_names[k]] for k in kept]
         self._command_fields = self._agreed_fields()
         unknown = [field for field in self._command_fields if field != "effort"]
         if self.transmission_type == TransmissionType.SITE and unknown:
             warnings.warn(
-                f"The XML actuators on the sites {target_names} read a {' and a '.join(unknown)}, "
-                "but sites have effort targets only, so their control stays 0.",
+                f"The XML actuators on the sites {target_names} read {' and '.join(unknown)}, "
+                "but sites have only effort targets, so their control stays 0.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -117,7 +117,7 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
             self._override_target(spec, target_names[k])
 
     def _agreed_fields(self) -> tuple[CommandField, ...]:
-        """Return the commands that all elements read; raise if they or `command_field` disagree."""
+        """Return the commands that all elements read; raise if elements or `command_field` disagree."""
         stated = self.cfg.command_field
         detected: dict[tuple[CommandField, ...], list[str]] = defaultdict(list)
         for element in self._mjs_actuators:
@@ -125,13 +125,13 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
         breakdown = "; ".join(f"{', '.join(fields)}: {names}" for fields, names in detected.items())
         if len(detected) > 1:
             raise ValueError(
-                f"XmlActuatorCfg for {self.cfg.target_names_expr} matches actuators of several "
-                f"kinds ({breakdown}). Use one config for each kind."
+                f"XmlActuatorCfg for {self.cfg.target_names_expr}: expected actuators of one kind, "
+                f"got {breakdown}; use one config per kind."
             )
         if stated is not None and (stated,) not in detected:
             raise ValueError(
-                f"XmlActuatorCfg for {self.cfg.target_names_expr} has command_field={stated!r}, "
-                f"but the XML has {breakdown}. Leave command_field out to follow the XML."
+                f"XmlActuatorCfg for {self.cfg.target_names_expr}: command_field={stated!r} "
+                f"contradicts the XML ({breakdown}); omit command_field to follow the XML."
             )
         return next(iter(detected))
 
@@ -139,7 +139,7 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
         """Return the commands that one element reads."""
         inputs = control_inputs(element)
         if inputs == (None,):
-            # Detection does not know every kind; what the config states is trusted then.
+            # Not every kind can be detected; `command_field` overrides detection.
             return (self.cfg.command_field or detect_command_field(element),)
         known = tuple(field for field in inputs if field is not None)
         if not inputs or len(set(known)) < len(inputs):
@@ -147,7 +147,7 @@ class XmlActuator(DirectActuator[XmlActuatorCfg]):
             raise ValueError(
                 f"XmlActuatorCfg for {self.cfg.target_names_expr}: expected at most one position, "
                 f"velocity and effort input, got {kinds} on {element.name or element.target!r}; "
-                "use other patterns, and write its controls by Entity.write_ctrl_to_sim."
+                "use other patterns, and write its controls with Entity.write_ctrl_to_sim."
             )
         return known
 

@@ -1,1 +1,1 @@
-"""Robots that come with the library, ready to be put into a scene."""
+"""Robot assets: configs ready to use in a scene."""

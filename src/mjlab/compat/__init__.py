@@ -1,14 +1,13 @@
-"""Names and defaults of earlier 1.x releases, accepted here and nowhere else.
+"""Backward compatibility with releases 1.1 to 1.6: legacy names, fields, defaults and signatures.
 
-Task packages in the field were written against any release from 1.1 to 1.6. What a later release
-renamed, dropped or made stricter still works: a module that once offered more names ends with
-`__getattr__ = older_names(__name__)`, and a config class that once took more fields, or demanded
-fewer, carries `@accepts_older_fields`.
+Names that later releases renamed, removed or made stricter still work for task packages written
+against releases 1.1 to 1.6. Modules with legacy names end with `__getattr__ = older_names(__name__)`;
+config classes with legacy fields or defaults have the decorator `@accepts_older_fields`.
 
-Deprecation policy: each use warns once, naming today's spelling, and all of it stays through 1.x
-and is removed in 2.0.
+Deprecation policy: each use warns once and names the replacement. Legacy names stay through 1.x and
+are removed in 2.0.
 
-Nothing is imported before an older name is asked for. Names without a successor are in
+Implementations are imported on first access. Legacy names without a replacement are in
 `mjlab.compat.older`.
 """
 
@@ -25,7 +24,7 @@ from typing import Any, TypeVar, cast
 C = TypeVar("C", bound=type)
 T = TypeVar("T")
 
-# Where an older name lives today, as "module:name".
+# Replacement of each legacy name, as "module:name".
 _EVENTS = {
     "EntityIndexing": "mjlab.entity:EntityIndexing",
     "FieldSpec": "mjlab.compat.older:FieldSpec",
@@ -73,7 +72,7 @@ _VISER = {
 }
 _VISER["rotation_quat_from_vectors"] = "mjlab.compat.older:rotation_quat_from_vectors"
 
-# Names that modules of 1.6 imported for their own use, and packages import from there.
+# Names that 1.6 modules imported for internal use, and packages import from these modules.
 _MATH = "mjlab.utils.lab_api.math"
 _HOMES = {
     "BuiltinSensor": "mjlab.sensor",
@@ -195,7 +194,7 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.viewer.viser.conversions": _VISER,
 }
 
-# Static methods that a class once had, with the function that does it today.
+# Legacy static methods by class, with their replacement.
 _STATIC_METHODS: dict[str, dict[str, str]] = {
     "MjlabViserScene": {"create": "mjlab.viewer.viser.scene:MjlabViserScene"},
 }
@@ -206,7 +205,7 @@ for _module, _passed in _PASSED_THROUGH.items():
         **_NAMES.get(_module, {}),
     }
 
-# Attributes that instances of a class once had, and the function of one that computes them.
+# Legacy attributes by class, with the function that computes their value.
 _ATTRIBUTES: dict[str, dict[str, str]] = {
     "ContactSensor": {"_slots": "contact_slots"},
     "DifferentialIKAction": {"_joint_ids": "ik_joint_ids"},
@@ -216,9 +215,8 @@ _ATTRIBUTES: dict[str, dict[str, str]] = {
     "TerminationManager": {"_truncated_buf": "truncated_buf"},
 }
 
-# Fields that a class once had, with what becomes of a value given for them, in this order. A
-# translation gets the value and the keyword arguments, which it may change; None means that the
-# value has no effect.
+# Legacy fields by class, with replacement and translation, applied in this order. A translation
+# receives the value and the keyword arguments, and may modify these. None: the value has no effect.
 _Translation = Callable[[Any, dict[str, Any]], None]
 _REQUIRED_BEFORE_1_6 = {"contype": 1, "conaffinity": 1, "condim": 3, "priority": 0}
 
@@ -227,7 +225,7 @@ _GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": 
 
 
 def _set_std(value: Any, fields: dict[str, Any], key: str) -> None:
-    # Models were deterministic unless they said `stochastic`, and then ignored their noise.
+    # Models without `stochastic` were deterministic and ignored their noise settings.
     if fields.get("distribution_cfg"):
         fields["distribution_cfg"] = {**fields["distribution_cfg"], key: value}
 
@@ -260,20 +258,20 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
         ),
     },
     "MujocoCfg": {
-        # Today's MuJoCo has it on, and a flag that switches it off.
+        # MuJoCo now enables multiccd by default, with a flag to disable it.
         "multiccd": (
-            "disableflags=('multiccd',) to switch it off",
+            "disableflags=('multiccd',) to disable multiccd",
             lambda value, fields: fields.update(
                 disableflags=(*fields.get("disableflags", ()), *(() if value else ("multiccd",)))
             ),
         )
     },
 }
-# MuJoCo features that earlier releases had to enable and today's has on.
+# MuJoCo features that are now enabled by default; earlier releases enabled them explicitly.
 ALWAYS_ENABLED_FLAGS = frozenset({"multiccd"})
 _LOOSE_DEFAULTS: dict[str, dict[str, Any]] = {"CollisionCfg": _REQUIRED_BEFORE_1_6}
-# Methods that subclasses override and that once took fewer arguments: the argument that an older
-# override lacks, and the function that calls it with today's arguments, as "module:function".
+# Overridable methods with an added argument: the argument that legacy overrides lack, and the adapter
+# that calls them with current arguments, as "module:function".
 _OLDER_METHODS: dict[str, dict[str, tuple[str, str]]] = {
     "CommandTerm": {
         "_update_command": ("env_ids", "mjlab.compat.older_terms:update_command"),
@@ -281,8 +279,8 @@ _OLDER_METHODS: dict[str, dict[str, tuple[str, str]]] = {
         "create_gui": ("request_action", "mjlab.compat.older_terms:create_gui"),
     },
 }
-# Terms that read sites of `asset_cfg` before they read a sensor: the parameter that names the
-# sensor today, and the term for calls without it, as "module:name".
+# Terms that read sites of `asset_cfg` in earlier releases and now read a sensor: the parameter for
+# the sensor, and the term for calls without it, as "module:name".
 _OLDER_PARAMS: dict[str, tuple[str, str]] = {
     "foot_height": ("sensor_name", "mjlab.compat.older_terms:foot_height"),
     "feet_clearance": ("height_sensor_name", "mjlab.compat.older_terms:feet_clearance"),
@@ -295,23 +293,21 @@ _OLDER = "mjlab.compat.older"
 
 @functools.cache
 def _warn_once(message: str) -> None:
-    # A FutureWarning, because Python hides deprecations from those who run a package.
+    # FutureWarning, because Python hides DeprecationWarning outside `__main__`.
     warnings.warn(message, FutureWarning, stacklevel=3)
 
 
 def older_names(module_name: str) -> Callable[[str], Any]:
-    """Return a module `__getattr__` that resolves names which earlier releases offered there."""
+    """Return a module `__getattr__` that resolves the module's legacy names."""
     table = _NAMES.get(module_name, {})
 
     def __getattr__(name: str) -> Any:
         if name not in table:
             raise AttributeError(f"module {module_name!r} has no attribute {name!r}")
         value = _load(table[name])
-        message = (
-            f"{module_name}.{name} is an older name; today it is {table[name].replace(':', '.')}."
-        )
+        message = f"{module_name}.{name} is deprecated; use {table[name].replace(':', '.')}."
         if table[name].startswith(f"{_OLDER}:"):
-            message = f"{module_name}.{name} is an older name, and is removed in mjlab 2.0."
+            message = f"{module_name}.{name} is deprecated and will be removed in mjlab 2.0."
         if inspect.isfunction(value):
             return _warning_when_called(value, module_name, name, message)
         _warn_once(message)
@@ -321,16 +317,16 @@ def older_names(module_name: str) -> Callable[[str], Any]:
 
 
 def older_exports(module_name: str) -> list[str]:
-    """Return the older names of a module that `from <module> import *` has to bring along.
+    """Return the legacy names of a module for `__all__`.
 
-    Task packages build their own `mdp` module that way, so these belong in `__all__`. Only
-    functions: they warn when they are called, so that the import itself stays quiet.
+    Task packages build their `mdp` module with `from <module> import *`, so `__all__` must contain
+    legacy names. Only functions, because they warn when called, not when imported.
     """
     return [name for name in _NAMES[module_name] if name[0].islower()]
 
 
 def offers_older_static_methods(cls: C) -> C:
-    """Class decorator: offer the static methods that were dropped from a class."""
+    """Class decorator: add legacy static methods."""
     for name, path in _STATIC_METHODS[cls.__name__].items():
         setattr(cls, name, staticmethod(_calling(f"{cls.__name__}.{name}", path)))
     return cls
@@ -338,7 +334,7 @@ def offers_older_static_methods(cls: C) -> C:
 
 def _calling(older_name: str, path: str) -> Callable[..., Any]:
     def older(*args: Any, **kwargs: Any) -> Any:
-        _warn_once(f"{older_name} is an older name; today it is {path.replace(':', '.')}.")
+        _warn_once(f"{older_name} is deprecated; use {path.replace(':', '.')}.")
         return _load(path)(*args, **kwargs)
 
     return older
@@ -348,9 +344,9 @@ def _calling(older_name: str, path: str) -> Callable[..., Any]:
 def _warning_when_called(
     function: Callable[..., Any], module_name: str, name: str, message: str
 ) -> Callable[..., Any]:
-    """Return a function that is the same object at each access, and is pickled by its older name."""
+    """Wrap a function so that it warns when called. Cached, and pickled by its legacy name."""
 
-    # `wraps` also carries over what the function declares: the model fields it randomizes.
+    # `wraps` also copies the function's attributes, such as the model fields it randomizes.
     @functools.wraps(function)
     def older(*args: Any, **kwargs: Any) -> Any:
         _warn_once(message)
@@ -361,11 +357,11 @@ def _warning_when_called(
 
 
 class _OlderAttribute:
-    """Attribute of an instance, computed by a function of `mjlab.compat.older`."""
+    """Legacy instance attribute, computed by a function of `mjlab.compat.older`."""
 
     def __init__(self, class_name: str, name: str, function: str) -> None:
         self._path = f"{_OLDER}:{function}"
-        self._message = f"{class_name}.{name} is an older attribute, and is removed in mjlab 2.0."
+        self._message = f"{class_name}.{name} is deprecated and will be removed in mjlab 2.0."
 
     def __get__(self, instance: Any, owner: type) -> Any:
         if instance is None:
@@ -375,14 +371,14 @@ class _OlderAttribute:
 
 
 def offers_older_attributes(cls: C) -> C:
-    """Class decorator: answer attributes that earlier releases had."""
+    """Class decorator: add legacy attributes."""
     for name, function in _ATTRIBUTES[cls.__name__].items():
         setattr(cls, name, _OlderAttribute(cls.__name__, name, function))
     return cls
 
 
 def accepts_older_fields(config_class: C) -> C:
-    """Class decorator for configs: take fields that were dropped, and defaults that were lost."""
+    """Class decorator for configs: accept legacy fields and defaults."""
     cls: Any = config_class
     dropped = _DROPPED_FIELDS.get(cls.__name__, {})
     defaults = _LOOSE_DEFAULTS.get(cls.__name__, {})
@@ -391,12 +387,12 @@ def accepts_older_fields(config_class: C) -> C:
 
     def assume(name: str) -> Any:
         value = defaults[name]
-        _warn_once(f"{cls.__name__}.{name} is required today; {value!r} is assumed.")
+        _warn_once(f"{cls.__name__}.{name} is required; using {value!r} as in releases before 1.6.")
         return value
 
     for field in dataclasses.fields(cls):
         if field.name in defaults:
-            # For `__init__` that `@dataclass` generates in subclasses. That of `cls` exists already.
+            # For `__init__` generated by `@dataclass` in subclasses; that of `cls` already exists.
             field.default_factory = functools.partial(assume, field.name)
 
     @functools.wraps(plain_init)
@@ -404,7 +400,7 @@ def accepts_older_fields(config_class: C) -> C:
         for name in [name for name in dropped if name in kwargs]:
             today, translate = dropped[name]
             value = kwargs.pop(name)
-            _warn_once(f"{cls.__name__}.{name} is an older field; today use {today}.")
+            _warn_once(f"{cls.__name__}.{name} is deprecated; use {today}.")
             if translate is not None:
                 translate(value, kwargs)
         for name in defaults:
@@ -417,11 +413,11 @@ def accepts_older_fields(config_class: C) -> C:
 
 
 def older_defaults(config_class: type, missing: dict[str, list[str]]) -> dict[str, Any]:
-    """Return the values of fields that a dict by pattern leaves open, and warn once if any is.
+    """Return default values of fields for unmatched elements; warn once if there are unmatched elements.
 
     Args:
-        config_class: The config.
-        missing: By field, the elements that none of its patterns matches.
+        config_class: Config class.
+        missing: Elements without a matching pattern, by field.
     """
     defaults = _LOOSE_DEFAULTS[config_class.__name__]
     gaps = [
@@ -431,17 +427,17 @@ def older_defaults(config_class: type, missing: dict[str, list[str]]) -> dict[st
     ]
     if gaps:
         _warn_once(
-            f"{config_class.__name__}: no pattern matches some elements, so {', '.join(gaps)}. "
-            "Today patterns cover all; add a last pattern '.*'."
+            f"{config_class.__name__}: no pattern matches some elements, so {', '.join(gaps)}; "
+            "add a last pattern '.*'."
         )
     return defaults
 
 
 def accept_older_methods(base: type, subclass: type) -> None:
-    """Make methods of `subclass` callable as those of `base` are today.
+    """Adapt legacy overrides in `subclass` to the current signatures of `base`.
 
-    `base` calls it from `__init_subclass__`. An override in the spelling of an earlier release is
-    replaced by a method that takes today's arguments and calls it.
+    Called by `base.__init_subclass__`. Overrides with a legacy signature are replaced by methods that
+    take the current arguments and call them.
     """
     for name, (argument, caller) in _OLDER_METHODS[base.__name__].items():
         method = getattr(subclass, name)
@@ -451,7 +447,7 @@ def accept_older_methods(base: type, subclass: type) -> None:
 
 
 def _takes(method: Callable[..., Any], argument: str, position: int) -> bool:
-    """Return whether a method takes an argument at its position, by name or as a required one."""
+    """Return True if a method takes `argument` at `position`, by name or as a required argument."""
     parameters = inspect.signature(method).parameters.values()
     if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
         return True
@@ -461,22 +457,22 @@ def _takes(method: Callable[..., Any], argument: str, position: int) -> bool:
 
 
 def _called_as_today(method: Any, argument: str, caller: str) -> Callable[..., Any]:
-    message = f"{method.__qualname__} takes no {argument}, as in an earlier release; today it does."
+    message = f"{method.__qualname__} without argument {argument} is deprecated; add {argument}."
 
     @functools.wraps(method)
     def older(*args: Any, **kwargs: Any) -> Any:
         _warn_once(message)
         return _load(caller)(method, *args, **kwargs)
 
-    # Signatures are read from what is wrapped, and a subclass must see that this takes everything.
+    # `inspect.signature` follows `__wrapped__`, but subclasses must see the adapter's signature.
     del older.__wrapped__
     return older
 
 
 def accepts_older_params(term: T) -> T:
-    """Decorator for terms, functions or classes: take sites in `asset_cfg` instead of a sensor.
+    """Decorator for terms (functions or classes): accept sites in `asset_cfg` instead of a sensor.
 
-    A call (or, for a class, a config) with `asset_cfg` and without the sensor goes to the older term.
+    Calls (for a class: configs) with `asset_cfg` and without the sensor use the legacy term.
     """
     cls: Any = term
     name = cls.__name__
@@ -488,14 +484,14 @@ def accepts_older_params(term: T) -> T:
         )
         if older:
             _warn_once(
-                f"{name} without {sensor} takes the heights of sites above z = 0, as in releases "
-                f"1.1 and 1.2; today it takes {sensor}."
+                f"{name} without {sensor} is deprecated (site heights above z = 0, as in releases "
+                f"1.1 and 1.2); set {sensor}."
             )
         return older
 
     if inspect.isclass(term):
-        # Python initializes what `__new__` returns as what it is: the older term is a subclass.
-        # Copies are made without arguments, and of the class that they are.
+        # The legacy term is a subclass, so Python calls its `__init__` after `__new__`. Copies call
+        # `__new__` without arguments, on the class of the copied object.
         def __new__(today: type, cfg: Any = None, env: Any = None) -> Any:
             older = today is cls and cfg is not None and is_older(cfg.params)
             return object.__new__(_load(path) if older else today)
@@ -510,13 +506,13 @@ def accepts_older_params(term: T) -> T:
 def _either(
     today: Any, load_older: Callable[[], Any], is_older: Callable[[dict[str, Any]], bool]
 ) -> Any:
-    """Return a function that calls one of two, with their check of parameters where they have one."""
+    """Return a function that calls the current or legacy term, with their `check_when_built`."""
     signature = inspect.signature(today)
 
     @functools.wraps(today)
     def term(*args: Any, **kwargs: Any) -> Any:
-        given = dict(zip(signature.parameters, args, strict=False)) | kwargs
-        return (load_older() if is_older(given) else today)(*args, **kwargs)
+        params = dict(zip(signature.parameters, args, strict=False)) | kwargs
+        return (load_older() if is_older(params) else today)(*args, **kwargs)
 
     if hasattr(today, "check_when_built"):
         term.check_when_built = _either(  # ty: ignore
@@ -535,7 +531,7 @@ def _with_either(signature: inspect.Signature, sensor: str) -> inspect.Signature
 
 
 def offers_older_sites(make_cfg: T) -> T:
-    """Decorator for the velocity template: its terms about feet take sites, as in 1.1 and 1.2."""
+    """Decorator for the velocity template: foot terms accept sites, as in releases 1.1 and 1.2."""
     make: Any = make_cfg
 
     @functools.wraps(make)
@@ -554,6 +550,6 @@ def _load(path: str) -> Any:
 
 
 def set_array_field(field: Any, values: Any) -> None:
-    """Write `values` into the first elements of an array field of a spec; None leaves it."""
+    """Write `values` to the first elements of an array field of a spec. None: unchanged."""
     for index, value in enumerate(values or ()):
         field[index] = value

@@ -1,7 +1,7 @@
-"""Names of earlier 1.x releases that have no successor; reached by name, through the table.
+"""Legacy names of 1.x releases without a replacement; resolved through the tables of `mjlab.compat`.
 
-The `mdp` packages of the tasks export functions from here, so imports at the top are limited to
-`mjlab.envs` and what it imports; the rest is imported where it is used.
+The tasks' `mdp` packages export functions of this module, so module-level imports are limited to
+`mjlab.envs` and its imports; other imports are inside functions.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ logger = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class DelayedActuatorCfg(ActuatorCfg):
-    """A delay around another actuator config; today every config takes the delay itself.
+    """Delay around another actuator config. Replaced by the delay fields of `ActuatorCfg`.
 
-    Targets and passive properties are those of `base_cfg`. The whole command is delayed, whichever
-    part `delay_target` names.
+    Targets and passive properties are those of `base_cfg`. All targets of a command are delayed,
+    independent of `delay_target`.
     """
 
     target_names_expr: tuple[str, ...] = field(default=(), init=False)
-    """Those of `base_cfg`."""
+    """Target patterns of `base_cfg`."""
     base_cfg: ActuatorCfg
-    """The actuator to delay."""
+    """Actuator config to delay."""
     delay_target: Any = "position"
     """Not used."""
 
@@ -71,12 +71,12 @@ class _HasDelay(ABCMeta):
 
 
 class DelayedActuator(Actuator, metaclass=_HasDelay):
-    """Any actuator that has a delay is an instance of this."""
+    """Virtual base class of all actuators with a delay."""
 
 
 @dataclass
 class FieldSpec:
-    """Description of a model field for `randomize_field`; unused, for packages that build one."""
+    """Model field description of `randomize_field`. Unused; for packages that construct it."""
 
     entity_type: Literal["dof", "joint", "body", "geom", "site", "actuator"]
     use_address: bool = False
@@ -84,7 +84,7 @@ class FieldSpec:
     valid_axes: list[int] | None = None
 
 
-# Quaternions were randomized component by component.
+# Legacy randomization of quaternions, component by component.
 _QUATERNIONS = {
     row.name: row
     for row in (
@@ -124,10 +124,10 @@ def randomize_field(
     axes: list[int] | None = None,
     shared_random: bool = False,
 ) -> None:
-    """Randomize the model field called `field`; today each field has a function of its own.
+    """Randomize the model field called `field`. Replaced by one function per field.
 
-    Expands the field if no term has declared it, and recomputes the constants that depend on it.
-    Raises `ValueError` for a field it does not know.
+    Expands the field if no term has declared it, and recomputes dependent constants. Raises
+    `ValueError` for an unknown field.
     """
     row = _row(field)
     env.sim.expand_model_fields(row.fields)
@@ -146,9 +146,7 @@ def randomize_field(
 
 def _row(field: str) -> FieldRow:
     if field not in _ROWS:
-        raise ValueError(
-            f"randomize_field knows no field {field!r}. Choose one of {sorted(_ROWS)}."
-        )
+        raise ValueError(f"randomize_field: unknown field {field!r}. Available: {sorted(_ROWS)}.")
     return _ROWS[field]
 
 
@@ -157,7 +155,7 @@ def _fields_of(params: dict[str, Any]) -> tuple[str, ...]:
     return (*row.fields, *derived_fields(row.recompute))
 
 
-# Which fields an event changes depends on its parameters here, so the event manager asks.
+# Callables, because the fields of the event depend on its parameters.
 setattr(randomize_field, "model_fields", _fields_of)  # noqa: B010
 setattr(randomize_field, "recompute", lambda params: _row(params["field"]).recompute)  # noqa: B010
 
@@ -168,14 +166,14 @@ def sync_actuator_delays(
     lag_range: tuple[int, int],
     asset_cfg: SceneEntityCfg = ROBOT,
 ) -> None:
-    """Set one lag, drawn per environment, on all delayed actuators of the selection.
+    """Set the same random per-environment lag on all selected delayed actuators.
 
     Args:
-        lag_range: Smallest and largest lag (physics substeps), both included.
+        lag_range: Minimum and maximum lag (physics substeps), inclusive.
     """
     low, high = int(lag_range[0]), int(lag_range[1])
     if not 0 <= low <= high:
-        raise ValueError(f"lag_range must be 0 <= smallest <= largest, got {tuple(lag_range)}.")
+        raise ValueError(f"lag_range: expected 0 <= low <= high, got {tuple(lag_range)}.")
     rows = as_ids(env_ids, env.num_envs, env.device)
     lags = torch.randint(low, high + 1, (len(rows),), device=env.device)
     for selected in selected_actuators(env, rows, asset_cfg):
@@ -184,7 +182,7 @@ def sync_actuator_delays(
 
 
 class RewardWeightStage(TypedDict):
-    """A reward weight, and the number of environment steps after which it holds."""
+    """Reward weight, and the number of environment steps after which it applies."""
 
     step: int
     weight: float
@@ -196,9 +194,9 @@ def reward_weight(
     reward_name: str,
     weight_stages: list[RewardWeightStage],
 ) -> torch.Tensor:
-    """Set a reward's weight to that of the last stage whose step has been passed, and return it.
+    """Set a reward's weight to that of the last stage passed, and return the weight.
 
-    Unlike `reward_curriculum`, a stage starts one step after its `step`.
+    Unlike in `reward_curriculum`, a stage starts one step after its `step`.
     """
     cfg = env.reward_manager.get_term_cfg(reward_name)
     for stage in weight_stages:
@@ -210,7 +208,7 @@ def reward_weight(
 def flat_orientation(
     env: ManagerBasedRlEnv, std: float, asset_cfg: SceneEntityCfg = ROBOT
 ) -> torch.Tensor:
-    """Reward a body that stands upright: `upright` without terrain sensors."""
+    """Reward upright orientation of a body: `upright` without terrain sensors."""
     from mjlab.tasks.velocity.mdp.rewards import single_body, tilt_of
 
     asset: Entity = env.scene[asset_cfg.name]
@@ -221,7 +219,7 @@ def flat_orientation(
 
 
 def disable_collision(geom: Any) -> None:
-    """Switch off the contacts of a geom of a spec."""
+    """Disable collisions of a spec geom."""
     geom.contype = 0
     geom.conaffinity = 0
 
@@ -233,7 +231,7 @@ def update_assets(
     glob: str = "*",
     recursive: bool = False,
 ) -> None:
-    """Add the contents of the files in a folder to `assets`, by `<meshdir>/<file name>`."""
+    """Add the files of a folder to `assets`, with keys `<meshdir>/<file name>`."""
     folder = Path(path)
     for file in folder.rglob(glob) if recursive else folder.glob(glob):
         if file.is_file():
@@ -241,7 +239,7 @@ def update_assets(
 
 
 def get_assets(meshdir: str) -> dict[str, bytes]:
-    """Return the mesh files of a robot by path: none, as ours are drawn with primitive shapes."""
+    """Return an empty dict: the robots use primitive shapes instead of mesh files."""
     return {}
 
 
@@ -251,20 +249,20 @@ def rotation_quat_from_vectors(from_vec: Any, to_vec: Any) -> Any:
     end = np.asarray(to_vec, dtype=float) / np.linalg.norm(to_vec)
     quat = np.array([1.0 + start @ end, *np.cross(start, end)])
     if quat[0] < 1e-9:
-        # Opposite vectors: half a turn about any axis across them.
+        # Opposite vectors: rotation by pi about any perpendicular axis.
         axis = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
         quat = np.array([0.0, *axis])
     return quat / np.linalg.norm(quat)
 
 
 class Timer:
-    """Measures wall time between ticks, in seconds."""
+    """Timer of wall time between ticks (s)."""
 
     def __init__(self) -> None:
         self._previous = time.time()
 
     def tick(self) -> float:
-        """Return the time since the last tick."""
+        """Return the time since the last tick (s)."""
         now = time.time()
         elapsed, self._previous = now - self._previous, now
         return elapsed
@@ -278,7 +276,7 @@ def compute_flat_patches(
     flat_patch_sampling: dict[str, Any] | None,
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray] | None:
-    """Return the flat patches of a height field of integers, (number, 3) by name.
+    """Return flat patches of an integer height field, (number, 3) by name.
 
     `z_offset` is the height of the field's lowest point.
     """
@@ -293,7 +291,7 @@ def compute_flat_patches(
     }
 
 
-# Attributes of instances.
+# Legacy instance attributes.
 
 
 @dataclass(frozen=True)
@@ -305,15 +303,15 @@ class ContactSlot:
     field_name: str
     """Name of the field."""
     sensor_name: str
-    """Name of the MuJoCo sensor, which measures all fields of the primary."""
+    """Name of the MuJoCo sensor of all fields of the primary."""
     sensor: ContactSensor
-    """The contact sensor."""
+    """Contact sensor."""
     index: int
     """Index of the primary."""
 
     @property
     def data_view(self) -> torch.Tensor:
-        """Present values, (N, number of slots times size of the field)."""
+        """Current values, (N, number of slots * field size)."""
         values = self.sensor._split(self.sensor._block())[self.field_name]
         num_slots = self.sensor.cfg.num_slots
         first = self.index * num_slots
@@ -321,7 +319,7 @@ class ContactSlot:
 
 
 def contact_slots(sensor: ContactSensor) -> list[ContactSlot]:
-    """Return the fields of each primary, one primary after the other."""
+    """Return the fields of all primaries, grouped by primary."""
     return [
         ContactSlot(primary, field, sensor._element_name(primary), sensor, index)
         for index, primary in enumerate(sensor.primary_names)
@@ -330,7 +328,7 @@ def contact_slots(sensor: ContactSensor) -> list[ContactSlot]:
 
 
 def ik_joint_ids(action: DifferentialIKAction) -> torch.Tensor:
-    """Return the entity's joints that the action moves, (number of joints,)."""
+    """Return the ids of the joints driven by the action, (number of joints,)."""
     count = action._entity.num_joints
     return torch.arange(count, device=action.device)[action._columns]
 
@@ -341,12 +339,12 @@ def generalized_force(data: Any) -> torch.Tensor:
 
 
 def step_count(manager: MetricsManager) -> torch.Tensor:
-    """Return the steps of each running episode, (N,) int64."""
+    """Return the number of steps of each current episode, (N,) int64."""
     return manager._steps.long()
 
 
 def episode_sums(manager: MetricsManager) -> dict[str, torch.Tensor]:
-    """Return the sum of each metric over the running episodes, views (N,) by name."""
+    """Return the sums of metrics over current episodes, views (N,) by name."""
     return dict(zip(manager.active_terms, manager._sum, strict=True))
 
 
@@ -363,25 +361,25 @@ def truncated_buf(manager: TerminationManager) -> torch.Tensor:
     return manager.time_outs
 
 
-# The registry as a dict.
+# Task registry as a dict.
 
 
 @dataclass
 class RegisteredTask:
-    """A task's configs, as copies, and its runner class."""
+    """Copies of a task's configs, and its runner class."""
 
     env_cfg: Any
-    """Environment config to train with."""
+    """Environment config for training."""
     play_env_cfg: Any
-    """Environment config to play with."""
+    """Environment config for play."""
     rl_cfg: Any
     """Config of the learner."""
     runner_cls: type | None
-    """Class of the runner; None for the default."""
+    """Runner class. None: default."""
 
 
 class _Registry(MutableMapping[str, RegisteredTask]):
-    """All tasks by name."""
+    """Registered tasks by name."""
 
     def __getitem__(self, name: str) -> RegisteredTask:
         from mjlab.tasks import registry
@@ -423,7 +421,7 @@ class _Registry(MutableMapping[str, RegisteredTask]):
 REGISTRY = _Registry()
 
 
-# Functions of scripts.
+# Legacy functions of scripts.
 
 
 def run_sim(
@@ -438,22 +436,22 @@ def run_sim(
     line_range: tuple[int, int] | None,
     renderer: Any = None,
 ) -> None:
-    """Write the motion of the scene's `robot` in a CSV of poses to `motion.npz`.
+    """Convert a CSV of poses of the scene's `robot` to `motion.npz`.
 
-    The file is in the folder of temporary files, as in 1.6; a copy named `<output_name>.npz` is
-    in the working folder. `csv_to_npz` uploads it with `--upload True`.
+    Writes to the temporary folder, as in 1.6, with a copy `<output_name>.npz` in the working folder.
+    `csv_to_npz` uploads it with `--upload True`.
 
     Args:
-        sim: Without effect; the conversion needs no simulation.
-        scene: The scene that has the robot.
-        joint_names: Joints in the order of the columns. Others keep their default position.
-        input_file: The CSV.
-        input_fps: Its poses per second.
+        sim: No effect; the conversion needs no simulation.
+        scene: Scene with the robot.
+        joint_names: Joints in column order. Other joints keep their default position.
+        input_file: CSV file.
+        input_fps: Poses per second of the CSV.
         output_fps: Frames per second of the motion.
         output_name: Name of the motion.
-        render: Record a video beside the copy.
-        line_range: First and last line to read, counted from 1. None reads all.
-        renderer: Without effect.
+        render: Record a video next to the copy.
+        line_range: First and last line to read, counted from 1. None: all lines.
+        renderer: No effect.
     """
     from mjlab.scripts.csv_to_npz import record_motion
     from mjlab.tasks.tracking.motion_file import npz_path, write_motion
@@ -481,17 +479,17 @@ _DEMO_MOTION = "slow_walk"
 
 
 def ensure_default_motion() -> str:
-    """Return the path of a motion of the G1 that ships with the package."""
+    """Return the path of a bundled G1 motion."""
     from mjlab.tasks.tracking.motion_sources import shipped_motions
 
     return str(shipped_motions()[_DEMO_MOTION])
 
 
 def ensure_default_checkpoint() -> str:
-    """Raise `FileNotFoundError`: no tracking policy ships with the package."""
+    """Raise `FileNotFoundError`: the package has no bundled tracking policy."""
     raise FileNotFoundError(
-        "mjlab ships no checkpoint of motion tracking; train one with "
-        "`train Mjlab-Tracking-Flat-Unitree-G1`, or run `demo`, which brings a policy of the Go1."
+        "mjlab has no bundled motion tracking checkpoint; train one with "
+        "`train Mjlab-Tracking-Flat-Unitree-G1`, or run `demo` for a bundled Go1 policy."
     )
 
 

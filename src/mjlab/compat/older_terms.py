@@ -1,10 +1,10 @@
-"""Terms as earlier 1.x releases spelled them; reached by name, through the tables of `mjlab.compat`.
+"""Legacy terms of 1.x releases; resolved through the tables of `mjlab.compat`.
 
-Commands of 1.1 to 1.5 updated all environments in every call, with `_update_command(self)` and
-`compute(self, dt)`. After a partial reset only some environments may advance, so the state of the
-others is put back.
+Commands of releases 1.1 to 1.5 update all environments in every call, with `_update_command(self)`
+and `compute(self, dt)`. After a partial reset, only some environments may advance, so the state of
+the other environments is restored.
 
-Foot terms of 1.1 and 1.2 read the heights of sites above z = 0 instead of a height sensor.
+Foot terms of releases 1.1 and 1.2 read site heights above z = 0 instead of a height sensor.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _HEIGHT_SENSOR = "foot_height_scan"
 
 
 def update_command(method: Callable[..., Any], term: Any, *args: Any, **kwargs: Any) -> Any:
-    """Call `_update_command(self)`; with `env_ids`, only their state changes."""
+    """Call `_update_command(self)`. With `env_ids`, only the state of `env_ids` changes."""
     env_ids, args, kwargs = _split_env_ids(args, kwargs)
     with _other_envs_kept(term, env_ids):
         return method(term, *args, **kwargs)
 
 
 def compute(method: Callable[..., Any], term: Any, dt: Any, *args: Any, **kwargs: Any) -> Any:
-    """Call `compute(self, dt)` with `dt` as one number; with `env_ids`, only their state changes.
+    """Call `compute(self, dt)` with scalar `dt`. With `env_ids`, only the state of `env_ids` changes.
 
-    A `dt` per environment is zero where an episode has just begun. Those environments get the time
-    back that the call takes from their `time_left`.
+    A per-environment `dt` is zero for environments at the start of an episode. The call's decrement
+    of their `time_left` is undone.
     """
     env_ids, args, kwargs = _split_env_ids(args, kwargs)
     if isinstance(dt, torch.Tensor):
@@ -70,7 +70,7 @@ def create_gui(
     on_change: Any = None,
     request_action: Any = None,
 ) -> Any:
-    """Call `create_gui(self, name, server, get_env_idx)`, with the further arguments it takes."""
+    """Call `create_gui(self, name, server, get_env_idx)` with the additional arguments it takes."""
     args = (term, name, server, get_env_idx)
     further = {"on_change": on_change, "request_action": request_action}
     parameters = inspect.signature(method).parameters
@@ -80,7 +80,7 @@ def create_gui(
     named = {key: value for key, value in further.items() if key in parameters}
     if named:
         return method(*args, **named)
-    # Under other names.
+    # Arguments with other names.
     positional = kinds.count(inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return method(*(*args, *further.values())[:positional])
 
@@ -88,7 +88,7 @@ def create_gui(
 def _split_env_ids(
     args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
-    """Separate `env_ids` from arguments that a method in the field has of its own."""
+    """Separate `env_ids` from additional arguments of a legacy method."""
     if "env_ids" in kwargs:
         kwargs = dict(kwargs)
         return kwargs.pop("env_ids"), args, kwargs
@@ -99,11 +99,11 @@ def _split_env_ids(
 
 @contextmanager
 def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
-    """Put back what the body changes in a term or in the physics outside `env_ids` (None: all).
+    """Undo changes of the body to term and physics state outside `env_ids` (None: all).
 
-    Tensors with one row per environment keep their new values in rows `env_ids`. All other state,
-    such as step counters and running means, is put back whole: a reset takes no time. Generators
-    go on, so that the next draw is another one.
+    Tensors with one row per environment keep their new values in rows `env_ids`. Other state, such as
+    step counters and running means, is restored completely, because a reset takes no simulation time.
+    Generators are not restored, so that later samples differ.
     """
     if env_ids is not None:
         env_ids = as_ids(env_ids, term.num_envs, term.device)
@@ -127,16 +127,16 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
         moved |= not torch.equal(kept, field)
         field.copy_(kept)
     if moved:
-        # The body may have computed derived quantities from the state that was put back; forces of
-        # the environments that it was not asked for stay those of the last substep.
+        # The body may have computed derived quantities from the discarded state. Forces of environments
+        # outside `env_ids` stay those of the last substep.
         term._env.sim.forward(stage="vel")
         term._env.sim.forward(env_ids)
 
 
 def _hides_class_state(term: Any, name: str) -> bool:
-    """Return whether an attribute of `term` hides one of its class, such as a step counter.
+    """Return True if an attribute of `term` hides a class attribute, such as a step counter.
 
-    Tensors with one row per environment stay, as those that the class does not mention.
+    False for tensors with one row per environment, as for attributes without a class attribute.
     """
     value = getattr(term, name)
     if isinstance(value, torch.Tensor) and value.shape[:1] == (term.num_envs,):
@@ -146,7 +146,7 @@ def _hides_class_state(term: Any, name: str) -> bool:
 
 
 def _merge_rows(before: Any, after: Any, env_ids: torch.Tensor, num_envs: int) -> Any:
-    """Return `before`, with the rows `env_ids` of its per-environment tensors from `after`."""
+    """Return `before`, with rows `env_ids` of its per-environment tensors taken from `after`."""
     if isinstance(before, torch.Tensor) and isinstance(after, torch.Tensor):
         if before.shape != after.shape or before.shape[:1] != (num_envs,):
             return before
@@ -176,7 +176,7 @@ def _check_sites(
 
 @checked_when_built(_check_sites)
 def foot_height(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
-    """Height of each selected site above z = 0 (m), (N, sites)."""
+    """Height of selected sites above z = 0 (m), (N, sites)."""
     sites = as_columns(asset_cfg.site_ids, env.device)
     return env.scene[asset_cfg.name].data.site_pos_w[:, sites, 2]
 
@@ -195,7 +195,7 @@ def feet_clearance(
 
 
 class feet_swing_height(feet_rewards.feet_swing_height):
-    """Cost of landing after a swing whose peak above z = 0 was too low or too high."""
+    """Penalty at landing for swings with a peak height above z = 0 that is too low or too high."""
 
     def __call__(  # ty: ignore[incompatible-method-override]
         self,
@@ -206,7 +206,7 @@ class feet_swing_height(feet_rewards.feet_swing_height):
         command_threshold: float,
         asset_cfg: SceneEntityCfg,
     ) -> torch.Tensor:
-        """Update the peak heights, and return the cost of landings in this step, (N,)."""
+        """Update peak heights, and return the penalty of landings in this step, (N,)."""
         cost = self.landing_cost(env, sensor_name, foot_height(env, asset_cfg), target_height)
         return if_commanded(cost, env, command_name, command_threshold)
 
@@ -227,16 +227,16 @@ class feet_swing_height(feet_rewards.feet_swing_height):
 
 
 def offer_sites(template: ManagerBasedRlEnvCfg) -> None:
-    """Let packages set sites of feet in the velocity template, as those of 1.1 and 1.2 do."""
+    """Let packages set foot sites in the velocity template, as in releases 1.1 and 1.2."""
     for term in _height_terms(template):
         term.params = _FeetParams(term.params)
         term.params.template = template
 
 
 class _FeetParams(dict[str, Any]):
-    """Parameters of a template's term that reads `asset_cfg` where today there is a height sensor.
+    """Parameters of a template term that accept `asset_cfg` in place of the height sensor.
 
-    Reading `asset_cfg` turns all terms of the template that read the sensor into older ones.
+    Access of `asset_cfg` converts all terms of the template that read the sensor to legacy terms.
     """
 
     template: ManagerBasedRlEnvCfg | None = None
@@ -254,7 +254,7 @@ class _FeetParams(dict[str, Any]):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _FeetParams:
         copied = _FeetParams({key: copy.deepcopy(value, memo) for key, value in self.items()})
-        # A copy of the whole template refers to itself; a copy of the term alone to none.
+        # A copied template refers to itself; a separately copied term refers to no template.
         copied.template = memo.get(id(self.template))
         return copied
 

@@ -1,4 +1,4 @@
-"""Simulated things: their configuration, their state, and commands to them."""
+"""Entities: configuration, state and writers of robots and objects."""
 
 from mjlab.entity.data import EntityData as EntityData
 from mjlab.entity.entity import Entity as Entity

@@ -1,6 +1,6 @@
-"""From an entity's config to its spec: joints, actuators, initial state, simulation options.
+"""Entity spec construction: simulation options, joints, actuators, initial state.
 
-Everything here works on specs and values; `Entity` calls it in the order of this file.
+Functions on specs and values; `Entity` calls them in the order of this file.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from mjlab.utils.string import resolve_expr
 
 KEY_NAME = "init_state"
 BIT_FIELDS = ("disableflags", "enableflags", "disableactuator")
-"""Options that are sets of independent switches, one a bit."""
+"""Options that are bit masks of independent flags."""
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _BALL = mujoco.mjtJoint.mjJNT_BALL
 
-# The order of MuJoCo's MJOPTION_FIELDS (mjxmacro.h), which is that of the bits in
-# `spec.authored.option`: they tell a value that was written out from one that was left open.
+# Order of MuJoCo's MJOPTION_FIELDS (mjxmacro.h), and of the bits in `spec.authored.option`. A bit
+# tells an explicitly authored value from a default.
 _AUTHORED_ORDER = (
     "timestep",
     "impratio",
@@ -63,38 +63,37 @@ _AUTHORED_ORDER = (
 )
 
 
-def copy_spec(made: Any, function: str) -> mujoco.MjSpec:
-    """Return a copy of what a user's function made; raise `ValueError` if it is not a spec.
+def copy_spec(spec: Any, function: str) -> mujoco.MjSpec:
+    """Return a copy of a spec returned by the user's `function`; raise `ValueError` for other types.
 
-    Editors change it, a scene takes it in, and a function might return one spec twice.
+    A copy, because editors and scenes modify the spec, and the function may return the same one twice.
     """
-    if not isinstance(made, mujoco.MjSpec):
+    if not isinstance(spec, mujoco.MjSpec):
         raise ValueError(
-            f"{function} returned {type(made).__name__}; it must return a mujoco.MjSpec, such as "
+            f"{function}: expected it to return mujoco.MjSpec, got {type(spec).__name__}; use e.g. "
             "mujoco.MjSpec.from_file(path)."
         )
-    return made.copy()
+    return spec.copy()
 
 
-# Simulation options. A scene has one `<option>`. Attaching a spec to the scene drops the `<option>`
-# of that spec, so what an entity asks for is taken out before, and the scene decides what becomes of
-# it.
+# Simulation options. A scene has one `<option>`, and attaching a spec drops the `<option>` of that
+# spec. So options of entities are extracted before, and the scene decides which to apply.
 
 
 @dataclass(frozen=True)
 class EntityOptions:
-    """Options that a spec states: written out in its XML, or different from MuJoCo's defaults."""
+    """Options that a spec states: authored in its XML, or different from MuJoCo's defaults."""
 
     values: dict[str, Any] = field(default_factory=dict)
-    """Option field to value: a number, or a tuple for vectors."""
+    """Value by option field: a number, or a tuple for vectors."""
     switches: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """For each of `BIT_FIELDS`: (bits that are set, bits about which the spec says anything)."""
+    """(bits set, bits stated) by field of `BIT_FIELDS`."""
 
 
 def pop_options(spec: mujoco.MjSpec) -> EntityOptions:
-    """Return the options that `spec` states, and put its `<option>` back to MuJoCo's defaults.
+    """Return the options that `spec` states, and reset its `<option>` to MuJoCo's defaults.
 
-    Without the second, MuJoCo would warn at every attachment about values that are not lost.
+    Without the reset, MuJoCo warns at every attachment about lost values.
     """
     options, default = stated_options(spec), mujoco.MjSpec().option
     for name in _AUTHORED_ORDER:
@@ -124,7 +123,7 @@ def stated_options(spec: mujoco.MjSpec) -> EntityOptions:
 
 
 def write_option(option: Any, name: str, value: Any) -> None:
-    """Set a field of a MuJoCo option block, element by element where it is a vector."""
+    """Set a scalar or vector field of a MuJoCo option block."""
     current = getattr(option, name)
     if isinstance(current, np.ndarray):
         current[:] = value
@@ -132,37 +131,35 @@ def write_option(option: Any, name: str, value: Any) -> None:
         setattr(option, name, value)
 
 
-# Joints and root body.
+# Joints, root body and names.
 
 
 def find_joints(
     spec: mujoco.MjSpec,
 ) -> tuple[mujoco.MjsJoint | None, tuple[mujoco.MjsJoint, ...]]:
-    """Return the free joint of `spec`, if any, and the others. An unnamed free joint is named.
+    """Return the free joint of `spec` (or None) and the other joints. Names an unnamed free joint.
 
     Raises:
-        ValueError: there are several free joints, one that is not the first joint, or ball joints.
+        ValueError: several free joints, a free joint that is not the first joint, or ball joints.
     """
     joints = tuple(spec.joints)
     free = [joint for joint in joints if joint.type == _FREE]
     if len(free) > 1:
         raise ValueError(
-            f"The spec {spec.modelname!r} has {len(free)} free joints, of the bodies "
-            f"{[joint.parent.name for joint in free]}; an entity may have one. Make each "
-            "floating body an entity of its own."
+            f"Spec {spec.modelname!r}: expected at most one free joint, got {len(free)}, of the bodies "
+            f"{[joint.parent.name for joint in free]}; make each floating body a separate entity."
         )
     if free and joints[0] is not free[0]:
         raise ValueError(
             f"The free joint of body {free[0].parent.name!r} comes after the joint "
             f"{joints[0].name!r} of body {joints[0].parent.name!r}. The free joint must be the "
-            "first joint of an entity: put its body first, or make it an entity of its own."
+            "first joint of an entity; put its body first, or make it a separate entity."
         )
     balls = [joint.name or f"(unnamed, of {joint.parent.name!r})" for joint in joints
              if joint.type == _BALL]  # fmt: skip
     if balls:
         raise ValueError(
-            f"The spec {spec.modelname!r} has ball joints: {balls}. An entity's joints have one "
-            "position each; use three hinges instead."
+            f"Spec {spec.modelname!r}: ball joints are not supported, got {balls}; use three hinges."
         )
     if free and not free[0].name:
         free[0].name = "floating_base_joint"
@@ -170,24 +167,24 @@ def find_joints(
 
 
 def place_body(body: mujoco.MjsBody, pose: tuple[float, ...]) -> None:
-    """Set where a body is in its parent: position, quaternion (w, x, y, z)."""
+    """Set the pose of a body in its parent: position, quaternion (w, x, y, z)."""
     body.pos[:] = pose[:3]
-    # An orientation written in another form would win over the quaternion.
+    # An orientation in another form (such as euler) takes precedence over the quaternion.
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     body.quat[:] = pose[3:7]
 
 
 def short_name(name: str) -> str:
-    """Return the part of an element's name after the last '/', which is its name in its entity.
+    """Return an element's name within its entity: the part after the last '/'.
 
-    Names that merged variants give to geoms are kept whole: their last part is but a number.
+    Names of merged variant geoms are kept whole, because their last part is only a number.
     """
     _, merged, rest = name.partition("mjlab/pad/")
     return merged + rest if merged else name.rsplit("/", 1)[-1]
 
 
 def short_names(elements: Iterable[Any]) -> tuple[str, ...]:
-    """Return the names of spec elements in their entity."""
+    """Return the names of spec elements within their entity."""
     return tuple(short_name(element.name) for element in elements)
 
 
@@ -202,13 +199,13 @@ def find_names(
     subset: Sequence[str] | None = None,
     preserve_order: bool = False,
 ) -> Found:
-    """Find names by regular expressions; errors name the `kind` of elements. See `Entity`."""
+    """Find names by regular expressions, see `Entity`. Errors name the `kind` of element."""
     try:
         return resolve_matching_names(
             name_keys, names if subset is None else subset, preserve_order
         )
     except ValueError as error:
-        raise ValueError(f"Cannot find {kind} by {name_keys!r}. {error}") from None
+        raise ValueError(f"Patterns {name_keys!r} do not resolve to {kind}. {error}") from None
 
 
 # Actuators.
@@ -223,28 +220,28 @@ def build_actuators(
 ) -> list[Actuator]:
     """Build the configured actuators and add their elements to an entity's spec.
 
-    Elements come config by config, or, with `sort`, in the order of what they act on (joints, then
-    tendons, then sites), after those that the XML already has.
+    Elements are added config by config, or, with `sort`, in the order of their targets (joints,
+    tendons, sites), after the actuators of the XML.
 
     Args:
-        cfgs: Configs of the actuators.
-        spec: The entity's spec.
-        joints: The joints of the entity, without a free joint.
-        build: Returns the actuator of a config, given ids and names of its targets in the entity.
+        cfgs: Actuator configs.
+        spec: Spec of the entity.
+        joints: Joints of the entity, without a free joint.
+        build: Returns the actuator of a config, from ids and names of its targets in the entity.
         sort: Sort the elements.
 
     Raises:
-        ValueError: the patterns of a config do not resolve, with the reason and the candidates; or
-            what they match has an actuator already, of another config, or of the XML with the name
-            that the new one gets. Other actuators of the XML stay, with a warning: both act.
+        ValueError: the patterns of a config do not resolve (with reason and candidates); or a
+            target already has an actuator, of another config, or of the XML with the name of the
+            new one. Other XML actuators on a target stay active, with a warning.
     """
     elements = {
         TransmissionType.JOINT: joints,
         TransmissionType.TENDON: spec.tendons,
         TransmissionType.SITE: spec.sites,
     }
-    # An entity's own names leave out the prefixes of specs that it was put together from, but
-    # elements of the spec refer to each other by full names.
+    # Entity names omit the prefixes of attached specs, but spec elements refer to each other by
+    # full names.
     full_names = {kind: [element.name for element in own] for kind, own in elements.items()}
     names = {kind: short_names(own) for kind, own in elements.items()}
     built = []
@@ -252,7 +249,7 @@ def build_actuators(
         ids, found = _find_targets(cfg, names)
         built.append((build(cfg, ids, found), [full_names[cfg.transmission_type][i] for i in ids]))
     _check_second_actuators(spec, built)
-    # Those that wrap the XML's actuators add nothing, and look for them before there are others.
+    # XmlActuators first: they look up the XML's actuators before new ones are added.
     ordered = [pair for pair in built if isinstance(pair[0].cfg, XmlActuatorCfg)]
     added = [pair for pair in built if not isinstance(pair[0].cfg, XmlActuatorCfg)]
     if sort:
@@ -267,7 +264,7 @@ def build_actuators(
 def _find_targets(
     cfg: ActuatorCfg, names: dict[TransmissionType, tuple[str, ...]]
 ) -> tuple[list[int], list[str]]:
-    """Return ids and names of a config's targets; warn if other kinds of elements match too."""
+    """Return ids and names of a config's targets; warn if elements of other kinds match too."""
     patterns, kind = cfg.target_names_expr, cfg.transmission_type
     label = (
         f"{type(cfg).__name__}(target_names_expr={patterns!r}, transmission_type={kind.value!r})"
@@ -279,14 +276,14 @@ def _find_targets(
             f"{other.value}s {also} (transmission_type=TransmissionType.{other.name})"
             for other, also in _matches_elsewhere(cfg, names).items()
         ]
-        hint = f"\nThe patterns do match: {'; '.join(hints)}." if hints else ""
+        hint = f"\nThe patterns match: {'; '.join(hints)}." if hints else ""
         raise ValueError(f"{label}: {error}{hint}") from None
     if not found:
-        raise ValueError(f"{label} names no {kind.value}. Available: {list(names[kind])}.")
+        raise ValueError(f"{label} matches no {kind.value}. Available: {list(names[kind])}.")
     if "" in found:
         raise ValueError(
-            f"{label} matches a {kind.value} without a name, which no actuator can refer to. Name it "
-            "in the XML."
+            f"{label} matches an unnamed {kind.value}; name it in the XML, so that an actuator can "
+            "refer to it."
         )
     for other, also in _matches_elsewhere(cfg, names).items():
         if all(any(re.fullmatch(pattern, name) for name in also) for pattern in patterns):
@@ -302,7 +299,7 @@ def _find_targets(
 def _matches_elsewhere(
     cfg: ActuatorCfg, names: dict[TransmissionType, tuple[str, ...]]
 ) -> dict[TransmissionType, list[str]]:
-    """Return the elements of other kinds that a config's patterns match."""
+    """Return elements of other kinds matched by a config's patterns."""
     found = {
         kind: [name for name in own if any(re.fullmatch(p, name) for p in cfg.target_names_expr)]
         for kind, own in names.items()
@@ -312,10 +309,10 @@ def _matches_elsewhere(
 
 
 def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, list[str]]]) -> None:
-    """Warn if a config adds an actuator to a target that has one of the XML: their forces add up.
+    """Warn if a config adds an actuator to a target with an XML actuator: their forces add up.
 
     Raises:
-        ValueError: two configs act on one target, or the actuators would have the same name.
+        ValueError: two configs act on the same target, or two actuators get the same name.
     """
     in_xml: dict[tuple[TransmissionType, str], list[str]] = {}
     for element in spec.actuators:
@@ -328,36 +325,36 @@ def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, lis
         cfg, kind = actuator.cfg, actuator.transmission_type
         wraps = isinstance(cfg, XmlActuatorCfg)
         label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
-        # One that wraps those of the XML leaves out what has none.
+        # XmlActuator skips targets without an actuator.
         names = [name for name in targets if (kind, name) in in_xml or not wraps]
         taken = {
             n: f"one by {claimed[wraps, kind, n]}" for n in names if (wraps, kind, n) in claimed
         }
         beside = {
             name: " and ".join(
-                f"the actuator {other or '(unnamed)'!r} of the XML" for other in in_xml[kind, name]
+                f"the XML actuator {other or '(unnamed)'!r}" for other in in_xml[kind, name]
             )
             for name in names
             if not wraps and (kind, name) in in_xml
         }
         taken |= {name: by for name, by in beside.items() if name in in_xml[kind, name]}
-        message = f"{label} acts on {kind.value}s that have an actuator already: "
+        message = f"{label} acts on {kind.value}s that already have an actuator: "
         if taken:
             raise ValueError(
-                f"{message}{_list_taken(taken)}. Give each one actuator: narrow the patterns, remove "
-                "the actuator from the XML, or use it as it is there, by XmlActuatorCfg alone."
+                f"{message}{_list_taken(taken)}. Narrow the patterns, remove the actuator from the XML, "
+                "or use only XmlActuatorCfg, which takes over the XML actuator."
             )
-        # New actuators are named as what they act on.
+        # New actuators are named after their targets.
         same = [short_name(name) for name in names if not wraps and name in names_in_xml]
         if same:
             raise ValueError(
-                f"{label} adds actuators to the {kind.value}s {same}, and names them so; the XML has "
-                "actuators of these names on other targets. Rename or remove those in the XML."
+                f"{label} adds actuators named after the {kind.value}s {same}, but the XML has "
+                "actuators with these names on other targets; rename or remove the XML actuators."
             )
         if beside:
             warnings.warn(
-                f"{message}{_list_taken(beside)}. Both act, and their forces add up. If that is not "
-                "meant, remove the actuator from the XML.",
+                f"{message}{_list_taken(beside)}. Both are active and their forces add up; if this is "
+                "not intended, remove the actuator from the XML.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -374,7 +371,7 @@ def _list_taken(taken: dict[str, str]) -> str:
 
 @dataclass(frozen=True)
 class XmlKey:
-    """The first keyframe of an entity's XML."""
+    """First keyframe of an entity's XML."""
 
     name: str
     qpos: tuple[float, ...]
@@ -383,23 +380,23 @@ class XmlKey:
 
 @dataclass(frozen=True)
 class InitialState:
-    """The configured initial state, resolved for one entity's joints and actuators."""
+    """Configured initial state, resolved for the joints and actuators of one entity."""
 
     root_state: tuple[float, ...]
-    """Position, quaternion, linear and angular velocity; only the pose with a fixed base."""
+    """Position, quaternion, linear and angular velocity; for a fixed base, only the pose."""
     joint_pos: tuple[float, ...]
     joint_vel: tuple[float, ...]
     qpos: dict[mujoco.MjsJoint, tuple[float, ...]]
-    """The values of each joint, the free one included, in spec order."""
+    """`qpos` of each joint, a free joint included, in spec order."""
     ctrl: dict[mujoco.MjsActuator, tuple[float, ...]]
-    """The controls of each actuator, in spec order."""
+    """Controls of each actuator, in spec order."""
 
 
 def pop_keyframes(spec: mujoco.MjSpec) -> XmlKey | None:
-    """Return the first keyframe of `spec`, and delete all of them.
+    """Return the first keyframe of `spec`, and delete all keyframes.
 
-    A keyframe holds the whole of `qpos` and `ctrl`, so one made for the XML alone does not fit
-    once actuators are added. The scene gets a keyframe made from the resolved initial state.
+    A keyframe holds all of `qpos` and `ctrl`, so a keyframe of the XML does not fit once actuators
+    are added. The scene gets a keyframe with the resolved initial state.
     """
     keys = list(spec.keys)
     if not keys:
@@ -407,8 +404,8 @@ def pop_keyframes(spec: mujoco.MjSpec) -> XmlKey | None:
     first = XmlKey(keys[0].name, tuple(keys[0].qpos), tuple(keys[0].ctrl))
     if len(keys) > 1:
         warnings.warn(
-            f"The spec {spec.modelname!r} has {len(keys)} keyframes: "
-            f"{[key.name for key in keys]}. Only the first is used, and only where "
+            f"Spec {spec.modelname!r} has {len(keys)} keyframes: "
+            f"{[key.name for key in keys]}. Only the first is used, and only if "
             "init_state.joint_pos is None; the others are dropped.",
             UserWarning,
             stacklevel=2,
@@ -455,9 +452,9 @@ def resolve_initial_state(
 
 
 def add_key(spec: mujoco.MjSpec, states: list[InitialState]) -> None:
-    """Add the keyframe `init_state` to `spec`, which holds the elements of `states`.
+    """Add the keyframe `init_state` to `spec`. `spec` holds the elements of `states`.
 
-    Joints and actuators that belong to no entity take the model's own reference and zero.
+    Joints outside entities get the model's reference position; actuators outside entities get 0.
     """
     known_joints = {joint: v for state in states for joint, v in state.qpos.items()}
     known_ctrl = {actuator: u for state in states for actuator, u in state.ctrl.items()}
@@ -479,16 +476,14 @@ def _joint_pos_of_key(
     """Return the joint positions of the keyframe; raise `ValueError` if it does not fit."""
     if key is None:
         raise ValueError(
-            "init_state.joint_pos is None, which takes the joint positions from the first "
-            f"keyframe of the XML, but the spec {spec.modelname!r} has no keyframe. Add one, or "
-            "give joint_pos as a dict of joint name pattern to position."
+            f"init_state.joint_pos: None requires a keyframe in the XML, but spec {spec.modelname!r} "
+            "has no keyframe; add one, or set joint_pos to a dict of joint name pattern to position."
         )
     expected = sum(qpos_width(joint.type) for joint in spec.joints)
     if len(key.qpos) != expected:
         raise ValueError(
-            "init_state.joint_pos is None, which takes the joint positions from the keyframe "
-            f"{key.name!r}, but that has {len(key.qpos)} values in qpos and the spec "
-            f"{spec.modelname!r} needs {expected}."
+            f"init_state.joint_pos is None: expected keyframe {key.name!r} to have {expected} values "
+            f"in qpos for spec {spec.modelname!r}, got {len(key.qpos)}."
         )
     start, values = 0, {}
     for joint in spec.joints:
@@ -510,11 +505,11 @@ def _initial_ctrl(
     for actuator in spec.actuators:
         inputs = control_inputs(actuator)
         stop = start + len(inputs)
-        # The actuators that the XML itself has come first, in the order of its keyframe.
+        # XML actuators come first, in the order of the keyframe.
         if stop <= len(known):
             ctrl[actuator] = tuple(map(float, known[start:stop]))
         else:
-            # A joint position is no sensible force, speed or activation.
+            # Joint positions are commands of position inputs only.
             on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
             held = positions.get(actuator.target, 0.0) if on_joint else 0.0
             ctrl[actuator] = tuple(held if kind == "position" else 0.0 for kind in inputs)
@@ -523,7 +518,7 @@ def _initial_ctrl(
 
 
 def _reference(joint: mujoco.MjsJoint) -> list[float]:
-    """Return what the compiler puts into `qpos0` for a joint."""
+    """Return the compiled `qpos0` of a joint."""
     if joint.type == mujoco.mjtJoint.mjJNT_FREE:
         return [*joint.parent.pos, *joint.parent.quat]
     if joint.type == mujoco.mjtJoint.mjJNT_BALL:
@@ -535,7 +530,7 @@ def _reference(joint: mujoco.MjsJoint) -> list[float]:
 def _vector(values: tuple[float, ...], length: int, name: str) -> tuple[float, ...]:
     if len(values) != length:
         raise ValueError(
-            f"init_state.{name} has {len(values)} values ({tuple(values)}); it needs {length}."
+            f"init_state.{name}: expected {length} values, got {len(values)}: {tuple(values)}."
         )
     return _floats(values)
 

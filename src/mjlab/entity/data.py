@@ -1,4 +1,4 @@
-"""The state of one entity, in every environment, as torch tensors."""
+"""Entity state: batched torch tensors of all environments, and writers."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from mjlab.utils.state import stateful
 @stateful
 @dataclass(eq=False)
 class EntityData:
-    """State and targets of one entity. N environments, nb bodies, nj joints, and so on.
+    """State and targets of one entity. Shapes: N environments, nb bodies, nj joints.
 
     World frame unless a name ends in `_b` (frame of the root link); quaternions are (w, x, y, z);
-    SI units, radians; velocities of links and of centres of mass are (linear, angular).
+    SI units and radians; spatial velocities are (linear, angular).
 
-    A property computes only itself, when it is read. Where the entity's elements follow each other
-    in the simulation, `joint_pos`, `body_link_pos_w` and other plain fields are **views of the
-    simulation**: they change as it advances, so clone what has to last.
+    Properties are computed on read. If the entity's elements are contiguous in the simulation,
+    `joint_pos`, `body_link_pos_w` and other plain fields are **views of the simulation**: their
+    values change as it advances; clone tensors that must persist.
 
-    After `sim.step()` joint positions and velocities are current, and everything that MuJoCo
-    derives from them (poses, velocities of links, forces, accelerations) belongs to the state
-    before the last substep, until `sim.forward()`. In observations poses and velocities are
-    current; forces and accelerations are those of the last substep (`ManagerBasedRlEnv.step`).
+    After `sim.step()` joint positions and velocities are current; derived quantities (link poses,
+    link velocities, forces, accelerations) belong to the state before the last substep, until
+    `sim.forward()`. In observations, poses and velocities are current; forces and accelerations are
+    those of the last substep (`ManagerBasedRlEnv.step`).
 
-    Writers: `env_ids` is None (all), a slice, a boolean mask or a one-dimensional tensor of indices;
-    element ids, which count within the entity, may also be a list. Tensors of both select their
-    product. Values are tensors or arrays of any float type; the simulation holds float32.
+    Writers: `env_ids` is None (all), a slice, a boolean mask or a 1-D tensor of indices; element ids
+    count within the entity and may also be a list. If both are tensors, they select their product.
+    Values are tensors or arrays of any float type; the simulation holds float32.
 
-    Writes go straight to the simulation. What derives from the state (`body_link_pos_w`, velocities
-    of links, sensors, ...) keeps its old values until the next `sim.forward()`. Environments whose
-    poses or joint positions were written are noted in `moved_envs`: forces of the last substep do
-    not belong to them any more, so `env.step` and `env.reset` recompute these.
+    Writes go directly to the simulation. Derived quantities (`body_link_pos_w`, link velocities,
+    sensors, ...) keep their old values until the next `sim.forward()`. `moved_envs` marks
+    environments whose poses or joint positions were written: their forces of the last substep are
+    stale, so `env.step` and `env.reset` recompute them.
     """
 
     _transient = {
@@ -59,11 +59,11 @@ class EntityData:
     ROOT_STATE_DIM = ROOT_POSE_DIM + ROOT_VEL_DIM
 
     indexing: EntityIndexing
-    """Where the entity's elements are in the model."""
+    """Ids and addresses of the entity's elements in the model."""
     data: Any
-    """The simulation's data fields."""
+    """Data fields of the simulation."""
     model: Any
-    """The simulation's model fields."""
+    """Model fields of the simulation."""
     device: str
     default_root_state: torch.Tensor
     """(N, 13) configured position, quaternion, linear and angular velocity, without environment
@@ -73,13 +73,13 @@ class EntityData:
     default_joint_vel: torch.Tensor
     """(N, nj) configured joint velocities."""
     default_joint_pos_limits: torch.Tensor
-    """(N, nj, 2) limits of the compiled model; infinite where a joint has none."""
+    """(N, nj, 2) limits of the compiled model; infinite for unlimited joints."""
     joint_pos_limits: torch.Tensor
-    """(N, nj, 2) limits in use. Changing `jnt_range` afterwards does not change them."""
+    """(N, nj, 2) limits in use. Later changes of `jnt_range` do not affect them."""
     soft_joint_pos_limits: torch.Tensor
-    """(N, nj, 2) limits shrunk about their middle by the configured factor."""
+    """(N, nj, 2) limits scaled about their center by `soft_joint_pos_limit_factor`."""
     gravity_vec_w: torch.Tensor
-    """(N, 3) unit vector down, (0, 0, -1); not the model's gravity."""
+    """(N, 3) unit vector down, (0, 0, -1), independent of the model's gravity."""
     forward_vec_b: torch.Tensor
     """(N, 3) forward direction of the root link, (1, 0, 0)."""
     is_fixed_base: bool
@@ -96,10 +96,10 @@ class EntityData:
     site_effort_target: torch.Tensor
     """(N, number of sites) commands for site actuators; (N, 0) without such actuators."""
     encoder_bias: torch.Tensor
-    """(N, nj) added to joint positions in `joint_pos_biased`; kept over resets."""
+    """(N, nj) offset added to joint positions in `joint_pos_biased`. Resets keep it."""
     moved_envs: torch.Tensor | None = None
-    """(N,) bool, where a pose or joint positions were written since the last substep; None for
-    nowhere."""
+    """(N,) bool, environments whose pose or joint positions were written since the last substep.
+    None: no environment."""
     _views: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class EntityData:
         self._ctrl = Addresses(ix.ctrl_ids, device)
         self._forces = Addresses(ix.force_ids, device)
         self._root = Addresses([ix.root_body_id], device)
-        # A free joint's addresses always follow each other.
+        # Addresses of a free joint are always contiguous.
         start_q, start_v = ix.free_joint_q_adr[:1].tolist(), ix.free_joint_v_adr[:1].tolist()
         self._free_q = slice(start_q[0], start_q[0] + 7) if start_q else slice(0, 0)
         self._free_v = slice(start_v[0], start_v[0] + 6) if start_v else slice(0, 0)
@@ -157,12 +157,12 @@ class EntityData:
 
     @property
     def root_link_lin_vel_b(self) -> torch.Tensor:
-        """(N, 3) linear velocity of the root link's origin, in its frame."""
+        """(N, 3) linear velocity of the root link's origin, in the frame of the root link."""
         return quat_apply_inverse(self.root_link_quat_w, self.root_link_lin_vel_w)
 
     @property
     def root_link_ang_vel_b(self) -> torch.Tensor:
-        """(N, 3) angular velocity of the root link, in its frame."""
+        """(N, 3) angular velocity of the root link, in the frame of the root link."""
         return quat_apply_inverse(self.root_link_quat_w, self.root_link_ang_vel_w)
 
     @property
@@ -176,11 +176,11 @@ class EntityData:
         forward = quat_apply(self.root_link_quat_w, self.forward_vec_b)
         return torch.atan2(forward[:, 1], forward[:, 0])
 
-    # Root centre of mass.
+    # Root center of mass.
 
     @property
     def root_com_pos_w(self) -> torch.Tensor:
-        """(N, 3) centre of mass of the root body."""
+        """(N, 3) center of mass of the root body."""
         return self._root_row("xipos")
 
     @property
@@ -196,12 +196,12 @@ class EntityData:
 
     @property
     def root_com_vel_w(self) -> torch.Tensor:
-        """(N, 6) velocity of the root body's centre of mass."""
+        """(N, 6) velocity of the root body's center of mass."""
         return torch.cat((self.root_com_lin_vel_w, self.root_com_ang_vel_w), dim=-1)
 
     @property
     def root_com_lin_vel_w(self) -> torch.Tensor:
-        """(N, 3) linear velocity of the root body's centre of mass."""
+        """(N, 3) linear velocity of the root body's center of mass."""
         return self._root_linear("xipos")
 
     @property
@@ -211,7 +211,7 @@ class EntityData:
 
     @property
     def root_com_lin_vel_b(self) -> torch.Tensor:
-        """(N, 3) velocity of the root body's centre of mass, in the frame of the root LINK."""
+        """(N, 3) velocity of the root body's center of mass, in the frame of the root LINK."""
         return quat_apply_inverse(self.root_link_quat_w, self.root_com_lin_vel_w)
 
     @property
@@ -220,7 +220,7 @@ class EntityData:
         return quat_apply_inverse(self.root_link_quat_w, self.root_com_ang_vel_w)
 
     def _root_linear(self, position: str) -> torch.Tensor:
-        # The root is the top-level body of its own tree.
+        # The root is the top-level body of its tree.
         return _linear_velocity(
             self._root_row(position), self._root_row("subtree_com"), self._root_row("cvel")
         )
@@ -259,7 +259,7 @@ class EntityData:
 
     @property
     def body_com_pos_w(self) -> torch.Tensor:
-        """(N, nb, 3) centres of mass of the bodies."""
+        """(N, nb, 3) centers of mass of the bodies."""
         return self._columns("xipos", self._bodies)
 
     @property
@@ -274,7 +274,7 @@ class EntityData:
 
     @property
     def body_com_lin_vel_w(self) -> torch.Tensor:
-        """(N, nb, 3) linear velocities of the bodies' centres of mass."""
+        """(N, nb, 3) linear velocities of the bodies' centers of mass."""
         return self._body_linear("xipos")
 
     @property
@@ -284,13 +284,13 @@ class EntityData:
 
     @property
     def body_com_vel_w(self) -> torch.Tensor:
-        """(N, nb, 6) velocities of the bodies' centres of mass."""
+        """(N, nb, 6) velocities of the bodies' centers of mass."""
         return torch.cat((self.body_com_lin_vel_w, self.body_com_ang_vel_w), dim=-1)
 
     def link_lin_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
-        """Return linear velocities of the origins of links `bodies` of the entity, (N, n, 3).
+        """Return linear velocities of the origins of links `bodies`, (N, n, 3).
 
-        This is faster than choosing from `body_link_lin_vel_w`, which computes those of all links.
+        Faster than indexing `body_link_lin_vel_w`, which computes all links.
         """
         ids = self._bodies.tensor[bodies]
         if self._body_trees.constant == self.indexing.root_body_id:
@@ -301,7 +301,7 @@ class EntityData:
         return _linear_velocity(pos, com, cvel)
 
     def link_ang_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
-        """Return angular velocities of links `bodies` of the entity, (N, n, 3)."""
+        """Return angular velocities of links `bodies`, (N, n, 3)."""
         return self.data.cvel.index_select(1, self._bodies.tensor[bodies])[..., :3]
 
     def _body_linear(self, position: str) -> torch.Tensor:
@@ -313,7 +313,7 @@ class EntityData:
 
     @property
     def body_external_wrench(self) -> torch.Tensor:
-        """(N, nb, 6) applied force and torque, at the bodies' centres of mass."""
+        """(N, nb, 6) applied wrench (force, torque) at the bodies' centers of mass."""
         return self._columns("xfrc_applied", self._bodies)
 
     @property
@@ -345,7 +345,7 @@ class EntityData:
 
     @property
     def geom_lin_vel_w(self) -> torch.Tensor:
-        """(N, number of geoms, 3) linear velocities of the geoms' centres."""
+        """(N, number of geoms, 3) linear velocities of the geoms' centers."""
         return _linear_velocity(
             self.geom_pos_w,
             self._tree_com(self._geom_trees),
@@ -359,7 +359,7 @@ class EntityData:
 
     @property
     def geom_vel_w(self) -> torch.Tensor:
-        """(N, number of geoms, 6) velocities of the geoms' centres."""
+        """(N, number of geoms, 6) velocities of the geoms' centers."""
         return torch.cat((self.geom_lin_vel_w, self.geom_ang_vel_w), dim=-1)
 
     @property
@@ -405,7 +405,7 @@ class EntityData:
 
     @property
     def joint_pos_biased(self) -> torch.Tensor:
-        """(N, nj) joint positions as encoders with a bias report them."""
+        """(N, nj) joint positions plus `encoder_bias`."""
         return self.joint_pos + self.encoder_bias
 
     @property
@@ -415,15 +415,15 @@ class EntityData:
 
     @property
     def joint_acc(self) -> torch.Tensor:
-        """(N, nj) joint accelerations, of the last substep."""
+        """(N, nj) joint accelerations of the last substep."""
         return self._columns("qacc", self._joint_v)
 
     @property
     def joint_torques(self) -> torch.Tensor:
-        """Not offered: see the error for the two things it could mean."""
+        """Not supported, because the name is ambiguous; raises with the alternatives."""
         raise UnsupportedError(
-            "joint_torques could mean two things. Use qfrc_actuator for what the actuators apply "
-            "to the joints, or actuator_force for the force of each actuator before its gear."
+            "EntityData.joint_torques is ambiguous; use qfrc_actuator for the generalized forces of "
+            "the actuators on the joints, or actuator_force for actuator forces before their gear."
         )
 
     @property
@@ -438,30 +438,30 @@ class EntityData:
 
     @property
     def actuator_force(self) -> torch.Tensor:
-        """(N, number of forces) forces of the actuators in turn, before their gear.
+        """(N, number of forces) forces of the actuators, in order, before their gear.
 
-        Those of the last substep. An orientation servo has three, every other actuator one; see
-        `indexing.force_columns`.
+        Values of the last substep. An orientation servo has three forces, every other actuator one;
+        see `indexing.force_columns`.
         """
         return self._columns("actuator_force", self._forces)
 
     @property
     def qfrc_actuator(self) -> torch.Tensor:
-        """(N, nj) generalized forces of the actuators on the joints in the last substep."""
+        """(N, nj) generalized actuator forces on the joints in the last substep."""
         return self._columns("qfrc_actuator", self._joint_v)
 
     @property
     def qfrc_external(self) -> torch.Tensor:
-        """(N, nj) generalized forces on the joints of the wrenches now applied to bodies.
+        """(N, nj) generalized joint forces due to the wrenches applied to bodies.
 
-        `sum_b S_j . (tau_b + (p_b - c) x f_b, f_b)` over the bodies b that joint axis j moves, with
-        its motion axis `S_j` (`cdof`) about c, the centre of mass of the tree.
+        `sum_b S_j . (tau_b + (p_b - c) x f_b, f_b)` over the bodies b moved by joint axis j, with
+        motion axis `S_j` (`cdof`) about c, the center of mass of the tree.
         """
-        # Not `qfrc_smooth` without its other parts: those are of different stages of MuJoCo.
+        # Not `qfrc_smooth` minus its other parts: MuJoCo computes these at different stages.
         force, torque = self._columns("xfrc_applied", self._bodies).split(3, dim=-1)
         arm = self._columns("xipos", self._bodies) - self._tree_com(self._body_trees)
         wrench = torch.cat((torque + torch.linalg.cross(arm, force), force), dim=-1)
-        # A sum, because products of matrices may be rounded to TF32.
+        # A sum, because matrix products may be rounded to TF32.
         below = (self.indexing.moved_bodies[..., None] * wrench[:, None]).sum(dim=2)
         return (self._columns("cdof", self._joint_v) * below).sum(dim=-1)
 
@@ -485,12 +485,12 @@ class EntityData:
             else:
                 target[env_ids] = 0.0
 
-    # Writing into the simulation.
+    # Writers.
 
     def write_root_state(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Write pose and velocity of the root link, (k, 13): see the next two writers."""
+        """Write pose and velocity of the root link, (k, 13); see the next two writers."""
         self._require_floating("write_root_state")
-        root_state = as_values(root_state, 13, "The root state", self.device)
+        root_state = as_values(root_state, 13, "root state", self.device)
         self.write_root_pose(root_state[..., :7], env_ids)
         self.write_root_velocity(root_state[..., 7:], env_ids)
 
@@ -501,15 +501,15 @@ class EntityData:
             ValueError: the entity has a fixed base, or the width is wrong.
         """
         self._require_floating("write_root_pose")
-        pose = as_values(pose, 7, "The root pose", self.device)
+        pose = as_values(pose, 7, "root pose", self.device)
         assign(self.data.qpos, pose, env_ids, self._free_q)
         self._note_move(env_ids)
 
     def write_root_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
         """Write the world velocity of the root link, (k, 6): linear (of its origin), angular.
 
-        MuJoCo keeps the angular part in the body frame, so it is rotated by the orientation that
-        `qpos` holds now: write the pose first.
+        MuJoCo stores angular velocity in the body frame, so it is rotated by the current
+        orientation in `qpos`: write the pose first.
 
         Raises:
             ValueError: the entity has a fixed base, or the width is wrong.
@@ -519,7 +519,7 @@ class EntityData:
         assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
 
     def write_root_velocity_b(self, velocity_b: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Write the velocity of the root link given in its own frame, (k, 6): linear, angular.
+        """Write the velocity of the root link in the link frame, (k, 6): linear, angular.
 
         Raises:
             ValueError: the entity has a fixed base, or the width is wrong.
@@ -531,9 +531,9 @@ class EntityData:
         assign(self.data.qvel, torch.cat((linear, angular_b), dim=-1), env_ids, self._free_v)
 
     def write_root_com_velocity(self, velocity: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Write the world velocity of the root body's centre of mass, (k, 6): linear, angular.
+        """Write the world velocity of the root body's center of mass, (k, 6): linear, angular.
 
-        The origin of the link then moves with `v_com - omega x (R body_ipos)`.
+        The velocity of the link origin is `v_com - omega x (R body_ipos)`.
 
         Raises:
             ValueError: the entity has a fixed base, or the width is wrong.
@@ -550,7 +550,7 @@ class EntityData:
         joint_ids: Ids = None,
         env_ids: EnvIds = None,
     ) -> None:
-        """Write joint positions and velocities, (k, number of joints) or (k, 1) each."""
+        """Write joint positions and velocities, each (k, number of joints) or (k, 1)."""
         self.write_joint_position(position, joint_ids, env_ids)
         self.write_joint_velocity(velocity, joint_ids, env_ids)
 
@@ -564,7 +564,7 @@ class EntityData:
         """
         self._require_articulated("write_joint_position")
         columns, width = self._joint_q.select(joint_ids)
-        position = as_values(position, width, "The joint position", self.device, broadcasts=True)
+        position = as_values(position, width, "joint position", self.device, broadcasts=True)
         assign(self.data.qpos, position, env_ids, columns)
         self._note_move(env_ids)
 
@@ -578,7 +578,7 @@ class EntityData:
         """
         self._require_articulated("write_joint_velocity")
         columns, width = self._joint_v.select(joint_ids)
-        velocity = as_values(velocity, width, "The joint velocity", self.device, broadcasts=True)
+        velocity = as_values(velocity, width, "joint velocity", self.device, broadcasts=True)
         assign(self.data.qvel, velocity, env_ids, columns)
 
     def write_external_wrench(
@@ -588,55 +588,54 @@ class EntityData:
         body_ids: Sequence[int] | torch.Tensor | slice | None = None,
         env_ids: EnvIds = None,
     ) -> None:
-        """Set force and torque on bodies, (k, number of bodies, 3) each; None leaves a half alone.
+        """Set force and torque on bodies, each (k, number of bodies, 3). None: unchanged.
 
-        World frame, acting at the bodies' centres of mass. They persist until they are overwritten
-        or the environment is reset.
+        Wrenches are in the world frame, act at the bodies' centers of mass, and persist until
+        overwritten or until the environment is reset.
         """
         columns, _ = self._bodies.select(body_ids)
         wrench = self.data.xfrc_applied
-        for value, half, what in ((force, slice(0, 3), "force"), (torque, slice(3, 6), "torque")):
+        for value, half, name in ((force, slice(0, 3), "force"), (torque, slice(3, 6), "torque")):
             if value is not None:
-                values = as_values(value, 3, f"The external {what}", self.device)
+                values = as_values(value, 3, f"external {name}", self.device)
                 assign(wrench[..., half], values, env_ids, columns)
 
     def write_ctrl(self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None) -> None:
-        """Write controls of actuators, (k, number of controls), or (k, 1) for all alike.
+        """Write controls of actuators, (k, number of controls), or (k, 1) to broadcast.
 
-        `ctrl_ids` are ids of actuators as `find_actuators` returns them. Controls follow each other
-        by actuator: most have one, `<pid>`, `<dcmotor>` and `<orientation>` may have several.
+        `ctrl_ids` are actuator ids as returned by `find_actuators`. Controls are grouped by actuator:
+        most have one; `<pid>`, `<dcmotor>` and `<orientation>` may have several.
 
         Raises:
             ValueError: the entity has no configured actuators, or the width is wrong.
         """
         if not self.is_actuated:
             raise ValueError(
-                "write_ctrl: this entity has no actuators. List them in "
+                "write_ctrl: entity has no configured actuators; add them to "
                 "EntityCfg.articulation.actuators."
             )
         columns, width = self._ctrl.select(self.indexing.control_columns(ctrl_ids))
-        ctrl = as_values(ctrl, width, "The control", self.device, broadcasts=True)
+        ctrl = as_values(ctrl, width, "control", self.device, broadcasts=True)
         assign(self.data.ctrl, ctrl, env_ids, columns)
 
     def write_mocap_pose(self, pose: torch.Tensor, env_ids: EnvIds = None) -> None:
         """Write the pose of the mocap root, (k, 7): position, quaternion (w, x, y, z).
 
         Raises:
-            ValueError: the root is no mocap body, or the width is wrong.
+            ValueError: the root is not a mocap body, or the width is wrong.
         """
         mocap_id = self.indexing.mocap_id
         if mocap_id is None:
             raise ValueError(
-                "write_mocap_pose: the root of this entity is no mocap body. Place a floating "
-                "entity with write_root_pose."
+                "write_mocap_pose: entity has no mocap root; use write_root_pose for a floating base."
             )
-        pose = as_values(pose, 7, "The mocap pose", self.device)
+        pose = as_values(pose, 7, "mocap pose", self.device)
         assign(self.data.mocap_pos, pose[..., :3], env_ids, mocap_id)
         assign(self.data.mocap_quat, pose[..., 3:], env_ids, mocap_id)
         self._note_move(env_ids)
 
     def _note_move(self, env_ids: EnvIds) -> None:
-        # A new tensor, because one that was made under `inference_mode` cannot be written outside.
+        # A new tensor, because tensors created under `inference_mode` cannot be written outside it.
         if self.moved_envs is None:
             size = len(self.default_root_state)
             moved = torch.zeros(size, dtype=torch.bool, device=self.device)
@@ -646,42 +645,42 @@ class EntityData:
         self.moved_envs = moved
 
     def _read_velocity(
-        self, what: str, velocity: torch.Tensor, env_ids: EnvIds
+        self, writer: str, velocity: torch.Tensor, env_ids: EnvIds
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the orientations of the root now, (k, 4), and both halves of `velocity`, (k, 3).
+        """Return the current root orientations, (k, 4), and both halves of `velocity`, (k, 3).
 
-        Raises `ValueError`, naming the writer `what`, for a fixed base or a wrong width.
+        Raises `ValueError`, naming `writer`, for a fixed base or a wrong width.
         """
-        self._require_floating(what)
-        velocity = as_values(velocity, 6, "The root velocity", self.device)
+        self._require_floating(writer)
+        velocity = as_values(velocity, 6, "root velocity", self.device)
         quat = self.data.qpos[:, self._free_q][as_index(env_ids), 3:7]
         halves = velocity.expand(len(quat), 6)
         return quat, halves[:, :3], halves[:, 3:]
 
-    def _require_floating(self, what: str) -> None:
+    def _require_floating(self, writer: str) -> None:
         if self.is_fixed_base:
             raise ValueError(
-                f"{what}: this entity has a fixed base. Place it with write_mocap_pose, or give "
-                "its root body a free joint."
+                f"{writer}: entity has a fixed base; use write_mocap_pose, or add a free joint to its "
+                "root body."
             )
 
-    def _require_articulated(self, what: str) -> None:
+    def _require_articulated(self, writer: str) -> None:
         if not self.is_articulated:
-            raise ValueError(f"{what}: this entity has no joints other than a free one.")
+            raise ValueError(f"{writer}: entity has no joints other than a free joint.")
 
-    # Reading a simulation field.
+    # Simulation fields.
 
     def _columns(self, name: str, at: Addresses) -> torch.Tensor:
-        """Return the entity's part of a data field: a view, kept, where addresses allow one."""
+        """Return the entity's columns of a data field, as a cached view if they are contiguous."""
         key = (name, id(at))
         view = self._views.get(key)
         if view is not None:
             return view
         field = getattr(self.data, name)
         if isinstance(at.all, torch.Tensor):
-            # Several times as fast as indexing with the tensor.
+            # Several times faster than indexing with the tensor.
             return field.index_select(1, at.all)
-        # Tensors of data fields live as long as the simulation, so views of them do too.
+        # Views can be cached: tensors of data fields live as long as the simulation.
         view = self._views[key] = field[:, at.all]
         return view
 
@@ -693,9 +692,9 @@ class EntityData:
         return view
 
     def _tree_com(self, trees: Addresses) -> torch.Tensor:
-        """Return centres of mass of trees, (N, n, 3), or (N, 1, 3) if all are the root's tree.
+        """Return centers of mass of trees, (N, n, 3), or (N, 1, 3) if all are the root's tree.
 
-        An entity with several top-level bodies has several trees, each with its own centre.
+        An entity with several top-level bodies has several trees, each with a separate center of mass.
         """
         if trees.constant == self.indexing.root_body_id:
             return self._columns("subtree_com", self._root)
@@ -705,15 +704,15 @@ class EntityData:
 def compute_velocity_from_cvel(
     pos: torch.Tensor, subtree_com: torch.Tensor, cvel: torch.Tensor
 ) -> torch.Tensor:
-    """Return the world velocity of points fixed to bodies: (..., 6) linear, angular.
+    """Return the world velocity of points fixed to bodies, (..., 6): linear, angular.
 
-    MuJoCo's `cvel = (omega, v_c)` is the velocity of the point of the (extended) body that is now
-    at `c`, the centre of mass of the body's whole tree. Hence `v(p) = v_c - omega x (c - p)`.
+    MuJoCo's `cvel = (omega, v_c)` is the velocity of the point of the (extended) body at `c`, the
+    center of mass of the body's whole tree. Hence `v(p) = v_c - omega x (c - p)`.
 
     Args:
-        pos: (..., 3) world positions p.
-        subtree_com: (..., 3) centre of mass of the tree that each point's body belongs to.
-        cvel: (..., 6) `cvel` of each point's body.
+        pos: World positions p, (..., 3).
+        subtree_com: Center of mass of the tree of each point's body, (..., 3).
+        cvel: `cvel` of each point's body, (..., 6).
     """
     linear = _linear_velocity(pos, subtree_com, cvel)
     return torch.cat((linear, cvel[..., :3].expand_as(linear)), dim=-1)
@@ -728,23 +727,23 @@ def _linear_velocity(
 def as_values(
     value: Any, width: int, name: str, device: str, broadcasts: bool = False
 ) -> torch.Tensor:
-    """Return a tensor, array or number as float32, whose last dimension must be `width`.
+    """Return a tensor, array or number as float32; the last dimension must be `width`.
 
-    With `broadcasts` it may be 1: one value for all elements.
+    With `broadcasts`, the last dimension may be 1: one value for all elements.
 
     Raises:
-        ValueError: the width is another.
+        ValueError: the last dimension is wrong.
     """
     if not isinstance(value, torch.Tensor):
-        # Copied, because torch warns about arrays that it may not write to.
+        # Copied, because torch warns about read-only arrays.
         value = torch.as_tensor(np.array(value), dtype=torch.float32, device=device)
     elif value.dtype != torch.float32:
         value = value.to(device, torch.float32)
     widths = (1, width) if broadcasts else (width,)
     if value.ndim > 0 and value.shape[-1] not in widths:
         raise ValueError(
-            f"{name} has {value.shape[-1]} values per environment (shape {tuple(value.shape)}), "
-            f"but {width} are to be written. Give a tensor of shape (number of envs, {width})."
+            f"{name}: expected a tensor of shape (number of envs, {width}), got "
+            f"{value.shape[-1]} values per environment (shape {tuple(value.shape)})."
         )
     return value
 
@@ -755,7 +754,7 @@ def assign(
     env_ids: EnvIds,
     columns: slice | torch.Tensor | int,
 ) -> None:
-    """Write `value` into rows `env_ids` and `columns` of `field`; tensors select their product."""
+    """Write `value` into rows `env_ids` and `columns` of `field`; two tensors select their product."""
     if env_ids is None:
         field[:, columns] = value
     elif isinstance(columns, torch.Tensor) and not isinstance(env_ids, slice):

@@ -1,4 +1,4 @@
-"""One simulated thing: its configuration, its part of the scene's spec, and its run-time state."""
+"""Entities: configuration, MuJoCo spec, and run-time state of robots and objects."""
 
 from __future__ import annotations
 
@@ -41,48 +41,48 @@ from mjlab.utils.xml import fix_spec_xml, strip_buffer_textures
 
 @dataclass
 class EntityArticulationInfoCfg:
-    """What moves an entity's joints, tendons and sites."""
+    """Actuators and soft joint limits."""
 
     actuators: tuple[ActuatorCfg, ...] = ()
-    """Actuators to add, or to take from the XML. Actuators of the XML that are not listed stay in
-    the model with their control at zero."""
+    """Actuators to add, or to take over from the XML. XML actuators that no config lists stay in
+    the model with zero control."""
     soft_joint_pos_limit_factor: float = 1.0
-    """Size of the soft joint limits as a share of the limits, about the same middle."""
+    """Range of the soft joint limits as a fraction of the joint range, about the same center."""
 
 
 @dataclass
 class EntityCfg:
-    """Describes an entity: any MuJoCo spec, with a floating or a fixed base, with joints or none.
+    """Entity configuration: any MuJoCo spec, with floating or fixed base, with or without joints.
 
-    An entity with a fixed base is put under a mocap body, so that each environment can place it.
+    A fixed base is attached to a mocap body, so that each environment can place it.
     """
 
     @dataclass
     class InitialStateCfg:
-        """The state that reset events start from, before environment origins are added."""
+        """Initial state, used by reset events. Environment origins are added later."""
 
         pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        """Position of the root, in metres."""
+        """Root position (m)."""
         rot: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-        """Orientation of the root, as a quaternion (w, x, y, z)."""
+        """Root orientation, quaternion (w, x, y, z)."""
         lin_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        """Linear velocity of a floating root, in the world frame."""
+        """Linear velocity of a floating root (m/s), world frame."""
         ang_vel: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        """Angular velocity of a floating root, in the world frame."""
+        """Angular velocity of a floating root (rad/s), world frame."""
         joint_pos: dict[str, float] | None = field(default_factory=lambda: {".*": 0.0})
-        """Joint positions by name pattern. A pattern matches the start of a name, the first that
-        does wins, other joints take 0. None takes them from the first keyframe of the XML."""
+        """Joint positions (rad or m) by name pattern. Patterns match at the start of a name, the
+        first match wins, other joints get 0. None: joint positions of the first XML keyframe."""
         joint_vel: dict[str, float] = field(default_factory=lambda: {".*": 0.0})
-        """Joint velocities by name pattern, likewise."""
+        """Joint velocities (rad/s or m/s) by name pattern, matched as in `joint_pos`."""
 
     init_state: InitialStateCfg = field(default_factory=InitialStateCfg)
-    """The initial state."""
+    """Initial state."""
     spec_fn: Callable[[], mujoco.MjSpec] = field(default_factory=lambda: mujoco.MjSpec)
-    """Returns the MuJoCo spec of the entity, which is copied."""
+    """Function that returns the entity's MuJoCo spec. The spec is copied."""
     articulation: EntityArticulationInfoCfg | None = None
     """Actuators and soft joint limits."""
     sort_actuators: bool = False
-    """Order actuators by what they act on (joints, tendons, sites) instead of by config."""
+    """Order actuators by target (joints, tendons, sites) instead of by config."""
     lights: tuple[spec_cfg.LightCfg, ...] = ()
     """Lights to add."""
     cameras: tuple[spec_cfg.CameraCfg, ...] = ()
@@ -90,11 +90,11 @@ class EntityCfg:
     textures: tuple[spec_cfg.TextureCfg, ...] = ()
     """Textures to add."""
     materials: tuple[spec_cfg.MaterialCfg, ...] = ()
-    """Materials to add and to give to geoms."""
+    """Materials to add and assign to geoms."""
     meshes: tuple[spec_cfg.MeshCfg, ...] = ()
-    """Changes of mesh assets."""
+    """Edits of mesh assets."""
     geoms: tuple[spec_cfg.GeomCfg, ...] = ()
-    """Changes of geoms."""
+    """Edits of geoms."""
     collisions: tuple[spec_cfg.CollisionCfg, ...] = ()
     """Collision settings of geoms, applied after `geoms`."""
 
@@ -105,34 +105,33 @@ class EntityCfg:
 
 @stateful
 class Entity:
-    """A simulated thing. Built from its config alone; `initialize` ties it to a simulation.
+    """Simulated robot or object. Built from its config; `initialize` binds it to a simulation.
 
-    Names are without the prefix of the scene: the part after the last "/". Elements without a name
-    are called "". Every `find_*` takes regular expressions that must match a whole name, and
-    returns indices within the entity and names, in the entity's order, or, with `preserve_order`,
-    pattern by pattern. With a subset of names to choose from, indices count in that subset. All
-    raise `ValueError`, listing the candidates, if a pattern matches nothing or two patterns match
-    one name.
+    Names omit the scene prefix: they are the part after the last "/". Unnamed elements are called
+    "". Every `find_*` takes regular expressions that must match a whole name, and returns indices
+    within the entity and names, in entity order, or, with `preserve_order`, pattern by pattern. With
+    a subset of names to choose from, indices count within that subset. `find_*` raises `ValueError`,
+    listing the candidates, if a pattern matches nothing or two patterns match one name.
 
-    `env_ids` of setters and writers is None (all), a slice, a boolean mask or a one-dimensional
-    tensor of indices; element ids count within the entity and may also be a list. Tensors of both
-    select their product. Values are tensors or arrays of any float type. All raise `ValueError` if a
-    width is wrong or the entity has no such elements. Setters store a target for the next
-    `write_data_to_sim`; writers change the simulation now, and what derives from the state follows
+    `env_ids` of setters and writers is None (all), a slice, a boolean mask or a 1-D tensor of
+    indices; element ids count within the entity and may also be a list. If both are tensors, they
+    select their product. Values are tensors or arrays of any float type. Setters and writers raise
+    `ValueError` if a width is wrong or the entity has no such elements. Setters store a target for the
+    next `write_data_to_sim`; writers change the simulation immediately, and derived quantities follow
     at the next `sim.forward()`.
     """
 
     def __init__(self, cfg: EntityCfg) -> None:
-        """Build the entity's spec: the user's, edited, with actuators and initial keyframe.
+        """Build the entity's spec: user spec, editors, actuators, initial keyframe.
 
         Raises:
-            ValueError: the spec has several free joints, one that is not its first joint, or ball
-                joints; patterns of actuators or editors do not resolve.
+            ValueError: the spec has several free joints, a free joint that is not its first joint,
+                or ball joints; patterns of actuators or editors do not resolve.
         """
         self.cfg = cfg
         spec = self._make_spec()
         self.options = pop_options(spec)
-        """Simulation options that the entity's own XML asks for; the scene decides on them."""
+        """Simulation options stated in the entity's XML. The scene decides whether to apply them."""
         xml_key = pop_keyframes(spec)
         self._spec = self._placeable(spec)
         self._spec_to_write = self._spec
@@ -165,7 +164,7 @@ class Entity:
             joint_pos=init.joint_pos,
             joint_vel=init.joint_vel,
         )
-        """The configured initial state, resolved for this entity's joints and actuators."""
+        """Configured initial state, resolved for this entity's joints and actuators."""
         if self._free_joint is None:
             place_body(self.root_body, self.initial_state.root_state)
         add_key(self._spec, [self.initial_state])
@@ -174,88 +173,88 @@ class Entity:
         return copy_spec(self.cfg.spec_fn(), "EntityCfg.spec_fn")
 
     def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
-        """Return `spec` under a mocap body, if its base is fixed."""
+        """Return `spec`, attached to a mocap body if its base is fixed."""
         return auto_wrap_fixed_base_mocap(lambda: spec)()
 
-    # What it is.
+    # Properties.
 
     @property
     def spec(self) -> mujoco.MjSpec:
-        """The entity's spec. In a scene, its elements carry the prefix of the entity."""
+        """MuJoCo spec. In a scene, element names carry the entity's prefix."""
         return self._spec
 
     @property
     def data(self) -> EntityData:
-        """State and targets in all environments.
+        """State and targets of all environments.
 
         Raises:
             RuntimeError: the entity has not been initialized with a simulation.
         """
         if self._data is None:
             raise WrongStateError(
-                "This entity has no data yet: call Scene.initialize (or Entity.initialize) with "
-                "the compiled model and the simulation first."
+                "Entity.data: expected an initialized entity; call Scene.initialize (or "
+                "Entity.initialize) with the compiled model and the simulation first."
             )
         return self._data
 
     @property
     def indexing(self) -> EntityIndexing:
-        """Where the entity's elements are in the model."""
+        """Ids and addresses of the entity's elements in the model."""
         return self.data.indexing
 
     @property
     def actuators(self) -> list[Actuator]:
-        """The configured actuators."""
+        """Configured actuators."""
         return self._actuators
 
     @property
     def joints(self) -> tuple[mujoco.MjsJoint, ...]:
-        """The joints, without a free joint, in spec order."""
+        """Joints in spec order, without a free joint."""
         return self._joints
 
     @property
     def root_body(self) -> mujoco.MjsBody:
-        """The first body; the mocap body that holds everything, where the base is fixed."""
+        """Root body: the first body; for a fixed base, the mocap body."""
         return self._spec.bodies[1]
 
     @property
     def is_fixed_base(self) -> bool:
-        """Whether the entity has no free joint."""
+        """True if the entity has no free joint."""
         return self._free_joint is None
 
     @property
     def is_articulated(self) -> bool:
-        """Whether the entity has joints other than a free one."""
+        """True if the entity has joints other than a free joint."""
         return bool(self._joints)
 
     @property
     def is_actuated(self) -> bool:
-        """Whether the entity has configured actuators."""
+        """True if the entity has configured actuators."""
         return bool(self._actuators)
 
     @property
     def is_mocap(self) -> bool:
-        """Whether the root is a mocap body."""
+        """True if the root is a mocap body."""
         return bool(self.root_body.mocap)
 
     @property
     def has_tendon_actuators(self) -> bool:
-        """Whether a configured actuator acts on a tendon."""
+        """True if a configured actuator acts on a tendon."""
         return TransmissionType.TENDON in {one.transmission_type for one in self._actuators}
 
     @property
     def has_site_actuators(self) -> bool:
-        """Whether a configured actuator acts on a site."""
+        """True if a configured actuator acts on a site."""
         return TransmissionType.SITE in {one.transmission_type for one in self._actuators}
 
     @property
     def variant_metadata(self) -> VariantInfo | None:
-        """What differs between environments; None unless built from a `VariantEntityCfg`."""
+        """Variants and their assignment; None unless built from a `VariantEntityCfg`."""
         return None
 
     @property
     def needs_substep(self) -> bool:
-        """Whether an actuator has to act between the physics substeps of one step."""
+        """True if an actuator must act at every physics substep of an environment step."""
         return any(actuator.needs_substep for actuator in self._actuators)
 
     # Life cycle.
@@ -265,12 +264,12 @@ class Entity:
         return compile_composed(self._spec)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Tie the entity to a simulation.
+        """Bind the entity to a simulation.
 
         Args:
-            mj_model: The compiled model of the scene.
-            model: The simulation's model fields.
-            data: The simulation's data fields, whose `nworld` is the number of environments.
+            mj_model: Compiled model of the scene.
+            model: Model fields of the simulation.
+            data: Data fields of the simulation; `nworld` is the number of environments.
             device: Torch device of the fields.
         """
         indexing = build_indexing(self._spec, self._free_joint, self.is_actuated, mj_model, device)
@@ -283,7 +282,7 @@ class Entity:
         self._fused_group.initialize(data.nworld, device)
 
     def reset(self, env_ids: EnvIds = None) -> None:
-        """Set targets to zero and forget delays and histories; the state is left to events."""
+        """Set targets to zero and clear delays and histories. Reset events write the state."""
         self.data.clear_state(env_ids)
         for actuator in self._actuators:
             actuator.reset(env_ids)
@@ -291,20 +290,20 @@ class Entity:
     def clear_state(self, env_ids: EnvIds = None) -> None:
         """Deprecated: call `reset`."""
         warnings.warn(
-            "Entity.clear_state is an older name of Entity.reset.", DeprecationWarning, stacklevel=2
+            "Entity.clear_state is deprecated; use Entity.reset.", DeprecationWarning, stacklevel=2
         )
         self.reset(env_ids)
 
     def update(self, dt: float) -> None:
-        """Tell the actuators that `dt` seconds have passed."""
+        """Update the actuators after a physics substep of `dt` seconds."""
         for actuator in self._actuators:
             actuator.update(dt)
 
     def write_data_to_sim(self, env_ids: EnvIds = None) -> None:
-        """Turn targets into controls, through the actuators.
+        """Convert targets to controls through the actuators and write `ctrl`.
 
-        With `env_ids`, only those environments' controls are written and only their delay lines
-        and histories advance: an environment never notices that another one was reset.
+        With `env_ids`, only the controls, delay lines and histories of these environments change:
+        a partial reset does not affect other environments.
         """
         if not self._actuators:
             return
@@ -314,7 +313,7 @@ class Entity:
         for actuator in self._own_actuators:
             actuator.apply_controls(data, env_ids)
 
-    # Names of elements.
+    # Element names.
 
     @property
     def body_names(self) -> tuple[str, ...]:
@@ -348,7 +347,7 @@ class Entity:
 
     @property
     def actuator_names(self) -> tuple[str, ...]:
-        """Names of all actuators in the spec, also of those that no config lists."""
+        """Names of all actuators in the spec, unlisted XML actuators included."""
         return short_names(self._spec.actuators)
 
     @property
@@ -376,7 +375,7 @@ class Entity:
         """Names of the contact pairs."""
         return short_names(self._spec.pairs)
 
-    # Numbers of elements.
+    # Element counts.
 
     @property
     def num_bodies(self) -> int:
@@ -433,7 +432,7 @@ class Entity:
         """Number of contact pairs."""
         return len(self.pair_names)
 
-    # Finding elements by name.
+    # Name lookups.
 
     def find_bodies(self, name_keys: str | Sequence[str], preserve_order: bool = False) -> Found:
         """Find bodies by name."""
@@ -445,7 +444,7 @@ class Entity:
         joint_subset: Sequence[str] | None = None,
         preserve_order: bool = False,
     ) -> Found:
-        """Find joints by name; the free joint is none of them."""
+        """Find joints by name, a free joint excluded."""
         return find_names("joints", name_keys, self.joint_names, joint_subset, preserve_order)
 
     def find_geoms(
@@ -534,10 +533,11 @@ class Entity:
         return find_names("pairs", name_keys, self.pair_names, pair_subset, preserve_order)
 
     def find_joints_by_actuator_names(self, actuator_name_keys: Any) -> Found:
-        """Find joints, in the entity's order, among those that a configured actuator acts on.
+        """Find joints, in entity order, among the joints driven by configured actuators.
 
         Raises:
-            ValueError: a pattern matches none of these joints, or two match one; lists them.
+            ValueError: a pattern matches none of these joints, or two patterns match one joint;
+                lists the joints.
         """
         actuated = {
             name
@@ -550,55 +550,55 @@ class Entity:
         _, found = find_names("actuated joints", actuator_name_keys, candidates)
         return [names.index(name) for name in found], found
 
-    # Targets of actuators.
+    # Actuator targets.
 
     def set_joint_position_target(
         self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Set position targets (k, number of joints), in radians or metres."""
+        """Set position targets (rad or m), (k, number of joints)."""
         _set_target(self.data.joint_pos_target, position, joint_ids, env_ids, "joint")
 
     def set_joint_velocity_target(
         self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Set velocity targets (k, number of joints)."""
+        """Set velocity targets (rad/s or m/s), (k, number of joints)."""
         _set_target(self.data.joint_vel_target, velocity, joint_ids, env_ids, "joint")
 
     def set_joint_effort_target(
         self, effort: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Set effort targets (k, number of joints)."""
+        """Set effort targets (N m or N), (k, number of joints)."""
         _set_target(self.data.joint_effort_target, effort, joint_ids, env_ids, "joint")
 
     def set_tendon_len_target(
         self, length: torch.Tensor, tendon_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Set length targets (k, number of tendons)."""
+        """Set length targets, (k, number of tendons)."""
         _set_target(self.data.tendon_len_target, length, tendon_ids, env_ids, "tendon")
 
     def set_tendon_vel_target(
         self, velocity: torch.Tensor, tendon_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Set velocity targets (k, number of tendons)."""
+        """Set velocity targets, (k, number of tendons)."""
         _set_target(self.data.tendon_vel_target, velocity, tendon_ids, env_ids, "tendon")
 
     def set_tendon_effort_target(
         self, effort: torch.Tensor, tendon_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Set effort targets (k, number of tendons)."""
+        """Set effort targets, (k, number of tendons)."""
         _set_target(self.data.tendon_effort_target, effort, tendon_ids, env_ids, "tendon")
 
     def set_site_effort_target(
         self, effort: torch.Tensor, site_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Set effort targets (k, number of sites)."""
+        """Set effort targets, (k, number of sites)."""
         _set_target(self.data.site_effort_target, effort, site_ids, env_ids, "site")
 
     def seed_position_targets(self, env_ids: EnvIds = None) -> None:
-        """Where no joint position target was set since the reset, take the current position.
+        """Set joint position targets that are unset since the reset to the current positions.
 
-        A reset leaves all targets at zero. Position actuators would then pull towards zero until
-        the first action: after the reset events have placed the joints, this holds them there.
+        A reset sets all targets to zero, so position actuators would pull toward zero until the
+        first action. Called after the reset events, this holds the joints where the events placed them.
         """
         target = self.data.joint_pos_target
         if target.shape[1] == 0:
@@ -607,32 +607,32 @@ class Entity:
         chosen = target[rows]
         target[rows] = torch.where(chosen == 0.0, self.data.joint_pos[rows], chosen)
 
-    # Writing the state.
+    # State writers.
 
     def write_root_state_to_sim(self, root_state: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Write the root link's pose and velocity (k, 13)."""
+        """Write the root link's pose and velocity, (k, 13)."""
         self.data.write_root_state(root_state, env_ids)
 
     def write_root_link_pose_to_sim(self, root_pose: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Write the root link's world pose (k, 7): position, quaternion (w, x, y, z)."""
+        """Write the root link's world pose, (k, 7): position, quaternion (w, x, y, z)."""
         self.data.write_root_pose(root_pose, env_ids)
 
     def write_root_link_velocity_to_sim(
         self, root_velocity: torch.Tensor, env_ids: EnvIds = None
     ) -> None:
-        """Write the root link's world velocity (k, 6). Write its pose before."""
+        """Write the root link's world velocity, (k, 6). Write the pose first."""
         self.data.write_root_velocity(root_velocity, env_ids)
 
     def write_root_link_velocity_b_to_sim(
         self, root_velocity_b: torch.Tensor, env_ids: EnvIds = None
     ) -> None:
-        """Write the root link's velocity given in its own frame (k, 6). Write its pose before."""
+        """Write the root link's velocity in the link frame, (k, 6). Write the pose first."""
         self.data.write_root_velocity_b(root_velocity_b, env_ids)
 
     def write_root_com_velocity_to_sim(
         self, root_velocity: torch.Tensor, env_ids: EnvIds = None
     ) -> None:
-        """Write the world velocity of the root body's centre of mass (k, 6), after its pose."""
+        """Write the root body's center-of-mass velocity, world frame, (k, 6). Write the pose first."""
         self.data.write_root_com_velocity(root_velocity, env_ids)
 
     def write_joint_state_to_sim(
@@ -642,19 +642,19 @@ class Entity:
         joint_ids: Ids = None,
         env_ids: EnvIds = None,
     ) -> None:
-        """Write joint positions and velocities (k, number of joints); (k, 1) for all joints alike."""
+        """Write joint positions and velocities, (k, number of joints), or (k, 1) to broadcast."""
         self.data.write_joint_state(position, velocity, joint_ids, env_ids)
 
     def write_joint_position_to_sim(
         self, position: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write joint positions (k, number of joints); (k, 1) for all joints alike."""
+        """Write joint positions, (k, number of joints), or (k, 1) to broadcast."""
         self.data.write_joint_position(position, joint_ids, env_ids)
 
     def write_joint_velocity_to_sim(
         self, velocity: torch.Tensor, joint_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write joint velocities (k, number of joints); (k, 1) for all joints alike."""
+        """Write joint velocities, (k, number of joints), or (k, 1) to broadcast."""
         self.data.write_joint_velocity(velocity, joint_ids, env_ids)
 
     def write_external_wrench_to_sim(
@@ -664,42 +664,42 @@ class Entity:
         env_ids: EnvIds = None,
         body_ids: Sequence[int] | torch.Tensor | slice | None = None,
     ) -> None:
-        """Set world force and torque on bodies (k, number of bodies, 3), at their mass centres."""
+        """Set world force and torque at the bodies' centers of mass, (k, number of bodies, 3)."""
         self.data.write_external_wrench(forces, torques, body_ids, env_ids)
 
     def write_ctrl_to_sim(
         self, ctrl: torch.Tensor, ctrl_ids: Ids = None, env_ids: EnvIds = None
     ) -> None:
-        """Write controls (k, number of controls) of actuators `ctrl_ids`, as `find_actuators` counts.
+        """Write controls of actuators `ctrl_ids` (see `find_actuators`), (k, number of controls).
 
         See `EntityData.write_ctrl` for actuators with several controls.
         """
         self.data.write_ctrl(ctrl, ctrl_ids, env_ids)
 
     def write_mocap_pose_to_sim(self, mocap_pose: torch.Tensor, env_ids: EnvIds = None) -> None:
-        """Write the pose of the mocap root (k, 7): position, quaternion (w, x, y, z)."""
+        """Write the pose of the mocap root, (k, 7): position, quaternion (w, x, y, z)."""
         self.data.write_mocap_pose(mocap_pose, env_ids)
 
-    # Files.
+    # Export.
 
     def snapshot_spec(self) -> None:
-        """Keep a copy of the spec for `write_xml` and `to_zip`. A scene calls this.
+        """Copy the spec for `write_xml` and `to_zip`. Called by the scene before attaching the entity.
 
-        MuJoCo cannot write a spec that has been attached to another one.
+        MuJoCo cannot export a spec that has been attached to another one.
         """
         self._spec_to_write = self._spec.copy()
 
     def write_xml(self, xml_path: Path) -> None:
-        """Write the entity's spec as XML, without textures made from raw pixels.
+        """Write the entity's spec as XML, without textures built from raw pixels.
 
-        Of an entity in a scene this is the spec as it was before the scene took it in.
+        For an entity in a scene, this is the spec before it was attached.
         """
         spec = self._spec_to_write.copy()
         strip_buffer_textures(spec)
         Path(xml_path).write_text(fix_spec_xml(spec.to_xml()))
 
     def to_zip(self, path: Path) -> None:
-        """Write the entity's spec and its assets as MuJoCo's own archive, as `write_xml` does."""
+        """Write the entity's spec and assets as a MuJoCo zip archive; see `write_xml`."""
         with open(path, "wb") as file:
             self._spec_to_write.to_zip(file)
 
@@ -710,7 +710,7 @@ def _set_target(
     width = target.shape[1]
     if width == 0:
         raise ValueError(
-            f"This entity has no {kind} targets: it has no {kind}s"
+            f"Entity has no {kind} targets: it has no {kind}s"
             + ("." if kind == "joint" else f", or no configured actuator acts on a {kind}.")
         )
     columns: slice | torch.Tensor
@@ -721,19 +721,19 @@ def _set_target(
     else:
         columns = as_ids(ids, width, target.device)
         width = columns.shape[0]
-    values = as_values(value, width, f"The {kind} target", str(target.device), broadcasts=True)
+    values = as_values(value, width, f"{kind} target", str(target.device), broadcasts=True)
     assign(target, values, env_ids, columns)
 
 
 def _make_data(
     entity: Entity, indexing: EntityIndexing, model: Any, data: Any, device: str
 ) -> EntityData:
-    """Return the data of `entity`, with defaults from its config and all targets zero."""
+    """Return the data of `entity`: defaults from its config, zero targets."""
     num_envs = data.nworld
     num_joints = len(indexing.joints)
 
     def row(values: Any) -> torch.Tensor:
-        """Return one row for each environment, each its own memory."""
+        """Return one row per environment, in separate memory."""
         one = torch.as_tensor(values, dtype=torch.float32, device=device)
         return one.expand(num_envs, *one.shape).clone()
 
@@ -743,7 +743,7 @@ def _make_data(
     articulation = entity.cfg.articulation
     factor = 1.0 if articulation is None else articulation.soft_joint_pos_limit_factor
     ids = indexing.joint_ids.long()
-    # Read from the simulation, because variants of an entity may have limits of their own.
+    # Read from the simulation, because limits may differ between variants.
     limits, limited = model.jnt_range[:, ids].clone().float(), model.jnt_limited[..., ids].bool()
     limits[..., 0].masked_fill_(~limited, -torch.inf)
     limits[..., 1].masked_fill_(~limited, torch.inf)
@@ -776,7 +776,7 @@ def _make_data(
 
 
 def _shrunk(limits: torch.Tensor, factor: float) -> torch.Tensor:
-    """Return limits scaled by `factor` about their middle; infinite ones stay so."""
+    """Return limits scaled by `factor` about their center. Infinite limits are unchanged."""
     middle = limits.mean(dim=-1)
     half = 0.5 * factor * (limits[..., 1] - limits[..., 0])
     shrunk = torch.stack((middle - half, middle + half), dim=-1)

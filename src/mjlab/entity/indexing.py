@@ -1,4 +1,4 @@
-"""Where an entity's elements are in the compiled model."""
+"""Ids and addresses of an entity's elements in the compiled model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mjlab.utils.mujoco import (
 )
 
 Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
-"""A selection: None for all, a slice, or whole numbers (list, tensor) or a boolean mask."""
+"""Selection: None (all), a slice, integers (list, tensor) or a boolean mask."""
 
 IdsT = TypeVar("IdsT", bound="Ids | int")
 
@@ -40,7 +40,7 @@ _OBJECT_TYPES = {
     "equalities": mujoco.mjtObj.mjOBJ_EQUALITY,
     "sensors": mujoco.mjtObj.mjOBJ_SENSOR,
 }
-# Fields of `EntityIndexing` besides bodies and joints.
+# Element fields of `EntityIndexing` other than bodies and joints.
 _FURTHER_KINDS = (
     "geoms", "sites", "tendons", "cameras", "lights", "materials", "textures", "pairs", "actuators",
 )  # fmt: skip
@@ -54,9 +54,9 @@ class EntityIndexing:
     """
 
     bodies: tuple[mujoco.MjsBody, ...]
-    """All bodies but the world; the first is the root."""
+    """Bodies without the world; the first is the root."""
     joints: tuple[mujoco.MjsJoint, ...]
-    """All joints but the free one."""
+    """Joints without a free joint."""
     geoms: tuple[mujoco.MjsGeom, ...]
     sites: tuple[mujoco.MjsSite, ...]
     tendons: tuple[mujoco.MjsTendon, ...]
@@ -79,39 +79,39 @@ class EntityIndexing:
     actuator_ids: torch.Tensor
     """Ids of `actuators`; empty if that is None."""
     ctrl_ids: torch.Tensor
-    """Columns of `ctrl` of `actuators` in turn; an actuator may have none, one or several."""
+    """Columns of `ctrl` of `actuators`, in order; an actuator may have none, one or several."""
     force_ids: torch.Tensor
-    """Columns of `actuator_force` of `actuators` in turn; three for an orientation, else one."""
+    """Columns of `actuator_force` of `actuators`, in order; three for an orientation, else one."""
     joint_ids: torch.Tensor
     mocap_id: int | None
-    """Index into `mocap_pos`, or None if the root is no mocap body."""
+    """Index into `mocap_pos`; None if the root is not a mocap body."""
     joint_q_adr: torch.Tensor
     """Addresses in `qpos`, without the free joint."""
     joint_v_adr: torch.Tensor
     """Addresses in `qvel`, without the free joint."""
     free_joint_q_adr: torch.Tensor
-    """The free joint's 7 addresses in `qpos`, or none."""
+    """The 7 addresses of the free joint in `qpos`; empty without a free joint."""
     free_joint_v_adr: torch.Tensor
-    """The free joint's 6 addresses in `qvel`, or none."""
+    """The 6 addresses of the free joint in `qvel`; empty without a free joint."""
     body_tree_ids: torch.Tensor
-    """For each body, the top-level body of its tree: `cvel` refers to that tree's centre of mass."""
+    """Top-level body of each body's tree. `cvel` refers to the center of mass of that tree."""
     geom_body_ids: torch.Tensor
-    """For each geom, the body it belongs to."""
+    """Body of each geom."""
     geom_tree_ids: torch.Tensor
-    """For each geom, the top-level body of its tree."""
+    """Top-level body of each geom's tree."""
     site_body_ids: torch.Tensor
-    """For each site, the body it belongs to."""
+    """Body of each site."""
     site_tree_ids: torch.Tensor
-    """For each site, the top-level body of its tree."""
+    """Top-level body of each site's tree."""
     moved_bodies: torch.Tensor
-    """(nj, number of bodies) float32, 1 where a degree of freedom of `joint_v_adr` moves a body."""
+    """1 if a degree of freedom of `joint_v_adr` moves a body, else 0; (nj, nb) float32."""
 
     def force_columns(self, actuator_ids: IdsT) -> IdsT | list[int]:
-        """Return the columns of `EntityData.actuator_force` of some of the entity's actuators."""
+        """Return the columns of `EntityData.actuator_force` of actuators `actuator_ids`."""
         return _columns_of(self._forces, actuator_ids)
 
     def control_columns(self, actuator_ids: IdsT) -> IdsT | list[int]:
-        """Return the positions in `ctrl_ids` of the controls of some of the entity's actuators."""
+        """Return the positions in `ctrl_ids` of the controls of actuators `actuator_ids`."""
         return _columns_of(self._controls, actuator_ids)
 
     @property
@@ -121,16 +121,15 @@ class EntityIndexing:
 
     _root_id: int = -1
     _forces: tuple[range, ...] = ()
-    """For each of `actuators`, its columns among `force_ids`."""
+    """Range in `force_ids` of each of `actuators`."""
     _controls: tuple[range, ...] = ()
-    """For each of `actuators`, its columns among `ctrl_ids`."""
+    """Range in `ctrl_ids` of each of `actuators`."""
 
 
 class Addresses:
-    """Positions along one axis of a simulation field, and selections of them.
+    """Positions along one axis of a simulation field.
 
-    Positions that follow each other are handed out as a slice, so that reading a field gives a
-    view of it and nothing is copied.
+    Contiguous positions are returned as a slice, so that reading a field gives a view, not a copy.
     """
 
     def __init__(self, positions: Sequence[int] | torch.Tensor, device: str) -> None:
@@ -145,7 +144,7 @@ class Addresses:
         return len(self._host)
 
     def select(self, ids: Ids = None) -> tuple[slice | torch.Tensor, int]:
-        """Return the index of the chosen positions, and how many there are."""
+        """Return the index of the selected positions, and their number."""
         if ids is None:
             return self.all, len(self._host)
         if isinstance(ids, torch.Tensor):
@@ -162,7 +161,7 @@ def build_indexing(
     model: mujoco.MjModel,
     device: str,
 ) -> EntityIndexing:
-    """Find the elements of an entity's `spec` in the compiled `model`.
+    """Locate the elements of an entity's `spec` in the compiled `model`.
 
     Raises:
         ValueError: an element is not in the model, or is unnamed in a spec that was not compiled.
@@ -223,7 +222,7 @@ def build_indexing(
 
 
 def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> list[int]:
-    """Return the ids of spec elements in `model`: by name, or by spec order without a name.
+    """Return the ids of spec elements in `model`, by name, or by spec order for unnamed elements.
 
     Raises:
         ValueError: an element is not in the model, or is unnamed in a spec that was not compiled.
@@ -237,20 +236,20 @@ def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> li
             found = mujoco.mj_name2id(model, object_type, element.name)
             if found < 0:
                 raise ValueError(
-                    f"The compiled model has no {name} {element.name!r}. Initialize an entity with "
-                    "the model that was compiled from the spec it belongs to."
+                    f"The compiled model has no {name} {element.name!r}; initialize an entity with the "
+                    "model compiled from the entity's spec."
                 )
         elif found < 0:
             raise ValueError(
-                f"A {name} without a name cannot be found in the model, because its spec was changed "
-                "after it was compiled. Compile that spec, not a copy of it."
+                f"Unnamed {name} not found in the model, because its spec changed after it was "
+                "compiled; compile that spec, not a copy of it."
             )
         ids.append(found)
     return ids
 
 
 def _columns_of(own: tuple[range, ...], actuator_ids: IdsT) -> IdsT | list[int]:
-    """Return the columns of actuators that own some each; the ids themselves if each owns one."""
+    """Return the columns `own` of actuators; the ids themselves if each actuator has one column."""
     if actuator_ids is None or all(len(columns) == 1 for columns in own):
         return actuator_ids
     if isinstance(actuator_ids, torch.Tensor):
@@ -265,7 +264,7 @@ def _columns_of(own: tuple[range, ...], actuator_ids: IdsT) -> IdsT | list[int]:
 
 
 def _ranges(widths: Iterable[int]) -> tuple[range, ...]:
-    """Return ranges of these widths that follow each other from 0."""
+    """Return contiguous ranges of the given widths, starting at 0."""
     return tuple(
         range(a, b) for a, b in itertools.pairwise(itertools.accumulate(widths, initial=0))
     )

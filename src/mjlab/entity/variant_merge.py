@@ -1,8 +1,8 @@
-"""Merging variants of an entity into one spec: what they must share, slots, assets.
+"""Variant merging: structure checks, slots and assets of the merged spec.
 
-The merged spec has a geom, a slot, for as many geoms as the richest variant has. A slot holds one
-geom of each variant or none. What is compiled once for all environments (type, collision masks,
-condim, priority, group) is a slot's own, so that only geoms alike in these share one.
+A slot is a geom of the merged spec that holds at most one geom of each variant. Attributes that are
+compiled once for all environments (type, contype, conaffinity, condim, priority, group) belong to
+the slot, so geoms share a slot only if they agree in these.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mjlab.utils.spec import (
 
 GeomRole = Literal["visual", "collision"]
 RESERVED_NAME_PREFIXES = ("mjlab/pad/",)
-"""Beginnings of names that merging variants gives to geoms; specs must not use them."""
+"""Prefixes of geom names in merged specs. Users' specs must not use them."""
 MESH = mujoco.mjtGeom.mjGEOM_MESH
 _UNSUPPORTED = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
@@ -35,7 +35,7 @@ _UNSUPPORTED = {
     mujoco.mjtGeom.mjGEOM_SDF: "signed distance field",
 }
 
-# What belongs to a geom's place in its spec, or is set anew.
+# Attributes that belong to a geom's place in its spec, or are set separately.
 _NOT_COPIED = {"name", "id", "signature", "classname", "compiler", "info", "parent", "frame"}
 _NOT_COPIED |= {"meshname", "hfieldname", "material", "mass", "plugin", "userdata"}
 _COPY = {
@@ -45,60 +45,60 @@ _COPY = {
 }
 _ADD = {"textures": "add_texture", "materials": "add_material", "meshes": "add_mesh"}
 Assets = dict[str, list[list[Any]]]
-"""By kind, for each variant, the elements of the merged spec in the order of the variant's own."""
+"""Elements of the merged spec in the order of each variant's spec, by kind and variant."""
 
 
-# What variants must have in common.
+# Structure that variants must share.
 
 
 @dataclass(frozen=True)
 class JointSignature:
-    """A joint, as far as variants have to agree on it."""
+    """Joint properties that all variants must share."""
 
     name: str
     """Its name."""
     type: int
     """`mjtJoint`."""
     qpos_width: int
-    """Number of its positions."""
+    """Number of positions."""
     qvel_width: int
-    """Number of its velocities."""
+    """Number of velocities."""
 
 
 @dataclass(frozen=True)
 class GeomSignature:
-    """A geom that is no mesh."""
+    """Non-mesh geom."""
 
     name: str | None
-    """Its name, if it has one."""
+    """Name; None for an unnamed geom."""
     type: int
     """`mjtGeom`."""
     role: GeomRole
-    """Whether it can touch anything."""
+    """Collision or visual geom."""
 
 
 @dataclass(frozen=True)
 class BodySignature:
-    """A body with all below it."""
+    """Body with its descendants."""
 
     path: str
-    """Names from the root down, each after a slash."""
+    """Names from the root down, each preceded by a slash."""
     name: str
     """Its name."""
     joints: tuple[JointSignature, ...]
-    """Its joints, in order."""
+    """Joints, in order."""
     geoms: tuple[GeomSignature, ...]
-    """Its geoms that are no meshes, in order. Variants may differ in them."""
+    """Non-mesh geoms, in order. Variants may differ in these."""
     children: tuple[BodySignature, ...]
-    """The bodies attached to it, in order."""
+    """Child bodies, in order."""
 
 
 def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None:
-    """Check that specs can be variants of one entity: they may differ in geoms and in figures.
+    """Check that specs can be variants of one entity: they may differ in geoms and parameters.
 
     Raises:
         ValueError: a spec does not have exactly one top-level body with a free joint first; uses a
-            reserved name; or differs from the first one in bodies, joints, kinds of inertial,
+            reserved name; or differs from the first spec in bodies, joints, kinds of inertial,
             sites, cameras, lights, actuators, sensors, tendons or equalities.
     """
     for name, spec in zip(names, specs, strict=True):
@@ -112,23 +112,23 @@ def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None
 
 
 def _check_variant(name: str, spec: mujoco.MjSpec) -> None:
-    """Raise `ValueError` unless a spec floats as one tree, without reserved names."""
+    """Raise `ValueError` unless a spec is one floating tree without reserved names."""
     roots = list(spec.worldbody.bodies)
     if len(roots) != 1:
         raise ValueError(
-            f"Variant {name!r} has {len(roots)} top-level bodies ({[b.name for b in roots]}); it "
-            "must have exactly one. Put the others below it, or make them entities of their own."
+            f"Variant {name!r}: expected exactly one top-level body, got {len(roots)} "
+            f"({[b.name for b in roots]}); make the others its children, or separate entities."
         )
     joints = list(roots[0].joints)
     if not joints or joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise ValueError(
-            f"The top-level body {roots[0].name!r} of variant {name!r} has no free joint as its "
-            "first joint. Variants must float: add <freejoint/> to it."
+            f"Variant {name!r}: expected a free joint as first joint of the top-level body "
+            f"{roots[0].name!r}; add <freejoint/> to it."
         )
     if list(spec.worldbody.geoms) or list(spec.worldbody.sites):
         raise ValueError(
-            f"Variant {name!r} has geoms or sites in its world body, which belong to no variant. "
-            f"Put them into the body {roots[0].name!r}."
+            f"Variant {name!r}: geoms and sites in the world body are not supported; move them to the "
+            f"body {roots[0].name!r}."
         )
     used = [
         element.name
@@ -138,13 +138,13 @@ def _check_variant(name: str, spec: mujoco.MjSpec) -> None:
     ]
     if used:
         raise ValueError(
-            f"Variant {name!r} uses the names {used}. Names that begin with "
-            f"{RESERVED_NAME_PREFIXES[0]!r} are reserved for merged variants: rename them."
+            f"Variant {name!r}: names that start with {RESERVED_NAME_PREFIXES[0]!r} are reserved for "
+            f"merged variants; rename {used}."
         )
 
 
 def _structure(spec: mujoco.MjSpec) -> dict[str, list[Any]]:
-    """Return by kind of element what must be the same in all variants."""
+    """Return the structure that all variants must share, by kind of element."""
     bodies = list(walk_bodies(spec))
 
     def of_bodies(describe: Callable[[mujoco.MjsBody], Any]) -> list[Any]:
@@ -178,17 +178,17 @@ def _inertial_kind(body: mujoco.MjsBody) -> str:
 
 
 def _difference(kind: str, first: str, expected: list[Any], name: str, found: list[Any]) -> str:
-    """Return a message that names the first entries that are not the same."""
+    """Return a message that names the first entries that differ."""
     missing = [entry for entry in expected if entry not in found]
     extra = [entry for entry in found if entry not in expected]
     if missing or extra:
-        detail = f"{name!r} has {_shown(extra)} where {first!r} has {_shown(missing)}"
+        detail = f"{name!r} has {_shown(extra)}, {first!r} has {_shown(missing)}"
     else:
-        detail = f"{name!r} has them in the order {_shown(found)}, {first!r} {_shown(expected)}"
+        detail = f"order in {name!r}: {_shown(found)}; in {first!r}: {_shown(expected)}"
     return (
-        f"The variants {first!r} and {name!r} have other {kind}: {detail}. Variants of an entity "
-        f"may differ in geoms and figures alone. Give {name!r} the same {kind} as {first!r}, names "
-        "and order included, or make it an entity of its own."
+        f"Variants {first!r} and {name!r}: expected the same {kind}, by name and order, got a "
+        f"difference: {detail}. Variants may differ only in geoms and model parameters; make "
+        f"{name!r} a separate entity if the difference is intended."
     )
 
 
@@ -204,19 +204,19 @@ def _shown(entries: list[Any], most: int = 4) -> str:
     return ", ".join(texts) if texts else "nothing"
 
 
-# Slots: geoms that variants do not share.
+# Slots: geoms that are not shared by all variants.
 
 
 @dataclass(frozen=True, order=True)
 class SlotKey:
-    """Where a slot is."""
+    """Identifier of a slot."""
 
     body_path: str
     """Path of the body."""
     role: GeomRole
-    """Whether its geoms can touch anything."""
+    """Role of its geoms."""
     ordinal: int
-    """Number among the slots of that body and role."""
+    """Index among the slots of the same body and role."""
 
     @property
     def name(self) -> str:
@@ -226,19 +226,19 @@ class SlotKey:
 
 @dataclass(frozen=True)
 class VariantGeomSpec:
-    """A geom of a variant, as its spec has it after the entity's editors."""
+    """Geom of a variant, after the entity's editors."""
 
     mesh_name: str
-    """Its mesh, by the name in the variant's own spec; empty for a primitive."""
+    """Mesh name in the variant's spec; empty for a primitive."""
     geom_name: str | None
-    """Its name in the variant's own spec."""
+    """Name in the variant's spec."""
     contype: int
     conaffinity: int
     condim: int
     group: int
     priority: int
     material: str | None
-    """Its material, by the name in the variant's own spec."""
+    """Material name in the variant's spec."""
     rgba: tuple[float, float, float, float]
     friction: tuple[float, float, float]
     margin: float
@@ -246,12 +246,12 @@ class VariantGeomSpec:
     solref: tuple[float, float]
     solimp: tuple[float, float, float, float, float]
     mass: float
-    """Kilograms; NaN where the density counts."""
+    """Mass (kg); NaN if the mass is computed from the density."""
     density: float
 
     @classmethod
     def of(cls, geom: mujoco.MjsGeom) -> VariantGeomSpec:
-        """Read it from a spec's geom."""
+        """Return the attributes of a spec geom."""
         return cls(
             mesh_name=geom.meshname,
             geom_name=geom.name or None,
@@ -274,29 +274,29 @@ class VariantGeomSpec:
 
 @dataclass(frozen=True)
 class VariantSlot:
-    """A geom of the merged spec that holds another geom of each variant, or none."""
+    """Geom of the merged spec that holds at most one geom of each variant."""
 
     key: SlotKey
-    """Where it is."""
+    """Identifier."""
     template_geom_name: str
-    """Its name in the merged spec."""
+    """Name in the merged spec."""
     source_geom_names: tuple[str | None, ...]
-    """For each variant the name of its geom; None for no name, or no geom."""
+    """Geom name per variant. None: unnamed or absent geom."""
 
 
 @dataclass
 class Slot:
-    """A slot while variants are merged."""
+    """Slot during merging."""
 
     key: SlotKey
     kind: tuple[int, ...]
-    """What its geoms have in common; see `geom_kind`."""
+    """Attributes shared by its geoms; see `geom_kind`."""
     geoms: list[mujoco.MjsGeom | None]
-    """The geom of each variant."""
+    """Geom of each variant."""
 
 
 Shared = tuple[mujoco.MjsGeom, ...]
-"""One geom that all variants have, as each of them has it."""
+"""Geom shared by all variants, one element per variant."""
 
 
 def split_geoms(
@@ -304,11 +304,12 @@ def split_geoms(
 ) -> tuple[list[Shared], list[Slot]]:
     """Sort the geoms of one body of each variant into shared ones and slots.
 
-    A geom that is no mesh is shared if every variant has one of that name and kind, or, without
-    names, if all variants have the same kinds in the same order. It keeps its name.
+    A non-mesh geom is shared if every variant has a geom with the same name and kind. Unnamed
+    geoms are shared if all variants have the same kinds in the same order. Shared geoms keep their
+    names.
 
     Raises:
-        ValueError: a geom that would need a slot is of a type that cannot have one.
+        ValueError: a geom that needs a slot is of an unsupported type.
     """
     geoms = [list(body.geoms) for body in bodies]
     shared = _shared_geoms(geoms)
@@ -323,9 +324,9 @@ def split_geoms(
             unsupported = _UNSUPPORTED.get(geom.type) or ("plugin" if geom.plugin.active else None)
             if unsupported is not None:
                 raise ValueError(
-                    f"Variant {names[k]!r} has the {unsupported} geom {geom.name!r} in the body "
-                    f"{path!r}, which its siblings do not have. Variants may differ in meshes and "
-                    "primitives alone: give all of them that geom, by the same name, or none."
+                    f"Variant {names[k]!r}: {unsupported} geom {geom.name!r} of body {path!r} is "
+                    "missing in other variants. Variants may differ only in meshes and primitives; "
+                    "add the geom to all variants, with the same name, or remove it."
                 )
             role, kind = geom_role(geom), geom_kind(geom)
             place = slots.setdefault((role, kind), [])
@@ -356,7 +357,7 @@ def _shared_geoms(geoms: list[list[mujoco.MjsGeom]]) -> list[Shared]:
 
 
 def geom_kind(geom: mujoco.MjsGeom) -> tuple[int, ...]:
-    """Return what of a geom cannot differ between environments on every engine."""
+    """Return the attributes of a geom that some engines cannot vary between environments."""
     return tuple(
         int(getattr(geom, name))
         for name in ("type", "contype", "conaffinity", "condim", "priority", "group")
@@ -364,12 +365,12 @@ def geom_kind(geom: mujoco.MjsGeom) -> tuple[int, ...]:
 
 
 def geom_role(geom: mujoco.MjsGeom) -> GeomRole:
-    """Return `visual` for a geom that can touch nothing, else `collision`."""
+    """Return `visual` for a geom that cannot collide, else `collision`."""
     return "collision" if geom.contype or geom.conaffinity else "visual"
 
 
 def walk_bodies(spec: mujoco.MjSpec) -> Iterator[tuple[str, mujoco.MjsBody]]:
-    """Yield the path and the body of each body but the world, parents first."""
+    """Yield (path, body) for each body except the world, parents first."""
 
     def below(parent: mujoco.MjsBody, path: str) -> Iterator[tuple[str, mujoco.MjsBody]]:
         for index, body in enumerate(parent.bodies):
@@ -383,10 +384,10 @@ def walk_bodies(spec: mujoco.MjSpec) -> Iterator[tuple[str, mujoco.MjsBody]]:
 def check_references(
     name: str, spec: mujoco.MjSpec, slots: list[Slot], shared: list[Shared], k: int
 ) -> None:
-    """Check that nothing in the spec of variant `k` names a geom that becomes part of a slot.
+    """Check that no element of variant `k` refers to a geom that becomes part of a slot.
 
     Raises:
-        ValueError: a sensor, contact pair or tendon does.
+        ValueError: a sensor, contact pair or tendon refers to such a geom.
     """
     own = [geom.name for slot in slots if (geom := slot.geoms[k]) is not None and geom.name]
     geom_type = mujoco.mjtObj.mjOBJ_GEOM
@@ -405,17 +406,16 @@ def check_references(
         for wrap in tendon.path
         if wrap.type in (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
     ]
-    for what, target in used:
+    for user, target in used:
         if target in own:
             raise ValueError(
-                f"The {what} of variant {name!r} refers to the geom {target!r}, which its siblings "
-                "do not share: meshes, and primitives of another type, are put together under "
-                "other names. Refer to its body or to a site instead, or give all variants that "
-                "geom as a primitive of the same name and type."
+                f"Variant {name!r}: {user} refers to geom {target!r}, but only geoms shared by all "
+                "variants keep their names when variants are merged; refer to its body or a site, "
+                "or add a primitive of the same name and type to all variants."
             )
 
 
-# The merged spec.
+# Merged spec.
 
 
 def merge_specs(
@@ -424,21 +424,21 @@ def merge_specs(
     bodies: list[list[mujoco.MjsBody]],
     slots: list[list[Slot]],
 ) -> tuple[Assets, list[list[mujoco.MjsGeom]]]:
-    """Turn the first of `specs`, in place, into one with the slots and the assets of all.
+    """Merge the slots and assets of all `specs` into the first one, in place.
 
     Args:
         names: Names of the variants.
-        specs: Their specs.
-        bodies: For each path, the body of each variant.
-        slots: For each path, the slots of its body.
+        specs: Specs of the variants.
+        bodies: Body of each variant, by path.
+        slots: Slots of each path's body.
 
     Returns:
-        The merged assets, and for each path the geoms of the slots.
+        The merged assets, and the slot geoms of each path.
     """
     merged = specs[0]
     any_in_memory = any(spec.assets for spec in specs)
     for name, spec in zip(names, specs, strict=True):
-        # The names that the compiler would give them, so that they can be renamed.
+        # Assign the names that the compiler would assign, so that assets can be renamed.
         for asset in (*spec.meshes, *spec.textures):
             if not asset.name and asset.file:
                 asset.name = PurePosixPath(asset.file).stem
@@ -455,7 +455,7 @@ def merge_specs(
 
 
 def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:
-    """Bring all meshes, materials and textures into the first spec, as `<variant>/<name>`."""
+    """Copy all meshes, materials and textures into the first spec, as `<variant>/<name>`."""
     merged = specs[0]
     files = dict(merged.assets)
     _rename_own(merged, f"{names[0]}/")
@@ -479,11 +479,11 @@ def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:
 
 
 def _rename_own(spec: mujoco.MjSpec, prefix: str) -> None:
-    """Rename the assets of a spec, and all references to them."""
+    """Prefix the names of a spec's assets, and all references to them."""
     for kind in _COPY:
         for asset in list(getattr(spec, kind)):
             if kind == "materials":
-                # Once compiled, a material keeps the names of its textures, so it is replaced.
+                # Replaced instead of renamed: a compiled material keeps the names of its textures.
                 renamed = spec.add_material(name=prefix + asset.name)
                 copy_material_data(asset, renamed)
                 renamed.textures = [prefix + name if name else name for name in asset.textures]
@@ -499,7 +499,7 @@ def _rename_own(spec: mujoco.MjSpec, prefix: str) -> None:
 
 
 def _slot_geom(names: list[str], body: mujoco.MjsBody, slot: Slot) -> mujoco.MjsGeom:
-    """Return the geom of a slot: that of the first variant, renamed, or a new one without mass."""
+    """Return the geom of a slot: the first variant's geom, renamed, or a new geom without mass."""
     own = slot.geoms[0]
     if own is not None:
         own.name = slot.key.name
@@ -520,10 +520,10 @@ def _slot_geom(names: list[str], body: mujoco.MjsBody, slot: Slot) -> mujoco.Mjs
 def _make_hulls(
     merged: mujoco.MjSpec, assets: Assets, slots: list[list[Slot]], specs: list[mujoco.MjSpec]
 ) -> None:
-    """Have the compiler make the convex hull of every mesh that can touch something.
+    """Make the compiler compute the convex hull of every mesh that can collide.
 
-    It makes one only for meshes that a colliding geom uses, and the merged spec uses but one mesh
-    in each slot. Once made it stays with the mesh, also after the geom is gone.
+    The compiler computes hulls only for meshes of colliding geoms, and the merged spec uses only one
+    mesh per slot. A mesh keeps its hull after the geom is deleted.
     """
     needed: dict[str, None] = {}
     for own in slots:

@@ -1,8 +1,8 @@
-"""An entity that is another thing in each environment: other meshes, primitives and figures.
+"""Variant entities: per-environment meshes, primitives and model parameters.
 
-All variants have the same bodies and joints, so that states, actions and observations look alike.
-The scene holds one spec with room for every variant; each environment then gets the values that
-its variant compiles to.
+All variants have the same bodies and joints, so states, actions and observations have the same
+shapes. The scene holds one merged spec with slots for the geoms of every variant; each environment
+gets the compiled values of its variant.
 """
 
 from __future__ import annotations
@@ -51,35 +51,35 @@ from mjlab.utils.spec import compile_composed, compile_spec
 Assignment = dict[str, float] | Callable[[int], Sequence[int]] | None
 
 InertialMode = Literal["mesh-derived", "diagonal", "fullinertia"]
-"""Source of a body's inertia: its geoms, `diaginertia` or `fullinertia`."""
+"""Source of a body's inertia: geoms, `diaginertia` or `fullinertia`."""
 
 
 def _variant_spec_fn_unset() -> mujoco.MjSpec:
     raise ValueError(
-        "A VariantEntityCfg has no spec_fn; its specs come from `variants`. Build the entity by "
-        "cfg.build()."
+        "VariantEntityCfg.spec_fn is not used, because specs come from `variants`; build the entity "
+        "with cfg.build()."
     )
 
 
 @dataclass
 class VariantEntityCfg(EntityCfg):
-    """Describes a floating entity that is one of several things, another in each environment.
+    """Configuration of a floating entity with one of several variants per environment.
 
     Variants must have the same bodies, joints, actuators, sensors, tendons and equalities, by name
-    and order. They may differ in meshes and primitives, also in their number and types, in
-    materials, and in all figures (masses, sizes, friction, ...) that the engine can hold per
-    environment; others are refused by name when the simulation is built. All other settings of the
-    config (collisions, actuators, ...) are applied to each variant, by the names in its own spec.
+    and order. They may differ in number and types of meshes and primitives, in materials, and in all
+    model parameters (masses, sizes, friction, ...) that the engine can hold per environment; for
+    others, building the simulation raises an error that names them. All other settings of the config
+    (collisions, actuators, ...) are applied to each variant, by the names in the variant's spec.
     """
 
     spec_fn: Callable[[], mujoco.MjSpec] = _variant_spec_fn_unset
-    """Not used: leave it alone."""
+    """Not used. Must stay unset."""
     variants: dict[str, Callable[[], mujoco.MjSpec]] = field(default_factory=dict)
-    """By name, functions that make the MuJoCo spec of a variant, a new one at each call."""
+    """Functions that return a new MuJoCo spec per call, by variant name."""
     assignment: dict[str, float] | Callable[[int], Sequence[int]] | None = None
-    """Which variant each environment gets, for the life of the simulation: None for equal shares;
-    weights by name (1 where missing), rounded to the largest remainders; or a function from the
-    number of environments to the index of each one's variant."""
+    """Assignment of variants to environments, fixed for the simulation: None for equal shares;
+    weights by name (default 1), rounded by largest remainders; or a function from the number of
+    environments to the variant index of each environment."""
 
     def __post_init__(self) -> None:
         self._check()
@@ -87,9 +87,9 @@ class VariantEntityCfg(EntityCfg):
     def _check(self) -> None:
         if self.spec_fn is not _variant_spec_fn_unset:
             raise ValueError(
-                "VariantEntityCfg.spec_fn is set, but the specs come from `variants`. Give the "
-                "function there, under a name, or use EntityCfg for an entity that is the same "
-                "everywhere."
+                "VariantEntityCfg.spec_fn: expected it to be unset, because specs come from "
+                "`variants`; add the function to `variants`, or use EntityCfg for an entity without "
+                "variants."
             )
         if self.variants:
             resolve_assignment(tuple(self.variants), self.assignment)
@@ -98,28 +98,29 @@ class VariantEntityCfg(EntityCfg):
         """Build the entity.
 
         Raises:
-            ValueError: there are no variants, they do not have the same structure, or the
-                assignment makes no sense; names the variant and says what to do.
+            ValueError: `variants` is empty, the variants differ in structure, or the assignment is
+                invalid. The message names the variant and a fix.
         """
         return VariantEntity(self)
 
 
 @dataclass(frozen=True)
 class VariantMetadata:
-    """What a simulation and a person have to know of an entity's variants."""
+    """Variants of an entity: names, assignment, slots, specs and compiled values."""
 
     variant_names: tuple[str, ...]
     """Names of the variants, in order."""
     assignment: tuple[float, ...] | Callable[[int], Sequence[int]] = ()
-    """The weight of each variant, or the function that assigns them."""
+    """Weight of each variant, or the function that assigns variants."""
     slots: tuple[VariantSlot, ...] = ()
-    """Geoms of the merged spec that differ: by path, visual ones first, by number."""
+    """Geoms of the merged spec that differ between variants, sorted by path, role (visual first)
+    and number."""
     variant_slot_specs: tuple[tuple[VariantGeomSpec | None, ...], ...] = ()
-    """For each variant what it has in each slot, or None."""
+    """Geom in each slot, per variant. None: empty slot."""
     variant_source_specs: tuple[mujoco.MjSpec, ...] = ()
-    """The spec of each variant alone, with the entity's editors and actuators."""
+    """Spec of each variant alone, with the entity's editors and actuators applied."""
     table: VariantTable | None = field(default=None, repr=False, compare=False)
-    """The values that each variant compiles to."""
+    """Compiled values of each variant."""
 
     @property
     def num_mesh_geoms(self) -> int:
@@ -131,41 +132,41 @@ class VariantMetadata:
 
     @property
     def variant_mesh_names(self) -> tuple[tuple[str | None, ...], ...]:
-        """For each variant the name of the mesh in each slot, or None."""
+        """Mesh name in each slot, per variant. None: no mesh."""
         return tuple(
             tuple(None if geom is None else geom.mesh_name or None for geom in own)
             for own in self.variant_slot_specs
         )
 
     def assign_worlds(self, num_envs: int) -> np.ndarray:
-        """Return the variant of each environment, (num_envs,) int64. `ValueError` if not possible."""
+        """Return the variant index of each environment, (num_envs,) int64; see `assign_worlds`."""
         return assign_worlds(self.assignment, self.variant_names, num_envs)
 
     def columns(self, model: mujoco.MjModel) -> list[VariantColumns]:
-        """Return what each variant puts into a model that was compiled from a spec with this one."""
+        """Return the values of each variant in `model`, compiled from a spec with the merged spec."""
         if self.table is None:
             raise ValueError(
-                "This VariantMetadata has no values. Take the one of a built entity "
+                "VariantMetadata has no compiled values; use that of a built entity "
                 "(`Entity.variant_metadata`) or of `build_merged_variant_spec`."
             )
         return self.table.columns(model)
 
 
 class VariantEntity(Entity):
-    """An entity whose spec has room for all of its variants.
+    """Entity whose merged spec has slots for all variants.
 
-    It is built as its first variant, and the others as entities of their own, by the same config;
-    then the first one's spec gets the geoms and assets of all.
+    The entity is built as its first variant, and the other variants as separate entities with the
+    same config. Their geoms and assets are then merged into the first spec.
     """
 
     def __init__(self, cfg: VariantEntityCfg) -> None:
-        """Build all variants and merge them; raises ValueError as `VariantEntityCfg.build` says."""
+        """Build and merge all variants. Raises as `VariantEntityCfg.build`."""
         cfg._check()
         names = tuple(cfg.variants)
         if not names:
             raise ValueError(
-                "VariantEntityCfg.variants is empty. Give at least one function that makes a spec, "
-                "by the name of its variant."
+                "VariantEntityCfg.variants: expected at least one function that returns a spec, by "
+                "variant name, got none."
             )
         sources = [
             copy_spec(make(), f"VariantEntityCfg.variants[{name!r}]")
@@ -193,12 +194,12 @@ class VariantEntity(Entity):
 
     @property
     def variant_metadata(self) -> VariantMetadata:
-        """What there is in which environment."""
+        """Variants and their assignment to environments."""
         return self._metadata
 
 
 def build_merged_variant_spec(cfg: VariantEntityCfg) -> tuple[mujoco.MjSpec, VariantMetadata]:
-    """Return the spec that has room for all variants of an entity, and what is in it.
+    """Return the merged spec of all variants of an entity, and its metadata.
 
     Raises:
         ValueError: as `VariantEntityCfg.build`.
@@ -209,14 +210,14 @@ def build_merged_variant_spec(cfg: VariantEntityCfg) -> tuple[mujoco.MjSpec, Var
 
 @dataclass
 class MeshVariantResult:
-    """Models of a scene whose entities have variants."""
+    """Models of a scene with variant entities."""
 
     wp_model: Any
-    """MuJoCo Warp's model, with the fields of each world's own variants."""
+    """MuJoCo Warp model, with per-world values of variant fields."""
     mj_model: mujoco.MjModel
-    """The compiled model."""
+    """Compiled model."""
     world_to_variant: dict[str, np.ndarray]
-    """Variant of each world, (nworld,), by entity."""
+    """Variant index of each world, (nworld,), by entity name."""
 
 
 def build_variant_model(
@@ -225,13 +226,13 @@ def build_variant_model(
     variant_info: list[tuple[str, VariantMetadata]],
     configure_model: Callable[[mujoco.MjModel], None] | None = None,
 ) -> MeshVariantResult:
-    """Compile a scene for MuJoCo Warp, for packages that have no `Simulation`.
+    """Compile a scene for MuJoCo Warp, for packages that do not use `Simulation`.
 
     Args:
-        spec: The scene's spec, with the merged specs of the entities in it.
+        spec: Spec of the scene, with the merged specs of its entities.
         nworld: Number of worlds.
-        variant_info: Name and variants of each entity that has some.
-        configure_model: Changes the compiled model before it is put on the device.
+        variant_info: Name and variants of each variant entity.
+        configure_model: Edits the compiled model before it is put on the device.
 
     Raises:
         ValueError: the spec does not compile, with MuJoCo's message.
@@ -246,14 +247,14 @@ def build_variant_model(
     )
 
 
-# Which variant each environment gets.
+# Assignment of variants to environments.
 
 
 def allocate_worlds(weights: tuple[float, ...], nworld: int) -> list[int]:
-    """Return the variant of each of `nworld` environments, by weight, in contiguous blocks.
+    """Return the variant index of each of `nworld` environments, in contiguous blocks.
 
-    Each variant gets its quota `w_i / sum(w) * nworld`, rounded down. What is left over goes to the
-    largest remainders, of equal ones to the earlier variant.
+    Each variant gets its quota `w_i / sum(w) * nworld`, rounded down. The rest goes to the largest
+    remainders; ties go to the earlier variant.
 
     Raises:
         ValueError: a weight is negative or not finite, or all are zero.
@@ -262,11 +263,11 @@ def allocate_worlds(weights: tuple[float, ...], nworld: int) -> list[int]:
     total = sum(weights)
     if bad or not 0.0 < total < math.inf:
         raise ValueError(
-            f"The weights of variants are {tuple(weights)}; they must be finite, none negative, "
-            "and not all zero. A weight of 0 leaves a variant out."
+            f"Variant weights: expected finite numbers >= 0, not all zero, got {tuple(weights)}; "
+            "a weight of 0 omits a variant."
         )
     quotas = [weight / total * nworld for weight in weights]
-    # Quotas that are whole but for rounding, such as 3 * (1 / 3), count as whole.
+    # Tolerance for quotas that are integers except for rounding, such as 3 * (1 / 3).
     counts = [math.floor(quota + 1e-9) for quota in quotas]
     remainders = [quota - count for quota, count in zip(quotas, counts, strict=True)]
     order = sorted(range(len(weights)), key=lambda k: (-round(remainders[k], 9), k))
@@ -278,10 +279,10 @@ def allocate_worlds(weights: tuple[float, ...], nworld: int) -> list[int]:
 def resolve_assignment(
     names: tuple[str, ...], assignment: Assignment
 ) -> tuple[float, ...] | Callable[[int], Sequence[int]]:
-    """Return one weight for each variant, or the callable that assigns them.
+    """Return one weight per variant, or the callable that assigns variants.
 
     Raises:
-        ValueError: `assignment` names a variant that does not exist, or its weights make no sense.
+        ValueError: `assignment` names an unknown variant or has invalid weights.
     """
     if assignment is not None and not isinstance(assignment, dict):
         return assignment
@@ -292,7 +293,7 @@ def resolve_assignment(
     try:
         allocate_worlds(weights, 1)
     except ValueError as error:
-        raise ValueError(f"VariantEntityCfg.assignment is {weights_by_name}. {error}") from None
+        raise ValueError(f"VariantEntityCfg.assignment {weights_by_name}: {error}") from None
     return weights
 
 
@@ -301,30 +302,30 @@ def assign_worlds(
     names: tuple[str, ...],
     nworld: int,
 ) -> np.ndarray:
-    """Return the variant of each environment, (nworld,) int64.
+    """Return the variant index of each environment, (nworld,) int64.
 
     Raises:
-        ValueError: a callable returns another number of indices, or one that no variant has.
+        ValueError: weights are invalid, or a callable returns a wrong number of indices or an index
+            out of range.
     """
     if not callable(assignment):
         return np.array(allocate_worlds(assignment, nworld), dtype=np.int64)
     found = np.asarray(assignment(nworld))
     if found.shape != (nworld,) or found.dtype.kind not in "iu":
         raise ValueError(
-            f"VariantEntityCfg.assignment was called with {nworld} and returned an array of shape "
-            f"{found.shape} and type {found.dtype}; it must return {nworld} whole numbers, the "
-            "index of each environment's variant."
+            f"VariantEntityCfg.assignment({nworld}): expected {nworld} integers, the variant index of "
+            f"each environment, got an array of shape {found.shape} and type {found.dtype}."
         )
     outside = sorted({int(k) for k in found if not 0 <= k < len(names)})
     if outside:
         raise ValueError(
-            f"VariantEntityCfg.assignment returned the indices {outside}; the variants "
-            f"{list(names)} have the indices 0 to {len(names) - 1}."
+            f"VariantEntityCfg.assignment: expected indices 0 to {len(names) - 1} of the variants "
+            f"{list(names)}, got {outside}."
         )
     return found.astype(np.int64)
 
 
-# Merging the specs of all variants.
+# Merged spec.
 
 
 def _merge(
@@ -332,10 +333,10 @@ def _merge(
     specs: list[mujoco.MjSpec],
     assignment: tuple[float, ...] | Callable[[int], Sequence[int]],
 ) -> VariantMetadata:
-    """Turn the first spec into the merged one, and say what is in it."""
+    """Merge all specs into the first one, in place, and return the metadata."""
     models = []
     for name, spec in zip(names, specs, strict=True):
-        # A scene takes no notice of these settings of a part, and they would change what there is.
+        # Scenes ignore these settings of attached specs, and they would remove elements here.
         spec.compiler.discardvisual = False
         spec.compiler.fusestatic = False
         try:
@@ -353,7 +354,7 @@ def _merge(
     slots = [slot for _, own in split for slot in own]
     for k, (name, spec) in enumerate(zip(names, specs, strict=True)):
         check_references(name, spec, slots, shared, k)
-    # By kind, the elements that all variants have, with their id in each.
+    # Elements shared by all variants, with their id in each variant, by kind.
     groups: dict[str, list[Any]] = {"bodies": bodies, "geoms": shared}
     elements = {}
     for kind in _FIELD_PREFIXES:
@@ -377,7 +378,7 @@ def _merge(
 
 
 def _describe(slots: list[Slot], count: int) -> tuple[Any, Any]:
-    """Return the slots as metadata shows them, and what each variant has in them."""
+    """Return the slots in metadata order, and the geoms of each variant in them."""
     ordered = sorted(slots, key=lambda s: (s.key.body_path, s.key.role != "visual", s.key.ordinal))
     shown = tuple(
         VariantSlot(
@@ -397,9 +398,9 @@ def _describe(slots: list[Slot], count: int) -> tuple[Any, Any]:
     return shown, specs
 
 
-# Values of each variant in the fields of a compiled model.
+# Compiled values of each variant.
 
-# Kinds of elements, with the beginning of the names of their model fields.
+# Prefix of model field names, by kind of element.
 _FIELD_PREFIXES = {
     "bodies": "body_",
     "joints": "jnt_",
@@ -413,8 +414,8 @@ _FIELD_PREFIXES = {
     "sensors": "sensor_",
 }
 
-# Real fields are figures. Of whole numbers, most are addresses; these are figures too.
-_WHOLE_FIGURES = frozenset(
+# Integer fields that hold parameters; most others hold addresses. Real fields always hold parameters.
+_INTEGER_PARAMETERS = frozenset(
     {"jnt_limited", "jnt_actfrclimited", "jnt_actgravcomp", "site_type", "site_group", "cam_mode"}
     | {"cam_projection", "cam_resolution", "light_mode", "light_type", "light_active"}
     | {"light_castshadow", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited"}
@@ -422,12 +423,12 @@ _WHOLE_FIGURES = frozenset(
     | {"actuator_biastype", "actuator_actearly", "eq_active0"}
 )
 
-# These follow from the others, and are computed for the whole scene.
+# Derived fields, recomputed for the whole scene.
 _DERIVED = frozenset({"body_margin", "dof_length", "dof_M0", "actuator_length0"}) | (
     frozenset((*FIXED_CONSTANTS, *CONSTANTS_AT_QPOS0)) - {"actuator_biasprm", "eq_data"}
 )
 
-# One row a control, or a force, of which an actuator may have several.
+# Fields with one row per control or force; an actuator may have several.
 _CONTROL_FIELDS = frozenset({"actuator_ctrllimited", "actuator_ctrlrange"})
 _FORCE_FIELDS = frozenset({"actuator_gear", "actuator_lengthrange"})
 _ASSET_FIELDS = {
@@ -437,13 +438,13 @@ _ASSET_FIELDS = {
     "geom_dataid": "meshes",
 }
 
-# What a geom has where it is not there: no extent, no mesh, no colour. The rest stays as it is in
+# Values of absent geoms: no extent, no mesh, no material. Other fields keep the values of
 # another variant.
 _ABSENT = {"geom_size": 0, "geom_rbound": 0, "geom_aabb": 0, "geom_dataid": -1, "geom_matid": -1}
 
 
 class VariantTable:
-    """Values of all variants, each compiled alone, with the merged elements that they are for."""
+    """Values of all variants, each compiled alone, and the merged elements they apply to."""
 
     def __init__(
         self,
@@ -451,20 +452,19 @@ class VariantTable:
         elements: dict[str, list[tuple[Any, list[int]]]],
         assets: dict[str, list[list[Any]]],
     ) -> None:
-        """Hold them.
+        """Store compiled variants and merged elements.
 
         Args:
             models: Each variant compiled alone.
-            elements: By kind, elements of the merged spec, each with its id in every model; -1
-                where a variant does not have it. The first body is the root.
-            assets: By kind, for each variant, the merged element of each of its meshes and
-                materials.
+            elements: Elements of the merged spec with their id in every model (-1: absent), by
+                kind. The first body is the root.
+            assets: Merged element of each mesh and material of each variant, by kind.
         """
         self._models, self._elements, self._assets = models, elements, assets
         self._root = elements["bodies"][0][0]
 
     def columns(self, model: mujoco.MjModel) -> list[VariantColumns]:
-        """Return what each variant puts into `model`, compiled from a spec with the merged one."""
+        """Return the values of each variant in `model`, compiled from a spec with the merged spec."""
         ids = {
             kind: np.array(element_ids(model, kind, [e for e, _ in pairs]), dtype=int)
             for kind, pairs in self._elements.items()
@@ -484,7 +484,7 @@ class VariantTable:
     ) -> VariantColumns:
         fields: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for kind, pairs in self._elements.items():
-            # Of what this variant does not have, the figures come from one that does.
+            # Values of elements absent in this variant come from the first variant that has them.
             sources = [
                 (k, own[k]) if own[k] >= 0 else next((j, i) for j, i in enumerate(own) if i >= 0)
                 for _, own in pairs
@@ -496,7 +496,7 @@ class VariantTable:
                 if len(values):
                     fields[name] = ids[kind], np.stack(values)
         fields |= self._by_address(k, model, ids["joints"], ids["actuators"])
-        # Where the root starts is the entity's initial state, the same for all.
+        # The root pose is the entity's initial state, the same for all variants.
         for name in ("body_pos", "body_quat"):
             targets, values = fields[name]
             fields[name] = targets[1:], values[1:]
@@ -508,7 +508,7 @@ class VariantTable:
         return VariantColumns(fields, ids["geoms"][absent])
 
     def _fields_of(self, kind: str) -> list[str]:
-        """Return the fields with one row for each element of a kind, that hold figures."""
+        """Return the fields that hold parameters, with one row per element of `kind`."""
         prefix, model = _FIELD_PREFIXES[kind], self._models[0]
         names = [name for name in dir(model) if name.startswith(prefix)]
         return [
@@ -516,13 +516,13 @@ class VariantTable:
             for name in names
             if isinstance(array := getattr(model, name), np.ndarray)
             and name not in _DERIVED | _CONTROL_FIELDS | _FORCE_FIELDS
-            and (array.dtype.kind == "f" or name in _WHOLE_FIGURES or name in _ASSET_FIELDS)
+            and (array.dtype.kind == "f" or name in _INTEGER_PARAMETERS or name in _ASSET_FIELDS)
         ]
 
     def _by_address(
         self, k: int, model: mujoco.MjModel, joints: np.ndarray, actuators: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """Return the fields with rows for degrees of freedom, positions, controls and forces."""
+        """Return the fields with one row per degree of freedom, position, control or force."""
         own = self._models[k]
         there = [ids[k] for _, ids in self._elements["actuators"]]
         places: dict[str, list[tuple[int, int]]] = {
@@ -545,8 +545,8 @@ class VariantTable:
         fields = {}
         for name, kind in names.items():
             array = getattr(own, name)
-            is_figure = array.dtype.kind == "f" or name in _WHOLE_FIGURES
-            if places[kind] and is_figure and name not in _DERIVED:
+            is_parameter = array.dtype.kind == "f" or name in _INTEGER_PARAMETERS
+            if places[kind] and is_parameter and name not in _DERIVED:
                 here, rows = np.array(places[kind], dtype=int).T
                 fields[name] = here, array[rows]
         return fields

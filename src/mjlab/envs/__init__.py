@@ -1,4 +1,4 @@
-"""The environment loop, its configuration, and the library of reusable terms in `mdp`."""
+"""Environments: the manager-based RL environment, its config, and reusable MDP terms in `mdp`."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ _LAZY = {
     "VecEnvStepReturn": "mjlab.envs.types",
 }
 
-# A config needs the config class alone; the environment loads when one is built.
+# Task configs need only the config class; the environment is imported when one is built.
 __getattr__ = lazy_names(__name__, _LAZY)

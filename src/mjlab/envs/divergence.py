@@ -1,4 +1,4 @@
-"""Environments whose physics diverged: the first is named with its joint."""
+"""Report of the first environment whose physics diverged, with the joint responsible."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ logger = logging.getLogger(__name__)
 
 
 class DivergenceLog:
-    """Logs the first divergence of an environment, with the joint that blew up.
+    """Logs the first divergence of an environment, with the joint responsible.
 
     Attributes:
-        is_done: True once that was logged; nothing is watched then.
+        is_done: True once a divergence was logged; later steps are not monitored.
     """
 
     def __init__(self, sim: Simulation) -> None:
@@ -27,16 +27,16 @@ class DivergenceLog:
         self._found = Lookup()
 
     def begin_step(self) -> None:
-        """Keep the velocities from which the physics starts."""
+        """Store the velocities at the start of the step."""
         if not self.is_done:
             self._velocities.copy_(self._sim.data.qvel)
 
     def plan_lookups(self, diverged: torch.Tensor) -> list[Lookup]:
-        """Return what to look up on a GPU before `end_step`."""
+        """Plan and return the lookups of `end_step`; a GPU performs them before it."""
         return [] if self.is_done else [self._found.plan(diverged, diverged)]
 
     def end_step(self, diverged: torch.Tensor, step: int) -> None:
-        """Log an environment of the mask `diverged` (N,), if there is one, before it is reset."""
+        """Log the first environment of the mask `diverged`, (N,), if any. Called before resets."""
         if self.is_done:
             return
         ids = self._found.take(diverged)
@@ -48,23 +48,23 @@ class DivergenceLog:
         env = int(ids[0])
         joint, cure = self._find_joint(env)
         logger.warning(
-            "The physics of environment %d diverged in step %d: %s. Its episode ended with zero reward "
-            "for that step. Further ones are counted as Simulation/nan_resets. %s",
+            "The physics of environment %d diverged in step %d: %s. The episode ended with zero reward "
+            "for that step. Later divergences are counted as Simulation/nan_resets. %s",
             env, step, joint, cure,
         )  # fmt: skip
 
     def _find_joint(self, env: int) -> tuple[str, str]:
-        """Return the joint with what is wrong with it, and the cure."""
+        """Return a description of the joint's fault, and the cure."""
         model = self._sim.mj_model
         velocity = self._sim.data.qvel[env]
         if not bool(torch.isfinite(velocity).any()):
-            # One joint makes all of its tree NaN within a step.
+            # One NaN joint makes its whole kinematic tree NaN within a step.
             velocity = self._velocities[env]
         speeds = velocity.abs().tolist()
         dof, motion = fastest_dof(model, speeds)
         if motion > 1.0:
             return describe_dof(model, dof, speeds[dof]), cure_of(model, dof)
-        # Within the step, or something wrote such a state.
+        # The divergence began within the step, or a term or event wrote the bad state.
         found = self._sim.bad_dof(env)
         if found is not None:
             name = model.joint(int(model.dof_jntid[found])).name

@@ -1,4 +1,4 @@
-"""Saving and restoring the run-time state of a whole environment."""
+"""Run-time state of a whole environment: capture and restore."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
     return {
         "num_envs": env.num_envs,
         "terms": _terms(env),
-        "terrain": _terrain_measures(env),
+        "terrain": _terrain_fingerprint(env),
         "counters": {name: getattr(env, name) for name in _COUNTERS},
         "buffers": {name: getattr(env, name).clone() for name in _BUFFERS},
         "observations": _cloned(env.obs_buf),
         "sim": env.sim.state_dict(),
         "scene": capture_state(env.scene),
         "managers": {name: capture_state(getattr(env, name)) for name in _managers(env)},
-        # What curricula changed in term configs: weights, parameters, command ranges.
+        # Edits of term configs by curricula: weights, parameters, command ranges.
         "config_edits": {name: getattr(env, name).config_edits() for name in _managers(env)},
     }
 
 
 def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
-    """Write `state` back into `env`, which was built from the same config.
+    """Restore `state` into an environment built from the same config.
 
     Raises:
-        ValueError: the state is of another task, size or engine; nothing was changed then.
+        ValueError: the state belongs to a different task, size or engine; `env` is unchanged.
     """
     _check_fits(env, state)
     for name, value in state["counters"].items():
@@ -58,7 +58,7 @@ def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         restore_state(getattr(env, name), state["managers"][name])
         getattr(env, name).apply_config_edits(state["config_edits"][name])
     restore_state(env.scene, state["scene"])
-    # Physics comes last, so that entity buffers which view simulation fields end up as saved.
+    # Physics comes last, because some entity buffers are views of simulation fields.
     env.sim.load_state_dict(state["sim"])
     env.obs_buf = _cloned(state["observations"])
 
@@ -66,21 +66,23 @@ def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
 def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
     if state["num_envs"] != env.num_envs:
         raise ValueError(
-            f"The saved environment state is of {state['num_envs']} environments; this run has "
-            f"{env.num_envs}. Resume with --num-envs {state['num_envs']} to continue exactly."
+            f"Saved environment state: expected {env.num_envs} environments as in this run, got "
+            f"{state['num_envs']}; resume with --num-envs {state['num_envs']} to continue exactly."
         )
     env.sim.check_state(state["sim"])
-    saved, here = state.get("terrain"), _terrain_measures(env)
-    if saved is not None and here is not None:
-        same = saved.shape == here.shape and torch.allclose(saved.cpu(), here, rtol=1e-6)
+    saved, current_terrain = state.get("terrain"), _terrain_fingerprint(env)
+    if saved is not None and current_terrain is not None:
+        same = saved.shape == current_terrain.shape and torch.allclose(
+            saved.cpu(), current_terrain, rtol=1e-6
+        )
         if not same:
             raise ValueError(
-                "The saved environments stand on another terrain than these. Terrain follows from "
-                "the seed: resume with the seed and the terrain settings of the run that saved them."
+                "Saved environment state: the terrain differs. Terrain generation depends on the "
+                "seed; resume with the seed and the terrain settings of the saved run."
             )
     current = state_dict(env)
     differences = [
-        f"{manager} had the terms {state['terms'].get(manager)} and has {current['terms'].get(manager)}"
+        f"{manager}: saved terms {state['terms'].get(manager)}, current {current['terms'].get(manager)}"
         for manager in sorted(state["terms"].keys() | current["terms"].keys())
         if state["terms"].get(manager) != current["terms"].get(manager)
     ]
@@ -88,14 +90,14 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
     if differences:
         more = f"; and {len(differences) - 5} more" if len(differences) > 5 else ""
         raise ValueError(
-            "The task is not the one that was saved: " + "; ".join(differences[:5]) + more + "."
+            "Saved environment state: the task differs: " + "; ".join(differences[:5]) + more + "."
         )
 
 
-def _terrain_measures(env: ManagerBasedRlEnv) -> torch.Tensor | None:
-    """Return numbers by which one generated terrain is told from another; None on a plane.
+def _terrain_fingerprint(env: ManagerBasedRlEnv) -> torch.Tensor | None:
+    """Return numbers that identify a generated terrain; None on a plane.
 
-    They are weighted sums over its geoms and height fields, which are part of the model.
+    The numbers are weighted sums over the terrain's geoms and height fields in the model.
     """
     terrain, model = env.scene.terrain, env.sim.mj_model
     if terrain is None or terrain.terrain_origins is None:
@@ -109,7 +111,7 @@ def _terrain_measures(env: ManagerBasedRlEnv) -> torch.Tensor | None:
 
 
 def _terms(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return the names of the terms that each manager has, in order."""
+    """Return the names of the terms of each manager, in order."""
     terms = {}
     for name in _managers(env):
         active = getattr(env, name).active_terms

@@ -1,4 +1,4 @@
-"""The environment: one decision process over N parallel simulations, built from managers."""
+"""Manager-based RL environment: N parallel simulations of one Markov decision process."""
 
 from __future__ import annotations
 
@@ -63,34 +63,34 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class ManagerBasedRlEnvCfg:
-    """A task: a scene, and named terms for each part of the decision process.
+    """Task configuration: a scene, and named terms of the Markov decision process.
 
-    A term set to None is switched off.
+    A term set to None is disabled.
     """
 
     decimation: int
-    """Physics substeps per environment step."""
+    """Number of physics substeps per environment step."""
     scene: SceneCfg
-    """Entities, terrain and sensors, and the number of environments."""
+    """Entities, terrain, sensors, and number of environments."""
     observations: dict[str, ObservationGroupCfg | None] = field(default_factory=dict)
     """Observation groups by name, such as `actor` and `critic`."""
     actions: dict[str, ActionTermCfg | None] = field(default_factory=dict)
-    """Action terms; their order is the order of the action vector."""
+    """Action terms, in the order of the action vector."""
     events: dict[str, EventTermCfg | None] = field(
         default_factory=lambda: {
             "reset_scene_to_default": EventTermCfg(func=reset_scene_to_default, mode="reset")
         }
     )
-    """What happens at startup, reset, intervals or every step. By default a reset puts the scene
-    into its default state; an empty dict resets to the model's `qpos0` only."""
+    """Event terms, triggered at startup, reset, intervals or every step. Default: reset the scene to
+    its default state. An empty dict resets to the model's `qpos0` only."""
     seed: int | None = None
-    """Seed of every random number; None draws one, which is stored here."""
+    """Seed of all random number generators. None: sample a seed and store it here."""
     sim: SimulationCfg = field(default_factory=SimulationCfg)
-    """Physics."""
+    """Physics configuration."""
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     """Camera and size of rendered images."""
     episode_length_s: float = 0.0
-    """Length of an episode, in seconds."""
+    """Maximum episode length (s)."""
     rewards: dict[str, RewardTermCfg | None] = field(default_factory=dict)
     """Reward terms."""
     terminations: dict[str, TerminationTermCfg | None] = field(default_factory=dict)
@@ -100,27 +100,27 @@ class ManagerBasedRlEnvCfg:
     curriculum: dict[str, CurriculumTermCfg | None] = field(default_factory=dict)
     """Curriculum terms."""
     metrics: dict[str, MetricsTermCfg | None] = field(default_factory=dict)
-    """Metric terms: logged, never rewarded."""
+    """Metric terms: logged, not rewarded."""
     recorders: dict[str, RecorderTermCfg | None] = field(default_factory=dict)
     """Recorder terms."""
     is_finite_horizon: bool = False
-    """True if the time limit is part of the task: a time-out is then not bootstrapped."""
+    """Treat the time limit as part of the task: time-outs are not bootstrapped."""
     auto_reset: bool = True
-    """Whether `step` resets environments that are done."""
+    """Reset terminated and truncated environments inside `step`."""
     scale_rewards_by_dt: bool = True
-    """Whether rewards are multiplied by the environment step, in seconds."""
+    """Multiply rewards by the control timestep (s)."""
 
 
 class ManagerBasedRlEnv:
-    """N environments stepped together. All tensors have a leading dimension N.
+    """N environments stepped in parallel. All tensors have a leading dimension N.
 
     Call `reset` before the first `step`: the constructor leaves the model's initial state.
 
     Attributes:
-        observes_ends: Have `step` return the observations in which episodes run out of time. False
-            at first; learners that bootstrap from them switch it on.
-        observes_failures: With `observes_ends`, return also those in which episodes terminate. False
-            at first; adapters to interfaces that have them switch it on.
+        observes_ends: Return the final observations of truncated episodes from `step`. Default
+            False; learners that bootstrap from final observations set it.
+        observes_failures: With `observes_ends`, also return the final observations of terminated
+            episodes. Default False; adapters to interfaces with final observations set it.
     """
 
     is_vector_env = True
@@ -134,16 +134,16 @@ class ManagerBasedRlEnv:
     ) -> None:
         """Build scene, simulation and managers of `cfg` on `device` (`cpu`, `cuda:0`, ...).
 
-        `render_mode` is None or `rgb_array`. Further keyword arguments are ignored.
+        `render_mode` is None or `rgb_array`. Additional keyword arguments are ignored.
 
         Raises:
-            ValueError: whatever is wrong with the config, by name, before any stepping; or the
-                device does not exist.
-            EngineUnavailableError: the engine cannot serve the device, or cannot run here.
+            ValueError: invalid config, named by field, or unknown device.
+            EngineUnavailableError: the engine does not support the device or cannot run on this
+                machine.
         """
         check_env_cfg(cfg)
         check_device(device)
-        # Refused before tensors go to a device that the engine does not serve.
+        # Checked before tensors are created on a device that the engine does not support.
         resolve_engine_name(cfg.sim.engine, device)
         self.cfg = cfg
         cfg.seed = self.seed(-1 if cfg.seed is None else cfg.seed)
@@ -152,7 +152,7 @@ class ManagerBasedRlEnv:
         self.extras: dict[str, Any] = {}
         self.obs_buf: VecEnvObs = {}
         self._device = device
-        # Origins are made with the scene, before the sizes of the model are known.
+        # The scene allocates origins before the model sizes are known.
         check_memory(cfg.scene.num_envs, LEAST_BYTES, device)
         self.scene = Scene(cfg.scene, device=device)
         self.scene.report_overruled_options(cfg.sim.mujoco)
@@ -177,8 +177,8 @@ class ManagerBasedRlEnv:
         self.diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._divergence_log = DivergenceLog(self.sim)
-        # Time that passes for commands in a step with resets. Kept, because torch counts no writes to
-        # a tensor made under `inference_mode`, and by these a `Lookup` knows that it is valid.
+        # Elapsed time of commands in a step with resets. Allocated here, because tensors created under
+        # `inference_mode` lack the version counter that `Lookup` needs.
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
         self._ended, self._observed = Lookup(), Lookup()
         self._looks_ahead = torch.device(device).type == "cuda"
@@ -188,7 +188,7 @@ class ManagerBasedRlEnv:
             self._renderer = self._create_renderer()
         self.metadata["render_fps"] = 1.0 / self.step_dt
         self.load_managers()
-        # Expanding model fields dropped the graphs that the simulation was built with.
+        # Expanding model fields invalidated the simulation's graphs.
         self.sim.create_graph()
         self.setup_manager_visualizers()
         self.sensor_visualizers = SensorSwitches(self.scene.sensors)
@@ -205,26 +205,26 @@ class ManagerBasedRlEnv:
         """Torch device of all tensors."""
         return self._device
 
-    # Kept, because asking MuJoCo takes longer than many a term, which ask for it in every step.
+    # Cached: terms read it every step, and reading it from MuJoCo takes longer than many a term.
     @functools.cached_property
     def physics_dt(self) -> float:
-        """Physics time step, in seconds."""
+        """Physics timestep (s)."""
         return float(self.sim.mj_model.opt.timestep)
 
     @property
     def step_dt(self) -> float:
-        """Environment step, in seconds: the physics time step times the decimation."""
+        """Control timestep (s): physics timestep times decimation."""
         return self.physics_dt * self.cfg.decimation
 
     @property
     def max_episode_length_s(self) -> float:
-        """Length of an episode, in seconds."""
+        """Maximum episode length (s)."""
         return self.cfg.episode_length_s
 
     @property
     def max_episode_length(self) -> int:
-        """Length of an episode, in environment steps."""
-        # The small number keeps 0.14 s / 0.02 s, which is 7.0000000000000001, at 7 steps.
+        """Maximum episode length (environment steps)."""
+        # The tolerance keeps 0.14 s / 0.02 s = 7.0000000000000001 at 7 steps.
         return math.ceil(self.max_episode_length_s / self.step_dt - 1e-6)
 
     @property
@@ -234,7 +234,7 @@ class ManagerBasedRlEnv:
 
     @property
     def unwrapped(self) -> ManagerBasedRlEnv:
-        """This environment, below any wrapper."""
+        """This environment, without wrappers."""
         return self
 
     # Construction.
@@ -251,10 +251,10 @@ class ManagerBasedRlEnv:
         )
 
     def load_managers(self) -> None:
-        """Build all managers, in the order in which they depend on each other."""
+        """Build all managers, in the order of their dependencies."""
         cfg = self.cfg
-        # Events come first: the model fields that they randomize have to be expanded before
-        # anything keeps a reference to them.
+        # Events come first: the model fields they randomize must be expanded before anything stores
+        # references to these fields.
         self.event_manager = EventManager(cfg.events, self)
         self.sim.expand_model_fields(self.event_manager.domain_randomization_fields)
         self.sim.expand_constants(self.event_manager.recompute_level)
@@ -275,12 +275,12 @@ class ManagerBasedRlEnv:
             RecorderManager(cfg.recorders, self) if cfg.recorders else NullRecorderManager()
         )
         self._configure_spaces()
-        # What is the same in all substeps of a step is written once.
+        # Targets that are constant within a step are written once.
         self._acts_between_substeps = self.action_manager.needs_substep or any(
             entity.needs_substep for entity in self.scene.entities.values()
         )
-        # Without anything that acts between substeps, the engine runs all of them in one go and
-        # records what sensors need of each.
+        # If nothing acts between substeps, the engine runs all substeps in one call and records
+        # the fields that sensors need from each substep.
         self._steps_as_one = not (
             self._acts_between_substeps
             or self.scene.needs_substep
@@ -290,7 +290,7 @@ class ManagerBasedRlEnv:
             self.event_manager.apply(mode="startup")
 
     def setup_manager_visualizers(self) -> None:
-        """Collect the managers that can draw into a viewer."""
+        """Collect the managers with debug visualization."""
         self.manager_visualizers: dict[str, Any] = {}
         if self.command_manager.active_terms:
             self.manager_visualizers["command_manager"] = self.command_manager
@@ -322,13 +322,13 @@ class ManagerBasedRlEnv:
     ) -> tuple[VecEnvObs, dict[str, Any]]:
         """Start new episodes in `env_ids` (None: all); return observations and extras.
 
-        A `seed` reseeds every random number generator. Observations are those of all
-        environments; only those of `env_ids` advance their delay and history buffers. Forces and
-        accelerations are current in `env_ids`, and those of the last substep in the others, as
-        after `step`; before the first substep they are current everywhere.
+        A `seed` reseeds every random number generator. All environments are observed; only
+        `env_ids` advance their delay and history buffers. Forces and accelerations are current in
+        `env_ids`, and those of the last substep in other environments, as after `step`; before
+        the first substep they are current everywhere.
 
         Raises:
-            ValueError: `env_ids` out of range, not integers, or a mask of another length.
+            ValueError: `env_ids` out of range, not integers, or a mask of the wrong length.
         """
         env_ids = as_reset_ids(env_ids, self.num_envs, self.device)
         if seed is not None:
@@ -350,55 +350,55 @@ class ManagerBasedRlEnv:
     def step(self, action: torch.Tensor) -> VecEnvStepReturn:
         """Advance all environments by one environment step.
 
-        The order is: process actions; `decimation` physics substeps; terminations and rewards;
-        step and interval events; resets of environments that are done; `forward`; commands;
-        observations. On both engines:
+        Order: process actions; `decimation` physics substeps; terminations and rewards; step and
+        interval events; resets of environments that are done; `forward`; commands; observations.
+        On both engines:
 
-        - Terminations, rewards, metrics, step and interval events read what the last substep
-          computed: `qpos` and `qvel` are current, and derived quantities (`xpos`, `cvel`,
-          `sensordata`, contacts, forces) are those from which that substep started.
-        - Commands and observations read current positions and velocities and what derives from
+        - Terminations, rewards, metrics, step and interval events read the results of the last
+          substep: `qpos` and `qvel` are current; derived quantities (`xpos`, `cvel`, `sensordata`,
+          contacts, forces) belong to the state at the start of that substep.
+        - Commands and observations read current positions, velocities and quantities derived from
           them: poses and velocities of links, position and velocity sensors, rays, images.
         - Quantities of the acceleration stage (contact and constraint forces, contact sensors,
-          `qacc`, `actuator_force`, accelerometers, force and torque sensors) stay those of the last
-          substep, which acted on the robot: `forward` goes no further than `stage="vel"`.
-        - A full `forward` gives them in environments that were reset, so that nothing of the old
-          episode is seen, and in those in which an event placed something (root pose, joint
-          positions or mocap pose, by a writer of `Entity`). Contact histories and air times begin
-          with the first substep after a reset.
+          `qacc`, `actuator_force`, accelerometers, force and torque sensors) stay those that acted
+          on the robot in the last substep: `forward` stops at `stage="vel"`.
+        - A full `forward` recomputes them in environments that were reset, so that no data of the
+          old episode is seen, and in environments whose root pose, joint positions or mocap pose an
+          event wrote through `Entity`. Contact histories and air times begin with the first substep
+          after a reset.
 
-        Where the physics diverged (positions, velocities or accelerations that are not finite, or
-        beyond MuJoCo's `mjMAXVAL` of 1e10), the episode terminates, and the reward of the step is zero.
-        `diverged` (N,) bool are these environments, `nan_resets` (N,) counts their episodes.
+        If the physics of an environment diverges (positions, velocities or accelerations not finite
+        or beyond MuJoCo's `mjMAXVAL` of 1e10), its episode terminates with zero reward for the step.
+        `diverged`, (N,) bool, marks these environments; `nan_resets`, (N,), counts their episodes.
 
-        A command that writes positions, and a term that writes `sim.data` itself, runs
-        `sim.forward(env_ids)`, on the environments concerned.
+        Commands that write positions, and terms that write `sim.data` directly, must call
+        `sim.forward(env_ids)` on the environments they change.
 
-        With `observes_ends` and `auto_reset`, steps in which episodes run out of time (truncated and
-        not terminated) observe these k environments before they are reset; with `observes_failures`
-        too, all that end, but those whose physics diverged.
-        `extras["final_observations"]` is what `step` would have returned for them had the episodes
-        gone on, group to (k, ...), and `extras["final_ids"]` are their ids (k,), ascending. Only
-        commands are those that acted in the step: they have neither advanced nor been redrawn.
-        Other steps have neither entry. Trajectories do not depend on the switch.
+        With `observes_ends` and `auto_reset`, `step` also observes the k environments whose episodes
+        are truncated and not terminated, before their reset; with `observes_failures`, all k whose
+        episodes end, except diverged ones. `extras["final_observations"]`, group to (k, ...), holds
+        the observations `step` would have returned had the episodes continued, and
+        `extras["final_ids"]`, (k,), their ids in ascending order. Commands are an exception: final
+        observations contain the commands of the step, neither advanced nor resampled. Steps without
+        such environments have neither entry. The flags do not affect trajectories.
 
         Args:
-            action: (N, A) float tensor; an array or a list is converted.
+            action: Float tensor, (N, A); arrays and lists are converted.
 
         Returns:
-            Observations (of the new episode where an environment was reset); reward (N,);
-            terminated (N,) and truncated (N,) bool; extras, with `extras["log"]`. All but the
-            observations are overwritten by the next step.
+            Observations (of the new episode in environments that were reset); reward (N,);
+            terminated (N,) and truncated (N,) bool; extras, with `extras["log"]`. The next step
+            overwrites all but the observations.
 
         Raises:
-            ValueError: an action of another shape, of no numbers, or one that is not finite.
-            RuntimeError: without `auto_reset`, an environment that is done was not reset.
+            ValueError: action of the wrong shape, not numeric, or not finite.
+            RuntimeError: without `auto_reset`, an environment is done and was not reset.
         """
         if not self.cfg.auto_reset and self._pending_reset.any():
             ids = self._pending_reset.nonzero().flatten().tolist()
             raise WrongStateError(
-                f"Environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were not "
-                "reset. Call env.reset(env_ids=...) first, or set auto_reset=True in the config."
+                f"step: environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were "
+                "not reset; call env.reset(env_ids=...) first, or set auto_reset=True in the config."
             )
         self._clear_extras()
         self.action_manager.process_action(as_action(action, self.device))
@@ -420,10 +420,10 @@ class ManagerBasedRlEnv:
         reset_ids = self._reset_done_envs()
         command_dt: float | torch.Tensor = self.step_dt
         if len(reset_ids) > 0:
-            # No time has passed for commands where an episode has just begun.
+            # Commands of new episodes do not advance in time.
             command_dt = self._command_dts.fill_(command_dt).index_fill_(0, reset_ids, 0.0)
             if self._looks_ahead:
-                # Resets redrew their timers. Here the GPU has less left to do than after `forward`.
+                # Resets resampled the timers. Synchronizing here is shorter than after `forward`.
                 look_up(self.command_manager.plan_lookups(command_dt))
         self._forward(reset_ids, moved)
         self._compute_commands(dt=command_dt)
@@ -445,9 +445,9 @@ class ManagerBasedRlEnv:
 
     @contextlib.contextmanager
     def common_steps_held(self) -> Generator[None]:
-        """Within this context steps do not count as steps of training.
+        """Freeze `common_step_counter` within this context, e.g. during evaluation.
 
-        `common_step_counter` stands still, and with it the curricula that go by it. For evaluations.
+        Curricula that depend on the counter do not advance.
         """
         held, self._holds_common_steps = self._holds_common_steps, True
         try:
@@ -490,7 +490,7 @@ class ManagerBasedRlEnv:
         self.reset_buf |= self.diverged
         self._nan_resets += self.diverged
         self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
-        # Also what a subclass of the manager adds.
+        # Covers rewards added by subclasses of the manager.
         self.reward_buf.masked_fill_(self.diverged, 0.0)
         log = self.extras["log"]
         log["Simulation/nan_resets"] = self.diverged.sum()
@@ -500,9 +500,9 @@ class ManagerBasedRlEnv:
         self.metrics_manager.compute()
 
     def _look_ahead(self) -> None:
-        """On a GPU, look up in one wait which environments end, and are due for events and commands.
+        """Look up environments that end or are due for events or commands with one GPU sync.
 
-        On the CPU a look-up costs least where it is needed.
+        Does nothing on the CPU: each lookup is cheapest at its point of use.
         """
         if not self._looks_ahead:
             return
@@ -524,13 +524,13 @@ class ManagerBasedRlEnv:
             self.extras.pop(name, None)
 
     def _observe_ends(self, moved: torch.Tensor | None) -> None:
-        """Put the observations of episodes that end into `extras`; see `step`.
+        """Store the final observations of episodes that end in `extras`; see `step`.
 
-        What resets and curricula read (derived quantities, rays, images, random numbers) is left as
-        it would be without.
+        Data read by resets and curricula (derived quantities, rays, images, random numbers) is not
+        affected.
 
         Args:
-            moved: (N,) bool, environments in which an event placed something; None for nowhere.
+            moved: Environments moved by an event, (N,) bool. None: no environment.
         """
         ended, excluded = self._observed_ends()
         ids = self._observed.take(ended, excluded)
@@ -552,13 +552,13 @@ class ManagerBasedRlEnv:
         self.extras["final_ids"] = ids
 
     def _observed_ends(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (N,) bool masks: the ends that are observed are those in the first, not in the second."""
+        """Return masks (ended, excluded), (N,) bool; the ends in `ended & ~excluded` are observed."""
         if self.observes_failures:
             return self.reset_buf, self.diverged
         return self.reset_time_outs, self.reset_terminated
 
     def _reset_done_envs(self) -> torch.Tensor:
-        """Reset environments that are done, under `auto_reset`; return their ids."""
+        """Reset environments that are done if `auto_reset`; return their ids."""
         if not self.cfg.auto_reset:
             return self.reset_buf.new_empty(0, dtype=torch.long)
         reset_ids = self._ended.take(self.reset_buf)
@@ -571,17 +571,17 @@ class ManagerBasedRlEnv:
         return reset_ids
 
     def _forward(self, reset_ids: torch.Tensor, moved: torch.Tensor | None) -> None:
-        """Make derived quantities current as far as `step` says.
+        """Update derived quantities to the stage described in `step`.
 
         Args:
             reset_ids: Environments that were reset.
-            moved: (N,) bool, those in which something was placed before the resets (what resets
-                place is in `reset_ids`, and looking would wait for the GPU); None for nowhere.
+            moved: Environments moved before the resets, (N,) bool. None: no environment. Excludes
+                moves by resets, covered by `reset_ids`: reading them would synchronize with the GPU.
         """
         full = reset_ids
         if moved is not None:
             full = moved.index_fill(0, reset_ids, True).nonzero().flatten()
-        # Before the first substep there is nothing to keep.
+        # Before the first substep, the data holds no forces to preserve.
         if len(full) == self.num_envs or self._sim_step_counter == 0:
             self.sim.forward()
         elif len(full) > 0:
@@ -593,11 +593,11 @@ class ManagerBasedRlEnv:
         self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None
     ) -> None:
         self.command_manager.compute(dt=dt, env_ids=env_ids)
-        # What resets placed is current by now, and commands see to what they place by themselves.
+        # Moves by resets are up to date after `forward`; commands update their own moves.
         self.scene.take_moved_envs()
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
-        # The curriculum runs first, because it judges the state in which the episode ended.
+        # The curriculum runs first, because it reads the final state of the episode.
         self.curriculum_manager.compute(env_ids=env_ids)
         self.sim.reset(env_ids)
         self.scene.reset(env_ids)
@@ -628,19 +628,20 @@ class ManagerBasedRlEnv:
 
     @staticmethod
     def seed(seed: int = -1) -> int:
-        """Seed every random number generator; -1 draws a seed. Returns the seed used."""
+        """Seed every random number generator and return the seed; -1 samples a seed."""
         if seed == -1:
             seed = draw_seed()
         seed_rng(seed)
         return seed
 
     def render(self, camera: str | int | None = None) -> np.ndarray | None:
-        """Return an RGB image (height, width, 3) of uint8 in mode `rgb_array`, else None.
+        """Return an RGB image, (height, width, 3) uint8, in mode `rgb_array`, else None.
 
-        `camera` names a camera of the model; None takes the view of the config.
+        `camera` is a camera of the model. None: the view of the config.
 
         Raises:
-            RenderingUnavailableError: this machine cannot render; the message says what to install.
+            RenderingUnavailableError: this machine cannot render; the message names the packages
+                to install.
         """
         if self.render_mode in (None, "human"):
             return None
@@ -648,7 +649,7 @@ class ManagerBasedRlEnv:
             raise UnsupportedError(
                 f"Render mode {self.render_mode!r} is not supported; use 'rgb_array' or None."
             )
-        # Opened late, so that a machine that cannot render can still train.
+        # Initialized lazily, so that machines without rendering can train.
         if not self._renderer_is_open:
             self._renderer.initialize()
             self._renderer_is_open = True
@@ -656,16 +657,16 @@ class ManagerBasedRlEnv:
         return self._renderer.render()
 
     def update_visualizers(self, visualizer: DebugVisualizer) -> None:
-        """Let managers and sensors draw into `visualizer`."""
+        """Draw the debug visualization of managers and sensors."""
         for part in (*self.manager_visualizers.values(), self.sensor_visualizers):
             part.debug_vis(visualizer)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all run-time state, so that a run can resume bit for bit."""
+        """Return all run-time state, for bitwise exact resume."""
         return env_state.state_dict(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore `state_dict`; raises ValueError if it comes from another task or size."""
+        """Restore a `state_dict`. Raises `ValueError` if task or number of environments differ."""
         env_state.load_state_dict(self, state)
 
     def close(self) -> None:
@@ -678,10 +679,10 @@ class ManagerBasedRlEnv:
 
 
 def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Refuse values that could only fail later.
+    """Check config values that would otherwise fail late.
 
     Raises:
-        ValueError: naming the field, what was given and what is allowed.
+        ValueError: invalid value; the message names the field, the value and the allowed values.
     """
     check_count("scene.num_envs", cfg.scene.num_envs)
     check_count("decimation", cfg.decimation)
@@ -691,8 +692,8 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     for name, entity in cfg.scene.entities.items():
         if entity is None:
             raise ValueError(
-                f"scene.entities[{name!r}] is None; an entity cannot be switched off like a term. "
-                f"Give an EntityCfg, or remove it: del cfg.scene.entities[{name!r}]."
+                f"scene.entities[{name!r}]: expected an EntityCfg, got None, which disables only "
+                f"terms; use del cfg.scene.entities[{name!r}] to remove the entity."
             )
     length = cfg.episode_length_s
     if not (isinstance(length, Real) and math.isfinite(length) and length >= 0):
@@ -700,55 +701,52 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     for name, term in cfg.terminations.items():
         if length == 0 and term is not None and term.func is time_out:
             raise ValueError(
-                f"episode_length_s is 0, so the termination {name!r} would fire at every step. "
-                "Set episode_length_s to the length of an episode in seconds, or remove the term."
+                f"episode_length_s: expected a number > 0 (s), got 0; the termination {name!r} would "
+                "fire at every step. Set episode_length_s, or remove the term."
             )
 
 
 def check_device(device: Any) -> None:
-    """Refuse a device on which no tensor could be made.
+    """Check that tensors can be created on `device`.
 
     Raises:
-        ValueError: no name of a CPU or CUDA device, or a CUDA device that is not there.
+        ValueError: not the name of a CPU or CUDA device, or a CUDA device that does not exist.
     """
-    allowed = "Use 'cpu', 'cuda', or 'cuda:<index>'."
     try:
         parsed = torch.device(device) if isinstance(device, str) else None
     except RuntimeError:
         parsed = None
     if parsed is None or parsed.type not in ("cpu", "cuda"):
-        raise ValueError(f"device is {device!r}, which is not a device name. {allowed}")
+        raise ValueError(f"device: expected 'cpu', 'cuda' or 'cuda:<index>', got {device!r}.")
     if parsed.type != "cuda":
         return
     if not torch.cuda.is_available():
         raise ValueError(
-            f"device is {device!r}, but PyTorch finds no CUDA here. Use 'cpu', or install an "
-            "NVIDIA driver and a PyTorch with CUDA."
+            f"device: got {device!r}, but PyTorch finds no CUDA device; use 'cpu', or install an "
+            "NVIDIA driver and PyTorch with CUDA."
         )
     count = torch.cuda.device_count()
     if (parsed.index or 0) >= count:
-        raise ValueError(
-            f"device is {device!r}, but the indices of the GPUs here are 0 to {count - 1}."
-        )
+        raise ValueError(f"device: expected a GPU index from 0 to {count - 1}, got {device!r}.")
 
 
 def as_action(action: Any, device: str) -> torch.Tensor:
     """Return an action as a tensor on `device`; arrays and lists of numbers become float32.
 
     Raises:
-        ValueError: it is neither a tensor nor an array of numbers.
-        TypeError: it is a tensor of complex numbers, or without data.
+        ValueError: `action` is neither a tensor nor an array of numbers.
+        TypeError: `action` is a complex tensor, or a tensor without data.
     """
     if isinstance(action, torch.Tensor):
-        check_real(action, str, "The action")
+        check_real(action, str, "action")
         return action.to(device)
     try:
-        # Copied, because torch warns about arrays that it may not write to.
+        # Copied, because torch warns about read-only arrays.
         return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"The action is a {type(action).__name__} that does not convert to a tensor ({error}). "
-            "Give a float tensor, array or list of shape (environments, components)."
+            f"action: expected a float tensor, array or list of shape (environments, components), "
+            f"got {type(action).__name__} ({error})."
         ) from error
 
 
@@ -756,34 +754,34 @@ def as_reset_ids(env_ids: Any, num_envs: int, device: str) -> torch.Tensor:
     """Return the environments to reset as a 1-D int64 tensor on `device`.
 
     Args:
-        env_ids: None for all, a slice, a bool mask (num_envs,), or indices in any integer type.
+        env_ids: Integer indices, a bool mask (num_envs,), a slice, or None for all.
         num_envs: Number of environments.
         device: Device of the result.
 
     Raises:
-        ValueError: a mask of another length, indices that are no integers or out of range.
+        ValueError: mask of the wrong length, or indices not integer or out of range.
     """
     if env_ids is None or isinstance(env_ids, slice):
         return as_ids(env_ids, num_envs, device)
     expected = (
-        f"env_ids must be integers from 0 to {num_envs - 1}, a bool mask of length {num_envs}, a "
+        f"env_ids: expected integers from 0 to {num_envs - 1}, a bool mask of length {num_envs}, a "
         "slice, or None for all environments"
     )
     try:
         ids = torch.as_tensor(env_ids, device=device).flatten()
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{expected}; got {env_ids!r}.") from error
+        raise ValueError(f"{expected}, got {env_ids!r}.") from error
     if ids.dtype == torch.bool:
         if len(ids) != num_envs:
-            raise ValueError(f"{expected}; got a mask of length {len(ids)}.")
+            raise ValueError(f"{expected}, got a mask of length {len(ids)}.")
         return ids.nonzero().flatten()
     # An empty list becomes a float tensor.
     if ids.numel() == 0:
         return ids.long()
     if ids.is_floating_point() or ids.is_complex():
-        raise ValueError(f"{expected}; got numbers of type {ids.dtype}.")
+        raise ValueError(f"{expected}, got numbers of type {ids.dtype}.")
     ids = ids.long()
     wrong = ids[(ids < 0) | (ids >= num_envs)]
     if len(wrong) > 0:
-        raise ValueError(f"{expected}; got {wrong[:10].tolist()}{' ...' * (len(wrong) > 10)}.")
+        raise ValueError(f"{expected}, got {wrong[:10].tolist()}{' ...' * (len(wrong) > 10)}.")
     return ids

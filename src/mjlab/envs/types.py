@@ -1,11 +1,11 @@
-"""Types of what an environment returns."""
+"""Types of observations and step results."""
 
 from __future__ import annotations
 
 import torch
 
 VecEnvObs = dict[str, torch.Tensor | dict[str, torch.Tensor]]
-"""Observations by group; a group whose terms are not concatenated is a dict by term."""
+"""Observations by group; groups whose terms are not concatenated are dicts by term."""
 
 VecEnvStepReturn = tuple[VecEnvObs, torch.Tensor, torch.Tensor, torch.Tensor, dict]
 """Observations, rewards, terminated, truncated, extras."""

@@ -1,4 +1,4 @@
-"""Managers: the named lists of terms that a task is made of."""
+"""Managers: the named terms of a task, by kind."""
 
 from mjlab.managers.action_manager import ActionManager, ActionTerm, ActionTermCfg
 from mjlab.managers.command_manager import (

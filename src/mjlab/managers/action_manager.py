@@ -1,4 +1,4 @@
-"""Actions: the policy's output, split among the terms that turn it into targets."""
+"""Action manager: splits the policy's output among terms that write actuator targets."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from mjlab.utils.indexing import as_index
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-# Environments that a message about bad actions shows.
-_SHOWN = 10
+# Number of environments listed in an error about non-finite actions.
+_MAX_SHOWN = 10
 
 
 @dataclass(kw_only=True)
 class ActionTermCfg(ABC):
-    """A part of the action; subclasses say in `build` which term it makes."""
+    """Base action term configuration. Subclasses construct the term in `build`."""
 
     entity_name: str
-    """Entity of the scene that the term acts on."""
+    """Name of the entity that the term acts on."""
 
     clip: dict[str, tuple] | None = None
-    """Bounds of processed actions: pattern of target names to (low, high)."""
+    """Bounds of processed actions: target name pattern to (low, high)."""
 
     @abstractmethod
     def build(self, env: ManagerBasedRlEnv) -> ActionTerm:
-        """Return the term."""
+        """Build the term."""
 
 
 class ActionTerm(ManagerTermBase):
-    """Base of action terms: processes its part of the action once a step, and applies it.
+    """Base class of action terms: processes its slice of the action once per step and applies it.
 
-    Raises `KeyError`, with what the scene holds, if it has no entity of the config's name.
+    Raises `KeyError`, listing the available names, if the scene has no entity `cfg.entity_name`.
     """
 
     def __init__(self, cfg: ActionTermCfg, env: ManagerBasedRlEnv) -> None:
@@ -50,33 +50,33 @@ class ActionTerm(ManagerTermBase):
 
     @property
     def action_dim(self) -> int:
-        """Number of action components that the term takes."""
+        """Number of action components of the term."""
         raise UnsupportedError(f"{self.name} must define the property action_dim.")
 
     @property
     def raw_action(self) -> torch.Tensor:
-        """The last action as given, (num_envs, action_dim)."""
+        """Last unprocessed action, (num_envs, action_dim)."""
         raise UnsupportedError(f"{self.name} must define the property raw_action.")
 
     @property
     def needs_substep(self) -> bool:
-        """Whether `apply_actions` must be called before every physics substep.
+        """True if `apply_actions` must be called before every physics substep.
 
-        It is enough to call it once a step if the method is marked `constant_within_step`.
+        One call per step suffices if the method is marked `constant_within_step`.
         """
         return not is_constant_within_step(type(self).apply_actions)
 
     def process_actions(self, actions: torch.Tensor) -> None:
-        """Take the action (num_envs, action_dim) of this step; called once a step."""
+        """Process the action of this step, (num_envs, action_dim). Called once per step."""
         raise UnsupportedError(f"{self.name} must define process_actions.")
 
     def apply_actions(self) -> None:
-        """Write targets to the entity; called before physics substeps."""
+        """Write targets to the entity. Called before physics substeps."""
         raise UnsupportedError(f"{self.name} must define apply_actions.")
 
 
 class ActionManager(BuiltTermsManager[ActionTerm]):
-    """Splits the action among its terms and remembers the last three actions.
+    """Splits the action among its terms and stores the last three actions.
 
     The config is kept by reference.
     """
@@ -88,7 +88,7 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
     def __init__(self, cfg: Mapping[str, ActionTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         size = (3, self.num_envs, self.total_action_dim)
-        # Newest first, in one tensor, so that a reset clears all three at once.
+        # Newest first. One tensor lets a reset clear all three at once.
         self._history = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._action, self._prev_action, self._prev_prev_action = self._history
         self._action_parts = self._action.split(self.action_term_dim, dim=1)
@@ -109,38 +109,38 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
 
     @property
     def action(self) -> torch.Tensor:
-        """The last action as given to `process_action`, (num_envs, total_action_dim).
+        """Last action passed to `process_action`, (num_envs, total_action_dim).
 
-        This and the next two are live: the next step overwrites them.
+        `action`, `prev_action` and `prev_prev_action` are live: the next step overwrites them.
         """
         return self._action
 
     @property
     def prev_action(self) -> torch.Tensor:
-        """The action before `action`."""
+        """Action before `action`."""
         return self._prev_action
 
     @property
     def prev_prev_action(self) -> torch.Tensor:
-        """The action before `prev_action`."""
+        """Action before `prev_action`."""
         return self._prev_prev_action
 
     @property
     def needs_substep(self) -> bool:
-        """Whether `apply_action` must be called before every physics substep."""
+        """True if `apply_action` must be called before every physics substep."""
         return any(term.needs_substep for term in self._terms.values())
 
     def process_action(self, action: torch.Tensor) -> None:
-        """Take the action (num_envs, total_action_dim) of this step and hand out its parts.
+        """Split the action of this step, (num_envs, total_action_dim), among the terms.
 
-        Raises `ValueError` if the shape is another, or if a number is NaN or infinite: on a CPU at
-        once, before anything is changed; on a GPU at the next step (a look at the values now would
-        make the CPU wait for the GPU), so that the bad action has acted for one step.
+        Raises `ValueError` for a wrong shape, and for NaN or infinite values: on a CPU immediately,
+        before any state changes; on a GPU at the next step, after the bad action has acted for one
+        step, because checking immediately would synchronize with the GPU.
         """
         if action.shape != self._action.shape:
             raise ValueError(
-                f"The action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)} "
-                f"(environments, components); components by term: "
+                f"action: expected shape {tuple(self._action.shape)} (environments, components), "
+                f"got {tuple(action.shape)}; components by term: "
                 f"{dict(zip(self._terms, self.action_term_dim, strict=True))}."
             )
         self._check_finite(action)
@@ -151,12 +151,12 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
             term.process_actions(part)
 
     def apply_action(self) -> None:
-        """Let every term write its targets; called before physics substeps."""
+        """Write the targets of all terms. Called before physics substeps."""
         for term in self._terms.values():
             term.apply_actions()
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
-        """Zero the remembered actions of these environments and reset the terms; logs nothing."""
+        """Zero the stored actions of `env_ids` and reset the terms. Logs nothing."""
         index = as_index(env_ids)
         self._history[:, index] = 0.0
         for term in self._terms.values():
@@ -164,7 +164,7 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         return {}
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return, for one environment, the raw action of each term."""
+        """Return the raw action of each term in one environment."""
         return [(name, term.raw_action[env_idx].tolist()) for name, term in self._terms.items()]
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
@@ -173,8 +173,8 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
 
 
 def check_now(action: torch.Tensor) -> None:
-    """Raise `ValueError`, naming environments and values, if `action` (N, A) is not finite."""
-    # One number tells for nearly every action that all is well; large ones may still overflow it.
+    """Raise `ValueError`, listing environments and values, if `action` (N, A) is not finite."""
+    # A finite sum proves that all values are finite; large finite values may overflow the sum.
     if math.isfinite(action.sum().item()):
         return
     bad = ~torch.isfinite(action).all(dim=1)
@@ -183,16 +183,16 @@ def check_now(action: torch.Tensor) -> None:
 
 
 class DeferredCheck:
-    """Checks actions on a GPU without waiting for it: each call reports about earlier ones.
+    """Checks actions on a GPU without synchronizing: each call raises for earlier actions.
 
-    A flag is copied to the host in the background; when the next call finds it there and set, that
-    call raises. What was wrong is kept on the device until then.
+    A flag is copied to the host asynchronously; the first call after the copy raises if the flag is
+    set. Bad values stay on the device until then.
 
     Args:
         num_envs: Number of environments N.
         action_dim: Number of action components A.
         device: Device of the actions.
-        event: Tells when the copy is done; has `record()` and `query()` as `torch.cuda.Event`.
+        event: Completion of the copy, with `record()` and `query()` of `torch.cuda.Event`.
     """
 
     def __init__(self, num_envs: int, action_dim: int, device: str, event: Any) -> None:
@@ -204,7 +204,7 @@ class DeferredCheck:
         self._pending = False
 
     def __call__(self, action: torch.Tensor) -> None:
-        """Raise `ValueError` if an earlier action was not finite, then look at this one."""
+        """Raise `ValueError` if an earlier action was not finite, then check `action`."""
         if self._pending and self._event.query():
             self._pending = False
             if self._flag:
@@ -222,9 +222,9 @@ class DeferredCheck:
 
 def _message(bad: torch.Tensor, action: torch.Tensor) -> str:
     ids = bad.nonzero().flatten()
-    rows = [f"env {i}: {action[i].tolist()}" for i in ids[:_SHOWN].tolist()]
-    more = f", and {len(ids) - _SHOWN} more" if len(ids) > _SHOWN else ""
+    rows = [f"env {i}: {action[i].tolist()}" for i in ids[:_MAX_SHOWN].tolist()]
+    more = f", and {len(ids) - _MAX_SHOWN} more" if len(ids) > _MAX_SHOWN else ""
     return (
-        f"Actions are NaN or infinite in {len(ids)} of {len(bad)} environments ({'; '.join(rows)}"
-        f"{more}). Every action must be a finite number: check what the policy gets and returns."
+        f"action: expected finite numbers, got NaN or infinite values in {len(ids)} of {len(bad)} "
+        f"environments ({'; '.join(rows)}{more}); check the policy's input and output."
     )

@@ -1,4 +1,4 @@
-"""Commands: goals that are given to the policy and redrawn from time to time."""
+"""Command manager: goals for the policy, resampled at intervals and resets."""
 
 from __future__ import annotations
 
@@ -30,31 +30,34 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class CommandTermCfg(ABC):
-    """A command; subclasses say in `build` which term it makes."""
+    """Base command term configuration. Subclasses construct the term in `build`."""
 
     resampling_time_range: tuple[float, float]
-    """Shortest and longest time until the command is redrawn, in seconds."""
+    """Range of the time between resamples (s)."""
 
     debug_vis: bool = False
-    """Whether the command draws in viewers."""
+    """Draw the command in viewers."""
 
     @abstractmethod
     def build(self, env: ManagerBasedRlEnv) -> CommandTerm:
-        """Return the term."""
+        """Build the term."""
 
 
 class CommandTerm(ManagerTermBase):
-    """Base of commands.
+    """Base class of command terms.
 
-    A subclass defines the property `command`, `_resample_command(env_ids)`, which draws commands
-    for some environments, and, where needed, `_update_command(env_ids)`, called every step (with
-    None: all) and after resets, `_update_metrics()`, which updates the tensors in `self.metrics`
-    for all environments, and `_debug_vis_impl(visualizer)`.
+    Subclasses define:
+
+    - property `command`;
+    - `_resample_command(env_ids)`: sample commands for `env_ids`;
+    - optionally `_update_command(env_ids)`, called every step (None: all) and after resets;
+    - optionally `_update_metrics()`: update the tensors in `self.metrics` for all environments;
+    - optionally `_debug_vis_impl(visualizer)`.
 
     Attributes:
-        time_left: Seconds until the next command, (num_envs,).
+        time_left: Time until the next resample (s), (num_envs,).
         command_counter: Number of commands in this episode, (num_envs,) int64.
-        metrics: Name to values (num_envs,); their means are logged at resets, then zeroed.
+        metrics: Name to values (num_envs,). Resets log their means and zero them.
 
     Raises `ValueError` if the config's time range is negative or has min > max.
     """
@@ -79,11 +82,11 @@ class CommandTerm(ManagerTermBase):
 
     @property
     def command(self) -> Any:
-        """The current command, (num_envs, ...)."""
+        """Current command, (num_envs, ...)."""
         raise UnsupportedError(f"{self.name} must define the property command.")
 
     def export_metadata(self, name: str) -> dict[str, list | str | float]:
-        """Return metadata from which a deployment can generate the command; empty by default.
+        """Return the metadata a deployment needs to generate the command; empty by default.
 
         Args:
             name: Name of the command.
@@ -91,13 +94,13 @@ class CommandTerm(ManagerTermBase):
         return {}
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
-        """Advance time, redraw commands whose time is over, and update.
+        """Advance the timers, resample expired commands, and update commands and metrics.
 
         Args:
-            dt: Seconds passed: one number, or (num_envs,) if `env_ids` is None.
+            dt: Elapsed time (s): one number, or (num_envs,) if `env_ids` is None.
             env_ids: Environments to advance; the others keep time, command and metrics. None: all.
 
-        Raises `ValueError` for a `dt` of several numbers together with `env_ids`.
+        Raises `ValueError` for a `dt` with several elements together with `env_ids`.
         """
         if env_ids is None:
             self._update_metrics()
@@ -108,16 +111,16 @@ class CommandTerm(ManagerTermBase):
         else:
             if isinstance(dt, torch.Tensor) and dt.numel() != 1:
                 raise ValueError(
-                    f"{self.name}.compute: with env_ids, dt must be one number, got shape "
+                    f"{self.name}.compute dt: expected one number together with env_ids, got shape "
                     f"{tuple(dt.shape)}."
                 )
-            # `_update_metrics` knows only all environments; one that accumulates would count a step
-            # that the others have not made, so their values are put back.
+            # `_update_metrics` updates all environments. Metrics that accumulate would count a step
+            # that the other environments have not made, so their values are restored.
             before = {name: (values, values.clone()) for name, values in self.metrics.items()}
             self._update_metrics()
             for name, (values, kept) in before.items():
                 kept[env_ids] = self.metrics[name][env_ids]
-                # Also where the update put another tensor in place of the old one.
+                # The original tensor is kept even if the update replaced it.
                 self.metrics[name] = values.copy_(kept)
             self.time_left[env_ids] -= dt
             due = env_ids[self.time_left[env_ids] <= 0.0]
@@ -126,18 +129,18 @@ class CommandTerm(ManagerTermBase):
         self._update_command(env_ids)
 
     def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
-        """Plan the look-ups of `compute(dt)`, which `env.step` makes on a GPU, and return them.
+        """Plan and return the lookups of `compute(dt)`. On a GPU, `env.step` performs them.
 
-        Without them, `compute` looks up by itself. A subclass may add those of its
-        `_update_command`.
+        Without planned lookups, `compute` performs its own. Subclasses may add the lookups of
+        their `_update_command`.
         """
         return [self._due_lookup.plan(self.time_left - dt <= 0.0, self.time_left, dt)]
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
-        """Draw new commands in these environments, and return and zero the mean of each metric.
+        """Resample the commands of `env_ids`; return the mean of each metric and zero the metrics.
 
-        Environments that `_is_measured` excludes are left out of the means, and those where a
-        metric is NaN or infinite of its mean.
+        The means leave out environments that `_is_measured` excludes; the mean of a metric also
+        leaves out environments with a NaN or infinite value.
         """
         ids = as_ids(env_ids, self.num_envs, self.device)
         if is_empty(ids):
@@ -156,14 +159,14 @@ class CommandTerm(ManagerTermBase):
         return log
 
     def take_turns_from(self, episode: int) -> None:
-        """Select the episodes that the next reset, of all environments, starts in an evaluation.
+        """Set the evaluation episodes started by the next reset of all environments.
 
-        For commands that share something out evenly over episodes, such as motions: environment i
-        is about to play episode `episode + i`. Does nothing unless overridden.
+        Environment i will run episode `episode + i`. For commands that distribute items, such as
+        motions, evenly over episodes. Does nothing by default.
         """
 
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Draw the command if the config says so."""
+        """Draw the command if `cfg.debug_vis`."""
         if self.cfg.debug_vis:
             self._debug_vis_impl(visualizer)
 
@@ -175,13 +178,13 @@ class CommandTerm(ManagerTermBase):
         on_change: Callable[[], None] | None = None,
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
-        """Add the command's own controls to the browser viewer; none unless overridden."""
+        """Add the command's controls to the Viser viewer. Does nothing by default."""
 
     def on_viewer_pause(self, paused: bool) -> None:
-        """Hear that the viewer was paused or continued; does nothing unless overridden."""
+        """Handle a pause or resume of the viewer. Does nothing by default."""
 
     def apply_gui_reset(self, env_ids: torch.Tensor) -> bool:
-        """Write a state that the viewer asked for after a reset; return whether one was written."""
+        """Write a state requested in the viewer after a reset; return True if one was written."""
         return False
 
     def _resample(self, env_ids: torch.Tensor) -> None:
@@ -194,17 +197,17 @@ class CommandTerm(ManagerTermBase):
         self.command_counter[env_ids] += 1
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
-        """Draw commands for these environments (1-D int64)."""
+        """Sample commands for `env_ids`, (n,) int64."""
         raise UnsupportedError(f"{self.name} must define _resample_command(env_ids).")
 
     def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
-        """Update commands that depend on the state; None means all environments."""
+        """Update state-dependent commands of `env_ids` (None: all)."""
 
     def _update_metrics(self) -> None:
         """Update the tensors in `self.metrics`."""
 
     def _is_measured(self, env_ids: torch.Tensor) -> torch.Tensor | None:
-        """Return which of these environments have metrics to log, (n,) bool; None: all."""
+        """Return a mask of the `env_ids` with metrics to log, (n,) bool. None: all."""
         return None
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
@@ -212,7 +215,7 @@ class CommandTerm(ManagerTermBase):
 
 
 class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
-    """Holds the commands by name. The config is kept by reference and may be edited."""
+    """Command terms by name. The config is kept by reference and may be edited."""
 
     _cfg_type = CommandTermCfg
     _term_type = CommandTerm
@@ -226,11 +229,11 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
             term.compute(dt, env_ids)
 
     def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
-        """Plan the look-ups of all commands; see `CommandTerm.plan_lookups`."""
+        """Plan the lookups of all commands; see `CommandTerm.plan_lookups`."""
         return [lookup for term in self._terms.values() for lookup in term.plan_lookups(dt)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
-        """Reset all commands in these environments and return `Metrics/<command>/<metric>`."""
+        """Reset the commands of `env_ids` (None: all) and return `Metrics/<command>/<metric>`."""
         ids = as_ids(env_ids, self.num_envs, self.device)
         log: dict[str, Any] = {}
         for name, term in self._terms.items():
@@ -238,22 +241,22 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         return log
 
     def get_command(self, name: str) -> torch.Tensor:
-        """Return the current command; raises `KeyError`, with the valid names, if unknown."""
+        """Return the current command. Raises `KeyError`, listing the valid names, if unknown."""
         return self.get_term(name).command
 
     def get_term_cfg(self, name: str) -> CommandTermCfg:
-        """Return the live config of a command; raises `ValueError` if unknown."""
+        """Return the live config of a command. Raises `ValueError` if unknown."""
         self._check_known(name, self.active_terms)
         return self._terms[name].cfg
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return, for one environment, the values of each command."""
+        """Return the values of each command in one environment."""
         return [
             (name, term.command[env_idx].flatten().tolist()) for name, term in self._terms.items()
         ]
 
     def get_visualizable_terms(self) -> list[tuple[str, CommandTerm]]:
-        """Return the commands that draw, as (name, term)."""
+        """Return the commands with `debug_vis`, as (name, term)."""
         return [(name, term) for name, term in self._terms.items() if term.cfg.debug_vis]
 
     def create_gui(
@@ -263,17 +266,17 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         on_change: Callable[[], None] | None = None,
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
-        """Let every command add its own controls to the browser viewer."""
+        """Add the controls of all commands to the Viser viewer."""
         for name, term in self._terms.items():
             term.create_gui(name, server, get_env_idx, on_change, request_action)
 
     def on_viewer_pause(self, paused: bool) -> None:
-        """Tell all commands that the viewer was paused or continued."""
+        """Notify all commands of a pause or resume of the viewer."""
         for term in self._terms.values():
             term.on_viewer_pause(paused)
 
     def apply_gui_reset(self, env_ids: torch.Tensor) -> bool:
-        """Ask all commands for a state to write after a reset; return whether one wrote it."""
+        """Call `apply_gui_reset` of all commands; return True if one of them wrote a state."""
         wrote = [term.apply_gui_reset(env_ids) for term in self._terms.values()]
         return any(wrote)
 

@@ -1,4 +1,4 @@
-"""Curriculum: terms that change the task as training proceeds."""
+"""Curriculum manager: terms that change the task during training."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class CurriculumTermCfg(ManagerTermBaseCfg):
-    """A curriculum term: `func(env, env_ids, **params)` is called when environments reset.
+    """Curriculum term configuration: `func(env, env_ids, **params)` is called at resets.
 
-    It returns what to log: None, a number, a tensor with one element, or a dict of those.
+    The return value is logged: None, a number, a tensor with one element, or a dict of those.
     """
 
 
 class CurriculumManager(TermListManager):
-    """Calls its terms at every reset, before anything of the old episode is lost."""
+    """Calls its terms at every reset, before the state of the old episode is overwritten."""
 
     _cfg_type = CurriculumTermCfg
     _leading = ("env", "env_ids")
@@ -34,20 +34,20 @@ class CurriculumManager(TermListManager):
         self._state: dict[str, Any] = dict.fromkeys(self._term_names)
 
     def compute(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Call all terms for the environments that are about to reset, and keep their results.
+        """Call all terms for the environments about to reset, and store their results.
 
-        Raises `ValueError` if a term returns a tensor that has not exactly one element.
+        Raises `ValueError` if a term returns a tensor without exactly one element.
         """
         index = as_index(env_ids)
         for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
             state = cfg.func(self._env, index, **cfg.params)
             for key, value in state.items() if isinstance(state, dict) else [(None, state)]:
                 if isinstance(value, torch.Tensor) and value.numel() != 1:
-                    where = "" if key is None else f", key {key!r}"
+                    suffix = "" if key is None else f", key {key!r}"
                     raise ValueError(
-                        f"{self._label(name)}{where}: returned a tensor of shape "
-                        f"{tuple(value.shape)}, but what is logged must be one number. Reduce it "
-                        "(mean, max) in the term, or return a dict of numbers."
+                        f"{self._label(name)}{suffix}: expected one number to log, got shape "
+                        f"{tuple(value.shape)}; reduce it (mean, max) in the term, or return a "
+                        "dict of numbers."
                     )
             self._state[name] = state
 
@@ -68,7 +68,7 @@ class CurriculumManager(TermListManager):
         return log
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return the last results of each term; they are the same for all environments."""
+        """Return the last results of each term. The results do not depend on `env_idx`."""
         terms = []
         for name, state in self._state.items():
             values = list(state.values()) if isinstance(state, dict) else [state]

@@ -1,4 +1,4 @@
-"""Events: changes of the state or the model at start-up, at resets, at intervals or every step."""
+"""Event manager: changes of state or model at startup, at resets, at intervals or every step."""
 
 from __future__ import annotations
 
@@ -28,35 +28,34 @@ logger = logging.getLogger(__name__)
 F = TypeVar("F", bound=Callable[..., Any])
 EventMode = Literal["startup", "reset", "interval", "step"]
 
-# Timers count down in steps, so that rounding must not put an event off by one.
+# Timers count down in steps; rounding must not delay an event by one step.
 _TIMER_TOLERANCE = 1e-6
 
-# Far enough back that an environment which never fired is always due.
+# Step of the last event in environments without one, early enough to be always due.
 _NEVER = -(2**40)
 
 
 @accepts_older_fields
 @dataclass(kw_only=True)
 class EventTermCfg(ManagerTermBaseCfg):
-    """An event: `func(env, env_ids, **params)`, where `env_ids` is None for all environments."""
+    """Event term configuration: `func(env, env_ids, **params)`; `env_ids` None: all environments."""
 
     mode: EventMode
-    """When it happens: once at "startup", at each "reset", at an "interval", or every "step"."""
+    """Trigger: once at `startup`, at each `reset`, at an `interval`, or every `step`."""
 
     interval_range_s: tuple[float, float] | None = None
-    """Shortest and longest time between two events of mode "interval", in seconds, neither
-    negative."""
+    """Range of the time between two events of mode `interval` (s), nonnegative."""
 
     is_global_time: bool = False
-    """Mode "interval": True has one timer for all environments, which resets do not touch."""
+    """Mode `interval`: share one timer, not reset with episodes, among all environments."""
 
     min_step_count_between_reset: int = 0
-    """Mode "reset": environment steps that must have passed since the event last happened in an
-    environment; 0 means at every reset."""
+    """Mode `reset`: minimum number of environment steps between two events in an environment.
+    0: every reset."""
 
 
 class EventManager(TermFunctionSwitches, TermListManager):
-    """Calls events at their time, and recomputes constants of the model that they changed.
+    """Triggers events and recomputes the model constants that depend on their changes.
 
     Raises `ValueError` for an unknown mode, and for mode "interval" without a valid
     `interval_range_s`.
@@ -69,10 +68,10 @@ class EventManager(TermFunctionSwitches, TermListManager):
     def __init__(self, cfg: Mapping[str, EventTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         self._terms_by_mode: dict[str, list[tuple[str, EventTermCfg]]] = {}
-        # Seconds left: a tensor (num_envs,), or a number for a global timer.
+        # Time left (s): (num_envs,), or a number for a global timer.
         self._timers: dict[str, torch.Tensor | float] = {}
         self._lookups: dict[str, Lookup] = {}
-        # Environment step at which the event last happened, (num_envs,) int64.
+        # Environment step of the last event, (num_envs,) int64.
         self._last_reset_step: dict[str, torch.Tensor] = {}
         for name, term in zip(self._term_names, self._term_cfgs, strict=True):
             self._terms_by_mode.setdefault(term.mode, []).append((name, term))
@@ -89,31 +88,31 @@ class EventManager(TermFunctionSwitches, TermListManager):
             if term.mode == "interval":
                 self._lookups[name] = Lookup()
                 if term.is_global_time:
-                    # On the host, which would wait for a number drawn on a GPU.
-                    self._timers[name] = self._draw(term, 1, "cpu").item()
+                    # Sampled on the host: reading a GPU sample would synchronize.
+                    self._timers[name] = self._sample_interval(term, 1, "cpu").item()
                 else:
-                    self._timers[name] = self._draw(term, self.num_envs)
+                    self._timers[name] = self._sample_interval(term, self.num_envs)
 
     @property
     def active_terms(self) -> dict[str, list[str]]:  # ty: ignore[incompatible-property-override]
-        """Names of the events of each mode that has any."""
+        """Names of the events by mode. Modes without events are left out."""
         return {mode: [name for name, _ in terms] for mode, terms in self._terms_by_mode.items()}
 
     @property
     def available_modes(self) -> list[str]:
-        """Modes that have events."""
+        """Modes with events."""
         return list(self._terms_by_mode)
 
     @property
     def domain_randomization_fields(self) -> tuple[str, ...]:
-        """Model fields that need a value for each environment, without repetition."""
+        """Model fields that need per-environment values, without duplicates."""
         fields = (field for cfg in self._term_cfgs for field in declared(cfg, "model_fields", ()))
         return tuple(dict.fromkeys(fields))
 
     @property
     def recompute_level(self) -> RecomputeLevel:
-        """Level that recomputes what any of the events changes."""
-        return joint_level(self._term_cfgs)
+        """Recompute level that covers all events."""
+        return combined_level(self._term_cfgs)
 
     def apply(
         self,
@@ -122,30 +121,30 @@ class EventManager(TermFunctionSwitches, TermListManager):
         dt: float | None = None,
         global_env_step_count: int | None = None,
     ) -> None:
-        """Let the events of a mode happen where they are due, then recompute what they changed.
+        """Trigger the events of `mode` that are due, then recompute the constants they affect.
 
-        After resets, constants are recomputed for the environments that were reset only: on the
-        native engine that costs more than a substep for each.
+        After resets, constants are recomputed only for the environments that were reset: on the
+        native engine recomputing costs more than a substep per environment.
 
         Args:
             mode: One of "startup", "reset", "interval" and "step".
-            env_ids: Environments that reset; required for "reset", refused for "interval".
-            dt: Seconds since the last call; required for "interval" and "step".
+            env_ids: Environments that reset; required for "reset", not allowed for "interval".
+            dt: Time since the last call (s); required for "interval" and "step".
             global_env_step_count: Environment steps since the start; required for "reset".
 
-        Raises `ValueError` if an argument is missing or out of place, or the mode is unknown.
+        Raises `ValueError` for a missing or disallowed argument, or an unknown mode.
         """
         check_one_of("Event mode", mode, get_args(EventMode))
         if mode in ("interval", "step") and dt is None:
-            raise ValueError(f"Events of mode {mode!r} need dt, the seconds since the last call.")
+            raise ValueError(f"Event mode {mode!r}: expected dt, the time since the last call (s).")
         if mode == "interval" and env_ids is not None:
             raise ValueError(
-                "Events of mode 'interval' take no env_ids: each environment has its timer."
+                "Event mode 'interval': env_ids must be None; every environment has a timer."
             )
         if mode == "reset" and (env_ids is None or global_env_step_count is None):
             raise ValueError(
-                "Events of mode 'reset' need env_ids, the environments that reset, and "
-                "global_env_step_count, the environment steps so far."
+                "Event mode 'reset': expected env_ids, the environments that reset, and "
+                "global_env_step_count, the number of environment steps so far."
             )
         fired, reset_ids = [], None
         if mode == "reset":
@@ -160,12 +159,12 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 is_due = True
             if is_due:
                 fired.append(cfg)
-        level = joint_level(fired)
+        level = combined_level(fired)
         if level != RecomputeLevel.none:
             self._env.sim.recompute_constants(level, reset_ids)
 
     def plan_lookups(self, dt: float) -> list[Lookup]:
-        """Plan the look-ups of `apply("interval", dt=dt)`; see `CommandTerm.plan_lookups`."""
+        """Plan the lookups of `apply("interval", dt=dt)`; see `CommandTerm.plan_lookups`."""
         return [
             self._lookups[name].plan(timer - dt < _TIMER_TOLERANCE, timer, dt)
             for name, timer in self._timers.items()
@@ -173,14 +172,14 @@ class EventManager(TermFunctionSwitches, TermListManager):
         ]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
-        """Reset terms of all modes and redraw the timers of these environments; logs nothing."""
+        """Reset terms of all modes and resample the timers of `env_ids`. Logs nothing."""
         self._reset_class_terms(env_ids)
         if self._timers and not is_empty(env_ids):
             ids = as_ids(env_ids, self.num_envs, self.device)
             for name, cfg in self._terms_by_mode["interval"]:
                 timer = self._timers[name]
                 if isinstance(timer, torch.Tensor):
-                    timer[ids] = self._draw(cfg, len(ids))
+                    timer[ids] = self._sample_interval(cfg, len(ids))
         return {}
 
     def _apply_interval(self, name: str, cfg: EventTermCfg, dt: float) -> bool:
@@ -188,7 +187,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
         if not isinstance(timer, torch.Tensor):
             timer -= dt
             due = timer < _TIMER_TOLERANCE
-            self._timers[name] = self._draw(cfg, 1, "cpu").item() if due else timer
+            self._timers[name] = self._sample_interval(cfg, 1, "cpu").item() if due else timer
             if due:
                 cfg.func(self._env, None, **cfg.params)
             return due
@@ -198,7 +197,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
             ids = (timer < _TIMER_TOLERANCE).nonzero().flatten()
         if len(ids) == 0:
             return False
-        timer[ids] = self._draw(cfg, len(ids))
+        timer[ids] = self._sample_interval(cfg, len(ids))
         cfg.func(self._env, ids, **cfg.params)
         return True
 
@@ -219,19 +218,21 @@ class EventManager(TermFunctionSwitches, TermListManager):
         super()._prepare_terms()
         for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
             for key, value in cfg.params.items():
-                # An empty selection is allowed and changes nothing. Where it was forgotten rather
-                # than meant, nobody would notice otherwise.
+                # An empty selection is allowed and changes nothing; a forgotten one would otherwise
+                # go unnoticed.
                 for field in value.empty_selections() if isinstance(value, SceneEntityCfg) else ():
                     logger.warning(
-                        "%s, parameter %r: %s of entity %r is empty, so the event changes nothing "
-                        "there. Name what it is for, or set the term to None.",
+                        "%s, parameter %r: %s of entity %r is empty, so the event changes nothing; "
+                        "name the elements to change, or set the term to None.",
                         *(self._label(name), key, field, value.name),
                     )
 
-    def _draw(self, cfg: EventTermCfg, count: int, device: str | None = None) -> torch.Tensor:
+    def _sample_interval(
+        self, cfg: EventTermCfg, count: int, device: str | None = None
+    ) -> torch.Tensor:
         low, high = cfg.interval_range_s or (0.0, 0.0)
-        drawn = torch.rand(count, dtype=torch.float32, device=device or self.device)
-        return drawn * (high - low) + low
+        samples = torch.rand(count, dtype=torch.float32, device=device or self.device)
+        return samples * (high - low) + low
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         terms = zip(self._term_names, self._term_cfgs, strict=True)
@@ -256,10 +257,10 @@ _DERIVED = {
 def requires_model_fields(
     *fields: str, recompute: RecomputeLevel = RecomputeLevel.none
 ) -> Callable[[F], F]:
-    """Declare that a function or class, used as an event, changes these fields of the model.
+    """Declare the model fields that a function or class changes when used as an event.
 
-    The fields, and those that derive from them at the level `recompute`, then get a value for each
-    environment, and the latter are recomputed after the event has fired.
+    These fields, and the fields derived from them at level `recompute`, are expanded to
+    per-environment values. Derived fields are recomputed after the event.
     """
 
     def declare(function: F) -> F:
@@ -272,21 +273,21 @@ def requires_model_fields(
 
 
 def derived_fields(level: RecomputeLevel) -> tuple[str, ...]:
-    """Return the model fields that recomputing at this level writes."""
+    """Return the model fields recomputed at `level`."""
     return tuple(f for part, fields in _DERIVED.items() if level & part for f in fields)
 
 
-def joint_level(cfgs: Iterable[EventTermCfg]) -> RecomputeLevel:
-    """Return the level that recomputes what any of these events changes."""
+def combined_level(cfgs: Iterable[EventTermCfg]) -> RecomputeLevel:
+    """Return the recompute level that covers all events of `cfgs`."""
     levels = (declared(cfg, "recompute", RecomputeLevel.none) for cfg in cfgs)
     return RecomputeLevel(functools.reduce(operator.or_, levels, 0))
 
 
 def declared(cfg: EventTermCfg, name: str, default: Any) -> Any:
-    """Return what an event's function declares: its `model_fields` or the level `recompute`.
+    """Return a declaration of an event's function: `model_fields` or the level `recompute`.
 
-    A function that learns from its parameters which field it changes declares a callable instead,
-    which gets the parameters: `function.model_fields(params)`.
+    Functions whose fields depend on their parameters declare a callable:
+    `function.model_fields(params)`.
     """
     value = getattr(cfg.func, name, default)
     return value(cfg.params) if callable(value) else value

@@ -1,7 +1,7 @@
-"""Look-ups of the environments in a mask, several at once on a GPU.
+"""Batched lookup of environment ids from masks on a GPU.
 
-`mask.nonzero()` makes the host wait until the GPU has done all that is queued. So `env.step` plans
-the look-ups that it and the managers will need, before they are needed, and `look_up` waits once.
+`mask.nonzero()` synchronizes with the GPU. `env.step` therefore plans its lookups and those of the
+managers in advance, and `look_up` synchronizes once for all.
 """
 
 from __future__ import annotations
@@ -13,46 +13,46 @@ import torch
 
 
 class Lookup:
-    """Ids of the environments in a mask, found before they are needed.
+    """Environment ids of a mask, computed ahead of use.
 
-    The mask is a function of inputs, such as a timer and the time that passes. `take` returns its
-    ids only while the inputs are unchanged: equal numbers, and the same tensors, to which PyTorch
-    has counted no write since. So terms may do anything between planning and use. (Writes through
-    `tensor.data`, and by kernels of other libraries, are not counted.)
+    The mask is a function of inputs, such as a timer and a time step. `take` returns the ids only
+    while the inputs are unchanged: equal numbers, and the same tensors at the same PyTorch version
+    counter. Terms may therefore do anything between planning and use. (The counter misses writes
+    through `tensor.data` and by kernels of other libraries.)
 
     Attributes:
-        mask: (N,) bool, the planned mask.
-        ids: (n,) int64, what `look_up` found; None before.
+        mask: Planned mask, (N,) bool.
+        ids: Ids found by `look_up`, (n,) int64; None before.
     """
 
     mask: torch.Tensor
 
     def __init__(self) -> None:
         self.ids: torch.Tensor | None = None
-        # The tensors are kept, so that none has the id of one that is gone.
+        # References keep the tensors alive: Python reuses the `id` of a freed object.
         self._inputs: tuple[torch.Tensor | float, ...] = ()
         self._stamps: list[Any] = []
 
     def plan(self, mask: torch.Tensor, *inputs: torch.Tensor | float) -> Lookup:
-        """Prepare for `look_up` of `mask`, (N,) bool, a function of `inputs`; return self."""
+        """Plan the lookup of `mask`, (N,) bool, a function of `inputs`; return self."""
         self.mask, self.ids = mask, None
         self._inputs, self._stamps = inputs, [_stamp(value) for value in inputs]
         return self
 
     def take(self, *inputs: torch.Tensor | float) -> torch.Tensor | None:
-        """Return the ids; None if they were not looked up, or these are not the same inputs."""
+        """Return the ids; None if they were not looked up or the inputs changed."""
         if self.ids is None or self._stamps != [_stamp(value) for value in inputs]:
             return None
         return self.ids
 
 
 def look_up(lookups: Sequence[Lookup]) -> None:
-    """Find the ids of planned look-ups, waiting for the GPU once. All masks are on a GPU."""
+    """Find the ids of planned lookups with one GPU synchronization. All masks are on a GPU."""
     if not lookups:
         return
     masks = torch.stack([lookup.mask for lookup in lookups])
     for lookup, mask in zip(lookups, masks.cpu(), strict=True):
-        # Copies from pinned memory do not wait.
+        # Copies from pinned memory do not synchronize.
         ids = mask.nonzero().flatten().pin_memory()
         lookup.ids = ids.to(masks.device, non_blocking=True)
 
@@ -60,5 +60,5 @@ def look_up(lookups: Sequence[Lookup]) -> None:
 def _stamp(value: torch.Tensor | float) -> Any:
     if not isinstance(value, torch.Tensor):
         return value
-    # Writes to inference tensors are not counted, so that they are never the same.
+    # Inference tensors have no version counter; a new object makes them always differ.
     return (id(value), object() if value.is_inference() else value._version)

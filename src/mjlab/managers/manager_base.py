@@ -1,8 +1,8 @@
 """Base classes of managers: an ordered dict of terms built from their configs.
 
-A manager resolves each term once, when it is built: selections of scene elements in its parameters
-are looked up, a class is replaced by an instance of it, and what does not fit is refused by name.
-At run time a manager only calls its terms.
+Terms are resolved once, when the manager is built: `SceneEntityCfg` parameters become element ids,
+classes become instances, and invalid terms raise errors that name them. At run time a manager only
+calls its terms.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ TermT = TypeVar("TermT")
 
 @dataclass
 class ManagerTermBaseCfg:
-    """A term: what to call, and the parameters to call it with."""
+    """Base term configuration: a callable and its parameters."""
 
     func: Any
-    """A function, or a class that is built with `(cfg, env)` and whose instance is then called.
-    An instance with a `reset(env_ids)` method is reset with its environments."""
+    """Function, or class constructed with `(cfg, env)` whose instance is called. Instances with a
+    `reset(env_ids)` method are reset with their environments."""
 
     params: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of the call. Values that are `SceneEntityCfg` are resolved first."""
+    """Keyword arguments of the call. `SceneEntityCfg` values are resolved first."""
 
 
 @stateful
 class ManagerTermBase:
-    """Base of terms that are classes, for those that want its properties.
+    """Optional base class of class-based terms.
 
-    Attributes that are tensors or numbers are run-time state: they are saved with a checkpoint and
-    restored, except for those named in a class attribute `_transient`.
+    Tensor and number attributes are run-time state: checkpoints save and restore them, except
+    attributes listed in the class attribute `_transient`.
     """
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
@@ -67,7 +67,7 @@ class ManagerTermBase:
 
     @property
     def device(self) -> str:
-        """Device of the tensors that the term gets and returns."""
+        """Device of the term's input and output tensors."""
         return self._env.device
 
     @property
@@ -76,23 +76,23 @@ class ManagerTermBase:
         return type(self).__name__
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> Any:
-        """Start a new episode in the given environments (None: all)."""
+        """Start a new episode in `env_ids` (None: all)."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Compute the term's value; terms that managers call override this."""
+        """Compute the term's value. Terms called by a manager override `__call__`."""
         raise UnsupportedError(f"{self.name} must define __call__ to be used as a term.")
 
 
 @stateful
 class ManagerBase(ABC):
-    """Base of all managers; a subclass builds its terms in `_prepare_terms`."""
+    """Base class of managers. Subclasses build their terms in `_prepare_terms`."""
 
     _transient = {"cfg", "_term_names", "_value_shape", "_built_values"}
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         self._env = env
         self._value_shape = torch.Size((env.num_envs,))
-        # Instances of class-based terms by label; kept here so that their state is saved.
+        # Instances of class-based terms by label, referenced so that checkpoints save their state.
         self._class_terms: dict[str, Any] = {}
         self._prepare_terms()
         self._built_values = {label: plain_values(cfg) for label, cfg in self._live_cfgs().items()}
@@ -124,23 +124,23 @@ class ManagerBase(ABC):
     @property
     @abstractmethod
     def active_terms(self) -> list[str] | dict[Any, list[str]]:
-        """Names of the terms that are switched on, in order."""
+        """Names of the enabled terms, in order."""
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
-        """Start a new episode in the given environments (None: all) and return what to log."""
+        """Start a new episode in `env_ids` (None: all) and return values to log."""
         self._reset_class_terms(env_ids)
         return {}
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return, for one environment, the name and the current values of each term."""
+        """Return the name and the current values of each term in one environment."""
         return []
 
     def config_edits(self) -> dict[str, Any]:
-        """Return what was changed in the configs of terms since they were built.
+        """Return the changes of term configs since the terms were built.
 
-        It is run-time state (the stage of a curriculum, say) for `apply_config_edits` to restore:
-        nested dicts of numbers, strings, tensors and sequences of those. Configs as a whole are
-        not, because whoever resumes may have set other values on purpose.
+        The changes are run-time state (e.g. the stage of a curriculum) for `apply_config_edits`:
+        nested dicts of numbers, strings, tensors and sequences of those. Unchanged values are left
+        out, because a resumed run may override them on purpose.
         """
         edits = {
             label: changes(self._built_values[label], plain_values(cfg))
@@ -149,24 +149,24 @@ class ManagerBase(ABC):
         return {label: edit for label, edit in edits.items() if edit}
 
     def apply_config_edits(self, edits: Mapping[str, Any]) -> None:
-        """Bring configs to where they were when `config_edits` returned this.
+        """Restore configs to their state when `config_edits` returned `edits`.
 
-        What it does not name is set to the value as built, because the configs may have been edited
-        since, by a first reset say. Changes of terms that are gone are skipped.
+        Values not in `edits` are restored to their values at build time, because later edits (e.g.
+        by a first reset) may have changed them. Edits of terms that no longer exist are skipped.
         """
         for label, cfg in self._live_cfgs().items():
             undone = changes(plain_values(cfg), self._built_values[label])
             write_changes(cfg, copy.deepcopy(undone))
             write_changes(cfg, edits.get(label, {}))
 
-    # For subclasses.
+    # Hooks and helpers of subclasses.
 
     @abstractmethod
     def _prepare_terms(self) -> None:
         """Build the terms from the config."""
 
     def _live_cfgs(self) -> dict[str, Any]:
-        """Return the config that each term reads, by label."""
+        """Return the config read by each term, by label."""
         return {}
 
     def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
@@ -179,43 +179,43 @@ class ManagerBase(ABC):
     def _enabled(
         self, cfg: Mapping[str, T | None], kind: type[T], quiet: bool = False
     ) -> Iterator[tuple[str, T]]:
-        """Yield the terms that are not None, having checked that they are of the right kind."""
+        """Yield the terms that are not None. Raises `TypeError` if a term is not of type `kind`."""
         for name, term_cfg in cfg.items():
             if term_cfg is None:
                 if not quiet:
-                    logger.info("%s: term %r is None, so it is off.", type(self).__name__, name)
+                    logger.info("%s: term %r is None (disabled).", type(self).__name__, name)
                 continue
             if not isinstance(term_cfg, kind):
                 raise WrongTypeError(
-                    f"{self._label(name)} must be a {kind.__name__} (or None to switch it off), "
+                    f"{self._label(name)}: expected {kind.__name__}, or None to disable the term, "
                     f"got {type(term_cfg).__name__}: {term_cfg!r}."
                 )
             yield name, term_cfg
 
     def _resolve_term(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Resolve the selections in `cfg.params`, and replace a class by an instance of it.
+        """Resolve the selections in `cfg.params`, and replace a class by its instance.
 
         Args:
             name: Name of the term, for messages.
-            cfg: Config of the term, which this manager owns: it is changed.
+            cfg: Config of the term, owned by this manager and modified in place.
             leading: Names of the positional arguments of the call, before the parameters.
         """
         self._resolve_params(name, cfg)
         if not callable(cfg.func):
             raise WrongTypeError(
-                f"{self._label(name)}: func must be a function or a class, got {cfg.func!r}."
+                f"{self._label(name)} func: expected a function or a class, got {cfg.func!r}."
             )
         self._make_callable(name, cfg, leading)
 
     def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
-        """Look up, in the scene, the top-level parameters that select elements of an entity."""
+        """Resolve the top-level `SceneEntityCfg` parameters in the scene."""
         for key, value in cfg.params.items():
             if isinstance(value, SceneEntityCfg):
                 with label_errors(f"{self._label(name)}, parameter {key!r}"):
                     value.resolve(self._env.scene)
 
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Replace a class by an instance of it, and check that the term can be called."""
+        """Replace a class by its instance, and check that the term is callable."""
         if inspect.isclass(cfg.func):
             with label_errors(self._label(name)):
                 cfg.func = cfg.func(cfg=cfg, env=self._env)
@@ -239,8 +239,8 @@ class ManagerBase(ABC):
         with label_errors(self._label(name)):
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):
-            # A term written as a plain class has run-time state like any other. Types that do not
-            # come from a class statement (functools.partial, say) cannot be marked and hold none.
+            # Plain classes have run-time state too. Types not created by a class statement, such as
+            # functools.partial, cannot be marked and hold no state.
             with contextlib.suppress(TypeError):
                 stateful(type(cfg.func))
             self._class_terms[name] = cfg.func
@@ -252,50 +252,50 @@ class ManagerBase(ABC):
                 reset(env_ids=as_index(env_ids))
 
     def _check_value(self, name: str, value: Any) -> None:
-        """Raise unless `value` is a tensor with one entry for each environment."""
+        """Raise unless `value` is a real tensor with one value per environment."""
         if not isinstance(value, torch.Tensor):
             raise WrongTypeError(
-                f"{self._label(name)} must return a tensor of shape {tuple(self._value_shape)}, "
-                f"got {type(value).__name__}: {value!r}."
+                f"{self._label(name)}: expected a tensor of shape {tuple(self._value_shape)}, got "
+                f"{type(value).__name__}: {value!r}."
             )
         if value.shape != self._value_shape:
             raise ValueError(
-                f"{self._label(name)} returned shape {tuple(value.shape)}, expected "
-                f"{tuple(self._value_shape)}: one value for each environment. Reduce the other "
-                "dimensions (sum, mean, squeeze) in the term."
+                f"{self._label(name)}: expected shape {tuple(self._value_shape)}, one value per "
+                f"environment, got {tuple(value.shape)}; reduce the other dimensions (sum, mean, "
+                "squeeze) in the term."
             )
         check_real(value, self._label, name)
 
     def _check_known(
         self, name: str, known: Sequence[str], error: type[Exception] = ValueError
     ) -> None:
-        """Raise `error` with the valid names unless `name` is one of them."""
+        """Raise `error`, listing the known names, unless `name` is in `known`."""
         check_exists(f"{type(self).__name__} term", name, known, error)
 
 
 class TermListManager(ManagerBase):
-    """A manager of one list of terms, whose config it copies."""
+    """Manager of one list of function or class terms. The config is copied."""
 
     _transient = {"_term_cfgs"}
     _cfg_type: type[ManagerTermBaseCfg] = ManagerTermBaseCfg
     _leading: Sequence[str] = ("env",)
-    # Fields of a term's config that the printed table shows.
+    # Config fields shown in the printed table.
     _shown: Sequence[str] = ()
 
     def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
-        # Terms are copied one by one, so that one config used twice becomes two terms.
+        # One copy per term: a config used twice must become two terms.
         self.cfg = {name: copy.deepcopy(term_cfg) for name, term_cfg in cfg.items()}
         super().__init__(env)
 
     @property
     def active_terms(self) -> list[str]:
-        """Names of the terms that are switched on, in order."""
+        """Names of the enabled terms, in order."""
         return self._term_names
 
     def get_term_cfg(self, term_name: str) -> Any:
-        """Return the live config of a term: what is changed in it takes effect at the next call.
+        """Return the live config of a term. Edits take effect at the next call.
 
-        Raises `ValueError`, with the valid names, if there is no such term.
+        Raises `ValueError`, listing the valid names, if the term is unknown.
         """
         self._check_known(term_name, self._term_names)
         return self._term_cfgs[self._term_names.index(term_name)]
@@ -321,7 +321,7 @@ class TermListManager(ManagerBase):
 
 
 class BuiltTermsManager(ManagerBase, Generic[TermT]):
-    """A manager of terms that their configs make in `build`. It keeps its config by reference."""
+    """Manager of terms constructed by `build` of their configs. The config is kept by reference."""
 
     _cfg_type: type[Any]
     _term_type: type[TermT]
@@ -337,7 +337,7 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
         return list(self._terms)
 
     def get_term(self, name: str) -> TermT:
-        """Return a term; raises `KeyError`, with the valid names, if there is none."""
+        """Return the term `name`. Raises `KeyError`, listing the valid names, if unknown."""
         self._check_known(name, self.active_terms, UnknownNameError)
         return self._terms[name]
 
@@ -347,8 +347,8 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
                 term = term_cfg.build(self._env)
             if not isinstance(term, self._term_type):
                 raise WrongTypeError(
-                    f"{self._label(name)}: {type(term_cfg).__name__}.build must return an "
-                    f"instance of {self._term_type.__name__}, got {type(term).__name__}."
+                    f"{self._label(name)}: expected {type(term_cfg).__name__}.build to return "
+                    f"{self._term_type.__name__}, got {type(term).__name__}."
                 )
             self._terms[name] = term
 
@@ -358,46 +358,46 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
 
 
 class NullManager:
-    """Mixin of managers without terms, which need no environment."""
+    """Mixin of managers without terms. The constructor takes no environment."""
 
     def __init__(self) -> None:
         super().__init__({}, SimpleNamespace(num_envs=0, device="cpu"))  # ty: ignore
         self.cfg = None
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return no terms."""
+        """Return an empty list."""
         return []
 
 
 @contextlib.contextmanager
 def label_errors(label: str) -> Generator[None]:
-    """Put `label` in front of the message of a `KeyError`, `TypeError` or `ValueError` of the block.
+    """Prefix messages of `KeyError`, `TypeError` and `ValueError` in the block with `label`.
 
-    What a term raises while it is built knows its cause, but not which of many terms it is. The
-    type of the error stays, unless it cannot be made from a message alone; it then becomes the
-    `KeyError`, `TypeError` or `ValueError` that it is derived from.
+    Errors raised while a term is built state the cause but not the term. The error type is kept,
+    unless the type cannot be constructed from a message alone; the error then becomes the
+    `KeyError`, `TypeError` or `ValueError` it derives from.
     """
     try:
         yield
     except (KeyError, TypeError, ValueError) as error:
-        # A KeyError shows its message as a quoted string, so that it is read from its arguments.
+        # str() of a KeyError is the repr of its message; the argument is the message itself.
         details = error.args[0] if len(error.args) == 1 else error
         message = f"{label}: {details}"
         try:
-            labelled = type(error)(message)
+            labeled = type(error)(message)
         except TypeError:
             kind = next(k for k in (KeyError, TypeError, ValueError) if isinstance(error, k))
-            labelled = kind(message)
-        raise labelled from error
+            labeled = kind(message)
+        raise labeled from error
 
 
-# Changes of configs.
+# Config edits.
 
 
 def plain_values(cfg: Any) -> dict[str, Any]:
-    """Return a copy of the plain values in a config, as nested dicts by field or key.
+    """Return a copy of the plain values of a config, as nested dicts by field or key.
 
-    Plain are numbers, strings, None, tensors, and lists and tuples of plain values.
+    Plain values: numbers, strings, None, tensors, and lists and tuples of plain values.
     """
     values: dict[str, Any] = {}
     for key, value in _items(cfg):
@@ -410,7 +410,7 @@ def plain_values(cfg: Any) -> dict[str, Any]:
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of `now` differs from `before`; both come from `plain_values`."""
+    """Return the values of `now` that differ from `before`; both are results of `plain_values`."""
     changed: dict[str, Any] = {}
     for key, value in now.items():
         old = before.get(key)
@@ -447,7 +447,7 @@ def _is_branch(value: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Return a copy of a plain value, of exactly the built-in types, or SKIP."""
+    """Return a copy of a plain value in exactly the built-in types, or SKIP."""
     if isinstance(value, torch.Tensor):
         return value.clone()
     if isinstance(value, (list, tuple)):
@@ -468,36 +468,36 @@ def _same(a: Any, b: Any) -> bool:
     return bool(a == b)
 
 
-# Debug drawings of terms, with a switch for each that viewers offer.
+# Debug visualization, enabled per term in viewers.
 
 
 class DebugVisSwitches:
-    """Mixin of managers whose terms may draw; all terms are on until switched off."""
+    """Mixin of managers with debug visualization. All terms are enabled by default."""
 
     _hidden: frozenset[str] = frozenset()
 
     def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the terms that can draw, as (name, object with `debug_vis`)."""
+        """Return the drawable terms, as (name, object with `debug_vis`)."""
         raise NotImplementedError
 
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Let every term that can draw, and is switched on, draw."""
+        """Draw all enabled terms."""
         for name, term in self.get_visualizable_terms():
             if name not in self._hidden:
                 term.debug_vis(visualizer)
 
     def set_debug_vis(self, name: str, enabled: bool) -> None:
-        """Switch the drawings of one term on or off.
+        """Enable or disable the debug visualization of a term.
 
-        Raises `ValueError`, with the valid names, if no such term can draw.
+        Raises `ValueError`, listing the drawable terms, if `name` is not drawable.
         """
-        check_exists("drawing term", name, [known for known, _ in self.get_visualizable_terms()])
+        check_exists("drawable term", name, [known for known, _ in self.get_visualizable_terms()])
         self._hidden = self._hidden - {name} if enabled else self._hidden | {name}
 
     def create_debug_vis_gui(
         self, server: viser.ViserServer, on_change: Callable[[], None] | None = None
     ) -> None:
-        """Add a check box for each term that can draw; `on_change` is called after a change."""
+        """Add a checkbox per drawable term; `on_change` is called after a change."""
         for name, _ in self.get_visualizable_terms():
             box = server.gui.add_checkbox(name, initial_value=name not in self._hidden)
 
@@ -510,13 +510,13 @@ class DebugVisSwitches:
 
 
 class TermFunctionSwitches(DebugVisSwitches):
-    """The same for managers of a list of terms, where the function of a term is what may draw."""
+    """`DebugVisSwitches` for managers of a list of terms; the term functions draw."""
 
     _term_names: list[str]
     _term_cfgs: list[Any]
 
     def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the terms that can draw, as (name, function object)."""
+        """Return the drawable terms, as (name, function object)."""
         terms = zip(self._term_names, self._term_cfgs, strict=True)
         return [
             (name, cfg.func)
@@ -526,12 +526,12 @@ class TermFunctionSwitches(DebugVisSwitches):
 
 
 class SensorSwitches(DebugVisSwitches):
-    """The same for the sensors of a scene."""
+    """`DebugVisSwitches` for the sensors of a scene."""
 
     def __init__(self, sensors: Mapping[str, Any]) -> None:
-        """Take the sensors by name, as the scene has them."""
+        """Store a reference to the scene's sensors by name."""
         self._sensors = sensors
 
     def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the sensors that draw, as (name, sensor)."""
+        """Return the sensors with debug visualization, as (name, sensor)."""
         return [(name, sensor) for name, sensor in self._sensors.items() if sensor.draws]

@@ -1,4 +1,4 @@
-"""Metrics: numbers to log for each episode that are no rewards."""
+"""Metrics manager: per-episode values that are logged but not rewarded."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ REDUCE_OPTIONS = ("last", "max", "mean", "sum")
 
 @dataclass(kw_only=True)
 class MetricsTermCfg(ManagerTermBaseCfg):
-    """A metric: `func(env, **params)` returns one number for each environment."""
+    """Metric term configuration: `func(env, **params)` returns one value per environment."""
 
     per_substep: bool = False
-    """True evaluates it after every physics substep; the value of a step is then their mean."""
+    """Evaluate after every physics substep; the value of a step is the mean over its substeps."""
 
     reduce: Literal["last", "max", "mean", "sum"] = "mean"
-    """How the values of an episode's steps become one."""
+    """Reduction of the step values of an episode."""
 
 
 @offers_older_attributes
 class MetricsManager(TermListManager):
-    """Collects the metrics of each episode. Values are neither weighted nor cleaned of NaN.
+    """Accumulates metrics per episode. Values are not weighted, and NaN is not replaced.
 
     Raises `ValueError` for an unknown `reduce`.
     """
@@ -50,7 +50,7 @@ class MetricsManager(TermListManager):
         self._max = torch.full(size, -torch.inf, dtype=torch.float32, device=self.device)
         self._steps = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._last)
-        # (num_envs,) bool, environments whose physics diverged in the step.
+        # Environments whose physics diverged in the step, (num_envs,) bool.
         self.excluded: torch.Tensor | None = None
         substep_terms = [k for k, c in enumerate(self._term_cfgs) if c.per_substep]
         self._substep_sums = torch.zeros(
@@ -65,11 +65,11 @@ class MetricsManager(TermListManager):
 
     @property
     def needs_substep(self) -> bool:
-        """Whether `compute_substep` must be called after every physics substep."""
+        """True if `compute_substep` must be called after every physics substep."""
         return bool(self._substep_rows)
 
     def compute_substep(self) -> None:
-        """Evaluate the terms that are `per_substep`, after a physics substep."""
+        """Evaluate the `per_substep` terms. Called after every physics substep."""
         if not self._substep_rows:
             return
         self._substeps += 1
@@ -77,9 +77,9 @@ class MetricsManager(TermListManager):
             row.add_(self._evaluate(k))
 
     def compute(self) -> None:
-        """Evaluate the other terms and take up the step, after rewards.
+        """Evaluate the other terms and accumulate the values of the step. Called after rewards.
 
-        Raises `ValueError` if a term returns another shape than (num_envs,).
+        Raises `ValueError` if a term returns a shape other than (num_envs,).
         """
         if not self._rows:
             return
@@ -92,7 +92,7 @@ class MetricsManager(TermListManager):
             self._substep_sums.zero_()
             self._substeps = 0
         if self.excluded is not None:
-            # Means leave out what is NaN.
+            # Means leave out NaN.
             self._last.masked_fill_(self.excluded, torch.nan)
         self._sum.add_(self._last)
         if "max" in self._terms_by_reduce:
@@ -100,10 +100,10 @@ class MetricsManager(TermListManager):
         self._steps.add_(1.0)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, torch.Tensor]:
-        """Return `Episode_Metrics/<term>`, the mean over these environments, and start anew.
+        """Return mean `Episode_Metrics/<term>` over `env_ids` and clear their accumulators.
 
-        Environments without a step have no maximum and are left out of its mean, as are, for each
-        term, environments where it is NaN or infinite. The mean is 0 if none is left.
+        The mean of a term leaves out environments with a NaN or infinite value; the mean of a
+        maximum also leaves out environments without a step. 0 if no environment remains.
         """
         self._reset_class_terms(env_ids)
         if is_empty(env_ids) or not self._term_names:
@@ -114,7 +114,7 @@ class MetricsManager(TermListManager):
             if reduce == "mean":
                 reduced = self._sum[:, index] / self._steps[index].clamp(min=1.0)
             else:
-                # Without a step the maximum is minus infinity, which is left out.
+                # Without a step the maximum is -inf, and `finite_mean` leaves it out.
                 reduced = {"sum": self._sum, "last": self._last, "max": self._max}[reduce][:, index]
             means = finite_mean(reduced)
             values |= {k: means[k] for k in terms}
@@ -124,7 +124,7 @@ class MetricsManager(TermListManager):
         return {f"Episode_Metrics/{name}": values[k] for k, name in enumerate(self._term_names)}
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return, for one environment, the value of each term in the last step."""
+        """Return the value of each term in the last step of one environment."""
         values = self._last[:, env_idx].tolist()
         return [(name, [value]) for name, value in zip(self._term_names, values, strict=True)]
 

@@ -1,4 +1,4 @@
-"""Values of terms that are NaN or infinite: counted, named once, left out of means."""
+"""NaN and infinite term values: counted, logged once per term, left out of means."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ logger = logging.getLogger(__name__)
 
 
 class NonFiniteWatch:
-    """Counts values of terms that are NaN or infinite, without waiting for a GPU.
+    """Counts NaN and infinite term values without synchronizing with the GPU.
 
     Args:
-        labels: Name of each term, as messages have it.
-        fault: What is wrong with such a value, and `counted_as` what it counts as, for messages.
+        labels: Name of each term in messages.
+        fault: Description of bad values in messages, e.g. "NaN or infinite".
+        counted_as: Replacement of bad values in messages, e.g. "0".
         num_envs: Number of environments N.
         device: Device of the values.
 
     Attributes:
-        fault: As given.
-        excluded: (N,) bool, environments in which no term is to blame: the physics diverged.
-        count: Number of such values in the last step, () int64.
+        fault: Description of bad values in messages.
+        excluded: Environments whose bad values are not counted, because the physics diverged,
+            (N,) bool.
+        count: Number of bad values in the last step, () int64.
     """
 
     def __init__(
@@ -36,26 +38,29 @@ class NonFiniteWatch:
         self._none = self.count
         self._step = 0
         terms = len(labels)
-        # Steps in a row in which every environment had such a value, for each term.
+        # Consecutive steps with a bad value in every environment, by term.
         self._streaks = torch.zeros(terms, dtype=torch.long, device=device)
         self._first_steps = torch.full((terms,), -1, dtype=torch.long, device=device)
         self._first_counts = torch.zeros(terms, dtype=torch.long, device=device)
         self._named: set[int] = set()
 
     def begin_step(self, excluded: torch.Tensor, step: int) -> None:
-        """Set `excluded`, and the number of the step for messages."""
+        """Set `excluded`, and the step number for messages."""
         self.excluded, self._step, self.count = excluded, step, self._none
 
-    def look(self, values: torch.Tensor) -> torch.Tensor | None:
-        """Return where values (terms, N) of a step are NaN or infinite; on a CPU, None if nowhere."""
-        # One number tells for nearly every step that all is well.
+    def check(self, values: torch.Tensor) -> torch.Tensor | None:
+        """Return a mask of NaN and infinite values of a step, (terms, N).
+
+        On a CPU, None if all values are finite.
+        """
+        # A finite sum proves that all values are finite.
         if self._on_cpu and math.isfinite(values.sum().item()):
-            # Not in place: it may have been made in inference mode.
+            # Not in place: the tensor may have been created in inference mode.
             self._streaks = torch.zeros_like(self._streaks)
             return None
         bad = ~torch.isfinite(values)
-        told = bad & ~self.excluded
-        counts = told.sum(dim=1)
+        counted = bad & ~self.excluded
+        counts = counted.sum(dim=1)
         found = counts > 0
         everywhere = found & (bad | self.excluded).all(dim=1)
         self._streaks = (self._streaks + 1) * everywhere
@@ -68,30 +73,32 @@ class NonFiniteWatch:
         return bad
 
     def report(self) -> None:
-        """Log each term that had such a value for the first time."""
+        """Log each term with a bad value, once per term."""
         for k, step in enumerate(self._first_steps.tolist()):
             if step < 0 or k in self._named:
                 continue
             self._named.add(k)
             logger.warning(
-                "%s was %s in %d of %d environments in step %d, which counts as %s. It is not logged again.",
+                "%s was %s in %d of %d environments in step %d and counts as %s; not logged again.",
                 self._labels[k], self.fault, int(self._first_counts[k]), len(self.excluded), step,
                 self._counted_as,
             )  # fmt: skip
 
     def streaks(self) -> dict[str, int]:
-        """Return the terms that were NaN or infinite in every environment, by label, with the number
-        of steps in a row up to now."""
+        """Return the number of consecutive steps with a bad value in every environment, by label.
+
+        Terms without such a streak are left out.
+        """
         streaks = zip(self._labels, self._streaks.tolist(), strict=True)
         return {label: steps for label, steps in streaks if steps > 0}
 
 
 def finite_mean(values: torch.Tensor) -> torch.Tensor:
-    """Return the mean over the last axis, leaving out NaN and infinite values; 0 if none is left.
+    """Return the mean of the finite values over the last axis; 0 if no value is finite.
 
     Args:
-        values: Float tensor (..., E) with one value for each of E environments.
+        values: Values of E environments, float (..., E).
     """
-    # `isfinite` takes twice the operations.
+    # `isfinite` takes twice as many operations.
     finite = values.abs() < torch.inf
     return torch.where(finite, values, 0.0).sum(dim=-1) / finite.sum(dim=-1).clamp(min=1)

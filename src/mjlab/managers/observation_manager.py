@@ -1,4 +1,4 @@
-"""Observations: what the policy, the critic and others see, in named groups."""
+"""Observation manager: named groups of terms (actor, critic, ...) with noise, delay and history."""
 
 from __future__ import annotations
 
@@ -31,84 +31,84 @@ Observation = torch.Tensor | dict[str, torch.Tensor]
 
 @dataclass
 class ObservationTermCfg(ManagerTermBaseCfg):
-    """A term of an observation group: `func(env, **params)` returns a tensor (num_envs, ...).
+    """Observation term configuration: `func(env, **params)` returns a tensor (num_envs, ...).
 
-    The value goes through noise, clip, scale, delay and history, in this order.
+    Pipeline: noise, clip, scale, delay, history.
     """
 
     noise: NoiseCfg | NoiseModelCfg | None = None
-    """Noise, or a noise model with state for each environment (a bias for each episode, say).
-    Applied only in groups with `enable_corruption`."""
+    """Noise, or a noise model with per-environment state (e.g. a bias per episode). Applied only in
+    groups with `enable_corruption`."""
 
     clip: tuple[float, float] | None = None
     """Lower and upper bound, applied before the scale."""
 
     scale: tuple[float, ...] | float | torch.Tensor | None = None
-    """Factor: one number, or one for each component of the last axis."""
+    """Factor: one number, or one per component of the last axis."""
 
     delay_min_lag: int = 0
-    """Smallest delay, in environment steps."""
+    """Minimum lag (environment steps)."""
 
     delay_max_lag: int = 0
-    """Largest delay, in environment steps; 0 means no delay."""
+    """Maximum lag (environment steps). 0: no delay."""
 
     delay_per_env: bool = True
-    """True draws a delay for each environment, False one for all."""
+    """Sample per-environment lags. False: one lag for all environments."""
 
     delay_hold_prob: float = 0.0
-    """Probability that a delay is kept when it is due to be redrawn."""
+    """Probability of keeping the lag when it is due for resampling."""
 
     delay_update_period: int = 0
-    """Environment steps between redraws of the delay; 0 redraws at every step."""
+    """Environment steps between resamples of the lag. 0: every step."""
 
     delay_per_env_phase: bool = True
-    """With a period: True spreads the redraws of the environments over it."""
+    """Stagger resampling across environments over `delay_update_period`."""
 
     history_length: int = 0
-    """Number of last values to return, oldest first; 0 returns the value alone. A group's
-    `history_length` replaces it."""
+    """Number of past values to return, oldest first. 0: the current value only. Replaced by the
+    group's `history_length`."""
 
     flatten_history_dim: bool = True
-    """True returns a history of H values as (num_envs, H * size), False as (num_envs, H, ...)."""
+    """Return a history of H values as (num_envs, H * size) instead of (num_envs, H, ...)."""
 
 
 @dataclass
 class ObservationGroupCfg:
-    """A named group of observation terms, such as "actor" or "critic"."""
+    """Configuration of a named group of observation terms, such as "actor" or "critic"."""
 
     terms: dict[str, ObservationTermCfg | None]
-    """Terms by name, in order. None switches a term off."""
+    """Terms by name, in order. None disables a term."""
 
     concatenate_terms: bool = True
-    """True joins the terms into one tensor, False returns a dict of name to tensor."""
+    """Concatenate the terms into one tensor. False: return a dict of name to tensor."""
 
     concatenate_dim: int = -1
-    """Dimension to join along. From 0 on it is counted without the environment dimension; negative
+    """Dimension of concatenation. Values >= 0 do not count the environment dimension; negative
     values count from the end."""
 
     enable_corruption: bool = False
-    """Whether the noise of the terms is applied."""
+    """Apply the noise of the terms."""
 
     history_length: int | None = None
-    """If given, replaces `history_length` and `flatten_history_dim` of every term; 0 switches
-    history off."""
+    """Replacement of `history_length` and `flatten_history_dim` of every term. 0: no history.
+    None: settings of the terms."""
 
     flatten_history_dim: bool = True
-    """How terms return their history where `history_length` is given here."""
+    """Flatten the histories of the terms. Used only with the group's `history_length`."""
 
     nan_policy: NanPolicy = "disabled"
-    """What to do with NaN and infinite values: nothing, warn and replace by 0, replace by 0, or
-    raise."""
+    """Handling of NaN and infinite values: `disabled`, `warn` (and replace by 0), `sanitize`
+    (replace by 0), or `error`."""
 
     nan_check_per_term: bool = True
-    """True checks each term before delay and history, False the group's result."""
+    """Apply `nan_policy` per term before delay and history. False: to the group's result."""
 
 
 @offers_older_attributes
 class ObservationManager(ManagerBase):
-    """Computes all observation groups; groups that are None or without terms are skipped.
+    """Computes all observation groups. Groups that are None or have no terms are skipped.
 
-    Every term's function is called once while the manager is built, to learn its shape.
+    Every term function is called once during construction, to infer its shape.
     """
 
     _transient = {"_stateful_terms"}
@@ -119,7 +119,7 @@ class ObservationManager(ManagerBase):
         self.cfg = dict(cfg)
         for name, group in cfg.items():
             if isinstance(group, ObservationGroupCfg):
-                # Each term is copied by itself, so that groups that share terms share no state.
+                # One copy per term: groups that share a term config must not share state.
                 terms = {key: copy.deepcopy(term) for key, term in group.terms.items()}
                 self.cfg[name] = dataclasses.replace(group, terms=terms)
         self._groups: dict[str, ObservationGroup] = {}
@@ -135,9 +135,9 @@ class ObservationManager(ManagerBase):
 
     @property
     def group_obs_dim(self) -> dict[str, tuple[int, ...] | list[tuple[int, ...]]]:
-        """For each group its shape, or the list of its terms' shapes if they are not joined.
+        """Shape of each group, or the list of its terms' shapes if they are not concatenated.
 
-        Shapes are without the environment dimension.
+        Shapes do not include the environment dimension.
         """
         return {
             name: self.group_obs_term_dim[name] if group.shape is None else group.shape
@@ -146,7 +146,7 @@ class ObservationManager(ManagerBase):
 
     @property
     def group_obs_term_dim(self) -> dict[str, list[tuple[int, ...]]]:
-        """For each group the shapes of its terms, without the environment dimension."""
+        """Shapes of the terms of each group, without the environment dimension."""
         return {
             name: [term.shape for term in group.terms.values()]
             for name, group in self._groups.items()
@@ -154,26 +154,26 @@ class ObservationManager(ManagerBase):
 
     @property
     def group_obs_concatenate(self) -> dict[str, bool]:
-        """For each group whether its terms are joined into one tensor."""
+        """True for each group whose terms are concatenated into one tensor."""
         return {name: group.cfg.concatenate_terms for name, group in self._groups.items()}
 
     def compute(
         self, update_history: bool = False, env_ids: torch.Tensor | None = None
     ) -> dict[str, Observation]:
-        """Return the observation of every group, each in memory of its own.
+        """Return the observation of every group as a new tensor.
 
         Args:
-            update_history: Whether values enter the histories. If not, a result computed since
-                the last reset is returned as it is.
-            env_ids: Environments that start an episode, if only their delays and histories are to
-                be filled. All environments are observed either way.
+            update_history: Append values to the histories. If False, a result computed since the
+                last reset is returned unchanged.
+            env_ids: Environments that start an episode: only their delays and histories are
+                filled. All environments are observed either way.
 
         Raises `ValueError` for `env_ids` without `update_history`.
         """
         if env_ids is not None and not update_history:
             raise ValueError(
-                "ObservationManager.compute(env_ids=...) fills histories, so it needs "
-                "update_history=True."
+                "ObservationManager.compute env_ids: expected update_history=True, because env_ids "
+                "fills histories, got False."
             )
         if update_history or self._obs_buffer is None:
             self._obs_buffer = {
@@ -182,10 +182,10 @@ class ObservationManager(ManagerBase):
         return self._obs_buffer
 
     def preview(self) -> dict[str, Observation]:
-        """Return what `compute(update_history=True)` would return.
+        """Return the result of `compute(update_history=True)` without side effects.
 
-        Delays, histories, noise models, terms that are classes, and random number generators stay
-        where they are.
+        The states of delays, histories, noise models, class-based terms and random number
+        generators are restored.
         """
         terms = [term for term in self._class_terms.values() if is_stateful(term)]
         parts = [*self._stateful_terms, *terms]
@@ -202,14 +202,14 @@ class ObservationManager(ManagerBase):
         update_history: bool = False,
         env_ids: torch.Tensor | None = None,
     ) -> Observation:
-        """Return the observation of one group, computed now; `compute` explains the arguments.
+        """Compute and return the observation of one group. Arguments as in `compute`.
 
-        Raises `ValueError`, with the valid names, if there is no such group.
+        Raises `ValueError`, listing the valid names, if the group is unknown.
         """
         return self._group(group_name).compute(update_history, env_ids)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
-        """Reset terms, delays, histories and noise models of these environments; logs nothing."""
+        """Reset terms, delays, histories and noise models of `env_ids` (None: all). Logs nothing."""
         self._obs_buffer = None
         self._reset_class_terms(env_ids)
         if not is_empty(env_ids):
@@ -218,16 +218,16 @@ class ObservationManager(ManagerBase):
         return {}
 
     def get_term_cfg(self, group_name: str, term_name: str) -> ObservationTermCfg:
-        """Return the live config of a term: noise, clip, scale and params may be changed in it.
+        """Return the live config of a term. Its noise, clip, scale and params may be edited.
 
-        Raises `ValueError`, with the valid names, if there is no such group or term.
+        Raises `ValueError`, listing the valid names, if the group or term is unknown.
         """
         terms = self._group(group_name).terms
         check_exists(f"term of observation group {group_name!r}", term_name, terms)
         return terms[term_name].cfg
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return ("group-term", values) of the last observation for one environment."""
+        """Return ("group-term", values) of the last observation of one environment."""
         observations = self.compute()
         return [
             (f"{group_name}-{term_name}", value[env_idx].flatten().tolist())
@@ -251,11 +251,11 @@ class ObservationManager(ManagerBase):
     def _build_term(
         self, label: str, cfg: ObservationTermCfg, group_cfg: ObservationGroupCfg
     ) -> ObservationTerm:
-        # Also where there is no corruption, which would hide a mistake until someone turns it on.
+        # Checked even without corruption: the mistake would surface only once it is enabled.
         if not (cfg.noise is None or isinstance(cfg.noise, NoiseCfg | NoiseModelCfg)):
             raise ValueError(
-                f"Observation term {label!r} noise: expected a NoiseCfg (UniformNoiseCfg("
-                f"n_min=-0.1, n_max=0.1), say), a NoiseModelCfg, or None, got {cfg.noise!r}."
+                f"Observation term {label!r} noise: expected a NoiseCfg (e.g. UniformNoiseCfg("
+                f"n_min=-0.1, n_max=0.1)), a NoiseModelCfg, or None, got {cfg.noise!r}."
             )
         if not group_cfg.enable_corruption:
             cfg.noise = None
@@ -286,17 +286,17 @@ class ObservationManager(ManagerBase):
 
 @stateful
 class ObservationGroup:
-    """The terms of one group, and how they are joined.
+    """Observation group: its terms and their concatenation.
 
     Args:
         name: Name of the group.
-        cfg: Its config.
-        terms: Its terms by name; at least one.
+        cfg: Config of the group.
+        terms: Terms by name; at least one.
 
     Attributes:
-        shape: Shape of the joined tensor without the environment dimension, or None for a dict.
+        shape: Shape of the concatenated tensor without the environment dimension. None: a dict.
 
-    Raises `ValueError` if the terms cannot be joined.
+    Raises `ValueError` if the terms cannot be concatenated.
     """
 
     _transient = {"name", "shape", "_dim", "_nan_policy"}
@@ -315,10 +315,10 @@ class ObservationGroup:
     def compute(
         self, update_history: bool, env_ids: torch.Tensor | None
     ) -> torch.Tensor | dict[str, torch.Tensor]:
-        """Return the group's observation in memory of its own."""
+        """Return the group's observation as a new tensor."""
         values = [term.compute(update_history, env_ids) for term in self.terms.values()]
         if self.cfg.concatenate_terms:
-            # Joining copies, also a single tensor.
+            # `cat` copies even a single tensor.
             return apply_nan_policy(torch.cat(values, dim=self._dim), self._nan_policy, self.name)
         return {
             name: apply_nan_policy(value.clone(), self._nan_policy, f"{self.name}/{name}")
@@ -326,7 +326,7 @@ class ObservationGroup:
         }
 
     def split(self, observation: torch.Tensor | dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return the parts of a result of `compute` by term."""
+        """Split a result of `compute` by term."""
         if isinstance(observation, dict):
             return observation
         dim = self._axis() + 1
@@ -334,7 +334,7 @@ class ObservationGroup:
         return dict(zip(self.terms, parts, strict=True))
 
     def _axis(self) -> int:
-        """Return the dimension to join along, counted without the environment dimension."""
+        """Return the dimension of concatenation, not counting the environment dimension."""
         dim = self.cfg.concatenate_dim
         return dim if dim >= 0 else dim + len(next(iter(self.terms.values())).shape)
 
@@ -349,29 +349,28 @@ class ObservationGroup:
             )
             if not others_agree:
                 raise ValueError(
-                    f"Observation group {self.name!r}: terms of shapes {shapes} (without the "
-                    f"environment dimension) cannot be joined along concatenate_dim="
-                    f"{self.cfg.concatenate_dim}. Flatten the terms, or set concatenate_terms="
-                    "False."
+                    f"Observation group {self.name!r}: expected shapes that concatenate along "
+                    f"concatenate_dim={self.cfg.concatenate_dim}, got {shapes} (without the "
+                    "environment dimension); flatten the terms, or set concatenate_terms=False."
                 )
         return (*first[:axis], sum(shape[axis] for shape in shapes.values()), *first[axis + 1 :])
 
 
 @stateful
 class ObservationTerm:
-    """The pipeline of one term, with its delay, its history and its noise model.
+    """Pipeline of one observation term: noise, clip, scale, delay, history.
 
     Args:
         label: "group/term", for messages.
-        cfg: Resolved config, owned by the manager. It is read at every call, so that a curriculum
-            may change noise, clip and scale; delay and history are fixed here.
+        cfg: Resolved config, owned by the manager. Noise, clip and scale are read at every call, so
+            that curricula may change them; delay and history are fixed at construction.
         env: The environment.
-        nan_policy: What to do with NaN and infinite values before they enter delay and history.
+        nan_policy: Handling of NaN and infinite values before they enter delay and history.
 
-    The term's function is called once, to learn its shape.
+    The term's function is called once, to infer its shape.
 
-    Raises `ValueError`, naming the term, for a clip, scale, delay or history that makes no sense,
-    and puts the term's name in front of what its function raises.
+    Raises `ValueError`, naming the term, for an invalid clip, scale, delay or history, and prefixes
+    errors of the term's function with the term's name.
 
     Attributes:
         shape: Shape of the result without the environment dimension.
@@ -414,22 +413,22 @@ class ObservationTerm:
             self.shape = flat if cfg.flatten_history_dim else tuple(with_history)
 
     def compute(self, update_history: bool, env_ids: torch.Tensor | None) -> torch.Tensor:
-        """Return the value (num_envs, *shape), which may be memory of the simulation.
+        """Return the value, (num_envs, *shape); it may be a view of simulation memory.
 
         Args:
-            update_history: Whether the value enters the history.
+            update_history: Append the value to the history.
             env_ids: Environments that start an episode: their delay and history are filled with
-                the value, those of the others stay as they are. None is a step of all.
+                the value; other environments keep theirs. None: a step of all environments.
         """
         value = self._call()
         cfg = self.cfg
         if cfg.noise is not None:
-            # The noise may work in place, which must not reach the simulation.
+            # In-place noise must not change simulation memory.
             value = value.clone()
             if not isinstance(cfg.noise, NoiseModelCfg):
                 value = cfg.noise.apply(value)
             else:
-                # A curriculum may have set it.
+                # A curriculum may have set the noise after construction.
                 if self._noise_model is None:
                     self._noise_model = self._build_noise_model()
                 value = self._noise_model(value)
@@ -459,11 +458,11 @@ class ObservationTerm:
 
     @property
     def has_state(self) -> bool:
-        """Whether `reset` does anything."""
+        """True if the term has state to reset."""
         return any(part is not None for part in (self._noise_model, self._delay, self._history))
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> None:
-        """Empty delay and history and start the noise model anew in these environments."""
+        """Clear delay and history and reset the noise model of `env_ids` (None: all)."""
         for part in (self._delay, self._history, self._noise_model):
             if part is not None:
                 part.reset(env_ids)
@@ -474,24 +473,24 @@ class ObservationTerm:
             self._check_first(value)
         elif value.shape != self._raw_shape:
             raise ValueError(
-                f"{self._name} returned shape {tuple(value.shape)}, but {tuple(self._raw_shape)} "
-                "when the environment was built. Shapes must not change."
+                f"{self._name}: expected shape {tuple(self._raw_shape)}, as when the environment was "
+                f"built, got {tuple(value.shape)}."
             )
         check_real(value, str, self._name)
-        # Policies are float32, whatever the default type with which a term makes its tensors.
+        # Policies are float32, whatever torch's default dtype.
         return value.float() if value.dtype == torch.float64 else value
 
     def _check_first(self, value: Any) -> None:
         expected = f"({self._env.num_envs}, ...), with one or more dimensions after the first"
         if not isinstance(value, torch.Tensor):
             raise WrongTypeError(
-                f"{self._name} must return a tensor of shape {expected}, got "
+                f"{self._name}: expected a tensor of shape {expected}, got "
                 f"{type(value).__name__}: {value!r}."
             )
         if value.ndim < 2 or value.shape[0] != self._env.num_envs:
-            hint = " Add `.unsqueeze(-1)` to return one number." if value.ndim == 1 else ""
+            hint = "; use `.unsqueeze(-1)` for one number" if value.ndim == 1 else ""
             raise ValueError(
-                f"{self._name} returned shape {tuple(value.shape)}, expected {expected}.{hint}"
+                f"{self._name}: expected shape {expected}, got {tuple(value.shape)}{hint}."
             )
         check_real(value, str, self._name)
 
@@ -517,12 +516,12 @@ class ObservationTerm:
         )
 
 
-def scale_tensor(label: str, scale: Any, raw_shape: torch.Size, device: str) -> torch.Tensor:
+def scale_tensor(name: str, scale: Any, raw_shape: torch.Size, device: str) -> torch.Tensor:
     """Return `scale` as a tensor that multiplies values of `raw_shape` (num_envs, ...).
 
-    A tensor is returned as it is, anything else as float32 on `device`.
+    Tensors are returned unchanged, other values as float32 on `device`.
 
-    Raises `ValueError` if it is no number or numbers, or does not fit `raw_shape`.
+    Raises `ValueError` if `scale` is not numeric or does not broadcast to `raw_shape`.
     """
     tensor = scale
     if not isinstance(scale, torch.Tensor):
@@ -530,28 +529,27 @@ def scale_tensor(label: str, scale: Any, raw_shape: torch.Size, device: str) -> 
             tensor = torch.tensor(scale, dtype=torch.float32, device=device)
         except (TypeError, ValueError, RuntimeError) as error:
             raise ValueError(
-                f"{label} scale: expected one number, one for each component, or None, got "
-                f"{scale!r}."
+                f"{name} scale: expected one number, one per component, or None, got {scale!r}."
             ) from error
     try:
-        # A larger result would mean that the scale stretches the observation.
+        # The scale must not expand the observation.
         fits = torch.broadcast_shapes(tensor.shape, raw_shape) == raw_shape
     except RuntimeError:
         fits = False
     if not fits:
         raise ValueError(
-            f"{label} scale: expected one number, or one for each of the {raw_shape[-1]} components "
+            f"{name} scale: expected one number, or one for each of the {raw_shape[-1]} components "
             f"of the last axis of the term's value {tuple(raw_shape)}, got shape "
             f"{tuple(tensor.shape)}."
         )
     return tensor
 
 
-def apply_nan_policy(value: torch.Tensor, policy: NanPolicy, label: str) -> torch.Tensor:
-    """Return `value` (num_envs, ...) after the policy.
+def apply_nan_policy(value: torch.Tensor, policy: NanPolicy, name: str) -> torch.Tensor:
+    """Return `value`, (num_envs, ...), after applying a NaN policy.
 
-    "disabled" looks at nothing, "sanitize" replaces NaN and infinite numbers by 0, "warn" logs the
-    environments first, and "error" raises `ValueError` with `label` and up to 10 environments.
+    "disabled" checks nothing, "sanitize" replaces NaN and infinite values by 0, "warn" also logs
+    the environments, and "error" raises `ValueError` with `name` and up to 10 environments.
     """
     if policy == "disabled":
         return value
@@ -561,7 +559,7 @@ def apply_nan_policy(value: torch.Tensor, policy: NanPolicy, label: str) -> torc
             return value
         ids = bad.nonzero().flatten()
         shown = ids[: 10 if policy == "error" else 5].tolist()
-        message = f"Observation {label!r} is NaN or infinite in {len(ids)} environments: {shown}"
+        message = f"Observation {name!r} is NaN or infinite in {len(ids)} environments: {shown}"
         message += " and others." if len(ids) > len(shown) else "."
         if policy == "error":
             raise ValueError(message)

@@ -1,4 +1,4 @@
-"""Recorders: terms that look on and keep what they want, for data sets and logs."""
+"""Recorder manager: terms that record data during rollouts, for data sets and logs."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class RecorderTermCfg(ManagerTermBaseCfg):
-    """A recorder: `func` is a subclass of `RecorderTerm`, which is built with `(cfg, env)`."""
+    """Recorder term configuration: `func` is a `RecorderTerm` subclass, built with `(cfg, env)`."""
 
 
 class RecorderTerm(ManagerTermBase):
-    """Base of recorders; every hook does nothing until overridden."""
+    """Base class of recorders. All hooks do nothing by default."""
 
     def __init__(self, cfg: RecorderTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(env)
@@ -37,24 +37,24 @@ class RecorderTerm(ManagerTermBase):
     def __call__(self) -> None:
         """Raise `NotImplementedError`: recorders have hooks instead."""
         raise UnsupportedError(
-            f"{self.name} is not called; override its hooks, such as record_post_step."
+            f"{self.name}: recorders are not callable; override hooks such as record_post_step."
         )
 
     def record_pre_reset(self, env_ids: torch.Tensor) -> None:
-        """Look at environments that are about to reset.
+        """Record environments that are about to reset.
 
-        `env.obs_buf` still is what the policy saw; action, reward and dones are those of the step
-        that ended the episodes.
+        `env.obs_buf` still holds the observation the policy acted on; action, reward and dones are
+        those of the step that ended the episodes.
         """
 
     def record_post_reset(self, env_ids: torch.Tensor) -> None:
-        """Look at environments that were reset; observations are those of the new episodes."""
+        """Record environments that were reset. Observations are those of the new episodes."""
 
     def record_post_step(self) -> None:
-        """Look at all environments at the end of a step."""
+        """Record all environments at the end of a step."""
 
     def close(self) -> None:
-        """Release what the recorder holds; called when the environment closes."""
+        """Release resources. Called when the environment closes."""
 
 
 class RecorderManager(TermListManager):
@@ -70,22 +70,22 @@ class RecorderManager(TermListManager):
         return name in self._terms
 
     def get_term(self, name: str) -> RecorderTerm:
-        """Return a recorder; raises `KeyError`, with the valid names, if there is none."""
+        """Return the recorder `name`. Raises `KeyError`, listing the valid names, if unknown."""
         self._check_known(name, self._term_names, UnknownNameError)
         return self._terms[name]
 
     def record_pre_reset(self, env_ids: torch.Tensor) -> None:
-        """Call this hook of all recorders, before the given environments reset."""
+        """Call `record_pre_reset` of all recorders. Called before `env_ids` reset."""
         for term in self._terms.values():
             term.record_pre_reset(env_ids)
 
     def record_post_reset(self, env_ids: torch.Tensor) -> None:
-        """Call this hook of all recorders, after the given environments were observed anew."""
+        """Call `record_post_reset` of all recorders. Called once `env_ids` have new observations."""
         for term in self._terms.values():
             term.record_post_reset(env_ids)
 
     def record_post_step(self) -> None:
-        """Call this hook of all recorders, at the end of a step."""
+        """Call `record_post_step` of all recorders. Called at the end of a step."""
         for term in self._terms.values():
             term.record_post_step()
 
@@ -99,7 +99,7 @@ class RecorderManager(TermListManager):
         for name, cfg in self._enabled(self.cfg, RecorderTermCfg, quiet=True):
             if not (inspect.isclass(cfg.func) and issubclass(cfg.func, RecorderTerm)):
                 raise WrongTypeError(
-                    f"{self._label(name)}: func must be a subclass of RecorderTerm, got "
+                    f"{self._label(name)} func: expected a subclass of RecorderTerm, got "
                     f"{cfg.func!r}."
                 )
             self._resolve_params(name, cfg)

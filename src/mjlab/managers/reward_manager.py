@@ -1,4 +1,4 @@
-"""Rewards: a weighted sum of terms."""
+"""Reward manager: weighted sum of reward terms."""
 
 from __future__ import annotations
 
@@ -27,21 +27,20 @@ logger = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class RewardTermCfg(ManagerTermBaseCfg):
-    """A reward term: `func(env, **params)` returns one number for each environment."""
+    """Reward term configuration: `func(env, **params)` returns one value per environment."""
 
     weight: float
-    """Factor of the term in the sum. With 0 the function is not called at all, and what does not
-    fit is told as a warning; it is an error at the first step with another weight."""
+    """Weight of the term. With weight 0 the function is not called, and an invalid term is logged
+    as a warning; it raises at the first step with another weight."""
 
 
 class RewardManager(TermFunctionSwitches, TermListManager):
-    """Sums the weighted terms of a step, and of each episode.
+    """Sums weighted reward terms per step and per episode.
 
     Args:
         cfg: Terms by name.
         env: The environment.
-        scale_by_dt: Whether rewards are multiplied by the duration of a step, so that weights are
-            rates per second.
+        scale_by_dt: Multiply rewards by the control timestep (s), so that weights are rates.
 
     Raises `ValueError` if a weight is not a finite number.
     """
@@ -61,22 +60,22 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._scale_by_dt = scale_by_dt
         super().__init__(cfg, env)
         size = (len(self._term_names), self.num_envs)
-        # Terms first, so that each term writes to memory without gaps.
+        # Terms first: each term writes to contiguous memory.
         self._rates = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._episode_sums = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
         labels = [self._label(name) for name in self._term_names]
         self.nonfinite = NonFiniteWatch(labels, "NaN or infinite", "0", self.num_envs, self.device)
-        # Weighted rates (num_envs, terms) of the last step, not multiplied by its duration.
+        # Weighted rates of the last step, not multiplied by dt, (num_envs, terms).
         self._step_reward = self._rates.t()
 
     def compute(self, dt: float) -> torch.Tensor:
-        """Return the reward (num_envs,) of a step of `dt` seconds, in a buffer used every step.
+        """Return the reward of a step of `dt` seconds, (num_envs,), in a buffer reused every step.
 
-        A term that is NaN or infinite in an environment counts as 0 there, and is logged the first
-        time. In environments whose physics diverged (`nonfinite.excluded`), all terms are 0. Raises
-        `ValueError` if a term returns another shape than (num_envs,).
+        NaN and infinite term values count as 0 and are logged once per term. All terms are 0 in
+        environments whose physics diverged (`nonfinite.excluded`). Raises `ValueError` if a term
+        returns a shape other than (num_envs,).
         """
         for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
             if cfg.weight == 0.0:
@@ -86,30 +85,30 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             self._check_value(name, value)
             torch.mul(value, cfg.weight, out=row)
         self._rates.masked_fill_(self.nonfinite.excluded, 0.0)
-        bad = self.nonfinite.look(self._rates)
+        bad = self.nonfinite.check(self._rates)
         if bad is not None:
             self._rates.masked_fill_(bad, 0.0)
         scale = dt if self._scale_by_dt else 1.0
         self._episode_sums.add_(self._rates, alpha=scale)
-        # One after the other: the sum then has the same bits for any number of threads.
+        # Sequential, so that the sum is bitwise equal for any number of threads.
         self._reward_buf.zero_()
         for row in self._rows:
             self._reward_buf.add_(row, alpha=scale)
         return self._reward_buf
 
     def episode_sum(self, term_name: str) -> torch.Tensor:
-        """Return what a term has added to the reward of each running episode, (num_envs,).
+        """Return the contribution of a term to the return of each running episode, (num_envs,).
 
-        Raises `ValueError`, with the valid names, if there is no such term.
+        Raises `ValueError`, listing the valid names, if the term is unknown.
         """
         self.get_term_cfg(term_name)
         return self._episode_sums[self._term_names.index(term_name)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, torch.Tensor]:
-        """Return `Episode_Reward/<term>`, and zero the sums of these environments.
+        """Return `Episode_Reward/<term>` and zero the sums of `env_ids`.
 
-        It is the mean over the environments of a term's sum, divided by the maximum episode length
-        in seconds (not divided if episodes have no length).
+        The value is the mean of the term's sum over `env_ids`, divided by the maximum episode
+        length in seconds (undivided if that length is 0).
         """
         self._reset_class_terms(env_ids)
         if is_empty(env_ids) or not self._term_names:
@@ -127,34 +126,34 @@ class RewardManager(TermFunctionSwitches, TermListManager):
 
     def _prepare_terms(self) -> None:
         for name, cfg in self.cfg.items():
-            # A weight that is NaN would silently turn the term off: NaN rewards count as 0.
+            # A NaN weight would silently disable the term: NaN rewards count as 0.
             if isinstance(cfg, RewardTermCfg) and not (
                 isinstance(cfg.weight, Real) and math.isfinite(cfg.weight)
             ):
                 raise ValueError(
-                    f"{self._label(name)}: weight is {cfg.weight!r}, but must be a finite number. "
-                    "To switch the term off, set the weight to 0 or the whole term to None."
+                    f"{self._label(name)} weight: expected a finite number, got {cfg.weight!r}; to "
+                    "disable the term, set its weight to 0 or the term to None."
                 )
         super()._prepare_terms()
 
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Build a term; one of weight 0 may be unfilled until a curriculum gives it a weight."""
+        """Build a term; defer errors of a term with weight 0 until a curriculum sets its weight."""
         assert isinstance(cfg, RewardTermCfg)
-        given, build_now = cfg.func, super()._make_callable
+        func, build_now = cfg.func, super()._make_callable
         try:
             build_now(name, cfg, leading)
         except (KeyError, TypeError, ValueError) as error:
             if cfg.weight != 0.0:
                 raise
             logger.warning(
-                "%s It has weight 0, so it is not needed; with another weight this is an error.",
+                "%s Ignored, because its weight is 0; raises with another weight.",
                 error.args[0] if len(error.args) == 1 else error,
             )
         else:
             return
 
         def build_and_call(env: Any, **params: Any) -> Any:
-            cfg.func = given
+            cfg.func = func
             try:
                 build_now(name, cfg, leading)
             except Exception:
@@ -165,6 +164,6 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         cfg.func = build_and_call
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return, for one environment, the weighted rate of each term in the last step."""
+        """Return the weighted rate of each term in the last step of one environment."""
         rates = self._step_reward[env_idx].tolist()
         return [(name, [rate]) for name, rate in zip(self._term_names, rates, strict=True)]

@@ -1,4 +1,4 @@
-"""Selecting elements of an entity (joints, bodies, geoms, ...) by name or by index."""
+"""Selection of entity elements (joints, bodies, geoms, ...) by name or index."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mjlab.scene import Scene
 
-# For each kind of element: the entity's method that finds it by pattern. The entity's list of
-# names, and the fields below, are called after the kind: `joint_names`, `joint_ids`.
+# Kind of element to the entity's method that finds it by pattern. The entity's list of names and
+# the fields below have the kind in their names: `joint_names`, `joint_ids`.
 _FINDERS = {
     "joint": "find_joints",
     "body": "find_bodies",
@@ -28,11 +28,11 @@ _FINDERS = {
 
 @dataclass
 class SceneEntityCfg:
-    """Names an entity of the scene and, if wanted, some of its elements.
+    """Selection of a scene entity and, optionally, of its elements.
 
-    A manager resolves the selections when it is built: names (regular expressions that must match
-    a whole name) become the names they match, and ids the indices of these within the entity, or
-    `slice(None)` where all are selected in natural order.
+    Managers resolve selections when they are built: names (regular expressions, matched in full)
+    become the matching names, and ids become the indices of these elements within the entity, or
+    `slice(None)` for all elements in natural order.
     """
 
     name: str
@@ -84,14 +84,13 @@ class SceneEntityCfg:
     """Indices of contact pairs."""
 
     preserve_order: bool = False
-    """True orders the selection by pattern, as given; False keeps the entity's natural order."""
+    """Order the selection by pattern instead of the entity's natural order."""
 
     def resolve(self, scene: Scene) -> None:
-        """Fill in names and ids from the scene; resolving twice changes nothing.
+        """Resolve names and ids in the scene. Resolving is idempotent.
 
-        Raises `KeyError` if the scene has no such entity, and `ValueError` if a pattern matches
-        nothing, two patterns match one name, an index is out of range, or names and ids are both
-        given and differ.
+        Raises `KeyError` for an unknown entity, and `ValueError` if a pattern matches nothing, two
+        patterns match one name, an index is out of range, or names and ids disagree.
         """
         entity = scene[self.name]
         for kind in _FINDERS:
@@ -100,8 +99,8 @@ class SceneEntityCfg:
                 continue
             if not hasattr(entity, _FINDERS[kind]):
                 raise ValueError(
-                    f"{self.name!r} is a {type(entity).__name__}, which has no {kind} to select; "
-                    "name an entity of the scene."
+                    f"{self.name!r}: expected an entity of the scene to select a {kind}, got "
+                    f"{type(entity).__name__}."
                 )
             names, ids = self._resolve_kind(kind, names, ids, entity)
             setattr(self, f"{kind}_names", names)
@@ -110,7 +109,7 @@ class SceneEntityCfg:
     def empty_selections(self) -> list[str]:
         """Return the fields of names, such as `geom_names`, that explicitly select nothing."""
         fields = [f"{kind}_names" for kind in _FINDERS]
-        # An empty string is a pattern, which has to match something.
+        # An empty string is a pattern and must match a name.
         return [field for field in fields if getattr(self, field) in ((), [])]
 
     def _resolve_kind(
@@ -119,35 +118,37 @@ class SceneEntityCfg:
         all_names = list(getattr(entity, f"{kind}_names"))
         if names is None:
             return self._names_at(kind, ids, all_names), ids
-        given = [names] if isinstance(names, str) else list(names)
+        requested = [names] if isinstance(names, str) else list(names)
         found_ids, found_names = [], []
-        if given:
-            # A plain name may hold characters that mean something in a pattern; names that were
-            # resolved before must find themselves.
-            patterns = [re.escape(name) if name in all_names else name for name in given]
+        if requested:
+            # Plain names may hold special characters of regular expressions; resolved names must
+            # match themselves.
+            patterns = [re.escape(name) if name in all_names else name for name in requested]
             find = getattr(entity, _FINDERS[kind])
             try:
                 found_ids, found_names = find(tuple(patterns), preserve_order=self.preserve_order)
             except ValueError as error:
-                raise ValueError(f"entity {self.name!r}, {kind}_names={given}: {error}") from error
+                raise ValueError(
+                    f"entity {self.name!r}, {kind}_names={requested}: {error}"
+                ) from error
         found_ids, found_names = list(found_ids), list(found_names)
         if isinstance(ids, slice):
             everything = found_ids == list(range(len(all_names)))
             return found_names, slice(None) if everything else found_ids
-        given_ids = [ids] if isinstance(ids, int) else list(ids)
-        at_ids = self._names_at(kind, given_ids, all_names)
-        if found_ids != given_ids or given != at_ids:
+        requested_ids = [ids] if isinstance(ids, int) else list(ids)
+        at_ids = self._names_at(kind, requested_ids, all_names)
+        if found_ids != requested_ids or requested != at_ids:
             raise ValueError(
-                f"entity {self.name!r}: {kind}_names={given} (found at {found_ids}) and "
-                f"{kind}_ids={given_ids} (named {at_ids}) do not agree. Give only one of them."
+                f"entity {self.name!r}: {kind}_names={requested} (ids {found_ids}) and "
+                f"{kind}_ids={requested_ids} (names {at_ids}) disagree; set only one of them."
             )
-        return given, ids
+        return requested, ids
 
     def _names_at(self, kind: str, ids: list[int], all_names: list[str]) -> list[str]:
         outside = [i for i in ids if not -len(all_names) <= i < len(all_names)]
         if outside:
             raise ValueError(
-                f"entity {self.name!r}: {kind}_ids {outside} do not exist; it has "
-                f"{len(all_names)}: {all_names}."
+                f"entity {self.name!r} {kind}_ids: expected indices into {len(all_names)} "
+                f"{kind}_names {all_names}, got {outside}."
             )
         return [all_names[i] for i in ids]

@@ -1,4 +1,4 @@
-"""Checks of terms: those a term function brings for the manager to make, and those terms share."""
+"""Checks of term parameters, run when managers are built."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ _ATTRIBUTE = "check_when_built"
 
 
 def checked_when_built(check: Callable[..., None]) -> Callable[[F], F]:
-    """Decorator of term functions: `check(env, **params)` is called when a manager is built.
+    """Decorate a term function: managers call `check(env, **params)` when they are built.
 
-    `check` gets the parameters of the term's config, selections resolved, and raises `ValueError`,
-    `KeyError` or `TypeError` if the term could not work with them. It should take `**_` for those
-    that it does not look at.
+    `check` receives the resolved parameters of the term's config and raises `ValueError`,
+    `KeyError` or `TypeError` if they are invalid. Use `**_` for parameters that are not checked.
 
-    A class has its constructor for this. A function would notice a sensor that does not exist only
-    at the first step, and columns in another order never.
+    Classes check in their constructor. A function would otherwise detect a missing sensor only at
+    the first step, and columns in the wrong order never.
     """
 
     def mark(function: F) -> F:
@@ -39,7 +38,7 @@ def checked_when_built(check: Callable[..., None]) -> Callable[[F], F]:
 
 
 def check_term(function: Any, env: ManagerBasedRlEnv, params: dict[str, Any]) -> None:
-    """Make the check of a term's function, if it brings one."""
+    """Run the check attached to a term function by `checked_when_built`, if any."""
     check = getattr(function, _ATTRIBUTE, None)
     if check is not None:
         check(env, **params)
@@ -52,12 +51,12 @@ def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
     """Return a sensor of the scene.
 
     Raises:
-        ValueError: there is no such sensor; the message names the nearest ones.
-        TypeError: it is of another kind.
+        ValueError: unknown sensor; the message suggests close names.
+        TypeError: the sensor is not of type `kind`.
     """
     sensors = env.scene.sensors
     if name not in sensors:
-        # A contact sensor is made of MuJoCo's own, one for each of its parts, that nobody asks for.
+        # The MuJoCo sensors of a contact sensor, one per primary, are not offered.
         contacts = tuple(f"{n}_" for n, s in sensors.items() if isinstance(s, ContactSensor))
         check_exists("sensor", name, [n for n in sensors if not n.startswith(contacts)])
     sensor: Any = sensors[name]
@@ -71,17 +70,17 @@ def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
 
 
 def require_fields(sensor: ContactSensor, *fields: str) -> None:
-    """Raise `ValueError` unless a contact sensor has all of these fields."""
+    """Raise `ValueError` unless a contact sensor has all `fields`."""
     missing = [field for field in fields if field not in sensor.cfg.fields]
     if missing:
         raise ValueError(
-            f"The contact sensor {sensor.cfg.name!r} has no {missing}. Add them to its fields, "
-            f"which are {tuple(sensor.cfg.fields)}."
+            f"Contact sensor {sensor.cfg.name!r} fields: expected {missing}, got "
+            f"{tuple(sensor.cfg.fields)}; add the missing fields."
         )
 
 
 def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any) -> None:
-    """Check a term that counts contacts, or forces in a history that exceed `force_threshold`."""
+    """Check a term that counts contacts, or forces above `force_threshold` in a force history."""
     sensor = require_sensor(env, sensor_name, ContactSensor)
     has_history = sensor.cfg.history_length > 0 and "force" in sensor.cfg.fields
     if not has_history:
@@ -92,7 +91,7 @@ def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any
 
 
 def require_command(env: ManagerBasedRlEnv, name: str | None) -> None:
-    """Raise `ValueError` unless there is a command of that name, or `name` is None."""
+    """Raise `ValueError` unless `name` is a command or None."""
     if name is not None:
         check_exists("command", name, env.command_manager.active_terms)
 
@@ -105,28 +104,28 @@ def check_std(std: float) -> None:
     check_positive("std", std)
 
 
-def check_range(label: str, bounds: Any) -> None:
-    """Raise `ValueError` unless `bounds` are two finite numbers, the smaller one first."""
+def check_range(name: str, bounds: Any) -> None:
+    """Raise `ValueError` unless `bounds` is (low, high), finite, with low <= high."""
     try:
         low, high = (float(bound) for bound in bounds)
     except (TypeError, ValueError):
         low, high = math.nan, math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-        raise ValueError(f"{label}: expected finite (low, high) with low <= high, got {bounds!r}.")
+        raise ValueError(f"{name}: expected finite (low, high) with low <= high, got {bounds!r}.")
 
 
 def is_interval(bounds: Any) -> bool:
-    """Return True for two real numbers (low, high) with low <= high, which NaN is not."""
+    """Return True for a pair of real numbers (low, high) with low <= high. False for NaN."""
     is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
     return is_pair and all(isinstance(b, Real) for b in bounds) and bounds[0] <= bounds[1]
 
 
 def check_real(value: torch.Tensor, label: Callable[..., str], *args: Any) -> None:
-    """Raise `TypeError` for complex numbers, and for a tensor without data (`meta`).
+    """Raise `TypeError` for complex tensors and for tensors without data (`meta`).
 
-    torch would cast the former in silence, and fail on the latter without saying whose it is.
-    `label(*args)` opens the message.
+    torch would cast complex values silently, and fail on `meta` tensors without naming the term.
+    The message starts with `label(*args)`.
     """
     if value.is_complex() or value.is_meta:
-        kind = "the device meta" if value.is_meta else str(value.dtype).removeprefix("torch.")
+        kind = "device meta" if value.is_meta else str(value.dtype).removeprefix("torch.")
         raise WrongTypeError(f"{label(*args)}: expected real numbers, got a tensor of {kind}.")

@@ -1,4 +1,4 @@
-"""Terminations: when episodes end, and whether by failure or by running out of time."""
+"""Termination manager: ends of episodes, by failure (terminated) or time-out (truncated)."""
 
 from __future__ import annotations
 
@@ -23,16 +23,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class TerminationTermCfg(ManagerTermBaseCfg):
-    """A reason to end an episode: `func(env, **params)` returns one bool for each environment."""
+    """Termination term configuration: `func(env, **params)` returns one bool per environment."""
 
     time_out: bool = False
-    """True if the episode is cut off rather than over, so that learning counts on what would have
-    followed."""
+    """Truncate instead of terminate: learners bootstrap from the value of the last state."""
 
 
 @offers_older_attributes
 class TerminationManager(TermListManager):
-    """Decides which episodes end. All results are buffers that the next step overwrites."""
+    """Evaluates termination terms. All results are buffers that the next step overwrites."""
 
     _cfg_type = TerminationTermCfg
     _shown = ("time_out",)
@@ -53,29 +52,30 @@ class TerminationManager(TermListManager):
         self.nonfinite = NonFiniteWatch(
             labels, "neither 0 nor 1", "true", self.num_envs, self.device
         )
-        # Of terms that return floats: NaN where it is neither 0 nor 1, else 0, (num_envs,).
+        # Index of a term that returns floats to NaN if the value is neither 0 nor 1, else 0,
+        # (num_envs,).
         self._numeric: dict[int, torch.Tensor] = {}
 
     @property
     def dones(self) -> torch.Tensor:
-        """Whether the episode ended for any reason, (num_envs,) bool."""
+        """True where the episode ended for any reason, (num_envs,) bool."""
         return self._dones
 
     @property
     def terminated(self) -> torch.Tensor:
-        """Whether a term that is no time-out ended the episode, (num_envs,) bool."""
+        """True where a term other than a time-out fired, (num_envs,) bool."""
         return self._terminated
 
     @property
     def time_outs(self) -> torch.Tensor:
-        """Whether a time-out ended the episode, (num_envs,) bool; `terminated` may be true too."""
+        """True where a time-out fired, (num_envs,) bool. `terminated` may be True as well."""
         return self._time_outs
 
     def compute(self) -> torch.Tensor:
         """Evaluate all terms and return `dones`.
 
-        A term that returns floats is logged the first time: what is not 0 counts as true, also NaN.
-        Raises `ValueError` if a term returns another shape than (num_envs,).
+        Terms that return floats are logged once; nonzero values, NaN included, count as True.
+        Raises `ValueError` if a term returns a shape other than (num_envs,).
         """
         self._terminated.zero_()
         self._time_outs.zero_()
@@ -86,8 +86,8 @@ class TerminationManager(TermListManager):
             if value.is_floating_point():
                 if k not in self._numeric:
                     logger.warning(
-                        "%s returned %s, expected bool: what is not 0 counts as true. Compare the "
-                        "value in the term.",
+                        "%s: expected bool, got %s; nonzero counts as true. Compare the value in "
+                        "the term.",
                         *(self._label(name), str(value.dtype).removeprefix("torch.")),
                     )
                 self._numeric[k] = torch.where((value == 0) | (value == 1), 0.0, torch.nan)
@@ -96,19 +96,19 @@ class TerminationManager(TermListManager):
         if self._numeric:
             none = torch.zeros(self.num_envs, device=self.device)
             rows = [self._numeric.get(k, none) for k in range(len(self._term_names))]
-            self.nonfinite.look(torch.stack(rows))
+            self.nonfinite.check(torch.stack(rows))
         return torch.logical_or(self._terminated, self._time_outs, out=self._dones)
 
     def get_term(self, name: str) -> torch.Tensor:
         """Return the last value of a term, (num_envs,) bool.
 
-        Raises `KeyError`, with the valid names, if there is no such term.
+        Raises `KeyError`, listing the valid names, if the term is unknown.
         """
         self._check_known(name, self._term_names, UnknownNameError)
         return self._rows[self._term_names.index(name)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
-        """Return `Episode_Termination/<term>`: in how many of these environments it was true."""
+        """Return `Episode_Termination/<term>`, the number of `env_ids` where the term fired."""
         self._reset_class_terms(env_ids)
         if is_empty(env_ids) or not self._term_names:
             return {}
@@ -119,6 +119,6 @@ class TerminationManager(TermListManager):
         }
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
-        """Return, for one environment, 1 for each term that was true in the last step, else 0."""
+        """Return 1 for each term that fired in the last step of one environment, else 0."""
         values = self._values[:, env_idx].tolist()
         return [(name, [float(v)]) for name, v in zip(self._term_names, values, strict=True)]

@@ -1,7 +1,7 @@
-"""Learning: the adapter to rsl_rl, its configs, the runner, evaluation and export.
+"""Reinforcement learning: rsl_rl adapter, configs, runner, evaluation and export.
 
-Names are imported when they are first used, so that `mjlab.rl.config`, which task configs and
-command lines read, comes without torch.
+Names are imported on first use, so that `mjlab.rl.config`, read by task configs and command
+lines, does not import torch.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from mjlab.utils.lazy import lazy_names
 
-# GitPython, which rsl_rl's logger imports, fails at import where there is no `git` to run.
+# GitPython, imported by rsl_rl's logger, fails at import if `git` is not installed.
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _HOMES = {
     "RslRlPpoAlgorithmCfg": "mjlab.rl.config",
     "RslRlVecEnvWrapper": "mjlab.rl.vecenv_wrapper",
 }
-# Not for `import *`, because Gymnasium need not be there.
+# Not for `import *`: Gymnasium is an optional dependency.
 _WITH_GYMNASIUM = {
     "check_vector_env": "mjlab.rl.vector_checks",
     "gymnasium_env": "mjlab.rl.gymnasium_vector",

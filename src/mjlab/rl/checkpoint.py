@@ -1,9 +1,9 @@
-"""Checkpoint files: written whole or not at all, and loaded without running what is in them.
+"""Checkpoint files: atomic writes, and loading without code execution.
 
-A checkpoint holds plain data only, which `torch.load(weights_only=True)` reads: tensors, numbers,
-strings, None, and dicts, lists, tuples and sets of those. Beside what the algorithm saves it has
-the number of iterations and `training_state`: what exact resume needs beyond the networks, which
-are environments, generators and clocks.
+A checkpoint holds plain data only, readable by `torch.load(weights_only=True)`: tensors, numbers,
+strings, None, and dicts, lists, tuples and sets of those. Besides the algorithm's entries it has
+the number of iterations and `training_state`: the state of environments, random number generators
+and timers that exact resume needs.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ VERSION = 1
 
 # Only in checkpoints of SAC.
 _SAC_KEY = "sac_state_dict"
-# The entries whose type is known, whoever wrote the file: a dict, or a number of iterations.
+# Entries with the same type in files of mjlab and rsl_rl: dicts and numbers of iterations.
 _DICT_ENTRIES = (
     "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
     "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
     "infos", "training_state",
 )  # fmt: skip
 _COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
-# Entries of learning, beside the networks.
+# Entries of the optimizers and of SAC.
 _LEARNING_ENTRIES = ("optimizer_state_dict", "rnd_optimizer_state_dict", _SAC_KEY)
 
-# Of older layouts: names of the standard deviation, and prefixes of actor and critic in one state dict.
+# Legacy layouts: names of the standard deviation, and prefixes of actor and critic in one state dict.
 _STD_NAMES = {
     "std": "distribution.std_param",
     "log_std": "distribution.log_std_param",
@@ -66,8 +66,8 @@ _SINGLE_MODEL_PREFIXES = {
     "critic_obs_normalizer.": ("critic_state_dict", "obs_normalizer."),
 }
 
-# Plain data are exactly these: subclasses (enums, named tuples, numpy's float64) are pickled as calls
-# of their class, which loading with `weights_only=True` refuses.
+# Plain data are exactly these types: subclasses (enums, named tuples, numpy's float64) are pickled as
+# calls of their class, and `weights_only=True` rejects those.
 _ATOMS = (
     type(None), bool, int, float, complex, str, bytes,
     torch.Tensor, torch.nn.Parameter, torch.Size, torch.dtype, torch.device,
@@ -77,11 +77,11 @@ _SEQUENCES = (list, tuple, set)
 
 
 class CheckpointError(MjlabError, RuntimeError):
-    """A checkpoint could not be written, read or used; the message says what to do."""
+    """Checkpoint that cannot be written, read or used; the message says what to do."""
 
 
 class RunFolderError(MjlabError, OSError):
-    """A run folder cannot be written to."""
+    """Run folder that is not writable."""
 
 
 # Files.
@@ -90,32 +90,32 @@ class RunFolderError(MjlabError, OSError):
 def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
     """Write `data` (tensors, numbers, strings, and dicts and lists of those) to `path`.
 
-    The file appears whole or not at all: everything goes to a temporary file in the same folder,
-    which is flushed to the disk and then renamed. Whatever was at `path` stays until then, and
-    nothing is left behind on failure. Numbers of numpy are written as Python's.
+    The write is atomic: data goes to a temporary file in the same folder; the file is flushed to disk
+    and then renamed. An existing file at `path` stays until then, and a failure leaves no files
+    behind. NumPy scalars are written as Python's.
 
     Raises:
         CheckpointError: the disk is full, the folder is read-only, and the like; or `data` holds
-            something that `load_checkpoint` would refuse, which the message names.
+            an entry that `load_checkpoint` would reject. The message names it.
     """
     path = Path(path)
     try:
         data = as_plain_data(dict(data))
     except TypeError as error:
         raise CheckpointError(
-            f"The checkpoint {str(path)!r} was not written, because it could not be loaded again: "
-            f"{error}. A checkpoint may hold tensors, numbers, strings, None, and dicts, lists and "
-            "tuples of those; convert this entry, or leave it out."
+            f"Checkpoint {str(path)!r}: expected tensors, numbers, strings, None, and dicts, lists and "
+            f"tuples of those, got an entry that cannot be loaded: {error}; convert or remove this "
+            "entry. The file was not written."
         ) from error
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, flush=True) as file:
-            # Serialized in memory first, because torch's zip writer turns a failing `write` of the
-            # file below it into a RuntimeError that hides the reason.
+            # Serialize in memory first: torch's zip writer turns a failing `write` of the
+            # underlying file into a RuntimeError that hides the reason.
             buffer = io.BytesIO()
             torch.save(data, buffer)
             file.write(buffer.getbuffer())
-        # The rename itself is on the disk only once the folder is. Not every system can open one.
+        # The rename is on disk only once the folder is flushed. Not every system can open folders.
         with contextlib.suppress(OSError):
             folder = os.open(path.parent, os.O_RDONLY)
             try:
@@ -130,15 +130,15 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
             ("The disk is full: the" if is_full else "The")
             + f" checkpoint {str(path)!r} could not be written{reason}."
             + (f" The last checkpoint, {str(kept)!r}, is intact." if kept is not None else "")
-            + (" Make room and resume with --agent.resume True." if is_full else "")
+            + (" Free disk space and resume with --agent.resume True." if is_full else "")
         ) from error
 
 
 def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return what `save_checkpoint` (or rsl_rl) wrote to `path`, with all tensors on the CPU.
+    """Load a checkpoint of `save_checkpoint` or rsl_rl, with all tensors on the CPU.
 
-    Only data is read: a file whose pickle would run code is refused. Checksums are compared, so that
-    not a bit of what is returned has changed on the disk (files of torch before 1.6 have none).
+    Only data is read: a file whose pickle would run code is rejected. Checksums are compared, so that
+    corruption on disk is detected (files of torch before 1.6 have no checksums).
 
     Raises:
         CheckpointError: the file is missing, truncated, not a checkpoint, or hostile.
@@ -153,9 +153,9 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         )
     try:
         with warnings.catch_warnings():
-            # About pickle protocols, which say nothing to a user.
+            # The warnings are about pickle protocols and of no use to a user.
             warnings.simplefilter("ignore", UserWarning)
-            # torch does not look whether the content of an archive is what was written.
+            # torch does not verify the checksums of an archive.
             if zipfile.is_zipfile(path):
                 with zipfile.ZipFile(path) as archive:
                     if (damaged := archive.testzip()) is not None:
@@ -163,27 +163,27 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             data = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         called = re.search(r"(?:GLOBAL|class|function) ([\w.]+)", str(error))
-        reason, hint = "it is not a file of torch, or is corrupt", ""
+        reason, hint = "not a file of torch, or corrupt", ""
         if called is not None:
-            reason = f"it wants to call {called[1]!r}, and a checkpoint may hold data only"
+            reason = f"expected plain data, got a call of {called[1]!r}"
             hint = (
-                " Do not use this file unless you trust where it comes from; weights can be saved "
-                "again with torch.save({...: state_dict()})."
+                " Do not use this file unless you trust its source; save weights as plain data with "
+                "torch.save({...: state_dict()})."
             )
         raise CheckpointError(
-            f"The checkpoint {str(path)!r} was refused: {reason}. Nothing in it was run.{hint}"
+            f"Checkpoint {str(path)!r} was rejected: {reason}. No code in it was run.{hint}"
         ) from error
     except Exception as error:
-        # Damaged bytes make the reader fail in any way there is.
+        # Damaged bytes make the reader raise arbitrary exceptions.
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:160]
         raise CheckpointError(
-            f"The checkpoint {str(path)!r} is truncated or corrupt "
-            f"({path.stat().st_size} bytes; {reason}). Use an earlier one."
+            f"Checkpoint {str(path)!r} is truncated or corrupt "
+            f"({path.stat().st_size} bytes; {reason}); use an earlier checkpoint."
         ) from error
     if not isinstance(data, dict):
         raise CheckpointError(
-            f"{str(path)!r} is not a checkpoint of a training run: it holds a "
-            f"{type(data).__name__}, not a dict."
+            f"Checkpoint {str(path)!r}: expected a dict, got a {type(data).__name__}; use a checkpoint "
+            "of a training run."
         )
     return data
 
@@ -213,10 +213,10 @@ def learner_of_checkpoint(path: str | os.PathLike[str]) -> Learner:
 
 
 def ensure_writable_folder(folder: str | os.PathLike[str]) -> Path:
-    """Make `folder` if it is missing, and write a file into it to see that this works.
+    """Create `folder` if it is missing, and check that it is writable.
 
     Raises:
-        RunFolderError: the folder cannot be made or written to.
+        RunFolderError: the folder cannot be created or is not writable.
     """
     folder = Path(folder)
     try:
@@ -226,40 +226,40 @@ def ensure_writable_folder(folder: str | os.PathLike[str]) -> Path:
             file.flush()
     except OSError as error:
         raise RunFolderError(
-            f"The run folder {str(folder)!r} cannot be written to ({error.strerror or error}). "
-            "Choose another place with --log-root, or change its permissions."
+            f"Run folder {str(folder)!r} cannot be written to ({error.strerror or error}); choose "
+            "another folder with --log-root, or change its permissions."
         ) from error
     return folder
 
 
 class RunRescue:
-    """Saves a run whose folder disappears, or in which an iteration fails.
+    """Context manager that saves a run if its folder disappears or an iteration fails.
 
-    A context around the iterations. Set `learned` to what the last finished iteration left, as
-    checkpoint entries: an error in the block saves that, unless there is a checkpoint of it.
+    Set `learned` to the checkpoint entries of the last finished iteration: an error in the block
+    saves them, unless that checkpoint exists already.
     """
 
     learned: dict[str, Any] | None = None
-    """Entries of a checkpoint that resumes in new episodes; None: there is nothing to save."""
+    """Entries of a checkpoint that resumes in new episodes. None: nothing to save."""
 
     def __init__(self, folder: str | os.PathLike[str] | None) -> None:
-        """Take the run folder; None: this process writes no files."""
+        """Store the run folder. None: this process writes no files."""
         self._folder = None if folder is None else os.fspath(folder)
         self._descriptor: int | None = None
 
     def __enter__(self) -> RunRescue:
         if self._folder is not None:
-            # Kept open, so that another folder of its name can be told from it. Windows opens no
-            # folders, and deletes none in which a file is open.
+            # An open descriptor distinguishes the folder from a new one of the same name. Windows
+            # cannot open folders, and does not delete folders with open files.
             with contextlib.suppress(PermissionError):
                 self._descriptor = os.open(self._folder, os.O_RDONLY)
         return self
 
     def check_folder(self, save: Callable[[str], None], name: str) -> None:
-        """Save the run beside its folder, by `save(path)`, if that is gone.
+        """Save the run next to its folder, by `save(path)`, if the folder was deleted or moved.
 
         Raises:
-            RunFolderError: the folder is gone; the message says where `name` is.
+            RunFolderError: the folder was deleted or moved; the message has the new path of `name`.
         """
         if self._descriptor is None or self._folder is None:
             return
@@ -270,8 +270,8 @@ class RunRescue:
         path = os.path.join(f"{os.path.normpath(self._folder)}_rescued", name)
         save(path)
         raise RunFolderError(
-            f"The run folder {self._folder!r} is no longer there: it was deleted or moved while the run "
-            f"was training. The run was saved to {path!r}, from which it resumes."
+            f"Run folder {self._folder!r} was deleted or moved during training. The run was saved to "
+            f"{path!r}; resume from there."
         )
 
     def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
@@ -283,18 +283,18 @@ class RunRescue:
         if not isinstance(error, Exception) or isinstance(error, (CheckpointError, RunFolderError)):
             return
         path = os.path.join(self._folder, f"model_{self.learned['iter']}.pt")
-        # Weights that are NaN may be why training failed, and could not be loaded again.
+        # NaN weights may be the reason of the failure, and could not be loaded.
         if os.path.exists(path) or not_finite(self.learned):
             return
         try:
             save_checkpoint(self.learned, path)
         except CheckpointError as failure:
-            # What failed first is what the user has to know.
+            # The first error is the one that the user needs to see.
             logger.warning("%s", failure)
             return
         logger.warning(
-            "Training failed in iteration %d. Weights and optimizer of before are in %s; a run that is "
-            "resumed from there starts in new episodes.",
+            "Training failed in iteration %d. Weights and optimizer of the previous iteration are in %s; "
+            "a run resumed from there starts in new episodes.",
             self.learned["iterations_finished"] + 1, path,
         )  # fmt: skip
 
@@ -309,20 +309,20 @@ def load_algorithm(
     strict: bool,
     path: str,
 ) -> bool:
-    """Let rsl_rl load its parts of a migrated `checkpoint`, read from `path`.
+    """Load the entries of a migrated `checkpoint` into rsl_rl's `algorithm`.
 
     Args:
-        algorithm: rsl_rl's, or one with its methods.
-        checkpoint: What `migrate` returned.
-        load_cfg: Which parts to load; None loads all.
-        strict: Whether every parameter has to fit.
-        path: The file, for messages.
+        algorithm: An rsl_rl algorithm, or one with its methods.
+        checkpoint: Result of `migrate`.
+        load_cfg: Parts to load; None: all.
+        strict: Require every parameter to fit.
+        path: Checkpoint file, for messages.
 
     Returns:
-        Whether the count of iterations is to be loaded.
+        True if the iteration count is to be loaded.
 
     Raises:
-        CheckpointError: a part is missing, does not fit, or is not finite; nothing was changed then.
+        CheckpointError: a part is missing, does not fit, or is not finite. Nothing was changed.
     """
     for name in ("actor", "critic", "student", "teacher"):
         model = getattr(algorithm, f"_raw_{name}", None)
@@ -334,18 +334,18 @@ def load_algorithm(
         broken = not_finite({name: checkpoint.get(name) for name in _LEARNING_ENTRIES})
         if broken:
             raise CheckpointError(
-                f"The checkpoint {path!r} holds values that are NaN or infinite: {', '.join(broken)}. "
-                "Use an earlier one; nothing was changed."
+                f"Checkpoint {path!r}: expected finite values, got NaN or infinite in "
+                f"{', '.join(broken)}; use an earlier checkpoint. Nothing was changed."
             )
-    # rsl_rl loads one part after the other, and what fits only in part is half loaded then.
+    # rsl_rl loads one part after the other: an error leaves the algorithm partly loaded.
     before = copy.deepcopy(algorithm.save())
     try:
         return algorithm.load(checkpoint, load_cfg, strict)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         algorithm.load(before, None, True)
         raise CheckpointError(
-            f"The checkpoint {path!r} does not fit this algorithm: {error}. To use its "
-            "policy only, load it with load_cfg={'actor': True}."
+            f"Checkpoint {path!r} does not fit this algorithm: {error}. To load only its policy, use "
+            "load_cfg={'actor': True}."
         ) from error
 
 
@@ -355,18 +355,18 @@ def check_fits(
     """Check that the state dict `saved` fits `model`.
 
     Raises:
-        CheckpointError: parameters are missing, unknown, of another shape, or NaN or infinite; all are
-            listed.
+        CheckpointError: parameters are missing, unknown, of the wrong shape, or NaN or infinite. The
+            message lists all of them.
     """
     if saved is None:
         raise CheckpointError(
-            f"The checkpoint {path!r} holds no {name} weights; use one that the same learner wrote."
+            f"Checkpoint {path!r} holds no {name} weights; use a checkpoint of the same learner."
         )
     own = model.state_dict()
     expected = {key: tuple(value.shape) for key, value in own.items()}
     found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
     if expected == found:
-        # What a network is built with, such as a mask of minus infinity, may be in its checkpoint.
+        # Values that are not finite in a new network either, such as a mask of -inf, are allowed.
         broken = [
             key
             for key, value in own.items()
@@ -374,8 +374,8 @@ def check_fits(
         ]
         if broken:
             raise CheckpointError(
-                f"The checkpoint {path!r} holds {name} weights that are NaN or infinite: "
-                f"{', '.join(broken)}. Use an earlier one; nothing was changed."
+                f"Checkpoint {path!r}: expected finite {name} weights, got NaN or infinite in "
+                f"{', '.join(broken)}; use an earlier checkpoint. Nothing was changed."
             )
         return
     lines = [
@@ -384,21 +384,22 @@ def check_fits(
         if expected.get(key) != found.get(key)
     ]
     raise CheckpointError(
-        f"The checkpoint {path!r} is of another network: its {name} does not fit this task's "
-        f"{name} config.\n" + "\n".join(lines) + "\nUse a checkpoint of this task, or make "
-        f"the network (--agent.{name}.) and the observations what they were when it was trained."
+        f"Checkpoint {path!r}: its {name} does not fit this task's {name} config.\n"
+        + "\n".join(lines)
+        + "\nUse a checkpoint of this task, or the network config "
+        f"(--agent.{name}.) and the observations of the training run."
     )
 
 
 def check_optimizer_fits(
     optimizer: torch.optim.Optimizer, saved: Mapping[str, Any] | None, *, path: str
 ) -> None:
-    """Check that the state `saved` is of as many parameters of the same shapes.
+    """Check that the state `saved` has the number of parameters and the shapes of `optimizer`.
 
-    torch itself compares numbers of parameters only, and would fail at the next update.
+    torch compares only the numbers of parameters, and would fail at the next update.
 
     Raises:
-        CheckpointError: it is not.
+        CheckpointError: the state does not fit.
     """
     try:
         fits = saved is not None and _optimizer_fits(optimizer, saved)
@@ -406,8 +407,8 @@ def check_optimizer_fits(
         fits = False
     if not fits:
         raise CheckpointError(
-            f"The checkpoint {path!r} holds no optimizer state for these networks. To use its "
-            "policy only, load it with load_cfg={'actor': True}; nothing was changed."
+            f"Checkpoint {path!r}: expected an optimizer state that fits these networks. To load only "
+            "its policy, use load_cfg={'actor': True}. Nothing was changed."
         )
 
 
@@ -418,14 +419,14 @@ def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) 
     for group, own in zip(groups, optimizer.param_groups, strict=True):
         if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
             return False
-        # Switches of torch's optimizers; another release may have others.
+        # Boolean settings of torch's optimizers differ between releases.
         switches = [name for name, value in own.items() if isinstance(value, bool)]
         if not all(isinstance(group.get(name, False), bool) for name in switches):
             return False
         for number, parameter in zip(group["params"], own["params"], strict=True):
             state = saved["state"].get(number)
             if state is not None and not state:
-                # torch would begin with new moments, without a word.
+                # torch would start with new moments, without a warning.
                 return False
             for value in (state or {}).values():
                 is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
@@ -435,7 +436,7 @@ def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) 
 
 
 def not_finite(value: Any, name: str = "") -> list[str]:
-    """Return the names of tensors within `value` that hold NaN, and of learning rates not finite."""
+    """Return the names of tensors in `value` with NaN, and of learning rates that are not finite."""
     if isinstance(value, torch.Tensor):
         return [name] if bool(value.isnan().any()) else []
     if isinstance(value, float):
@@ -456,7 +457,7 @@ def not_finite(value: Any, name: str = "") -> list[str]:
 def capture_training_state(
     env: VecEnv, algorithm: Any, logger_state: dict[str, Any], observations: TensorDict
 ) -> dict[str, Any]:
-    """Return the state between two iterations, `observations` being the ones to act on next."""
+    """Return the state between two iterations; `observations` are those of the next action."""
     unwrapped: Any = getattr(env, "unwrapped", env)
     hidden = [model.get_hidden_state() for model in _models(algorithm)]
     state: dict[str, Any] = {
@@ -486,24 +487,24 @@ def restore_training_state(
     load_logger: Callable[[dict[str, Any]], None],
     device: str | torch.device,
 ) -> TensorDict:
-    """Restore what `capture_training_state` returned, and return the observations to act on next.
+    """Restore the result of `capture_training_state`; return the observations of the next action.
 
     Args:
-        state: What was captured.
-        env: The environments.
-        algorithm: rsl_rl's, or one with its methods, on `device`.
-        load_logger: Takes the state of the logger.
+        state: Captured state.
+        env: Environments.
+        algorithm: An rsl_rl algorithm, or one with its methods, on `device`.
+        load_logger: Function that restores the state of the logger.
         device: Device of the networks.
 
     Raises:
-        ValueError: the state is of other environments; nothing was changed then.
+        ValueError: the state is of different environments. Nothing was changed.
         CheckpointError: the state is malformed.
     """
     try:
         observations = _matching_observations(state, env)
         unwrapped: Any = getattr(env, "unwrapped", env)
         if "env" in state and hasattr(unwrapped, "load_state_dict"):
-            # Tensors that the rollout made can only be written to in this mode.
+            # Tensors created in the rollout can only be written to in inference mode.
             with torch.inference_mode():
                 unwrapped.load_state_dict(_to(state["env"], env.device))
         load_logger(state["logger"])
@@ -512,7 +513,7 @@ def restore_training_state(
                 hidden = _to(hidden, device)
                 model.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
         if hasattr(algorithm, "last_hidden_states"):
-            # Of rsl_rl's distillation, which begins an update with those before the iteration.
+            # rsl_rl's distillation starts an update with the hidden states before the iteration.
             algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
         rnd = getattr(algorithm, "rnd", None)
         if rnd is not None and state["rnd"] is not None:
@@ -520,26 +521,26 @@ def restore_training_state(
             if (average := _reward_average(rnd)) is not None:
                 average.avg = _to(state["rnd"]["discounted_average"], device)
         observations = observations.to(device)
-        # Last, because restoring may have drawn random numbers.
+        # Last, because restoring may draw random numbers.
         set_rng_state(state["rng"])
         return observations
     except torch.OutOfMemoryError:
         raise
     except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         raise CheckpointError(
-            f"The checkpoint's training_state is malformed ({type(error).__name__}: {error}). Use an "
-            "earlier checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
+            f"Checkpoint training_state is malformed ({type(error).__name__}: {error}); use an earlier "
+            "checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
         ) from error
 
 
 def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
-    """Return the observations of `state`; raise ValueError if it is of other environments."""
+    """Return the observations of `state`; raise ValueError if it is of different environments."""
     if state.get("version") != VERSION:
-        raise ValueError(f"It was saved in format {state.get('version')}, not {VERSION}.")
+        raise ValueError(f"training_state version: expected {VERSION}, got {state.get('version')}.")
     if state["num_envs"] != env.num_envs:
         raise ValueError(
-            f"It is of {state['num_envs']} environments and this run has {env.num_envs}; give "
-            f"--num-envs {state['num_envs']}."
+            f"training_state num_envs: expected {env.num_envs}, got {state['num_envs']}; use --num-envs "
+            f"{state['num_envs']}."
         )
     observations = TensorDict({}, batch_size=[env.num_envs])
     for key, value in state["observations"].items():
@@ -549,12 +550,12 @@ def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
         for one in (observations, env.get_observations())
     )
     if found != expected:
-        raise ValueError(f"Its observations are {found}, and this run's {expected}.")
+        raise ValueError(f"training_state observations: expected {expected}, got {found}.")
     return observations
 
 
 def _flat(observations: TensorDict) -> dict[str, torch.Tensor]:
-    """Return the tensors by name; names of nested ones are joined by a newline."""
+    """Return the tensors by name; keys of nested tensors are joined by a newline."""
     return {
         "\n".join(key) if isinstance(key, tuple) else key: observations.get(key)
         for key in observations.keys(include_nested=True, leaves_only=True)
@@ -567,12 +568,12 @@ def _models(algorithm: Any) -> list[Any]:
 
 
 def _reward_average(rnd: Any) -> Any:
-    """Return the discounted average of the reward normalizer of RND; None without one."""
+    """Return the discounted average of RND's reward normalizer, None without a normalizer."""
     return getattr(getattr(rnd, "reward_normalizer", None), "disc_avg", None)
 
 
 def _to(value: Any, device: Any) -> Any:
-    """Move all tensors within dicts and lists to `device`."""
+    """Move all tensors in dicts and lists to `device`."""
     if isinstance(value, torch.Tensor):
         return value.to(device)
     if isinstance(value, dict):
@@ -582,17 +583,17 @@ def _to(value: Any, device: Any) -> Any:
     return value
 
 
-# Older layouts.
+# Legacy layouts.
 
 
 def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Return `checkpoint`, read from `path`, in today's layout; the argument is not changed.
+    """Return `checkpoint`, read from `path`, in the current layout; the argument is not modified.
 
-    Two older layouts are known: one state dict for actor and critic together
-    (`model_state_dict`), and an actor whose standard deviation is called `std` or `log_std`.
+    Two legacy layouts are supported: one state dict for actor and critic together
+    (`model_state_dict`), and an actor whose standard deviation is named `std` or `log_std`.
 
     Raises:
-        CheckpointError: an entry is not of the type that it must have.
+        CheckpointError: an entry has the wrong type.
     """
     _check_types(checkpoint, path)
     migrated = dict(checkpoint)
@@ -601,9 +602,9 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
         for name, value in migrated.pop("model_state_dict").items():
             if name in _STD_NAMES:
                 parts["actor_state_dict"][name] = value
-            for prefix, (part, today) in _SINGLE_MODEL_PREFIXES.items():
+            for prefix, (part, current) in _SINGLE_MODEL_PREFIXES.items():
                 if name.startswith(prefix):
-                    parts[part][today + name.removeprefix(prefix)] = value
+                    parts[part][current + name.removeprefix(prefix)] = value
         migrated.update(parts)
     if migrated.get("actor_state_dict") is not None:
         migrated["actor_state_dict"] = {
@@ -616,16 +617,16 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 def _check_types(checkpoint: Mapping[str, Any], path: str) -> None:
     for name in _DICT_ENTRIES:
         value = checkpoint.get(name)
-        # None stands for an entry that is not there: rsl_rl writes `infos` so.
+        # None is a missing entry: rsl_rl writes `infos` as None.
         if value is not None and not isinstance(value, dict):
             raise _malformed(path, name, "a dict", value)
         if value is not None and name.endswith("_state_dict"):
             for key in value:
                 if not isinstance(key, str):
                     raise _malformed(path, f"a key of {name}", "a string", key)
-    for name, least in _COUNT_ENTRIES.items():
-        if name in checkpoint and not _is_count(checkpoint[name], least):
-            raise _malformed(path, name, f"a whole number from {least} up", checkpoint[name])
+    for name, minimum in _COUNT_ENTRIES.items():
+        if name in checkpoint and not _is_count(checkpoint[name], minimum):
+            raise _malformed(path, name, f"an integer >= {minimum}", checkpoint[name])
     owes = checkpoint.get("owes_evaluation", False)
     if not isinstance(owes, bool):
         raise _malformed(path, "owes_evaluation", "a bool", owes)
@@ -637,19 +638,19 @@ def _check_types(checkpoint: Mapping[str, Any], path: str) -> None:
     counter = env_state.get("common_step_counter", 0)
     if not _is_count(counter, 0):
         name = "infos.env_state.common_step_counter"
-        raise _malformed(path, name, "a whole number from 0 up", counter)
+        raise _malformed(path, name, "an integer >= 0", counter)
 
 
-def _is_count(value: Any, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+def _is_count(value: Any, minimum: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= minimum
 
 
-def _malformed(path: str, name: str, allowed: str, value: Any) -> CheckpointError:
+def _malformed(path: str, name: str, expected: str, value: Any) -> CheckpointError:
     shown = repr(value)
     shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
     return CheckpointError(
-        f"The checkpoint {path!r} is malformed: {name} must be {allowed} and is {shown} "
-        f"({type(value).__name__}). Use another checkpoint; nothing was changed."
+        f"Checkpoint {path!r} is malformed: {name}: expected {expected}, got {shown} "
+        f"({type(value).__name__}); use another checkpoint. Nothing was changed."
     )
 
 
@@ -657,14 +658,14 @@ def _malformed(path: str, name: str, allowed: str, value: Any) -> CheckpointErro
 
 
 def as_plain_data(value: Any, path: str = "") -> Any:
-    """Return `value` with numpy's scalars as Python's; containers without any are returned as is.
+    """Return `value` with NumPy scalars converted to Python's; other containers are not copied.
 
     Args:
         value: Tensors, numbers, strings, None, and dicts, lists, tuples and sets of those.
-        path: Where in a file `value` is to be, for the message.
+        path: Position of `value` in the file, for the message.
 
     Raises:
-        TypeError: something else is in there; the message says where and of which type.
+        TypeError: `value` holds another type; the message has its position and type.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -676,9 +677,9 @@ def as_plain_data(value: Any, path: str = "") -> Any:
         same = all(one is other for one, other in zip(items, value, strict=True))
         return value if same else kind(items)
     if kind not in _DICTS:
-        raise TypeError(f"{path or 'it'} is a {kind.__module__}.{kind.__qualname__}")
+        raise TypeError(f"{path or 'value'} is a {kind.__module__}.{kind.__qualname__}")
     entries = {
-        as_plain_data(key, f"a key of {path or 'it'}"): as_plain_data(
+        as_plain_data(key, f"a key of {path or 'value'}"): as_plain_data(
             item, f"{path}.{key}" if path else str(key)
         )
         for key, item in value.items()
@@ -688,7 +689,7 @@ def as_plain_data(value: Any, path: str = "") -> Any:
         for key, other in zip(entries, value, strict=True)
     ):
         return value
-    # A copy and not a new dict, because state dicts of modules carry versions as an attribute.
+    # A copy instead of a new dict: state dicts of modules carry versions as an attribute.
     plain = copy.copy(value)
     plain.clear()
     plain.update(entries)

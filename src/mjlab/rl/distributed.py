@@ -1,12 +1,12 @@
-"""Several processes that train one policy: starting them, joining them, keeping them together.
+"""Multi-process training of one policy: launcher, process group, collective error handling.
 
-Every process has environments and random numbers of its own. rsl_rl averages gradients, the
-statistics of observation normalizers, and the policy change that the learning rate follows, so that
-all processes hold the same networks after every update. The first process alone writes files.
+Every process has separate environments and random numbers. rsl_rl averages gradients, statistics of
+observation normalizers, and the KL divergence that sets the learning rate, so that all processes hold
+the same networks after every update. Only the first process writes files.
 
-`launch_workers` is not torch's launcher, which sends SIGTERM to all processes as soon as it sees one
-end with an error: one that only lost its connection is then named, and the one that failed is ended
-before it can say why. Nor does that one report the exit status of processes after Ctrl-C.
+`launch_workers` replaces torch's launcher, which sends SIGTERM to all processes as soon as one ends
+with an error: it may name a process that only lost its connection, and end the one that failed before
+its error is printed. It also does not report the exit status of processes after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ from mjlab.utils.signals import FORWARDED, handled_signals
 
 T = TypeVar("T")
 
-# Set by our launcher, as host:port; torchrun announces its store by MASTER_ADDR and MASTER_PORT.
+# host:port, set by our launcher; torchrun sets MASTER_ADDR and MASTER_PORT instead.
 STORE_VARIABLE = "MJLAB_PROCESS_STORE"
-# Under this name the reference's launcher has it.
+# Name used by the launcher of mjlab 1.6.
 LOG_DIR_VARIABLE = "TORCHRUNX_LOG_DIR"
 
 logger = logging.getLogger(__name__)
 
-# Seconds after which a process says for whom it waits, and after which it gives up, as torch does.
+# Seconds until a waiting process logs a warning, and until it raises, as torch.
 _SECONDS_OF_SILENCE = 5.0
 _SECONDS_TO_JOIN = 1800.0
 _SECONDS_BETWEEN_LOOKS = 0.05
-# Seconds that processes may take to notice that one of them is gone, and to say so.
+# Seconds for processes to notice that another one ended, and to report it.
 _PATIENCE = 5.0
 
 
@@ -61,22 +61,22 @@ _PATIENCE = 5.0
 def launch_workers(
     command: list[str], count: int, environment: Mapping[str, str] | None = None
 ) -> None:
-    """Run `command` in `count` processes that find each other; return when all have ended.
+    """Run `command` in `count` connected processes; return when all have ended.
 
-    A signal goes on to every process, once, and what they then do, such as saving, is waited for. A
-    process that fails takes the others with it.
+    Signals are forwarded to every process, once; the launcher waits until they have saved. If one
+    process fails, the others are stopped.
 
     Args:
-        command: The program and its arguments.
+        command: Program and its arguments.
         count: Number of processes.
-        environment: Environment variables to set, besides those that number the processes.
+        environment: Environment variables to set, besides the ranks of the processes.
 
     Raises:
-        UserError: a process failed; the message says which, and how it ended.
-        KeyboardInterrupt: the processes were told to stop before they could.
+        UserError: a process failed; the message has its rank and exit status.
+        KeyboardInterrupt: a signal stopped the processes before they could handle it.
     """
-    # The store, in which processes find each other, is this process's own, so that its port cannot
-    # be taken by others in between.
+    # The launcher owns the store of the process group, so that no other program can take its port in
+    # the meantime.
     store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
     shared = {**os.environ, **(environment or {}), STORE_VARIABLE: f"127.0.0.1:{store.port}"}
     shared |= {PARENT_VARIABLE: str(os.getpid())}
@@ -94,8 +94,8 @@ def launch_workers(
     with handled_signals(forward, FORWARDED):
         for rank in range(count):
             own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
-            # A session of its own: a terminal sends Ctrl-C to all processes of its session, and a
-            # second signal tells training to stop at once.
+            # A separate session: a terminal sends Ctrl-C to all processes of its session, and a
+            # second signal stops training immediately.
             workers.append(subprocess.Popen(command, env=own, start_new_session=True))
             for number in received:
                 workers[-1].send_signal(number)
@@ -113,7 +113,7 @@ def launch_workers(
                 worker.wait()
     if not ended:
         return
-    # The one that failed, and not one that gave up because of it, or that had to be killed.
+    # The process that failed first, not one that failed because of it or was killed here.
     candidates = [rank for rank in (*ended, *_failed(workers)) if rank not in killed]
     rank = next(
         (rank for rank in candidates if workers[rank].returncode != OtherProcessError.exit_status),
@@ -122,27 +122,27 @@ def launch_workers(
     code = workers[rank].returncode
     if received and code in (130, -signal.SIGINT):
         raise KeyboardInterrupt
-    how = f"failed with status {code}; what it printed above says why"
+    how = f"failed with status {code}; see its output above"
     if code < 0:
         how = f"was ended by {signal.Signals(-code).name}"
     if code == -signal.SIGKILL:
-        how += ", which is what happens where memory runs out"
+        how += ", probably because memory ran out"
     raise UserError(f"Process {rank} of {count} {how}. The run has ended in all processes.")
 
 
-# Joining, and failing together.
+# Process group and collective errors.
 
 
 def join_processes(device: str) -> bool:
-    """Join the other processes of the run, which waits for them; return whether this call did.
+    """Join the process group of the run and wait for all processes; return True if this call joined.
 
-    It does not where there are no others, or where they were joined before. Networks on a GPU are
-    averaged by NCCL, those on the CPU, and everything that is no tensor on a GPU, by Gloo.
+    Returns False in a single process, or if the group was joined before. Tensors on a GPU are
+    averaged by NCCL; tensors on the CPU, and objects, by Gloo.
 
     Raises:
         ValueError: the environment variables of the launcher are contradictory.
-        OSError: the address that they name cannot be listened on.
-        TimeoutError: not all processes have come within half an hour.
+        OSError: their address cannot be listened on.
+        TimeoutError: not all processes joined within half an hour.
     """
     rank = process_rank()
     if rank.is_alone or torch.distributed.is_initialized():
@@ -152,7 +152,7 @@ def join_processes(device: str) -> bool:
         backend = "cpu:gloo,cuda:nccl"
         torch.cuda.set_device(torch.device(device))
     if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
-        # torchrun starts them all, and ends them where one is missing.
+        # torchrun starts all processes, and ends them if one is missing.
         torch.distributed.init_process_group(backend)
         return True
     torch.distributed.init_process_group(
@@ -163,7 +163,7 @@ def join_processes(device: str) -> bool:
 
 @contextlib.contextmanager
 def joined_processes(device: str) -> Generator[ProcessRank]:
-    """Be one of the processes of the run within the block.
+    """Join the process group of the run for the block.
 
     Raises:
         OtherProcessError: another process of the run ended within the block.
@@ -172,24 +172,22 @@ def joined_processes(device: str) -> Generator[ProcessRank]:
     try:
         yield process_rank()
     except RuntimeError as error:
-        # Gloo raises plain errors, in which its name is part of the place in its source.
+        # Gloo raises RuntimeError; its name is part of the source path in the message.
         is_lost = isinstance(error, torch.distributed.DistError) or "gloo" in str(error).lower()
         if torch.distributed.is_initialized() and is_lost:
-            raise OtherProcessError(
-                "Another process of this run ended; what it printed says why."
-            ) from error
+            raise OtherProcessError("Another process of this run ended; see its output.") from error
         raise
     if joined:
-        # Not after an error: the others may be gone, and this would wait for them.
+        # Not after an error: the call would wait for processes that may have ended.
         torch.distributed.destroy_process_group()
 
 
 def broadcast_from_first(make: Callable[[], T]) -> T:
-    """Return, in every process, what `make` returns in the first, which alone calls it.
+    """Call `make` in the first process; return its result in every process.
 
     Raises:
-        Exception: in the first process, what `make` raises.
-        OtherProcessError: in the others, if it raised.
+        Exception: in the first process, the error of `make`.
+        OtherProcessError: in the others, if `make` raised.
     """
     if not torch.distributed.is_initialized():
         return make()
@@ -203,10 +201,10 @@ def broadcast_from_first(make: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def fail_together() -> Generator[None]:
-    """Wait at the end of the block for all processes; if it failed in any, it fails in all.
+    """Wait for all processes at the end of the block; an error in one raises in all.
 
     Raises:
-        Exception: in the first process that failed, its own error.
+        Exception: in the first process that failed, its error.
         OtherProcessError: in all others.
     """
     error: Exception | None = None
@@ -234,9 +232,9 @@ def fail_together() -> Generator[None]:
 
 @contextlib.contextmanager
 def output_of(rank: ProcessRank) -> Generator[ProcessOutput | None]:
-    """Take, within the block, what a process other than the first prints; None for the first.
+    """Capture the output of a process other than the first within the block; None for the first.
 
-    An error that ends the block is not among it: whoever prints it prints it to the terminal.
+    An error that ends the block is not captured: callers print it to the terminal.
     """
     if rank.is_first:
         yield None
@@ -259,34 +257,34 @@ def output_of(rank: ProcessRank) -> Generator[ProcessOutput | None]:
         output.release()
 
 
-def log_file(rank: ProcessRank, asked: str | None, run_dir: Path) -> Path | None:
-    """Return the file for what a process prints: below TORCHRUNX_LOG_DIR, else `asked`, else
-    `<run>/torchrunx`. None where that is empty: it is dropped then."""
-    folder = os.environ.get(LOG_DIR_VARIABLE, asked)
+def log_file(rank: ProcessRank, log_dir: str | None, run_dir: Path) -> Path | None:
+    """Return the log file of a process, in TORCHRUNX_LOG_DIR, else `log_dir`, else
+    `<run>/torchrunx`. None if that is empty: the output is dropped."""
+    folder = os.environ.get(LOG_DIR_VARIABLE, log_dir)
     if folder is None:
         folder = str(run_dir / "torchrunx")
     return Path(folder) / f"rank_{rank.rank}.log" if folder else None
 
 
 class ProcessOutput(io.TextIOBase):
-    """Takes what a process prints, and writes it to a file once it is told which."""
+    """Buffer of a process's output, written to a file once `keep_in` sets its path."""
 
     def __init__(self) -> None:
         self._target: IO[str] | None = io.StringIO()
 
     def writable(self) -> bool:
-        """Whether this can be written to."""
+        """Return True."""
         return True
 
     def write(self, text: str) -> int:
-        """Take `text`; return its length."""
+        """Write `text`; return its length."""
         if self._target is not None:
             self._target.write(text)
             self._target.flush()
         return len(text)
 
     def keep_in(self, path: Path | None) -> None:
-        """Write to `path` from now on, and what was printed before, too; None: drop it all."""
+        """Write earlier and further output to `path`. None: drop all of it."""
         before = self._target.getvalue() if isinstance(self._target, io.StringIO) else ""
         self._target = None
         if path is not None:
@@ -301,7 +299,7 @@ class ProcessOutput(io.TextIOBase):
             self._target = None
 
 
-# Helpers of launching and joining.
+# Helpers of the launcher and the process group.
 
 
 def _running(workers: list[subprocess.Popen[bytes]]) -> list[int]:
@@ -313,21 +311,21 @@ def _failed(workers: list[subprocess.Popen[bytes]]) -> list[int]:
 
 
 def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
-    """Return the store in which processes find each other, once all of them have come."""
+    """Return the store of the process group once all processes have joined."""
     address = os.environ.get(STORE_VARIABLE)
     host, port = os.environ.get("MASTER_ADDR"), os.environ.get("MASTER_PORT")
     if address is not None:
         host, _, port = address.rpartition(":")
     if not host or port is None or not port.isdigit():
         raise ValueError(
-            f"WORLD_SIZE={rank.world_size}: expected MASTER_ADDR and MASTER_PORT, where processes find "
-            f"each other, got {host!r} and {port!r}; use torchrun, or unset WORLD_SIZE."
+            f"WORLD_SIZE={rank.world_size}: expected MASTER_ADDR and MASTER_PORT of process 0, got "
+            f"{host!r} and {port!r}; use torchrun, or unset WORLD_SIZE."
         )
     hosts = rank.is_first and address is None
     begin, where = time.monotonic(), f"{host}:{port}"
     names = f"Process {rank.rank} of {rank.world_size}"
-    hint = "WORLD_SIZE says how many there are; unset it to train in one process."
-    # Looking for a store that is not there does not return.
+    hint = "WORLD_SIZE sets the number of processes; unset it to train in one process."
+    # The constructor does not return while the store is missing.
     timer = threading.Timer(
         _SECONDS_OF_SILENCE,
         lambda: logger.warning("%s waits for process 0 at %s. %s", names, where, hint),
@@ -352,15 +350,15 @@ def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
         raise TimeoutError(f"{names} found no process 0 at {where}. {hint}") from error
     finally:
         timer.cancel()
-    come, told = store.add("mjlab/come", 1), False
-    while come < rank.world_size:
+    joined, warned = store.add("mjlab/joined", 1), False
+    while joined < rank.world_size:
         waited = time.monotonic() - begin
-        progress = f"at {where}: {come} of {rank.world_size} have come"
+        progress = f"at {where}: {joined} of {rank.world_size} have joined"
         if waited > _SECONDS_TO_JOIN:
             raise TimeoutError(f"{names} waited {waited:.0f} s for the others {progress}. {hint}")
-        if waited > _SECONDS_OF_SILENCE and not told:
+        if waited > _SECONDS_OF_SILENCE and not warned:
             logger.warning("%s waits for the others %s. %s", names, progress, hint)
-            told = True
+            warned = True
         time.sleep(0.05)
-        come = store.add("mjlab/come", 0)
+        joined = store.add("mjlab/joined", 0)
     return store

@@ -1,4 +1,4 @@
-"""Rollouts that teach nothing: diverged physics, and terms that are NaN in every environment."""
+"""Checks of rollouts: diverged physics, and terms that are NaN in every environment."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from mjlab.utils.errors import MjlabError
 
 # Terms may be NaN in the first step of all episodes, and iterations of SAC are short.
 _MIN_BROKEN_STEPS = 16
-# Of a few environments, one may diverge.
+# With few environments, a single one may diverge.
 _MIN_DIVERGED_EPISODES = 4
 
 
 class DivergedError(MjlabError, RuntimeError):
-    """Training failed because the physics of a joint diverged."""
+    """Training failure caused by diverged physics of a joint."""
 
 
 class BrokenTermError(MjlabError, ValueError):
-    """A reward or a termination was NaN or infinite in every environment for a whole iteration."""
+    """Reward or termination that was NaN or infinite in every environment for an iteration."""
 
 
 class RolloutWatch:
-    """Highest speed of each degree of freedom in this rollout and the one before; who diverged.
+    """Peak speed of each DoF in this rollout and the previous one, to name a diverged joint.
 
     The policy learns from a rollout after it, so the first NaN may appear in the next one.
     A step costs two small operations on the device of the environments, and no synchronization.
     """
 
     def __init__(self, env: Any) -> None:
-        """Watch `env`; one without a simulation is left alone."""
+        """Watch `env`; environments without a simulation are not checked."""
         self._env = env
         self._sim: Any = getattr(env, "sim", None)
         self._peak: torch.Tensor | None = None
@@ -42,25 +42,25 @@ class RolloutWatch:
         self._resets_before: torch.Tensor | None = None
 
     def start(self) -> None:
-        """Begin a rollout with the current speeds."""
+        """Start a rollout with the current speeds."""
         if self._sim is not None:
             self._previous_peak, self._peak = self._peak, self._speeds()
-            # Environments of other classes may have a simulation, too.
+            # Environments of other classes may have a simulation but no `nan_resets`.
             if (resets := getattr(self._env, "nan_resets", None)) is not None:
                 self._resets_before = resets.clone()
 
     def update(self) -> None:
-        """Update the highest speeds after a step."""
+        """Update the peak speeds after a step."""
         if self._peak is not None:
             torch.maximum(self._peak, self._speeds(), out=self._peak)
 
     def check(self, num_steps: int) -> None:
-        """Refuse to learn from a rollout of `num_steps` steps that teaches nothing.
+        """Check that a rollout of `num_steps` steps is usable for learning.
 
         Raises:
             DivergedError: most environments diverged, in at least 4 episodes.
             BrokenTermError: a reward was NaN or infinite, or a termination a float other than 0 and 1, in
-                every environment and every step (of at least 16).
+                every environment and every step (at least 16 steps).
         """
         if self._resets_before is None:
             return
@@ -69,7 +69,7 @@ class RolloutWatch:
         if 2 * diverged > self._env.num_envs and int(episodes.sum()) >= _MIN_DIVERGED_EPISODES:
             timestep = float(self._sim.mj_model.opt.timestep)
             cause = self._explanation() or (
-                f"the timestep is {timestep:g} s. Use a smaller sim.mujoco.timestep."
+                f"sim.mujoco.timestep is {timestep:g} s; use a smaller one."
             )
             raise DivergedError(
                 f"The physics diverged in {diverged} of {self._env.num_envs} environments within "
@@ -81,21 +81,21 @@ class RolloutWatch:
                 if steps >= max(num_steps, _MIN_BROKEN_STEPS):
                     raise BrokenTermError(
                         f"{term} was {manager.nonfinite.fault} in every environment for {steps} steps in a "
-                        "row. Nothing can be learned from it; correct the term, or set it to None."
+                        "row; correct the term, or set it to None."
                     )
 
     @contextmanager
     def explaining(self, policy: torch.nn.Module) -> Generator[None]:
-        """Raise `DivergedError` in place of errors about numbers that are not finite.
+        """Raise `DivergedError` instead of errors about NaN and infinite numbers.
 
-        Only if a joint was faster than a physics step resolves; other errors pass.
+        Only if a joint was too fast for the physics timestep; other errors pass.
         """
         try:
             yield
         except (DivergedError, BrokenTermError):
             raise
         except (RuntimeError, ValueError) as error:
-            # NaN in the distribution of actions, in a step or in the policy.
+            # NaN in the action distribution, in a step or in the policy.
             tensors = (
                 t for t in (*policy.parameters(), *policy.buffers()) if t.is_floating_point()
             )
@@ -113,7 +113,7 @@ class RolloutWatch:
         return self._sim.data.qvel.abs().amax(dim=0)
 
     def _explanation(self) -> str | None:
-        """Return the joint that diverged and what cures it; None if no joint is too fast."""
+        """Return the joint that diverged and the remedy; None if no joint is too fast."""
         if self._peak is None:
             return None
         model: mujoco.MjModel = self._sim.mj_model

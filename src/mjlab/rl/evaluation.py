@@ -1,9 +1,9 @@
-"""Evaluation: policies scored on episodes without exploration, and tasks judged solved or not.
+"""Evaluation: scores of policies without exploration, and the check that a task is solved.
 
-`evaluate_policy` plays one episode in each of many environments. `SolvedCheck` does so beside a
-training run, which stops on two evaluations. The first is of the same episodes each time, so that
-what changes is the policy. A noisy policy that is tried often enough passes it by luck, hence the
-second, of episodes that no evaluation of the run has had before.
+`evaluate_policy` plays one episode per environment. `SolvedCheck` does so during a training run,
+which stops after two successful evaluations. The first has the same episodes each time, so that
+only the policy changes. A noisy policy passes it by luck if it is tried often enough, hence the
+second, on episodes that are new to the run.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ logger = logging.getLogger(__name__)
 
 Policy = Callable[[Any], torch.Tensor]
 PerEnv = Callable[[Any], torch.Tensor]
-"""`func(env) -> (num_envs,)`: something that is known of every environment at every step."""
-FIGURES = ("mean_return", "mean_length", "success_rate", "failure_rate")
-"""Fields of `EvaluationResult` that `EvaluationResult.value` knows, beside the metrics."""
+"""`func(env) -> (num_envs,)`: per-environment value, read at every step."""
+RESULT_FIELDS = ("mean_return", "mean_length", "success_rate", "failure_rate")
+"""Fields of `EvaluationResult` that `EvaluationResult.value` accepts, besides metrics."""
 
-# Whether all episodes have ended is asked this often, because asking makes the host wait for a GPU.
+# Steps between checks for the end of all episodes: each check synchronizes with the GPU.
 _STEPS_BETWEEN_CHECKS = 16
 _LONGEST_EPISODE = 1_000_000
-# Fewer episodes say little of what happens in one of a hundred.
+# Fewer episodes say little about failures in one of a hundred.
 _MANY_EPISODES = 200
-# Two-sided 95 % of the normal distribution.
+# Two-sided 95 % quantile of the normal distribution.
 _Z95 = 1.959964
-# What the docstring of a success function says of the tensor.
+# Parts of a success function's docstring that describe the tensor.
 _OPENING = re.compile(r"^Return (?:where|whether|if) ")
 _SHAPE = re.compile(r",? \([^()]*,\)(?: bool)?\.?$")
 
@@ -67,34 +67,34 @@ def evaluate_policy(
 ) -> EvaluationResult:
     """Play episodes and score them.
 
-    Each environment is scored once in a round, on its first episode after a reset, so that short
-    episodes do not count more often than long ones. Where more episodes are asked for than there
-    are environments, there are several rounds. No round or evaluation is harder than the one
-    before: steps do not count as steps of training (`common_step_counter` stands still), no
-    curriculum moves environments to other terrain, and the environments are left in the state in
-    which they were found. On the CPU, torch gets as many threads as the policy is worth.
+    Each environment is scored once per round, on its first episode after a reset, so that short
+    episodes do not count more often than long ones. If `num_episodes` exceeds the number of
+    environments, several rounds are played. All rounds and evaluations are equally hard: steps do
+    not count as training steps (`common_step_counter` is constant), curricula do not move
+    environments to harder terrain, and the state of the environments is restored. On the CPU, the
+    number of torch threads depends on the size of the policy.
 
-    An episode that `max_steps` cuts off is not a success, whatever a success is.
+    Episodes truncated by `max_steps` are never successes.
 
     Args:
-        env: The environments.
+        env: Environments.
         policy: `policy(observations) -> actions (num_envs, num_actions)`, usually
             `runner.get_inference_policy()`, which does not explore.
-        num_episodes: Episodes to score; None: one for each environment.
-        max_steps: Episodes are cut off after this many steps; None: the task's episode length,
+        num_episodes: Number of episodes to score; None: one per environment.
+        max_steps: Number of steps until episodes are truncated; None: the task's episode length,
             after which episodes count as finished.
-        success_return: An episode with at least this return is a success.
-        success_func: Instead, `func(env) -> (num_envs,) bool`; its value one step before the end
-            of an episode decides.
-        success_is_survival: Instead, an episode that no termination ended before its time was over
-            is a success.
-        metrics: For each name, `func(env) -> (num_envs,)`, read before every step and averaged over
-            the steps of an episode.
-        seed: Seed of the evaluation; None leaves the generators as they are. With the same seed,
+        success_return: Minimum return of a successful episode.
+        success_func: Success function, instead: `func(env) -> (num_envs,) bool`, read one step
+            before the end of an episode.
+        success_is_survival: Count episodes as successes, instead, unless a termination ended them
+            before the time limit.
+        metrics: Functions by name, `func(env) -> (num_envs,)`, read before every step and averaged
+            over the steps of an episode.
+        seed: Seed of the evaluation; None: generators are not seeded. With the same seed,
             environments in the same state give the same episodes.
 
     Raises:
-        ValueError: `num_episodes` is not positive, or the episodes have no end.
+        ValueError: `num_episodes` is not positive, or episodes are too long.
     """
     num_episodes = env.num_envs if num_episodes is None else num_episodes
     check_positive("num_episodes", num_episodes)
@@ -102,8 +102,8 @@ def evaluate_policy(
         max_steps = int(env.max_episode_length)
         if not 0 < max_steps <= _LONGEST_EPISODE:
             raise ValueError(
-                f"Episodes of this task have {max_steps} steps, which is no end to wait for; "
-                "set env.episode_length_s, or give max_steps."
+                f"max_steps: expected an episode length of 1 to {_LONGEST_EPISODE} steps, got "
+                f"{max_steps}; set env.episode_length_s, or max_steps."
             )
     check_positive("max_steps", max_steps)
     if seed is not None:
@@ -113,11 +113,11 @@ def evaluate_policy(
     with (
         threads_for_policy(policy, env.num_envs, env.device),
         torch.inference_mode(),
-        _undisturbed(env),
+        _preserved_state(env),
     ):
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
-            # Commands that take turns, such as motions, go through them over all rounds.
+            # Commands that take turns, such as motions, continue their order over all rounds.
             manager: Any = getattr(env.unwrapped, "command_manager", None)
             for name in manager.active_terms if manager is not None else ():
                 manager.get_term(name).take_turns_from(first)
@@ -135,14 +135,14 @@ def evaluate_policy(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvaluationResult:
-    """Figures over the episodes of an evaluation.
+    """Statistics over the episodes of an evaluation.
 
     The return of an episode is the sum of its weighted rewards before scaling by the step's
     duration.
     """
 
     num_episodes: int
-    """Episodes scored."""
+    """Number of episodes scored."""
     mean_return: float
     """Mean return."""
     return_interval: tuple[float, float] | None
@@ -156,83 +156,83 @@ class EvaluationResult:
     mean_length: float
     """Mean length of an episode, in environment steps."""
     success_rate: float | None = None
-    """Fraction of episodes that succeeded, unfinished ones not among them; None where the task does
-    not define success."""
+    """Fraction of successful episodes; unfinished episodes do not succeed. None if the task does not
+    define success."""
     success_interval: tuple[float, float] | None = None
     """95 % confidence interval of the success rate (Wilson)."""
     failure_rate: float | None = None
-    """Fraction of episodes that a termination ended before their time was over."""
+    """Fraction of episodes ended by a termination before the time limit."""
     failure_interval: tuple[float, float] | None = None
     """95 % confidence interval of the failure rate (Wilson)."""
     terminations: dict[str, float] = dataclasses.field(default_factory=dict)
-    """For each termination of the task, the fraction of episodes in whose last step it was true."""
+    """Fraction of episodes with the termination true in the last step, by name."""
     metrics: dict[str, MeanAndInterval] = dataclasses.field(default_factory=dict)
-    """The task's metrics, each averaged over an episode's steps and then over episodes."""
+    """Metrics of the task, averaged over the steps of an episode and then over episodes."""
     num_unfinished: int = 0
-    """Episodes that `max_steps` cut off before the time of an episode of the task was over."""
+    """Number of episodes truncated by `max_steps` before the task's time limit."""
     duration: float = 0.0
-    """Time taken, in seconds."""
+    """Duration of the evaluation, in seconds."""
     returns: tuple[float, ...] = dataclasses.field(default=(), repr=False)
     """Return of each episode."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks to bear in mind with these figures, in sentences."""
+        """Remarks on the reliability of the statistics, in sentences."""
         notes = []
         if self.num_unfinished:
             notes.append(
-                f"{self.num_unfinished} of {self.num_episodes} episodes were cut off by max_steps. "
+                f"{self.num_unfinished} of {self.num_episodes} episodes were truncated by max_steps. "
                 "They count as neither successes nor failures."
             )
         if self.num_episodes == 1:
-            notes.append("One episode gives no interval of a mean.")
+            notes.append("A mean of one episode has no confidence interval.")
         if self.num_episodes < _MANY_EPISODES:
             notes.append(
-                f"Below {_MANY_EPISODES} episodes, rare failures may be missing, which makes the "
-                "intervals of means optimistic. Judge failures by the interval of their rate."
+                f"Below {_MANY_EPISODES} episodes, rare failures may be missing, so that intervals of "
+                "means are optimistic. Judge failures by the interval of the failure rate."
             )
         return tuple(notes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all figures but the single returns, and `notes`."""
-        figures = dataclasses.asdict(self)
-        del figures["returns"]
-        return {**figures, "notes": list(self.notes)}
+        """Return all fields except `returns`, and `notes`."""
+        values = dataclasses.asdict(self)
+        del values["returns"]
+        return {**values, "notes": list(self.notes)}
 
     @classmethod
-    def from_dict(cls, figures: Mapping[str, Any]) -> EvaluationResult:
-        """Return the result that `to_dict` made `figures` of, without the single returns.
+    def from_dict(cls, values: Mapping[str, Any]) -> EvaluationResult:
+        """Return the result for `values` of `to_dict`, without `returns`.
 
-        Further entries of `figures` are left out.
+        Unknown entries of `values` are ignored.
         """
         names = {field.name for field in dataclasses.fields(cls)}
-        own: dict[str, Any] = {name: value for name, value in figures.items() if name in names}
+        own: dict[str, Any] = {name: value for name, value in values.items() if name in names}
         own["metrics"] = {name: MeanAndInterval(**value) for name, value in own["metrics"].items()}
         return cls(**own)
 
     def to_json(self) -> str:
-        """Return the figures as JSON."""
+        """Return `to_dict` as JSON."""
         return json.dumps(self.to_dict(), indent=2)
 
     def value(self, name: str) -> float:
-        """Return a figure by name: a metric of the task, or a field such as `failure_rate`.
+        """Return a value by name: a metric of the task, or a field such as `failure_rate`.
 
         Raises:
-            ValueError: there is no such figure; the message lists those there are.
+            ValueError: the name is unknown; the message lists the available names.
         """
         if name in self.metrics:
             return self.metrics[name].mean
-        value = getattr(self, name, None) if name in FIGURES else None
+        value = getattr(self, name, None) if name in RESULT_FIELDS else None
         if value is None:
-            known = [*self.metrics, *(f for f in FIGURES if getattr(self, f) is not None)]
-            raise ValueError(f"Evaluation of this task: no figure {name!r}; {suggest(name, known)}")
+            known = [*self.metrics, *(f for f in RESULT_FIELDS if getattr(self, f) is not None)]
+            raise ValueError(f"Unknown evaluation metric {name!r}; {suggest(name, known)}")
         return float(value)
 
     def judged(self, name: str) -> float:
-        """Return a figure as bounds judge it: rates by the middle of their Wilson interval.
+        """Return a value as compared with bounds: for rates, the center of the Wilson interval.
 
-        That is nearer to 1/2 than the fraction observed, the more so the fewer the episodes are: no
-        failure in 4 episodes is judged as 24 %, in 200 as 0.9 %.
+        The center is nearer to 1/2 than the observed fraction, the more so the fewer the episodes: 0
+        failures in 4 episodes count as 24 %, in 200 as 0.9 %.
 
         Raises:
             ValueError: see `value`.
@@ -244,26 +244,32 @@ class EvaluationResult:
 
 @dataclasses.dataclass(frozen=True)
 class MeanAndInterval:
-    """A mean over episodes."""
+    """Mean over episodes, with its confidence interval."""
 
     mean: float
-    """The mean."""
+    """Mean."""
     interval: tuple[float, float] | None
     """95 % confidence interval of the mean (Student's t); None for one episode."""
 
 
 class SolvedCheck:
-    """Evaluates the policy, beside the run and without touching it, when it may have solved the
+    """Evaluation of the policy during a run, in separate environments, when it may have solved the
     task.
 
-    `last_iteration` is the number of iterations that were finished at the last evaluation.
+    `last_iteration` is the number of iterations finished at the last evaluation.
     """
 
     def __init__(self, env: Any, algorithm: Any, cfg: dict[str, Any], seed: int) -> None:
-        """Take the run's environments and algorithm, and an `EvaluationCfg` as a dict.
+        """Set up the check.
+
+        Args:
+            env: Environments of the run.
+            algorithm: Algorithm of the run.
+            cfg: An `EvaluationCfg` as a dict.
+            seed: Seed of the run.
 
         Raises:
-            ValueError: a condition names what is not measured.
+            ValueError: a condition names an unknown metric.
         """
         self._env = env
         self._algorithm = algorithm
@@ -275,7 +281,7 @@ class SolvedCheck:
         self._has_target = target is not None or bool(self._below or self._above)
         self._min_interval = int(cfg.get("min_interval", 3))
         self._num_episodes = int(cfg.get("num_episodes", 256))
-        known = {*(cfg.get("metrics") or {}), *FIGURES}
+        known = {*(cfg.get("metrics") or {}), *RESULT_FIELDS}
         defining_success = ("success_func", "success_return", "solved_return")
         is_defined = any(cfg.get(name) is not None for name in defining_success)
         if not is_defined and not cfg.get("success_is_survival"):
@@ -286,26 +292,26 @@ class SolvedCheck:
                     f"EvaluationCfg solved_below, solved_above: {name!r} is not measured; "
                     f"{suggest(name, sorted(known))} Others must be in `metrics`."
                 )
-        # Bounds on rates that so few episodes never meet, even if none of them fails.
+        # Bounds on rates that this number of episodes cannot meet, even without a failure.
         allowed = {"failure_rate": self._below.get("failure_rate", 1.0)}
         allowed["success_rate"] = 1.0 - self._above.get("success_rate", 0.0)
         for name, failures in allowed.items():
             if failures > 0.0 and self._num_episodes < (needed := episodes_to_show(failures)):
                 logger.warning(
-                    "EvaluationCfg: %d episodes never meet the bound on %s, because they say too little "
-                    "of failures as rare as %.3g %%; use num_episodes >= %d.",
+                    "EvaluationCfg: %d episodes never meet the bound on %s: they are too few to show "
+                    "failures as rare as %.3g %%; use num_episodes >= %d.",
                     self._num_episodes, name, 100.0 * failures, needed,
                 )  # fmt: skip
         self._eval_env: Any = None
         self.last_iteration = 0
 
     def should_evaluate(self, iteration: int, mean_step_reward: float) -> bool:
-        """Return whether the training data hint that the policy may be good enough.
+        """Return whether the training data suggest that the policy may be good enough.
 
         Args:
-            iteration: Iterations finished.
-            mean_step_reward: Mean weighted reward of a step of the last one, before scaling by the
-                step's duration.
+            iteration: Number of iterations finished.
+            mean_step_reward: Mean weighted reward per step of the last iteration, before scaling by
+                the step's duration.
         """
         if not self._has_target or iteration - self.last_iteration < self._min_interval:
             return False
@@ -320,36 +326,36 @@ class SolvedCheck:
         return mean_step_reward * int(self._env.max_episode_length) >= trigger
 
     def is_solved_by(self, result: EvaluationResult) -> bool:
-        """Return whether `result` is good enough in all that the config asks for."""
+        """Return whether `result` meets all conditions of the config."""
         if not self._has_target:
             return False
         target = self._cfg.get("solved_return")
         if target is not None and result.mean_return < target:
             return False
-        # Written so that NaN meets nothing.
-        return all(result.judged(name) <= most for name, most in self._below.items()) and all(
-            result.judged(name) >= least for name, least in self._above.items()
+        # Comparisons with NaN are False, so that NaN meets no condition.
+        return all(result.judged(name) <= high for name, high in self._below.items()) and all(
+            result.judged(name) >= low for name, low in self._above.items()
         )
 
     @property
     def stops_training(self) -> bool:
-        """Whether training ends when the task is solved."""
+        """True if training ends when the task is solved."""
         return bool(self._cfg.get("stop_when_solved", True))
 
     def evaluate(self) -> EvaluationResult:
-        """Score the policy in environments of their own, built at the first call.
+        """Score the policy in separate environments, built at the first call.
 
-        The episodes are the same each time.
+        The episodes are the same at each call.
         """
         if self._eval_env is None:
             self._eval_env = self._make_env(evaluation_seed(self._seed))
         return self._score(self._eval_env, evaluation_seed(self._seed))
 
     def confirm(self, iteration: int) -> EvaluationResult:
-        """Score the policy after `iteration` iterations in other environments, and other episodes.
+        """Score the policy after `iteration` iterations in new environments, on unused episodes.
 
-        No other evaluation of the run has them. They follow from the seed and the iteration, so
-        that a resumed run has the same ones.
+        The episodes depend on the seed and the iteration only, so that a resumed run has the same
+        episodes.
         """
         seed = evaluation_seed(self._seed, iteration)
         env = self._make_env(seed)
@@ -390,16 +396,16 @@ class SolvedCheck:
             policy.reset(hidden_state=hidden_state)
 
     def close(self) -> None:
-        """Close the environments, if there are any."""
+        """Close the environments if they were built."""
         if self._eval_env is not None:
             self._eval_env.close()
             self._eval_env = None
 
 
 def success_definition(cfg: EvaluationCfg) -> str | None:
-    """Return what makes an episode a success, or None where the task does not say.
+    """Return a description of the success criterion, None if the task does not define success.
 
-    Of a function that is the first line of its docstring, without what is said of the tensor.
+    A success function is described by the first line of its docstring, without the tensor shape.
     """
     if (func := cfg.success_func) is not None:
         while isinstance(func, functools.partial):
@@ -409,19 +415,19 @@ def success_definition(cfg: EvaluationCfg) -> str | None:
         words = _OPENING.sub("", _SHAPE.sub("", first_line)).rstrip(".")
         return f"{f'{words} ({name})' if words else name}, one step before the end"
     if cfg.success_is_survival:
-        return "no termination ended the episode before its time was over"
+        return "no termination before the time limit"
     target = required_return(cfg)
     return None if target is None else f"return of at least {target:g}"
 
 
 def required_return(cfg: EvaluationCfg) -> float | None:
-    """Return from which return an episode is a success; None where the return does not decide."""
+    """Return the minimum return of a successful episode, None if the return does not decide."""
     if cfg.success_func is not None or cfg.success_is_survival:
         return None
     return cfg.solved_return if cfg.success_return is None else cfg.success_return
 
 
-# Playing episodes.
+# Episodes.
 
 
 def make_evaluation_env(
@@ -430,12 +436,12 @@ def make_evaluation_env(
     seed: int,
     prepare: Callable[[Any], None] | None = None,
 ) -> RslRlVecEnvWrapper:
-    """Build environments like those of `env` beside them, to evaluate while training goes on.
+    """Build separate environments with the config of `env`, to evaluate during training.
 
-    `prepare` edits their config in place before.
+    `prepare` edits a copy of the config in place first.
 
-    The random number generators are left as they were, so that a run takes the same course
-    whether or not it is evaluated.
+    The state of the random number generators is preserved, so that evaluation does not change the
+    course of a run.
     """
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
 
@@ -446,14 +452,14 @@ def make_evaluation_env(
     if prepare is not None:
         prepare(cfg)
     with preserved_rng():
-        beside = type(unwrapped)(cfg=cfg, device=unwrapped.device)
-        return RslRlVecEnvWrapper(beside, clip_actions=env.clip_actions)
+        eval_env = type(unwrapped)(cfg=cfg, device=unwrapped.device)
+        return RslRlVecEnvWrapper(eval_env, clip_actions=env.clip_actions)
 
 
 def reward_unit(env: Any) -> float:
-    """Return what one unit of weighted reward is worth in the rewards that `env` returns.
+    """Return the factor from weighted rewards to the rewards that `env` returns.
 
-    That is the duration of a step, in seconds, where the environment scales rewards by it.
+    The factor is the step duration in seconds if the environment scales rewards by it, else 1.
     """
     unwrapped = env.unwrapped
     scaled = getattr(unwrapped.cfg, "scale_rewards_by_dt", False)
@@ -461,10 +467,11 @@ def reward_unit(env: Any) -> float:
 
 
 @contextmanager
-def _undisturbed(env: RslRlVecEnvWrapper) -> Generator[None]:
-    """Hold curricula within the block, of steps and of terrain; then restore the state of before.
+def _preserved_state(env: RslRlVecEnvWrapper) -> Generator[None]:
+    """Hold step and terrain curricula within the block; restore the environments' state after it.
 
-    What outlives a reset, such as counters of terms, would let evaluations depend on those before.
+    State that outlives a reset, such as counters of terms, would make evaluations depend on earlier
+    ones.
     """
     unwrapped: Any = env.unwrapped
     terrain = getattr(getattr(unwrapped, "scene", None), "terrain", None)
@@ -482,8 +489,8 @@ def _undisturbed(env: RslRlVecEnvWrapper) -> Generator[None]:
                 unwrapped.load_state_dict(state)
             except ValueError as error:
                 logger.warning(
-                    "The state of the evaluated environments is not restored, so that another "
-                    "evaluation in them may differ. %s", error,
+                    "The state of the evaluated environments was not restored; another evaluation in "
+                    "them may differ. %s", error,
                 )  # fmt: skip
 
 
@@ -516,7 +523,7 @@ def _play_round(
         if success_func is not None:
             succeeded = torch.where(running, success_func(unwrapped).bool(), succeeded)
         for name, func in metrics.items():
-            # Not multiplied, because zero times infinity would be NaN.
+            # `where` instead of a product: zero times infinity is NaN.
             sums[name] += torch.where(running, func(unwrapped), 0.0)
         observations, rewards, dones, _ = env.step(policy(observations).to(env.device))
         returns += rewards * running
@@ -544,22 +551,22 @@ def _play_round(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Episodes:
-    """What was recorded of E episodes; `+` puts two records together."""
+    """Records of E episodes; `+` concatenates two records."""
 
     returns: torch.Tensor
     """Sum of weighted rewards, (E,)."""
     lengths: torch.Tensor
-    """Steps, (E,) int64."""
+    """Number of steps, (E,) int64."""
     finished: torch.Tensor
     """True if the episode terminated or reached the task's episode length, (E,) bool."""
     failed: torch.Tensor
-    """Whether a termination ended it before its time was over, (E,) bool."""
+    """True if a termination ended the episode before the time limit, (E,) bool."""
     succeeded: torch.Tensor
     """Value of the task's success function one step before the end, (E,) bool."""
     terminations: dict[str, torch.Tensor]
-    """For each termination, whether it was true in the last step, (E,) bool."""
+    """True if the termination was true in the last step, (E,) bool, by name."""
     metrics: dict[str, torch.Tensor]
-    """For each metric, its mean over the steps of the episode, (E,)."""
+    """Mean of the metric over the steps of the episode, (E,), by name."""
 
     def __add__(self, other: Episodes) -> Episodes:
         joined: dict[str, Any] = {}
@@ -578,7 +585,7 @@ class Episodes:
 def summarize(
     episodes: Episodes, successes: torch.Tensor | None, duration: float
 ) -> EvaluationResult:
-    """Return the figures of `episodes`; `successes` (E,) bool, or None where not defined."""
+    """Return the statistics of `episodes`; `successes` is (E,) bool, None if not defined."""
     returns = episodes.returns
     count = len(returns)
     mean_return = mean_and_interval(returns)
@@ -609,7 +616,7 @@ def mean_and_interval(values: torch.Tensor) -> MeanAndInterval:
     mean, count = values.double().mean().item(), len(values)
     if count == 1:
         return MeanAndInterval(mean, None)
-    # Not at the top: it takes a tenth of a second, which a run that is not evaluated saves.
+    # Imported here: the import takes a tenth of a second, which runs without evaluation save.
     from scipy.special import stdtrit
 
     half = float(stdtrit(count - 1, 0.975)) * values.double().std().item() / math.sqrt(count)
@@ -619,19 +626,19 @@ def mean_and_interval(values: torch.Tensor) -> MeanAndInterval:
 def wilson_interval(rate: float, count: int) -> tuple[float, float]:
     """Return the 95 % interval of a success rate observed over `count` episodes.
 
-    Unlike the normal approximation it stays within [0, 1] and is not empty at 0 and 1:
+    Unlike the normal approximation, the interval stays within [0, 1] and is not empty at 0 and 1:
     (p + z^2/2n +- z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n).
     """
     shrink = 1.0 + _Z95**2 / count
-    centre = (rate + _Z95**2 / (2 * count)) / shrink
+    center = (rate + _Z95**2 / (2 * count)) / shrink
     half = _Z95 * math.sqrt(rate * (1 - rate) / count + _Z95**2 / (4 * count**2)) / shrink
-    # The interval contains the rate; rounding must not say otherwise.
-    return max(0.0, min(centre - half, rate)), min(1.0, max(centre + half, rate))
+    # Keep the rate in the interval despite rounding.
+    return max(0.0, min(center - half, rate)), min(1.0, max(center + half, rate))
 
 
 def episodes_to_show(rate: float) -> int:
-    """Return how many episodes without a failure are judged as a failure rate of at most `rate`.
+    """Return the number of episodes without failure needed to show a failure rate <= `rate`.
 
-    The middle of `wilson_interval(0, n)` is z^2 / (2 (n + z^2)).
+    The center of `wilson_interval(0, n)` is z^2 / (2 (n + z^2)).
     """
     return max(1, math.ceil(_Z95**2 * (0.5 / rate - 1.0)))

@@ -1,8 +1,8 @@
-"""Policies as ONNX files: export, metadata for a deployment, and playing them by onnxruntime.
+"""ONNX policies: export, deployment metadata, and inference with onnxruntime.
 
-A file takes any number of environments (a dynamic batch dimension). Recurrent policies have one input
-and one output for each part of their memory, as rsl_rl names them: `h_in` and `h_out`, for LSTMs also
-`c_in` and `c_out`, (layers, N, hidden).
+A file accepts any number of environments (dynamic batch dimension). Recurrent policies have one input
+and one output per hidden state, with rsl_rl's names: `h_in` and `h_out`, for LSTMs also `c_in` and
+`c_out`, (layers, N, hidden).
 
 Each key of the metadata is one string property of the file; lists are comma-separated. The keys of
 mjlab 1.6 come first, in its order and layout; numbers have full precision, and more keys follow:
@@ -11,22 +11,23 @@ mjlab 1.6 come first, in its order and layout; numbers have full precision, and 
 | --- | --- |
 | action_names, action_types, action_entities, action_dims | per action term |
 | action_target_names, action_offset, action_clip | per component of the action vector |
-| observation_group | the group that the policy reads; several make up `obs` in this order |
-| image_groups | the groups of images, each an input of its own; left out where there are none |
+| observation_group | observation groups of the policy, concatenated to `obs` in this order |
+| image_groups | image groups, each a separate input; omitted without images |
 | observation_dims | size of each of its terms, history included |
-| observation_delay | lowest and highest lag of each term, in steps |
+| observation_delay | minimum and maximum lag of each term, in steps |
 | initializers_sha256 | digest of the weights in the file, see `initializers_digest` |
-| step_dt, physics_dt, decimation | control period (s), physics time step (s), their ratio |
+| step_dt, physics_dt, decimation | control timestep (s), physics timestep (s), their ratio |
 
-A term's target is `action * action_scale + action_offset`, clipped to `action_clip`. Commands that a
-deployment generates itself, such as the gait clock, export their parameters (`CommandTerm.export_metadata`):
+The target of an action term is `action * action_scale + action_offset`, clipped to `action_clip`.
+Commands generated on the robot, such as the gait clock, export their parameters
+(`CommandTerm.export_metadata`):
 
 | key | value |
 | --- | --- |
-| clock_command | name of the gait clock among the commands |
-| clock_frequency, clock_fade_s | strides per second (Hz), and seconds in which the amplitude A goes from 0 to 1 |
-| clock_standing_threshold | commanded motion `|c_xy| + |c_z|` below which A falls to 0; 0: it never does |
-| clock_starts | phases c (strides) at which the clock starts; empty: any |
+| clock_command | command name of the gait clock |
+| clock_frequency, clock_fade_s | stride frequency (Hz), and fade time (s) of the amplitude A from 0 to 1 |
+| clock_standing_threshold | A fades to 0 for commanded motion `|c_xy| + |c_z|` below this; 0: never |
+| clock_starts | initial phases c (strides) of the clock; empty: any |
 
 The policy observes (A sin(2 pi c), A cos(2 pi c)).
 """
@@ -59,8 +60,8 @@ logger = logging.getLogger(__name__)
 OPSET = 18
 DIGEST_KEY = "initializers_sha256"
 _ACTIONS = "actions"
-# Metadata that must be the same where a policy was trained and where it is played. Numbers are
-# compared with a tolerance, because mjlab 1.6 writes three decimals.
+# Metadata that must agree between training and inference. Numbers are compared with a tolerance,
+# because mjlab 1.6 writes three decimals.
 _INTERFACE = (
     "observation_names",
     "observation_dims",
@@ -72,7 +73,7 @@ _INTERFACE = (
     "default_joint_pos",
     "step_dt",
 )
-# Files without these are of policies that see no gait clock.
+# Missing in files of policies that do not observe a gait clock.
 _CLOCK = ("clock_frequency", "clock_fade_s", "clock_standing_threshold", "clock_starts")
 _RELATIVE_TOLERANCE = 0.01
 _ABSOLUTE_TOLERANCE = 6e-4
@@ -84,14 +85,14 @@ _ABSOLUTE_TOLERANCE = 6e-4
 def export_with_metadata(
     write: Callable[[str, str], None], metadata: Callable[[], Metadata], path: str
 ) -> bool:
-    """Write a policy as ONNX with all that a deployment needs to know; return whether it was written.
+    """Write a policy as ONNX with deployment metadata; return True if the file was written.
 
-    Failures are logged: a run is not lost because its policy has no ONNX form.
+    Failures are logged: a run must not fail because its policy cannot be exported.
 
     Args:
-        write: Called as `write(folder, filename)`.
-        metadata: Returns the metadata.
-        path: The file.
+        write: Export function, called as `write(folder, filename)`.
+        metadata: Function that returns the metadata.
+        path: ONNX file.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -104,15 +105,15 @@ def export_with_metadata(
         digest = {DIGEST_KEY: initializers_digest(path)}
         attach_metadata_to_onnx(path, {**metadata(), **digest})
     except Exception as error:
-        logger.warning("The exported policy %s is without metadata: %s", path, error)
+        logger.warning("The exported policy %s has no metadata: %s", path, error)
     return True
 
 
 def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
-    """Write `model`, what rsl_rl's `as_onnx` returns, to `path`, for any number of environments.
+    """Write `model`, the result of rsl_rl's `as_onnx`, to `path`, for any number of environments.
 
-    The exporter is the one that traces (`dynamo=False`): it needs neither the compiler nor
-    onnxscript, whose imports alone take longer than the whole export, and it makes one file.
+    The tracing exporter (`dynamo=False`) writes a single file and needs neither the compiler nor
+    onnxscript, whose imports alone take longer than the whole export.
     """
     if getattr(model, "obs_dim_1d", None) == 0:
         model = _ImagesOnly(model)
@@ -149,7 +150,7 @@ def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
 
 
 class _ImagesOnly(torch.nn.Module):
-    """An image model without flat observations, and without the empty input for them."""
+    """Image model without the empty input for flat observations."""
 
     def __init__(self, model: Any) -> None:
         super().__init__()
@@ -167,7 +168,7 @@ class _ImagesOnly(torch.nn.Module):
 
 
 def _memories(inputs: Iterable[str], outputs: Iterable[str]) -> dict[str, str]:
-    """Return the inputs that hold memory, with the outputs that they are in the next step."""
+    """Return the hidden state inputs, each with the output that feeds it in the next step."""
     pairs = {name: f"{name.removesuffix('_in')}_out" for name in inputs if name.endswith("_in")}
     known = set(outputs)
     return {before: after for before, after in pairs.items() if after in known}
@@ -186,16 +187,16 @@ def write_atomically(path: Path, content: bytes) -> None:
 def get_base_metadata(
     env: ManagerBasedRlEnv, run_path: str, observation_groups: Sequence[str] | None = None
 ) -> Metadata:
-    """Return what a deployment needs to run a policy of `env`, whatever the task has.
+    """Return the metadata that a deployment needs to run a policy of `env`.
 
     Args:
-        env: The environment; environment 0 stands for all.
+        env: Environment; values are those of environment 0.
         run_path: Name of the run, or "local".
-        observation_groups: Groups that make up the policy's flat observation, in order; None takes
-            "actor", or the first one.
+        observation_groups: Groups of the policy's flat observation, in order; None: "actor", or the
+            first group.
 
-    Joint keys are those of the entity that the actions drive: the one called "robot" if it is
-    among them, else that of the first action term.
+    Joint keys are those of the entity that the actions drive: the entity "robot" if it is
+    actuated, else that of the first action term.
     """
     metadata: Metadata = {"run_path": run_path}
     actions = env.action_manager
@@ -231,7 +232,7 @@ def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:
             # The bias of a position or velocity servo is -kp l - kd l'.
             has_gains = int(model.actuator_biastype[element]) == affine
             bias = model.actuator_biasprm[element] if has_gains else np.zeros(3)
-            # A PD law that is computed outside MuJoCo is not in the model, but in the config.
+            # The gains of a PD law computed outside MuJoCo are in the config, not in the model.
             kp = getattr(actuator.cfg, "stiffness", 0.0 - bias[1])
             kd = getattr(actuator.cfg, "damping", 0.0 - bias[2])
             gains[name] = float(kp), float(kd)
@@ -284,7 +285,7 @@ def _action_metadata(terms: Mapping[str, Any]) -> Metadata:
         prefix = f"{term.cfg.entity_name}/" if several else ""
         targets: list[str] = list(getattr(term, "_target_names", ()))
         if len(targets) != term.action_dim:
-            # The term drives nothing that has a name.
+            # The term drives no named elements.
             targets = [f"{name}_{k}" for k in range(term.action_dim)]
         clip = getattr(term, "_clip", None)
         components["names"] += [prefix + target for target in targets]
@@ -295,7 +296,7 @@ def _action_metadata(terms: Mapping[str, Any]) -> Metadata:
             if isinstance(clip, torch.Tensor)
             else [[-np.inf, np.inf]] * term.action_dim
         )
-    # One number where one number was configured, as mjlab 1.6 writes it.
+    # A scalar for a scalar config value, as mjlab 1.6 writes it.
     single = len(scales) == 1 and isinstance(scales[0], (int, float))
     return {
         "action_scale": float(scales[0]) if single else components["scale"],
@@ -322,14 +323,14 @@ def _numbers(values: torch.Tensor) -> list[float]:
 
 
 def _shortest(value: float) -> float:
-    """Return the number with the fewest digits that is `value` in float32: 0.1, not 0.100000001."""
+    """Return the shortest decimal that equals `value` in float32: 0.1, not 0.100000001."""
     return float(str(np.float32(value)))
 
 
 def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | float]) -> None:
-    """Write `metadata` into the ONNX file; keys that it has already are replaced.
+    """Write `metadata` into the ONNX file; existing keys are replaced.
 
-    The file is replaced as a whole, so it is never seen half written.
+    The write is atomic.
     """
     import onnx
 
@@ -342,7 +343,7 @@ def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | 
 
 
 def metadata_texts(metadata: Mapping[str, list | str | float]) -> dict[str, str]:
-    """Return `metadata` as the strings that the ONNX file keeps."""
+    """Return `metadata` as strings, in the format of the ONNX file."""
     return {
         key: list_to_csv_str(value, decimals=None)
         if isinstance(value, (list, tuple))
@@ -356,8 +357,8 @@ def list_to_csv_str(
 ) -> str:
     """Return the items of `arr`, joined by `delimiter`; nested lists by `sub_delimiter`.
 
-    Numbers get `decimals` decimals, booleans counting as 1 and 0; None writes them in full, as
-    short as reads back to the same number. Everything else is `str`.
+    Numbers have `decimals` decimals, booleans as 1 and 0; None: the shortest decimal that reads back
+    as the same number. Other items are converted by `str`.
     """
     return delimiter.join(
         list_to_csv_str(item, decimals=decimals, delimiter=sub_delimiter)
@@ -378,12 +379,12 @@ def _text(item: Any, decimals: int | None) -> str:
 
 
 def initializers_digest(model: str | Path | Any) -> str:
-    """Return the SHA-256 (hexadecimal) over the initializers of an ONNX file: the policy's weights.
+    """Return the SHA-256 (hexadecimal) of the initializers of an ONNX file: the policy's weights.
 
-    Over each, in order of their names: name, NumPy type and shape, a line each, and the values.
+    Hashed for each, ordered by name: name, NumPy type and shape, one line each, and the values.
 
     Args:
-        model: The file, or what `onnx.load` returned for it.
+        model: ONNX file, or the result of `onnx.load`.
     """
     import onnx
 
@@ -397,23 +398,23 @@ def initializers_digest(model: str | Path | Any) -> str:
     return digest.hexdigest()
 
 
-# Playing.
+# Inference.
 
 
 class OnnxPolicyError(CheckpointError):
-    """Raised for a file that is no policy that can be played here; the text says why."""
+    """ONNX file that is not a policy, or not one for this environment; the message has the reason."""
 
 
 def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
-    """Return the policy in `path`, which fits the wrapped environment `env`.
+    """Load the policy in `path` and check that it fits the wrapped environment `env`.
 
     Raises:
-        OnnxPolicyError: it cannot be played, or not in this environment.
+        OnnxPolicyError: the policy cannot be run, or not in this environment.
     """
     try:
         policy = OnnxPolicy(path, device, env.unwrapped.num_envs)
         policy.check_fits(env.unwrapped)
-        # Once, so that a damaged graph is told before anything is shown or measured.
+        # One call, so that a damaged graph raises here.
         shapes = env.unwrapped.observation_manager.group_obs_dim
         policy({name: torch.zeros(2, *shapes[name], device=device) for name in policy.groups})
         policy.reset()
@@ -421,43 +422,43 @@ def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
         raise
     except Exception as error:
         raise OnnxPolicyError(
-            f"The policy {path} cannot be computed: {_first_line(error)}. The file is damaged, or "
-            "not a policy of this environment."
+            f"Policy {path} cannot be run: {_first_line(error)}. The file is damaged, or not a policy "
+            "of this environment."
         ) from error
     return policy
 
 
 class OnnxPolicy:
-    """A policy that was exported to ONNX, for any number of environments, on the CPU.
+    """ONNX policy for any number of environments, run on the CPU.
 
-    Called with observations, it returns actions (N, num_actions). One with a memory remembers what it
-    was called with before, until `reset`. Files with a fixed batch size of 1, which earlier releases
-    wrote, are run once for each environment.
+    Calls with observations return actions (N, num_actions). Recurrent policies keep their hidden
+    state until `reset`. Files with a fixed batch size of 1, as written by earlier releases, are run
+    once per environment.
 
-    A file may have further outputs, and inputs that these depend on; they are left out. Exported
-    policies of motion tracking return the reference at an input `time_step`, which is of use on a
-    robot, and which an environment has itself.
+    Further outputs of a file, and their inputs, are ignored: exported policies of motion tracking
+    return the reference at an input `time_step`, for use on a robot; an environment has its own
+    reference.
 
     Attributes:
-        metadata: What the file says about itself; see `mjlab.rl.exporter_utils`.
-        num_observations: Size of the flat observation of one environment; 0 if it sees images only.
+        metadata: Metadata of the file; see `mjlab.rl.exporter_utils`.
+        num_observations: Size of the flat observation of one environment; 0 for images only.
         num_actions: Size of the action of one environment.
-        image_shapes: For each group of images that it sees, (channels, height, width).
-        groups: Groups of observations that the policy reads.
+        image_shapes: Shape (channels, height, width) of each image group.
+        groups: Observation groups of the policy.
     """
 
     def __init__(self, path: str | Path, device: str = "cpu", num_envs: int = 1) -> None:
         """Read the file.
 
         Args:
-            path: The ONNX file.
+            path: ONNX file.
             device: Torch device of the actions. They are computed on the CPU.
-            num_envs: Number of environments that it will mostly be called with; decides on threads.
+            num_envs: Usual number of environments per call; sets the number of threads.
 
         Raises:
-            OnnxPolicyError: the file is missing, no ONNX file, has no output that is called
-                `actions` nor only one; or the actions depend on other inputs than a flat
-                observation, images and a memory.
+            OnnxPolicyError: the file is missing, is not an ONNX file, or has several outputs, none
+                named `actions`; or the actions depend on inputs other than a flat observation,
+                images and a hidden state.
         """
         self.path = Path(path)
         self.device = device
@@ -466,8 +467,8 @@ class OnnxPolicy:
         outputs = {item.name: _dims(item) for item in model.graph.output}
         if _ACTIONS not in outputs and len(outputs) != 1:
             raise OnnxPolicyError(
-                f"The policy {self.path} has the outputs {list(outputs)}, of which none is called "
-                f"{_ACTIONS!r}. Play the checkpoint (model_<iteration>.pt) instead."
+                f"Policy {self.path}: expected an output {_ACTIONS!r}, got outputs {list(outputs)}; play "
+                "the checkpoint (model_<iteration>.pt) instead."
             )
         actions = _ACTIONS if _ACTIONS in outputs else next(iter(outputs))
         self.num_actions = outputs[actions][-1]
@@ -475,7 +476,7 @@ class OnnxPolicy:
         self._outputs = [actions, *self._memories.values()]
         _keep_only(model.graph, self._outputs)
         self._read_inputs(model.graph)
-        # Groups that make up the flat observation, in order; None if the file does not say so.
+        # Groups of the flat observation, in order; None if the file does not name its groups.
         self._named_groups: list[str] | None = None
         if self._state is None:
             self._named_groups = []
@@ -490,9 +491,8 @@ class OnnxPolicy:
         """Return actions (N, num_actions).
 
         Args:
-            observations: The environment's groups of observations, of which those that the policy
-                was trained with are taken; or, for a policy without images, a tensor
-                (N, num_observations).
+            observations: Observation groups of the environment, a superset of `groups`; or, for a
+                policy without images, a tensor (N, num_observations).
         """
         inputs = {name: _array(observations[name]) for name in self.image_shapes}
         if self._state is not None:
@@ -519,7 +519,7 @@ class OnnxPolicy:
         return torch.from_numpy(actions).to(self.device)
 
     def reset(self, dones: torch.Tensor | None = None) -> None:
-        """Forget what was seen in environments where `dones` (N,) is not 0; None: in all."""
+        """Clear the hidden state of environments with nonzero `dones` (N,). None: all."""
         if dones is None:
             self._memory.clear()
             return
@@ -528,33 +528,33 @@ class OnnxPolicy:
             value[:, ended] = 0.0
 
     def check_fits(self, env: ManagerBasedRlEnv) -> None:
-        """Refuse an environment with other observations or actions than those of the training.
+        """Check that observations and actions of `env` are those of the training.
 
         Raises:
-            OnnxPolicyError: something differs; the text names all of it.
+            OnnxPolicyError: observations or actions differ; the message lists all differences.
         """
         differences = self._group_differences(env)
         if not differences:
-            wanted = metadata_texts(get_base_metadata(env, "", self._named_groups))
+            expected = metadata_texts(get_base_metadata(env, "", self._named_groups))
             own = {key: self.metadata[key] for key in _INTERFACE if key in self.metadata}
             own |= {key: self.metadata.get(key, "") for key in _CLOCK}
             differences = [
-                f"{key}: the policy has {value or 'none'}, the environment {wanted.get(key) or 'none'}"
+                f"{key}: the policy has {value or 'none'}, the environment {expected.get(key) or 'none'}"
                 for key, value in own.items()
-                if not _alike(value, wanted.get(key, ""))
+                if not _alike(value, expected.get(key, ""))
             ]
         sizes = env.action_manager.total_action_dim
         if sizes != self.num_actions:
             differences.append(f"actions: the policy has {self.num_actions}, not {sizes}")
         if differences:
             raise OnnxPolicyError(
-                f"The policy {self.path} was trained for another environment. "
+                f"Policy {self.path} was trained in a different environment. "
                 + "; ".join(differences)
                 + "."
             )
 
     def _group_differences(self, env: ManagerBasedRlEnv) -> list[str]:
-        """Return, one text each, the groups of observations that the environment has not."""
+        """Return a message for each observation group that the environment lacks."""
         groups = self._named_groups or []
         if not groups and not self.image_shapes:
             return []
@@ -586,16 +586,16 @@ class OnnxPolicy:
         is_known = len(flat) <= 1 and len(flat) + len(self.image_shapes) == len(inputs) > 0
         if not is_known or max(batches) > 1:
             raise OnnxPolicyError(
-                f"The actions of the policy {self.path} depend on the inputs {list(inputs)} of sizes "
-                f"{list(inputs.values())}; one flat input, any number of images and a memory (`h_in` "
-                "with an output `h_out`), for one environment or any number, can be played here. "
-                "Play the checkpoint (model_<iteration>.pt) instead."
+                f"Policy {self.path}: expected at most one flat input, any number of images and a hidden "
+                "state (`h_in` with an output `h_out`), with batch size 1 or dynamic, got inputs "
+                f"{list(inputs)} of sizes {list(inputs.values())}; play the checkpoint "
+                "(model_<iteration>.pt) instead."
             )
         # The size of a dynamic dimension reads 0.
         self._is_for_one = max(batches) == 1
 
     def _run(self, inputs: dict[str, np.ndarray], rows: slice) -> list[np.ndarray]:
-        """Return the actions and the next memory of some environments."""
+        """Return the actions and the next hidden state of environments `rows`."""
         feed = {name: value[rows] for name, value in inputs.items()}
         feed |= {name: value[:, rows] for name, value in self._memory.items()}
         return self._session.run(self._outputs, feed)
@@ -607,33 +607,35 @@ def _read_model(path: Path) -> Any:
     try:
         model = onnx.load(str(path))
     except FileNotFoundError as error:
-        raise OnnxPolicyError(f"There is no policy {path}.") from error
+        raise OnnxPolicyError(f"Policy {path} not found.") from error
     except Exception as error:
         raise OnnxPolicyError(
-            f"{path} is not an ONNX file that can be read: {_first_line(error)}"
+            f"Policy {path} is not an ONNX file that can be read: {_first_line(error)}"
         ) from error
     if not model.graph.node:
-        raise OnnxPolicyError(f"{path} is not an ONNX file that can be read: it has no graph.")
-    # Not refused, because people optimize graphs.
+        raise OnnxPolicyError(
+            f"Policy {path} is not an ONNX file that can be read: it has no graph."
+        )
+    # A warning only, because users optimize graphs.
     written = {item.key: item.value for item in model.metadata_props}.get(DIGEST_KEY)
     if written is not None and written != initializers_digest(model):
         logger.warning(
-            "The weights in %s are not those that were exported (%s differs): the file was edited or "
-            "damaged.", path, DIGEST_KEY,
+            "The weights in %s are not those exported (%s differs): the file was edited or damaged.",
+            path, DIGEST_KEY,
         )  # fmt: skip
     return model
 
 
 def _make_session(path: Path, model: Any, num_envs: int) -> Any:
-    """Return a session of onnxruntime with as many threads as the policy is worth."""
+    """Return an onnxruntime session; its number of threads depends on the size of the policy."""
     import onnxruntime
 
     weights = sum(math.prod(tensor.dims) for tensor in model.graph.initializer)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch_threads(weights, num_envs)
-    # Threads that wait by spinning take the cores of the physics.
+    # Spinning threads would take cores from the physics.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Errors are raised; they need not be printed too.
+    # Fatal errors only: errors are raised as exceptions.
     options.log_severity_level = 4
     try:
         return onnxruntime.InferenceSession(
@@ -641,22 +643,22 @@ def _make_session(path: Path, model: Any, num_envs: int) -> Any:
         )
     except Exception as error:
         raise OnnxPolicyError(
-            f"The policy {path} cannot be computed: {_first_line(error)}. The file is damaged, or "
-            "onnxruntime does not know it. Play the checkpoint (model_<iteration>.pt) instead."
+            f"Policy {path} cannot be run: {_first_line(error)}. The file is damaged, or not supported "
+            "by onnxruntime; play the checkpoint (model_<iteration>.pt) instead."
         ) from error
 
 
 def _keep_only(graph: Any, outputs: Sequence[str]) -> None:
-    """Remove from `graph`, in place, everything that `outputs` do not depend on."""
+    """Remove from `graph`, in place, all nodes, weights and inputs that `outputs` do not depend on."""
     needed = set(outputs)
-    # Nodes of a graph are in the order in which they are computed.
+    # Nodes of a graph are in order of computation.
     for index in reversed(range(len(graph.node))):
         node = graph.node[index]
         if needed.intersection(node.output):
             needed.update(node.input)
         else:
             del graph.node[index]
-    # Earlier versions of the format list weights among the inputs too.
+    # Earlier versions of the format also list weights as inputs.
     weights = {tensor.name for tensor in graph.initializer}
     for values, kept in ((graph.initializer, needed), (graph.input, needed - weights)):
         for index in reversed(range(len(values))):
@@ -680,10 +682,10 @@ def _first_line(error: Exception) -> str:
 
 
 def _alike(one: str, other: str) -> bool:
-    """Whether two properties say the same: words exactly, numbers nearly."""
+    """Return True if two properties agree: words exactly, numbers within a tolerance."""
     ours, theirs = one.replace(";", ",").split(","), other.replace(";", ",").split(",")
     if len(ours) == 1 and len(theirs) > 1:
-        # One number for all components.
+        # A scalar applies to all components.
         ours *= len(theirs)
     return len(ours) == len(theirs) and all(map(_same, ours, theirs))
 

@@ -1,4 +1,4 @@
-"""The environment as Gymnasium wants to see it: a vector environment, in NumPy or in torch.
+"""Gymnasium vector environment around `ManagerBasedRlEnv`, with NumPy arrays or torch tensors.
 
 Needs Gymnasium (`pip install "mjlab[gymnasium]"`).
 """
@@ -28,37 +28,37 @@ def gymnasium_env(
     clip_actions: float | None = None,
     tensors: bool = False,
 ) -> GymnasiumVectorEnv:
-    """Return `env` as a Gymnasium vector environment; closing that closes `env`.
+    """Return `env` as a Gymnasium vector environment; closing it closes `env`.
 
     Args:
-        env: The environment.
-        group: Observation group that is the observation. None: all groups, as a `Dict`.
-        clip_actions: Actions are clamped to plus and minus this, and the action space has these
-            bounds. None: neither.
+        env: Environment.
+        group: Observation group used as the observation. None: all groups, as a `Dict`.
+        clip_actions: Bound c: actions are clamped to [-c, c], also in the action space. None:
+            unbounded.
         tensors: Return torch tensors on the environment's device instead of NumPy arrays.
 
     Raises:
-        ValueError: no such group, or `clip_actions` is not positive.
+        ValueError: the group is unknown, or `clip_actions` is not positive.
     """
     return GymnasiumVectorEnv(env, group, clip_actions, tensors)
 
 
 class GymnasiumVectorEnv(VectorEnv):
-    """A `ManagerBasedRlEnv` with Gymnasium's vector interface; see `gymnasium_env`.
+    """`ManagerBasedRlEnv` with Gymnasium's vector interface; see `gymnasium_env`.
 
-    Environments are reset in the step in which their episode ends (`AutoresetMode.SAME_STEP`), and
-    `infos` of that step have what the episode ended with, as Gymnasium's own vector environments:
+    Environments are reset in the step that ends their episode (`AutoresetMode.SAME_STEP`). The
+    `infos` of that step hold the final values, as in Gymnasium's vector environments:
 
-    - `final_obs`: object array (N,) with the last observation where an episode ended, None elsewhere.
-      Where the physics diverged it is the observation before the step.
+    - `final_obs`: object array (N,) with the last observation of episodes that ended, else None.
+      If the physics diverged, the observation before the step.
     - `final_info`: `episode_return` and `episode_length` (N,) of the episodes that ended.
-    - `_final_obs`, `_final_info`, and within `final_info` `_episode_return` and `_episode_length`: (N,) bool,
-      where an episode ended.
+    - `_final_obs`, `_final_info`, and within `final_info` `_episode_return` and `_episode_length`: (N,)
+      bool, True if the episode ended.
 
-    If the environment has `auto_reset=False`, nothing is reset (`AutoresetMode.DISABLED`); episodes that ended are
-    to be reset by `reset(options={"reset_mask": mask})`.
+    With `auto_reset=False` environments are not reset (`AutoresetMode.DISABLED`); reset those that
+    ended by `reset(options={"reset_mask": mask})`.
 
-    Of a task with `is_finite_horizon`, episodes that run out of time count as terminated.
+    With `is_finite_horizon`, time-outs count as terminations.
 
     Rewards (N,) are float32. Arrays belong to the caller: later steps do not write to them.
     """
@@ -81,7 +81,7 @@ class GymnasiumVectorEnv(VectorEnv):
             "render_fps": core.metadata["render_fps"],
             "autoreset_mode": AutoresetMode.SAME_STEP if self._resets else AutoresetMode.DISABLED,
         }
-        # TorchRL looks for it where Gymnasium's own vector environments have it.
+        # TorchRL reads this attribute of Gymnasium's vector environments.
         self.autoreset_mode = self.metadata["autoreset_mode"]
         self.single_observation_space = observation_space(core, group)
         self.single_action_space = action_space(core, clip_actions)
@@ -96,14 +96,14 @@ class GymnasiumVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start new episodes everywhere, or where `options["reset_mask"]` (N,) bool is true.
+        """Reset all environments, or those with `options["reset_mask"]` (N,) bool.
 
-        A `seed` starts all over: curricula and what else outlasts episodes are as they were at the
-        first `reset` with one, and every random number generator of the process (Python, NumPy,
-        torch) is seeded. What was randomized when the environment was built stays.
+        A `seed` restores the state of the first `reset` with a seed, including curricula and other
+        state that outlasts episodes, and seeds every random number generator of the process (Python,
+        NumPy, torch). Randomizations made when the environment was built stay.
 
         Raises:
-            ValueError: the mask has another shape or type, or comes with a seed.
+            ValueError: the mask has the wrong shape or type, or is combined with a seed.
         """
         super().reset(seed=seed)
         mask = torch.ones(self.num_envs, dtype=torch.bool)
@@ -111,7 +111,7 @@ class GymnasiumVectorEnv(VectorEnv):
             if seed is not None:
                 raise ValueError("reset: expected a seed or a reset_mask, got both.")
             mask = torch.as_tensor(options["reset_mask"])
-            # Numbers would be taken for ids.
+            # Integers would be interpreted as ids.
             if mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
                 raise ValueError(
                     f"reset_mask: expected ({self.num_envs},) bool, got {tuple(mask.shape)} "
@@ -120,8 +120,8 @@ class GymnasiumVectorEnv(VectorEnv):
         mask = mask.to(self.device)
         if seed is not None:
             core = self.env.unwrapped
-            # Loading compares the shapes of observations, and writes into them: not into those that
-            # the caller has.
+            # Loading compares the shapes of observations and writes to them; the reset makes new
+            # tensors, so that those of the caller are not changed.
             core.reset()
             if self._first_state is None:
                 self._first_state = copy.deepcopy(core.state_dict())
@@ -158,7 +158,7 @@ class GymnasiumVectorEnv(VectorEnv):
         return self._shown(self._observations), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return the image of the view of all environments, as a tuple of one; None without a render mode."""
+        """Return one image of all environments, in a tuple; None without a render mode."""
         image = self.env.render()
         return None if image is None else (image,)
 
@@ -174,7 +174,7 @@ class GymnasiumVectorEnv(VectorEnv):
         before: dict[str, Any],
         extras: dict[str, Any],
     ) -> None:
-        """Add to `infos` what the episodes of environments `ended` (N,) ended with."""
+        """Add final observations, returns and lengths of environments `ended` (N,) to `infos`."""
         final = np.full(self.num_envs, None, dtype=object)
         rows = ended.nonzero().flatten()
         ids = rows[:0]
@@ -183,7 +183,7 @@ class GymnasiumVectorEnv(VectorEnv):
             shown = self._shown(extras["final_observations"])
             for position, row in enumerate(ids.tolist()):
                 final[row] = _row(shown, position)
-        # Those without a final observation diverged.
+        # Environments without a final observation diverged.
         diverged = rows[~torch.isin(rows, ids)]
         if len(diverged) > 0:
             shown = self._shown(_row(before, diverged))
@@ -203,7 +203,7 @@ class GymnasiumVectorEnv(VectorEnv):
         }
 
     def _shown(self, observations: dict[str, Any]) -> Any:
-        """Return observations as they are given to the caller: those of the group, as arrays."""
+        """Return the observations of the group, as arrays for the caller."""
         return self._arrays(observations if self._group is None else observations[self._group])
 
     def _arrays(self, values: Any) -> Any:
@@ -218,13 +218,13 @@ def step_env(
     """Step a `ManagerBasedRlEnv` for a library that keeps the results.
 
     Args:
-        env: The environment.
-        actions: Shape (N, A).
-        limit: Actions are clamped to plus and minus this; None: they are not.
+        env: Environment.
+        actions: Actions, (N, A).
+        limit: Bound c: actions are clamped to [-c, c]. None: unbounded.
 
     Returns:
-        The results of `env.step`, which later steps do not write to. With `is_finite_horizon`, episodes
-        that run out of time are terminated and not truncated.
+        Results of `env.step`; later steps do not write to them. With `is_finite_horizon`, time-outs
+        are terminations instead of truncations.
     """
     if limit is not None:
         actions = actions.clamp(-limit, limit)
@@ -246,10 +246,10 @@ def step_env(
 def observation_space(env: ManagerBasedRlEnv, group: str | None = None) -> gymnasium.Space:
     """Return the space of one environment's observations: a `Dict` of all groups, or one group's.
 
-    Bounds are those of terms with a `clip`, times their scale.
+    Bounds are the `clip` of terms, times their scale.
 
     Raises:
-        ValueError: no such group.
+        ValueError: the group is unknown.
     """
     manager = env.observation_manager
     names = list(manager.active_terms)
@@ -260,7 +260,7 @@ def observation_space(env: ManagerBasedRlEnv, group: str | None = None) -> gymna
 
 
 def action_space(env: ManagerBasedRlEnv, limit: float | None = None) -> gymnasium.spaces.Box:
-    """Return the space of one environment's actions (A,), within plus and minus `limit` if there is one.
+    """Return the space of one environment's actions (A,), within [-`limit`, `limit`]; None: unbounded.
 
     Raises:
         ValueError: `limit` is not positive.
@@ -292,7 +292,7 @@ def _group_space(manager: ObservationManager, group: str) -> gymnasium.Space:
 def _term_bounds(
     manager: ObservationManager, group: str, term: str, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest and largest value of each entry of a term."""
+    """Return the lower and upper bound of each entry of a term."""
     cfg = manager.get_term_cfg(group, term)
     if cfg.clip is None:
         return np.full(shape, -np.inf, np.float32), np.full(shape, np.inf, np.float32)
@@ -309,7 +309,7 @@ def _term_bounds(
 
 
 def _row(values: Any, row: Any) -> Any:
-    """Return a row of arrays, or several."""
+    """Return one or more rows of nested arrays."""
     if isinstance(values, dict):
         return {name: _row(value, row) for name, value in values.items()}
     return values[row]

@@ -1,4 +1,4 @@
-"""Learners by name, and the config of one made from the config of another."""
+"""Learners by name, and conversion of configs between learners."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from mjlab.utils.errors import check_exists
 Learner = Literal["ppo", "sac", "distillation"]
 
 _MIRROR_FUNCTION = "data_augmentation_func"
-# Fields of a run whose values suit one learner only.
+# Fields of a run with learner-specific values.
 _PACE = frozenset(("num_steps_per_env", "max_iterations", "save_interval"))
 
 
 def learner_of(cfg: RslRlBaseRunnerCfg) -> Learner:
-    """Return the learner of a config: `ppo` unless it is one of another."""
+    """Return the learner of a config; `ppo` by default."""
     if isinstance(cfg, RslRlDistillationRunnerCfg):
         return "distillation"
     return "sac" if isinstance(cfg, RslRlOffPolicyRunnerCfg) else "ppo"
 
 
 def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCfg:
-    """Return `cfg` if it is of `learner`, else a config of `learner` for the same run.
+    """Return `cfg` if its learner is `learner`, else a config of `learner` for the same run.
 
-    The fields of `RslRlBaseRunnerCfg` are copied, and the function that makes mirror images.
-    Networks and algorithm have the defaults of the learner, but for distillation: there the teacher is
-    the actor of `cfg`, and the student a network like it, with the same observations.
+    The fields of `RslRlBaseRunnerCfg` and the symmetry function are copied. Networks and algorithm
+    have the learner's defaults, except for distillation: the teacher is the actor of `cfg`, and the
+    student has the same network and observations.
 
     Raises:
         ValueError: the learner is unknown; or is SAC, and a network of `cfg` is recurrent or has an
-            image encoder; or is distillation, and `cfg` is not one of PPO.
+            image encoder; or is distillation, and the learner of `cfg` is not PPO.
     """
     check_exists("learner", learner, get_args(Learner))
     if learner_of(cfg) == learner:
@@ -47,8 +47,8 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
     if learner == "distillation":
         if learner_of(cfg) != "ppo":
             raise ValueError(
-                f"distillation: expected a teacher of the learner 'ppo', got one of "
-                f"{learner_of(cfg)!r}; use another profile, or none."
+                f"distillation: expected a teacher trained with the learner 'ppo', got "
+                f"{learner_of(cfg)!r}; use a different profile, or no profile."
             )
         teacher: RslRlModelCfg = copy.deepcopy(getattr(cfg, "actor", RslRlModelCfg()))
         groups = cfg.obs_groups.get("actor", ("actor",))
@@ -84,10 +84,10 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
 
 
 def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBaseRunnerCfg:
-    """Return a copy of `cfg` with what `other` says of the task, such as its evaluation.
+    """Return a copy of `cfg` with the task-specific fields of `other`, such as its evaluation.
 
-    The number of iterations, their length and the interval of checkpoints are those of `cfg`, and so
-    are the observation groups if the networks have other names.
+    The number of iterations, steps per iteration and save interval are those of `cfg`, as are the
+    observation groups if the networks have different names.
     """
     cfg = copy.deepcopy(cfg)
     for name, value in _shared_fields(other, learner_of(cfg)).items():
@@ -97,7 +97,7 @@ def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBase
 
 
 def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
-    """Return `cfg` as the dict of a runner that acts and does not learn: with the least replay."""
+    """Return `cfg` as the dict of a runner that acts but does not learn: with a replay of one step."""
     acting = asdict(cfg)
     if learner_of(cfg) == "sac":
         acting["algorithm"]["replay_steps"] = 1
@@ -105,9 +105,9 @@ def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
 
 
 def _shared_fields(cfg: RslRlBaseRunnerCfg, learner: Learner) -> dict[str, Any]:
-    """Return copies of the fields of `cfg` that a config of `learner` has too.
+    """Return copies of the fields that `cfg` shares with a config of `learner`.
 
-    Not the observation groups if the networks have other names.
+    The observation groups are left out if the networks have different names.
     """
     shared = {
         field.name: copy.deepcopy(getattr(cfg, field.name)) for field in fields(RslRlBaseRunnerCfg)

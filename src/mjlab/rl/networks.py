@@ -1,6 +1,6 @@
-"""Networks of a run: checks against the observations, settings completed, image encoders shared.
+"""Checks of networks against observations, completion of their settings, shared image encoders.
 
-rsl_rl would fail on most of what is checked here too, but later and without naming the setting.
+rsl_rl also fails on most of the errors checked here, but later and without naming the setting.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _SYMMETRY_KEYS = {
     _SYMMETRY_FUNCTION, "use_data_augmentation", "use_mirror_loss", "mirror_loss_coeff"
 }  # fmt: skip
 _SYMMETRY_EXAMPLE = (
-    'An example is {"data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right", '
-    '"use_data_augmentation": True}; None is without.'
+    'Example: {"data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right", '
+    '"use_data_augmentation": True}; None disables it.'
 )
 
 
@@ -43,13 +43,13 @@ def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
     """Check a runner's config against the observations of `env`, and complete it in place.
 
     Args:
-        env: The environments, as rsl_rl's `VecEnv`.
+        env: Environments, as rsl_rl's `VecEnv`.
         cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
 
     Raises:
         ValueError: see `check_networks` and `check_symmetry`.
     """
-    # rsl_rl's constructors take these only if they are used.
+    # rsl_rl's constructors accept these keys only if they are used.
     for name in _MODELS:
         model = cfg.get(name)
         if isinstance(model, dict):
@@ -64,14 +64,14 @@ def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
 
 
 def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
-    """Refuse networks that cannot take their observations.
+    """Check that networks can process their observations.
 
     Args:
         observations: Observations of the environment.
-        cfg: The runner's config as a dict.
+        cfg: Runner config as a dict.
 
     Raises:
-        ValueError: naming the network and the group of observations, and what to do.
+        ValueError: a network does not fit; the message names network, observation group and remedy.
     """
     if "replay_steps" in cfg["algorithm"]:
         _check_sac_models(observations, cfg)
@@ -79,7 +79,7 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
     if isinstance(student, dict) and student.get("distribution_cfg") is None:
         raise ValueError(
             "agent.student distribution_cfg: expected a distribution, got None; use "
-            "gaussian_distribution(0.1), whose deviation is that of the actions while learning."
+            "gaussian_distribution(0.1), with the standard deviation of the actions in training."
         )
     shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
     images = {
@@ -90,10 +90,10 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
     actor, critic = images.get("actor"), images.get("critic")
     if shared and (actor is None or critic is None or set(actor) != set(critic)):
         raise ValueError(
-            "algorithm.share_cnn_encoders is True, so actor and critic need image encoders for the "
-            f"same groups; the actor has them for {list(actor or ()) or 'none'}, the critic for "
-            f"{list(critic or ()) or 'none'}. Give both the same image groups in obs_groups and a "
-            "CNN class, or set share_cnn_encoders=False."
+            "algorithm.share_cnn_encoders: expected actor and critic with image encoders for the same "
+            f"groups, got {list(actor or ()) or 'none'} for the actor and "
+            f"{list(critic or ()) or 'none'} for the critic; use the same image groups in obs_groups "
+            "and a CNN class for both, or share_cnn_encoders=False."
         )
     for model in images:
         settings = cfg[model]
@@ -106,12 +106,12 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
-    """Raise ValueError if PPO's mini-batches would be empty: the loss is NaN, or nothing is learned."""
+    """Raise ValueError if PPO's mini-batches would be empty: the loss is NaN, or no update is made."""
     algorithm = cfg["algorithm"]
-    # Those of packages may divide their data as they like.
+    # Algorithms of other packages may divide their data differently.
     if resolve_callable(algorithm["class_name"]) is not PPO:
         return
-    # rsl_rl keeps the steps of an environment together for networks that remember them.
+    # rsl_rl does not split the steps of an environment for recurrent networks.
     kinds = [resolve_callable(cfg[model]["class_name"]) for model in ("actor", "critic")]
     is_recurrent = any(getattr(kind, "is_recurrent", False) for kind in kinds)
     steps = cfg["num_steps_per_env"]
@@ -127,30 +127,31 @@ def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
 
 
 def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
-    """Let the function of `symmetry_cfg` mirror the observations once.
+    """Check the function of `symmetry_cfg` by mirroring the observations once.
 
     Args:
-        env: The environments.
-        observations: Their observations, a TensorDict of batch size (N,).
+        env: Environments.
+        observations: Observations, a TensorDict of batch size (N,).
         cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
 
     Raises:
         ValueError: a setting is missing or unknown, the function does not exist, or it does not
-            return the given rows and as many or more mirrored ones.
+            return its input rows and one or more mirrored copies of them.
     """
     symmetry = cfg["algorithm"].get("symmetry_cfg")
     if not symmetry:
         return
     if _SYMMETRY_FUNCTION not in symmetry or not set(symmetry) <= _SYMMETRY_KEYS:
         raise ValueError(
-            f"symmetry_cfg has {', '.join(map(str, symmetry))}; it needs {_SYMMETRY_FUNCTION}, and may have "
-            f"{', '.join(sorted(_SYMMETRY_KEYS - {_SYMMETRY_FUNCTION}))}. {_SYMMETRY_EXAMPLE}"
+            f"symmetry_cfg: expected {_SYMMETRY_FUNCTION} and optionally "
+            f"{', '.join(sorted(_SYMMETRY_KEYS - {_SYMMETRY_FUNCTION}))}, got "
+            f"{', '.join(map(str, symmetry))}. {_SYMMETRY_EXAMPLE}"
         )
     try:
         function = resolve_callable(symmetry[_SYMMETRY_FUNCTION])
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(
-            f"symmetry_cfg names the function {symmetry[_SYMMETRY_FUNCTION]!r}, which cannot be imported: "
+            f"symmetry_cfg {_SYMMETRY_FUNCTION}: {symmetry[_SYMMETRY_FUNCTION]!r} cannot be imported: "
             f"{error}. {_SYMMETRY_EXAMPLE}"
         ) from error
     actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
@@ -158,38 +159,41 @@ def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
     rows, action_rows = mirrored.batch_size[0], mirrored_actions.shape[0]
     if rows != action_rows or rows < 2 * env.num_envs or rows % env.num_envs:
         raise ValueError(
-            f"The function {symmetry[_SYMMETRY_FUNCTION]!r} of symmetry_cfg returned {rows} observations and "
-            f"{action_rows} actions for {env.num_envs} environments; it has to return the given ones "
-            "and as many mirror images of all of them."
+            f"symmetry_cfg {_SYMMETRY_FUNCTION} {symmetry[_SYMMETRY_FUNCTION]!r}: expected the original "
+            f"and the mirrored rows of {env.num_envs} environments, got {rows} observations and "
+            f"{action_rows} actions."
         )
 
 
 @contextlib.contextmanager
 def shared_parameters_allowed() -> Generator[None]:
-    """Let rsl_rl hand parameters of shared encoders to its optimizer twice; see `deduplicate_parameters`."""
+    """Allow rsl_rl to pass parameters of shared encoders to its optimizer twice.
+
+    Call `deduplicate_parameters` afterwards.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*duplicate parameters")
         yield
 
 
 def deduplicate_parameters(optimizer: torch.optim.Optimizer) -> None:
-    """Make `optimizer`, before its first step, change each parameter once a step.
+    """Remove duplicate parameters of `optimizer`, before its first step.
 
-    rsl_rl gives it the parameters of the actor and those of the critic, hence those of encoders
-    that both share twice, and each step would move them twice by the same gradient.
+    rsl_rl passes the parameters of actor and critic, hence those of shared encoders twice; each
+    step would apply their gradient twice.
     """
     for group in optimizer.param_groups:
         group["params"] = list(dict.fromkeys(group["params"]))
 
 
 def _check_sac_models(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
-    for model, needed in _SAC_MODELS.items():
+    for model, base in _SAC_MODELS.items():
         name = cfg[model]["class_name"]
         kind = resolve_callable(name)
-        if not (isinstance(kind, type) and issubclass(kind, needed)):
+        if not (isinstance(kind, type) and issubclass(kind, base)):
             raise ValueError(
-                f"agent.{model} class_name: expected {needed.__module__}:{needed.__name__} or a "
-                f"subclass for the learner 'sac', got {name!r}; leave it out, or use --learner ppo."
+                f"agent.{model} class_name: expected {base.__module__}:{base.__name__} or a "
+                f"subclass for the learner 'sac', got {name!r}; omit it, or use --learner ppo."
             )
         for group in (cfg.get("obs_groups") or {}).get(model, (model,)):
             value = observations.get(group, None)
@@ -204,15 +208,15 @@ def _check_sac_models(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
 def _check_model(
     observations: TensorDict, cfg: Mapping[str, Any], model: str, shared: bool
 ) -> tuple[str, ...] | None:
-    """Check one network; return the image groups that it encodes, None without encoders."""
-    given = (cfg.get("obs_groups") or {}).get(model, (model,))
-    missing = [name for name in given if name not in observations]
+    """Check one network; return the image groups it encodes, None without encoders."""
+    names = (cfg.get("obs_groups") or {}).get(model, (model,))
+    missing = [name for name in names if name not in observations]
     if missing and model in (cfg.get("obs_groups") or {}):
         raise ValueError(
-            f"obs_groups[{model!r}] names {missing}, and the observation groups of the environment "
-            f"are {sorted(observations.keys())}."
+            f"obs_groups[{model!r}]: unknown observation groups {missing}. Available: "
+            f"{sorted(observations.keys())}."
         )
-    groups = {name: observations[name] for name in given if name in observations}
+    groups = {name: observations[name] for name in names if name in observations}
     for name, value in groups.items():
         _check_group(name, value)
     images = {name: value for name, value in groups.items() if value.ndim == 4}
@@ -220,22 +224,21 @@ def _check_model(
     if isinstance(kind, type) and issubclass(kind, CNNModel):
         if groups and not images:
             raise ValueError(
-                f"The {model} has image encoders (class_name {cfg[model]['class_name']!r}), and "
-                f"its observation groups {list(groups)} have no images, which are (channels, "
-                "height, width). Use class_name='MLPModel', or add a group of images to "
-                f"obs_groups[{model!r}]."
+                f"agent.{model} class_name {cfg[model]['class_name']!r}: expected images (channels, "
+                f"height, width), got the observation groups {list(groups)} without images; use "
+                f"class_name='MLPModel', or add an image group to obs_groups[{model!r}]."
             )
         if model != "critic" or not shared:
             _check_encoders(model, kind, cfg[model].get("cnn_cfg"), images)
         return tuple(images)
-    # Models of other packages may take what they like.
+    # Models of other packages may accept images.
     if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
         first = next(iter(images))
         raise ValueError(
-            f"The {model} (class_name {cfg[model]['class_name']!r}) takes flat observations only, "
-            f"and its observation group {first!r} holds images of shape "
-            f"{tuple(images[first].shape[1:])}. Give it an image encoder ({_CNN_EXAMPLE}), or "
-            f"take {first!r} out of obs_groups[{model!r}]."
+            f"agent.{model} class_name {cfg[model]['class_name']!r}: expected flat observations, got "
+            f"the observation group {first!r}, which holds images of shape "
+            f"{tuple(images[first].shape[1:])}; use an image encoder ({_CNN_EXAMPLE}), or remove "
+            f"{first!r} from obs_groups[{model!r}]."
         )
     return None
 
@@ -243,24 +246,24 @@ def _check_model(
 def _check_group(name: str, value: Any) -> None:
     if not isinstance(value, torch.Tensor):
         raise ValueError(
-            f"The observation group {name!r} is a dict of {sorted(value.keys())}, and networks "
-            "take tensors. Set concatenate_terms=True, or make a group of each term."
+            f"Observation group {name!r}: expected a tensor, got a dict of {sorted(value.keys())}; use "
+            "concatenate_terms=True, or one group per term."
         )
     if value.ndim not in (2, 4):
         raise ValueError(
-            f"The observation group {name!r} has shape {tuple(value.shape[1:])} for each "
-            "environment; networks take flat observations (size,) and images (channels, height, "
-            "width). Flatten it (flatten_history_dim=True where it is a history)."
+            f"Observation group {name!r}: expected flat observations (size,) or images (channels, "
+            f"height, width), got shape {tuple(value.shape[1:])} per environment; flatten it "
+            "(flatten_history_dim=True for a history)."
         )
     if not value.is_floating_point():
         raise ValueError(
-            f"The observation group {name!r} is of {value.dtype}, and networks take floating-point "
-            "numbers. Convert it in its observation term."
+            f"Observation group {name!r}: expected floating-point numbers, got {value.dtype}; convert "
+            "them in the observation term."
         )
 
 
 def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: dict[str, torch.Tensor]) -> None:
-    """Build each encoder of `model` once, without memory."""
+    """Check each encoder of `model` by building it once, without allocating memory."""
     name = f"agent.{model} cnn_cfg"
     if not cnn_cfg or not isinstance(cnn_cfg, dict):
         raise ValueError(
@@ -270,31 +273,30 @@ def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: dict[str, torc
         extra = [key for key in SPATIAL_SOFTMAX_KEYS if key in settings]
         if extra and kind is CNNModel:
             raise ValueError(
-                f"{name} has {extra}, and class_name='CNNModel' has no spatial softmax. Take them "
-                "out, or use class_name='mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel'."
+                f"{name}: {extra} not supported by class_name='CNNModel'; remove them, or use "
+                "class_name='mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel'."
             )
         temperature = settings.get("spatial_softmax_temperature", 1.0)
         check_positive(f"{name} spatial_softmax_temperature", temperature)
         settings = {k: v for k, v in settings.items() if k not in SPATIAL_SOFTMAX_KEYS}
         shape = tuple(images[group].shape[1:])
         try:
-            # On the meta device nothing is computed and no random number is drawn.
+            # The meta device neither computes nor draws random numbers.
             with torch.device("meta"):
                 channels, height, width = shape
                 CNN((height, width), channels, **settings)(torch.empty(1, *shape))
         except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
             raise ValueError(
-                f"{name} makes no encoder for the images {group!r} of shape {shape}: "
-                f"{str(error).splitlines()[0]}. The settings are {settings}; images have to be "
-                "large enough for all layers."
+                f"{name}: expected settings of an encoder for the images {group!r} of shape {shape}, "
+                f"large enough for all layers, got {settings}: {str(error).splitlines()[0]}."
             ) from error
 
 
 def _complete_image_settings(observations: TensorDict, cfg: dict[str, Any]) -> None:
-    """Edit a runner's config, in place, where rsl_rl would fail on settings without effect.
+    """Edit settings without effect that make rsl_rl fail, in place.
 
-    A network that sees images only has nothing to normalize, since images never are. A critic that
-    shares the actor's encoders needs no settings for its own.
+    Images are never normalized, so networks with images only do not normalize observations. A
+    critic that shares the actor's encoders needs no encoder settings.
     """
     for model in _MODELS:
         groups = (cfg.get("obs_groups") or {}).get(model, ())

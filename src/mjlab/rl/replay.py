@@ -1,4 +1,4 @@
-"""The replay storage of the off-policy learner: the last steps of every environment."""
+"""Replay buffer of the off-policy learner: the last steps of every environment."""
 
 from __future__ import annotations
 
@@ -17,52 +17,53 @@ from mjlab.utils.errors import check_count
 
 logger = logging.getLogger(__name__)
 
-# How an environment step ended, from the learner's view.
-_GOES_ON, _TERMINATED, _TIMED_OUT, _CUT_OFF = range(4)
-# Time-outs are rare: for one step in so many there is room for the observation an episode ended in.
+# Ends of environment steps: episode continues, terminated, timed out with a known final observation,
+# or continued with an unknown observation.
+_CONTINUES, _TERMINATED, _TIMED_OUT, _CUT_OFF = range(4)
+# Steps per slot for final observations: time-outs are rare.
 _STEPS_PER_TIME_OUT = 32
 
 
 @dataclass
 class Batch:
-    """Transitions drawn from the replay, each over one environment step or several."""
+    """Transitions sampled from the replay buffer, each over one or more environment steps."""
 
     observations: TensorDict
-    """Observation groups (B, numbers) before the transition."""
+    """Observation groups before the transition, (B, size)."""
     actions: torch.Tensor
-    """Actions (B, A)."""
+    """Actions, (B, A)."""
     returns: torch.Tensor
-    """Discounted sums of rewards (B,)."""
+    """Discounted sums of rewards, (B,)."""
     discounts: torch.Tensor
-    """Factor (B,) of the value of `next_observations`; 0 where the episode was terminated."""
+    """Discount of the value of `next_observations`, (B,); 0 for terminated episodes."""
     next_observations: TensorDict
-    """Observation groups (B, numbers) after the transition."""
+    """Observation groups after the transition, (B, size)."""
     weights: torch.Tensor
-    """Weight (B,) in the loss: 0 where it is not known what followed, else 1."""
+    """Weight in the loss, (B,): 0 if the next observation is unknown, else 1."""
 
 
 class ReplayStorage:
-    """The last `num_steps` environment steps of N environments, in a ring.
+    """Ring buffer of the last `num_steps` steps of N environments.
 
-    An observation is stored once: the one after a step is the one before the next step. Where an
-    episode ran out of time, the observation that it ended in is kept apart.
+    Each observation is stored once: the observation after a step is the one before the next step.
+    Final observations of episodes that timed out are stored separately.
 
-    Everything is allocated at once; `num_bytes` says how much that is.
+    All memory is allocated at construction; see `num_bytes`.
     """
 
     def __init__(
         self, num_steps: int, observations: TensorDict, groups: Sequence[str], num_actions: int
     ) -> None:
-        """Take the number of steps and the first observations.
+        """Allocate the buffer and store the first observations.
 
         Args:
-            num_steps: Steps of each environment to keep.
+            num_steps: Capacity, in steps per environment.
             observations: Observations of all environments, of batch size (N,).
-            groups: Names of the groups to keep.
+            groups: Names of the groups to store.
             num_actions: Number of actions A.
 
         Raises:
-            ValueError: there is no step to keep.
+            ValueError: `num_steps` is not positive.
         """
         check_count("SAC replay_steps", num_steps)
         self._num_envs = len(observations)
@@ -80,7 +81,7 @@ class ReplayStorage:
         self._actions = zeros(rows, envs, num_actions)
         self._rewards = zeros(rows, envs)
         self._kinds = zeros(rows, envs, dtype=torch.int8)
-        # Which of all ends that were ever stored belongs to a step that timed out.
+        # Number of the final observation of a step that timed out, among all ever stored.
         self._end_numbers = zeros(rows, envs, dtype=torch.int64)
         self._num_ends_stored = 0
         self._row = 0
@@ -89,26 +90,26 @@ class ReplayStorage:
 
     @property
     def num_filled(self) -> int:
-        """Number of steps stored of each environment."""
+        """Number of steps stored per environment."""
         return self._num_filled
 
     @property
     def num_bytes(self) -> int:
-        """Size of all tensors."""
+        """Size of all tensors, in bytes."""
         return sum(tensor.nbytes for tensor in self._tensors().values())
 
     def start(self, observations: TensorDict) -> None:
-        """Take the observations that the next step starts from, where `add` has not had them.
+        """Set the observations before the next step, if they did not come from `add`.
 
-        Where they are others than those that the last step led to, what that step led to is not
-        known.
+        In environments with observations different from those after the last step, the result of
+        the last step is marked as unknown.
         """
         if self._num_filled > 0:
-            elsewhere = torch.zeros(self._num_envs, dtype=torch.bool, device=self._device)
+            differs = torch.zeros(self._num_envs, dtype=torch.bool, device=self._device)
             for name, stored in self._observations.items():
-                elsewhere |= (stored[self._row] != observations[name]).flatten(1).any(dim=1)
+                differs |= (stored[self._row] != observations[name]).flatten(1).any(dim=1)
             last = self._kinds[self._row - 1]
-            last[elsewhere & (last == _GOES_ON)] = _CUT_OFF
+            last[differs & (last == _CONTINUES)] = _CUT_OFF
         self._put(observations)
 
     def add(
@@ -124,13 +125,13 @@ class ReplayStorage:
         """Store one step of all environments.
 
         Args:
-            actions: (N, A).
-            rewards: (N,).
-            dones: (N,), whether the episode ended.
-            time_outs: (N,), whether it only ran out of time; None: it never does.
-            next_observations: Those to act on next; of the new episode, where one ended.
-            final_ids: (k,), environments of which it is known in what their episode ended.
-            final_observations: Their observations, of batch size (k,).
+            actions: Actions, (N, A).
+            rewards: Rewards, (N,).
+            dones: Nonzero if the episode ended, (N,).
+            time_outs: True if the episode timed out, (N,). None: no time-outs.
+            next_observations: Observations of the next action, after the reset of ended episodes.
+            final_ids: Environments with a final observation, (k,).
+            final_observations: Final observations, of batch size (k,).
         """
         row = self._row
         self._actions[row] = actions
@@ -154,9 +155,9 @@ class ReplayStorage:
     def sample(
         self, size: int, gamma: float, num_steps: int, generator: torch.Generator | None = None
     ) -> Batch:
-        """Draw `size` transitions, each over `num_steps` steps or up to the end of the episode.
+        """Sample `size` transitions, each over `num_steps` steps or up to the end of the episode.
 
-        `gamma` discounts rewards; `generator` is the source of the random numbers.
+        `gamma` is the discount factor, `generator` the random number generator.
         """
         steps = min(num_steps, self._num_filled)
         starts = self._num_filled - steps + 1
@@ -164,7 +165,7 @@ class ReplayStorage:
             starts * self._num_envs, (size,), generator=generator, device=self._device
         )
         envs = drawn % self._num_envs
-        # Steps count from the oldest one.
+        # Steps are counted from the oldest step.
         oldest = self._row - self._num_filled
         first = (oldest + drawn // self._num_envs) % (self._num_steps + 1)
         kind = torch.zeros_like(drawn, dtype=torch.int8)
@@ -173,7 +174,7 @@ class ReplayStorage:
         last = first
         for step in range(steps):
             row = (first + step) % (self._num_steps + 1)
-            runs = kind == _GOES_ON
+            runs = kind == _CONTINUES
             last = torch.where(runs, row, last)
             returns += torch.where(runs, discounts * self._rewards[row, envs], 0.0)
             discounts = torch.where(runs, discounts * gamma, discounts)
@@ -209,17 +210,17 @@ class ReplayStorage:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore `state_dict`.
+        """Restore the contents of `state_dict`.
 
         Raises:
-            ValueError: the state is of other environments, observations or another length; nothing
-                was changed then.
+            ValueError: the state is of different environments, observations or capacity. Nothing was
+                changed.
         """
         own, saved = self._tensors(), state["tensors"]
         expected = {name: tuple(tensor.shape) for name, tensor in own.items()}
         found = {name: tuple(tensor.shape) for name, tensor in saved.items()}
         if expected != found:
-            raise ValueError(f"The saved replay has tensors {found}, and this run's {expected}.")
+            raise ValueError(f"Replay tensors: expected {expected}, got {found}.")
         for name, tensor in own.items():
             tensor.copy_(saved[name])
         self._row = state["row"]
@@ -242,45 +243,45 @@ class ReplayStorage:
 
 
 class ReplayFiles:
-    """The replay beside a checkpoint: `replay_model_100.pt` beside `model_100.pt`.
+    """Replay file of a checkpoint: `replay_model_100.pt` next to `model_100.pt`.
 
-    In a file of its own, because it is a thousand times as large as the networks; only the newest
+    The file is separate because it is a thousand times as large as the networks; only the newest
     checkpoint of a folder has one.
     """
 
     def __init__(self, checkpoint: str | os.PathLike[str]) -> None:
-        """Take the path of the checkpoint."""
+        """Set the path for `checkpoint`."""
         path = Path(checkpoint)
         self.path = path.with_name(f"replay_{path.name}")
-        """The file."""
+        """Path of the replay file."""
 
     def write(self, storage: ReplayStorage) -> None:
         """Write the contents of `storage`.
 
         Raises:
-            CheckpointError: it could not be written.
+            CheckpointError: the file could not be written.
         """
         save_checkpoint(storage.state_dict(), self.path)
 
     def read(self, storage: ReplayStorage) -> None:
-        """Fill `storage`; warn where there is no file, or one of other environments.
+        """Fill `storage`; warn if the file is missing or of different environments.
 
         Raises:
             CheckpointError: the file is damaged.
         """
         if not self.path.exists():
             logger.warning(
-                "The replay starts empty: %s is not there. Learning goes on from new steps only.",
+                "The replay starts empty: %s not found. Training continues from new steps only.",
                 self.path,
             )
             return
         try:
             storage.load_state_dict(load_checkpoint(self.path))
         except (KeyError, ValueError) as error:
-            logger.warning("The replay starts empty, because the saved one does not fit. %s", error)
+            logger.warning("The replay starts empty: the saved replay does not fit. %s", error)
 
     def remove_others(self) -> None:
-        """Delete the replays of the folder's other checkpoints."""
+        """Delete the replay files of the folder's other checkpoints."""
         for other in self.path.parent.glob("replay_model_*.pt"):
             if other != self.path:
                 other.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Log of a run: events for TensorBoard or Weights & Biases, observers, and the state of the code."""
+"""Run logs: TensorBoard or Weights & Biases events, training observers, git diffs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# What the config may also call a service, as rsl_rl's classes.
+# rsl_rl's class names of logging services, accepted by the config.
 _LOGGER_TYPES = {"WandbLogWriter": "wandb", "NeptuneLogWriter": "neptune"}
 # Folders of installed packages.
 _INSTALLED = ("site-packages", "dist-packages")
@@ -33,29 +33,29 @@ _INSTALLED = ("site-packages", "dist-packages")
 
 @dataclass(frozen=True, kw_only=True)
 class IterationStats:
-    """Figures of one finished iteration."""
+    """Statistics of one finished iteration."""
 
     iteration: int
-    """Iterations finished, this one included."""
+    """Number of iterations finished, this one included."""
     total_iterations: int
-    """Iterations that the run is to have."""
+    """Total number of iterations of the run."""
     total_steps: int
-    """Environment steps since the run began, over all environments."""
+    """Number of environment steps since the start of the run, over all environments."""
     collection_time: float
     """Time spent stepping the environments and the policy, in seconds."""
     learning_time: float
     """Time spent updating the policy, in seconds."""
     steps_per_second: float
-    """Environment steps per second, over both."""
+    """Environment steps per second of collection and learning time."""
     time_left: float
     """Estimated time until the last iteration, in seconds."""
     mean_reward: float | None
-    """Mean sum of rewards over the last 100 finished episodes, as the environment scales them;
-    None until one has finished."""
+    """Mean sum of rewards, as scaled by the environment, over the last 100 finished episodes. None
+    until an episode has finished."""
     mean_episode_length: float | None
-    """Mean length of those, in environment steps."""
+    """Mean length of the last 100 finished episodes, in environment steps. None until one finished."""
     mean_step_reward: float
-    """Mean weighted reward of a step of this iteration, before scaling by the step's duration."""
+    """Mean weighted reward per step of this iteration, before scaling by the step's duration."""
     learning_rate: float
     """Learning rate after this iteration."""
     action_std: float
@@ -63,61 +63,61 @@ class IterationStats:
     losses: dict[str, float] = field(default_factory=dict)
     """Mean losses of the update, by name."""
     environment: dict[str, float] = field(default_factory=dict)
-    """Means of what the environment logged, by name (`Episode_Reward/...`, `Metrics/...`)."""
+    """Means of the environment's log entries, by name (`Episode_Reward/...`, `Metrics/...`)."""
 
 
 class TrainingObserver:
-    """Is told what happens during `MjlabOnPolicyRunner.learn`; override what is of interest.
+    """Base class of observers of `MjlabOnPolicyRunner.learn`; override the events of interest.
 
-    Methods are called on the training thread, so they should be quick.
+    Methods are called on the training thread and should be fast.
     """
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
-        """Training starts; `first_iteration` iterations were finished before."""
+        """Handle the start of training; `first_iteration` iterations were finished before."""
 
     def on_iteration(self, stats: IterationStats) -> None:
-        """An iteration has finished."""
+        """Handle a finished iteration."""
 
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
-        """The policy was evaluated after `iteration` iterations; `solved` if it met all conditions.
+        """Handle an evaluation after `iteration` iterations; `solved` if it met all conditions.
 
-        Training does not stop yet: `on_confirmation` follows, unless training goes on anyway.
+        Training does not stop yet: `on_confirmation` follows if `stop_when_solved` is set.
         """
 
     def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
-        """A policy that met all conditions was evaluated in other episodes; `solved` if it did again.
+        """Handle the second evaluation of a solved task, on unused episodes.
 
-        Training stops then.
+        If it is `solved` again, training stops.
         """
 
     def on_checkpoint(self, path: str) -> None:
-        """A checkpoint was written."""
+        """Handle a written checkpoint."""
 
     def on_stop_requested(self, signal_name: str) -> None:
-        """SIGINT, SIGTERM or SIGHUP arrived; the running iteration is being finished."""
+        """Handle SIGINT, SIGTERM or SIGHUP; the current iteration still finishes."""
 
     def on_end(self, reason: str) -> None:
-        """Training ended: `finished`, `solved`, `interrupted` or `failed`."""
+        """Handle the end of training: `finished`, `solved`, `interrupted` or `failed`."""
 
 
 class RunLogger(Logger):
     """rsl_rl's logger, silent on the console and without a GPU synchronization per step.
 
-    What an iteration's steps report stays on the device until `finish_iteration` reads it all at
-    once. Tags in the event files are rsl_rl's, and `Train/mean_step_reward` besides.
+    Step data stays on the device until `finish_iteration` reads all of it at once. Tags in the
+    event files are rsl_rl's and `Train/mean_step_reward`.
 
-    Runners with a loop of their own, written against rsl_rl, call `log` instead.
+    Runners with a custom loop, written against rsl_rl, call `log` instead.
     """
 
     def __init__(self, *args: Any, reward_unit: float = 1.0, **kwargs: Any) -> None:
-        """Take rsl_rl's arguments, and what one unit of weighted reward is worth in the rewards
-        that `process_env_step` gets (the step's duration, where rewards are scaled by it)."""
+        """Set up with rsl_rl's arguments; `reward_unit` is the factor from weighted rewards to those
+        of `process_env_step` (the step's duration if rewards are scaled by it)."""
         super().__init__(*args, **kwargs)
         self._reward_unit = reward_unit
-        # rsl_rl's would be the repository around the virtual environment.
+        # rsl_rl's default is the repository around the virtual environment.
         self.git_status_repos = []
         self._session_time = 0.0
-        # Sums over the running episodes, and those of the last finished ones.
+        # Sums over the running episodes, and buffers of the last finished ones.
         self._episode_sums = [
             (self.cur_reward_sum, self.rewbuffer),
             (self.cur_episode_length, self.lenbuffer),
@@ -130,19 +130,19 @@ class RunLogger(Logger):
         self._finished: list[tuple[torch.Tensor, ...]] = []
         self._step_rewards: list[torch.Tensor] = []
         self._write_failed = False
-        self._has_told_losses = False
+        self._reported_losses = False
         self._thread_hook = threading.excepthook
 
     @property
     def logger_type(self) -> str | None:
-        """Logging service, as the config names it (`tensorboard`, `wandb`, ...).
+        """Logging service, by its config name (`tensorboard`, `wandb`, ...).
 
-        None until `init_logging_writer` has opened one, and in processes that write nothing.
+        None before `init_logging_writer`, and in processes that do not write.
         """
         if self.writer is None:
             return None
-        wanted = self.cfg.get("logger", "tensorboard")
-        name = wanted if isinstance(wanted, str) else wanted["class_name"]
+        service = self.cfg.get("logger", "tensorboard")
+        name = service if isinstance(service, str) else service["class_name"]
         return _LOGGER_TYPES.get(name, name)
 
     @property
@@ -150,24 +150,24 @@ class RunLogger(Logger):
         return bool(self.cfg["algorithm"].get("rnd_cfg"))
 
     def init_logging_writer(self) -> None:
-        """Open the event file, and keep the state of the code of `git_status_repos`.
+        """Open the event file, and write the git diffs of `git_status_repos`.
 
         Raises:
-            RunFolderError: the run folder cannot be written to.
-            ModuleNotFoundError: Weights & Biases is asked for and not installed.
-            ValueError: Weights & Biases did not start a run: nobody is logged in, and the like.
+            RunFolderError: the run folder is not writable.
+            ModuleNotFoundError: Weights & Biases is configured but not installed.
+            ValueError: Weights & Biases did not start a run, for example without a login.
         """
-        wanted = self.cfg.get("logger", "tensorboard")
+        service = self.cfg.get("logger", "tensorboard")
         if self.log_dir is not None and not self.disable_logs:
             ensure_writable_folder(self.log_dir)
-            self.cfg["logger"] = _writer_config(wanted, self.cfg)
-        # Not by rsl_rl, which uploads it wherever it logs to.
+            self.cfg["logger"] = _writer_config(service, self.cfg)
+        # Hidden from rsl_rl: it would upload the diffs to any logging service.
         sources, self.git_status_repos = self.git_status_repos, []
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             try:
                 super().init_logging_writer()
             except Exception as error:
-                # By name, because whoever does not log to it does not import wandb.
+                # Compared by name: wandb is imported only if it is the logging service.
                 if not any(c.__module__.partition(".")[0] == "wandb" for c in type(error).__mro__):
                     raise
                 reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
@@ -177,17 +177,17 @@ class RunLogger(Logger):
                     "--agent.logger tensorboard does without Weights & Biases."
                 ) from error
             finally:
-                # Runners read from their config which service there is.
-                self.cfg["logger"] = wanted
+                # Runners read the service from their config.
+                self.cfg["logger"] = service
                 self.git_status_repos = sources
         if self.log_dir is not None and not self.disable_logs:
             keeps_diff = self.cfg.get("save_git_diff", True)
             for source in self.git_status_repos if keeps_diff else ():
                 diff = write_git_diff(Path(self.log_dir), Path(source))
                 if diff is not None and self.cfg.get("upload_git_diff", False):
-                    # TensorBoard's writer uploads nothing.
+                    # TensorBoard's writer has no `save_file`.
                     getattr(self.writer, "save_file", lambda path: None)(str(diff))
-            # rsl_rl makes the folder in any case.
+            # rsl_rl creates the folder in any case.
             with contextlib.suppress(OSError):
                 Path(self.log_dir, "git").rmdir()
         for line in filter(None, printed.getvalue().splitlines()):
@@ -241,7 +241,7 @@ class RunLogger(Logger):
         action_std: torch.Tensor,
         rnd_weight: float | None,
     ) -> IterationStats:
-        """Write the figures of iteration number `iteration` (from 0), and return them."""
+        """Write the statistics of iteration number `iteration` (from 0), and return them."""
         steps = int(self.cfg["num_steps_per_env"]) * self.num_envs * self.gpu_world_size
         duration = collection_time + learning_time
         self.tot_timesteps += steps
@@ -271,17 +271,17 @@ class RunLogger(Logger):
     def report_broken_losses(self, stats: IterationStats) -> None:
         """Log losses that are NaN or infinite, once."""
         broken = [name for name, value in stats.losses.items() if not math.isfinite(value)]
-        if broken and not self._has_told_losses:
-            self._has_told_losses = True
+        if broken and not self._reported_losses:
+            self._reported_losses = True
             logger.warning(
                 "Losses that are NaN or infinite in iteration %d: %s. Rewards or observations may be too "
-                "large. It is not logged again.", stats.iteration, ", ".join(broken),
+                "large. This warning is logged once.", stats.iteration, ", ".join(broken),
             )  # fmt: skip
 
     def write_scalars(self, scalars: dict[str, float], step: int) -> None:
-        """Write `scalars` at `step` (usually the iteration) to the event file, if there is one.
+        """Write `scalars` at `step` (usually the iteration) to the event file, if it is open.
 
-        A disk that is full does not end training here: the next checkpoint says it clearly.
+        A full disk does not end training here: the next checkpoint raises a clear error.
         """
         if self.writer is None or self._write_failed:
             return
@@ -294,9 +294,9 @@ class RunLogger(Logger):
     def write_evaluation(
         self, result: EvaluationResult, iteration: int, group: str = "Evaluation"
     ) -> None:
-        """Write the figures of an evaluation after iteration number `iteration` (from 0).
+        """Write the results of an evaluation after iteration number `iteration` (from 0).
 
-        `group` is what their tags begin with.
+        `group` is the prefix of the tags.
         """
         scalars = {"mean_return": result.mean_return, "mean_length": result.mean_length}
         if result.success_rate is not None:
@@ -320,7 +320,7 @@ class RunLogger(Logger):
             logger.warning("The event file in %s was not closed: %s", self.log_dir, error)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what the curves of a resumed run need to go on as they were."""
+        """Return the state that continues the curves of a resumed run."""
         state: dict[str, Any] = {
             "total_steps": self.tot_timesteps,
             "total_time": self.tot_time,
@@ -339,7 +339,7 @@ class RunLogger(Logger):
         return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore `state_dict` of a run with as many environments."""
+        """Restore the `state_dict` of a run with the same number of environments."""
         self.load_totals(state)
         self.cur_reward_sum.copy_(state["reward_sums"])
         self.cur_episode_length.copy_(state["episode_lengths"])
@@ -348,13 +348,13 @@ class RunLogger(Logger):
             self.cur_ireward_sum.copy_(state["intrinsic_reward_sums"])
 
     def load_totals(self, state: dict[str, Any]) -> None:
-        """Restore of `state_dict` what does not depend on the number of environments."""
+        """Restore the entries of `state_dict` that do not depend on the number of environments."""
         self.tot_timesteps = state["total_steps"]
         self.tot_time = state["total_time"]
         if self._uses_rnd:
             if "extrinsic_rewards" not in state:
-                # Of an earlier version, or without RND. rsl_rl averages the parts of the reward
-                # wherever it averages the reward, so all of them start with the next episodes.
+                # State of an earlier version, or without RND. rsl_rl averages the reward and its
+                # parts together, so all of them start with the next episodes.
                 return
             self.erewbuffer.extend(state["extrinsic_rewards"])
             self.irewbuffer.extend(state["intrinsic_rewards"])
@@ -404,7 +404,7 @@ class RunLogger(Logger):
         if stats.mean_reward is not None and stats.mean_episode_length is not None:
             scalars["Train/mean_reward"] = stats.mean_reward
             scalars["Train/mean_episode_length"] = stats.mean_episode_length
-            # Weights & Biases has one count of steps, and a time axis of its own.
+            # Weights & Biases has a single step counter and a built-in time axis.
             if self.logger_type != "wandb":
                 over_time["Train/mean_reward/time"] = stats.mean_reward
                 over_time["Train/mean_episode_length/time"] = stats.mean_episode_length
@@ -419,10 +419,10 @@ class RunLogger(Logger):
     def _stop_writing(self, error: BaseException | None) -> None:
         if not self._write_failed:
             self._write_failed = True
-            logger.warning("Figures are no longer written to %s: %s", self.log_dir, error)
+            logger.warning("Metrics are no longer written to %s: %s", self.log_dir, error)
 
     def _on_thread_error(self, args: threading.ExceptHookArgs) -> None:
-        # TensorBoard writes in a thread, whose traceback would come before the error that it causes.
+        # TensorBoard writes in a thread; its traceback would precede the error that it causes.
         is_writer = type(args.thread).__module__.startswith("tensorboard.")
         if is_writer and issubclass(args.exc_type, OSError):
             self._stop_writing(args.exc_value)
@@ -431,10 +431,10 @@ class RunLogger(Logger):
 
 
 def write_git_diff(run_dir: Path, source: Path) -> Path | None:
-    """Write the state of the repository that `source` is in to `git/<repository>.diff`.
+    """Write the git state of the repository of `source` to `git/<repository>.diff`.
 
-    Says so if there are uncommitted changes in it. Returns the file; None if it is there already, or
-    if `source` is in no repository, such as that of an installed package.
+    Uncommitted changes are logged. Returns the file; None if it exists already, or if `source` is
+    outside a repository, such as that of an installed package.
     """
     # A virtual environment within a checkout is not part of it.
     if any(part in _INSTALLED for part in source.parts):
@@ -453,28 +453,28 @@ def write_git_diff(run_dir: Path, source: Path) -> Path | None:
         file.write((text + diff).encode(errors="replace"))
     if diff:
         logger.info(
-            "Uncommitted changes of %s are kept in %s; --agent.save-git-diff False leaves them out.",
+            "Uncommitted changes of %s are saved in %s; --agent.save-git-diff False disables this.",
             root,
             path,
         )
     return path
 
 
-def _writer_config(wanted: str | dict[str, Any], cfg: dict[str, Any]) -> str | dict[str, Any]:
-    """Return what rsl_rl makes the writer from."""
-    if wanted == "wandb":
-        wanted = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
-    is_wandb = isinstance(wanted, dict) and wanted.get("class_name") == "WandbLogWriter"
+def _writer_config(service: str | dict[str, Any], cfg: dict[str, Any]) -> str | dict[str, Any]:
+    """Return rsl_rl's config of the log writer."""
+    if service == "wandb":
+        service = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
+    is_wandb = isinstance(service, dict) and service.get("class_name") == "WandbLogWriter"
     if is_wandb and not cfg.get("upload_git_diff", False):
-        # wandb makes a difference of its own, of the repository around the working folder.
+        # wandb would upload a separate diff, of the repository around the working folder.
         os.environ.setdefault("WANDB_DISABLE_CODE", "true")
-    return wanted
+    return service
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """Return what git prints; nothing if it fails, or is not installed."""
+    """Return the output of git; an empty string if it fails or is not installed."""
     try:
-        told = subprocess.run(
+        result = subprocess.run(
             ["git", *arguments],
             cwd=folder,
             capture_output=True,
@@ -484,4 +484,4 @@ def _git(folder: Path, *arguments: str) -> str:
         )
     except OSError:
         return ""
-    return told.stdout if told.returncode == 0 else ""
+    return result.stdout if result.returncode == 0 else ""

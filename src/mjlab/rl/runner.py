@@ -53,26 +53,26 @@ from mjlab.utils.torch import torch_threads, using_torch_threads
 
 logger = logging.getLogger(__name__)
 
-# Reasons to leave the loop, in the order in which one outweighs another between processes.
+# Reasons to leave the loop, in order of increasing priority between processes.
 _REASONS = ("", "solved", "interrupted")
 
 
 class MjlabOnPolicyRunner(OnPolicyRunner):
-    """Trains a policy with rsl_rl's algorithms.
+    """Runner that trains a policy with rsl_rl's algorithms.
 
-    Unlike rsl_rl's runner it counts iterations in total: `learn(10)` does the same, bit for bit,
-    as `learn(5)`, `load` in a new process, and `learn(10)`. `current_learning_iteration` is the
-    number of iterations finished. Progress goes to `observers` instead of the console.
+    Unlike rsl_rl's runner, it counts total iterations: `learn(10)` is equal, bit for bit, to
+    `learn(5)`, `load` in a new process, and `learn(10)`. `current_learning_iteration` is the number
+    of iterations finished. Progress goes to `observers` instead of the console.
 
     After `learn`, `stop_reason` is `finished`, `solved`, `interrupted` (SIGINT or SIGTERM) or
-    `failed`, and `last_evaluation` the last evaluation's result, if there was one. Of a run that was
-    solved, that is the evaluation that confirmed it.
+    `failed`, and `last_evaluation` is the result of the last evaluation, if any. In a solved run,
+    that is the confirming evaluation.
     """
 
-    # Any: an environment has more than rsl_rl's `VecEnv` says (`unwrapped`).
+    # Any: environments have attributes that rsl_rl's `VecEnv` lacks (`unwrapped`).
     env: Any
 
-    # Set by subclasses whose `save` exports the policy itself.
+    # True in subclasses whose `save` exports the policy.
     exports_on_save = False
 
     def __init__(
@@ -81,14 +81,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Build networks and algorithm.
 
         Args:
-            env: The environments.
-            train_cfg: A `RslRlOnPolicyRunnerCfg` as a dict; it is edited here and by rsl_rl.
-            log_dir: Folder of the run. None: nothing is written.
+            env: Environments.
+            train_cfg: A `RslRlOnPolicyRunnerCfg` as a dict; edited here and by rsl_rl.
+            log_dir: Run folder. None: no files are written.
             device: Device of the networks.
 
         Raises:
-            ValueError: a network cannot take the observations that `obs_groups` gives it, or
-                `symmetry_cfg` has no function that makes mirror images.
+            ValueError: a network cannot process its observation groups, or `symmetry_cfg` has no
+                valid symmetry function.
         """
         prepare_train_cfg(env, train_cfg)
         # rsl_rl prints networks and observation sets.
@@ -112,13 +112,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         self._state_to_resume: dict[str, Any] | None = None
-        # An evaluation is due after the last iteration, and was left out to stop sooner.
+        # True if an evaluation was due after the last iteration but skipped to stop sooner.
         self._owes_evaluation = False
         self._solved_check = SolvedCheck(
             env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
         )
         self._num_threads = self._resolve_threads()
-        # Beside the threads of the physics, waiting ones of OpenMP cost more than they bring.
+        # Waiting OpenMP threads slow down the threads of the physics.
         on_cpu = torch.device(self.device).type == "cpu"
         self._num_collecting_threads = 1 if on_cpu else self._num_threads
         self._watch = RolloutWatch(self.env.unwrapped)
@@ -128,31 +128,31 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train until `num_learning_iterations` iterations are finished IN TOTAL.
 
-        Iterations before a `load` count. SIGINT, SIGTERM and SIGHUP end training after the running
-        iteration; a second one ends the process. Then as at the end a checkpoint that resumes exactly
-        is written, and the policy exported. After an error, weights and optimizer of the last finished
-        iteration are in a checkpoint, which resumes in new episodes.
+        Iterations before a `load` count. SIGINT, SIGTERM and SIGHUP end training after the current
+        iteration; a second signal ends the process. After one signal, as at the end, a checkpoint
+        for exact resume is written and the policy exported. After an error, weights and optimizer of
+        the last finished iteration are in a checkpoint that resumes in new episodes.
 
         Args:
             num_learning_iterations: Total number of iterations.
             init_at_random_ep_len: Start environments at random points of their episodes, so that
-                they do not all reset together. Has no effect where episodes are resumed.
+                they do not reset simultaneously. Without effect if episodes are resumed.
 
         Raises:
-            RunFolderError: the run folder cannot be written to, raised before any training; or it is
-                gone, and the run was saved beside it.
+            RunFolderError: the run folder is not writable, raised before any training; or it was
+                deleted or moved, and the run was saved next to it.
             CheckpointError: a checkpoint could not be written.
             DivergedError: the physics diverged in most environments, or training failed because of it.
             BrokenTermError: a reward or a termination stayed NaN in every environment.
-            ValueError: the environment returned NaN, Weights & Biases started no run, a student has no
-                teacher, or there are more mini-batches than samples.
+            ValueError: the environment returned NaN, Weights & Biases did not start a run, a student
+                has no teacher, or mini-batches outnumber samples.
         """
         if not getattr(self.alg, "teacher_loaded", True):
             raise ValueError(
-                "Distillation: expected a teacher, got none; give its checkpoint by "
-                "--agent.teacher-checkpoint, or call load_teacher."
+                "Distillation: expected a teacher, got none; use --agent.teacher-checkpoint, or "
+                "load_teacher."
             )
-        # Not when the runner is built, which playing does in any number of environments.
+        # Checked here, because runners are also built to play, in any number of environments.
         check_mini_batches(self.env.num_envs, self.cfg)
         first, total, reason = self.current_learning_iteration, num_learning_iterations, ""
         num_steps, save_interval = self.cfg["num_steps_per_env"], self.cfg["save_interval"]
@@ -180,8 +180,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                                     check_nan(observations, rewards, dones)
                                 observations = observations.to(self.device)
                                 rewards, dones = rewards.to(self.device), dones.to(self.device)
-                                credited, told = self._bootstrapped(observations, rewards, extras)
-                                self.alg.process_env_step(observations, credited, dones, told)
+                                credited, infos = self._bootstrapped(observations, rewards, extras)
+                                self.alg.process_env_step(observations, credited, dones, infos)
                                 intrinsic = self.alg.intrinsic_rewards if uses_rnd else None
                                 self.logger.process_env_step(rewards, dones, extras, intrinsic)
                             self._watch.check(num_steps)
@@ -214,19 +214,19 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 if not reason and iteration + 1 < total and iteration % save_interval == 0:
                     self._save_checkpoint()
             rescue.learned = None
-            # A run that is solved as it is resumed leaves a checkpoint as others do.
+            # A resumed run that is solved before its first iteration also writes a checkpoint.
             if self.current_learning_iteration > first or reason == "solved":
                 self._save_checkpoint()
             elif total <= first:
                 logger.warning(
-                    "Nothing to train: the checkpoint has finished %d iterations, and "
-                    "max_iterations, which counts them in, is %d.", first, total,
+                    "Nothing to train: the checkpoint has finished %d iterations, and max_iterations "
+                    "(in total) is %d.", first, total,
                 )  # fmt: skip
             self.stop_reason = reason or "finished"
 
     @contextlib.contextmanager
     def _session(self) -> Generator[StopRequest]:
-        """Be ready to train within the block: files open, signals caught, threads set."""
+        """Prepare training within the block: log files, signal handlers, threads."""
         self.logger.init_logging_writer()
         self.stop_reason = "failed"
         try:
@@ -243,9 +243,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             self._notify("on_end", self.stop_reason)
 
     def _initial_observations(self, init_at_random_ep_len: bool) -> TensorDict:
-        """Return the observations to start from: resumed ones, or those of the environments."""
+        """Return the initial observations: resumed ones, or those of the environments."""
         self.alg.train_mode()
-        # Here and not in the wrapper, which playing and evaluating use as well.
+        # Enabled here instead of in the wrapper, which play and evaluation use as well.
         takes_final = isinstance(self.alg, PPO) or getattr(
             self.alg, "takes_final_observations", False
         )
@@ -254,7 +254,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if self.is_distributed:
             self.alg.broadcast_parameters()
         if self._observations is not None:
-            # `learn` was called before in this process: the environments are where they were.
+            # `learn` was called before in this process: continue the episodes.
             return self._observations
         observations = self._resumed_observations()
         if observations is None:
@@ -268,19 +268,21 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         return observations
 
     def _resumed_observations(self) -> TensorDict | None:
-        """Restore episodes and generators of the checkpoint that was loaded, if there are any."""
+        """Restore episodes and random number generators of the loaded checkpoint, if any."""
         state, self._state_to_resume = self._state_to_resume, None
         if state is None:
             if self.current_learning_iteration > 0:
-                logger.warning("Episodes and random numbers start anew: the checkpoint has none.")
+                logger.warning(
+                    "Episodes and random numbers restart: not contained in the checkpoint."
+                )
             return None
         if self.is_distributed:
             # A checkpoint has the episodes of the first process only.
             logger.warning(
-                "Episodes and random numbers start anew, because several processes share the run."
+                "Episodes and random numbers restart, because several processes share the run."
             )
             self.logger.load_totals(state["logger"])
-            # Otherwise, every session would draw the numbers of the first one again.
+            # Otherwise every session would repeat the random numbers of the first.
             seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
             return None
         try:
@@ -290,17 +292,17 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         except ValueError as error:
             logger.warning(
                 "Weights, optimizer and iteration are resumed, but episodes and random numbers "
-                "start anew, because the saved state does not fit. %s", error,
+                "restart, because the saved state does not fit. %s", error,
             )  # fmt: skip
             return None
 
     def _bootstrapped(
         self, observations: TensorDict, rewards: torch.Tensor, extras: dict[str, Any]
     ) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Return rewards and extras for the algorithm, in which PPO's time-outs are bootstrapped.
+        """Return rewards and extras for the algorithm, with bootstrapped time-outs for PPO.
 
-        At a time-out rsl_rl's PPO adds gamma V(s), s being the observation before the step. With
-        final observations s', gamma V(s') is added here, and these time-outs are marked no more.
+        At a time-out, rsl_rl's PPO adds gamma V(s), with the observation s before the step. With
+        final observations s', gamma V(s') is added here, and `time_outs` is cleared for these.
         """
         is_ours = isinstance(self.alg, PPO) and "time_outs" in extras
         if not is_ours or "final_observations" not in extras:
@@ -308,43 +310,43 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         final = extras["final_observations"].to(self.device)
         ids = extras["final_ids"].to(self.device)
         time_outs = extras["time_outs"].to(self.device)
-        # Not the compiled critic, which would be compiled for each number of time-outs.
+        # The compiled critic would be recompiled for each number of time-outs.
         critic = self.alg._raw_critic
         if critic.is_recurrent:
-            # The hidden state is of all environments, and has seen the observations before the step.
+            # The hidden state covers all environments, and the observations before the step.
             hidden_state = critic.get_hidden_state()
-            everywhere = observations.clone()
-            everywhere[ids] = final
-            values = critic(everywhere)[ids]
+            all_observations = observations.clone()
+            all_observations[ids] = final
+            values = critic(all_observations)[ids]
             critic.reset(hidden_state=hidden_state)
         else:
             values = critic(final)
-        # A wrapper may have found that an episode terminated after all.
+        # A wrapper may have cleared time-outs of episodes that also terminated.
         values = values.detach().squeeze(-1) * time_outs[ids]
         rewards = rewards.index_add(0, ids, (self.alg.gamma * values).to(rewards.dtype))
         return rewards, {**extras, "time_outs": time_outs.index_fill(0, ids, False)}
 
     def _update(self) -> dict[str, float]:
-        """Learn from what was collected; return the losses.
+        """Update the networks from the rollout; return the losses.
 
-        rsl_rl's distillation lets a teacher with memory forget what it has seen. It goes on here.
+        rsl_rl's distillation resets the hidden state of a recurrent teacher; here it is restored.
         """
         algorithm: Any = self.alg
         teacher = getattr(algorithm, "teacher", None)
         if teacher is None or not teacher.is_recurrent:
             return algorithm.update()
-        remembered = teacher.get_hidden_state()
+        hidden_state = teacher.get_hidden_state()
         losses = algorithm.update()
-        teacher.reset(hidden_state=remembered)
-        # An update writes to this one, which the teacher's cannot take, made in inference mode.
+        teacher.reset(hidden_state=hidden_state)
+        # Updates write to these, and the teacher's were created in inference mode.
         algorithm.last_hidden_states = (algorithm.last_hidden_states[0], None)
         return losses
 
     def _agree_to_stop(self, is_solved: bool, interrupted: bool = False) -> str:
-        """Return the weightiest reason to stop of all processes, or ""."""
+        """Return the reason to stop with the highest priority among all processes, or ""."""
         code = 2 if interrupted else int(is_solved)
         if self.is_distributed:
-            # All processes have to leave the loop at the same iteration.
+            # All processes must leave the loop at the same iteration.
             shared = torch.tensor(code, device=self.device)
             torch.distributed.all_reduce(shared, op=torch.distributed.ReduceOp.MAX)
             code = int(shared.item())
@@ -353,14 +355,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     # Evaluation.
 
     def evaluate(self) -> EvaluationResult:
-        """Score the policy in environments of its own; the run itself is not touched."""
+        """Score the policy in separate environments; the run is not affected."""
         self.last_evaluation = self._solved_check.evaluate()
         return self.last_evaluation
 
     def _evaluate_solved(self, iteration: int) -> bool:
-        """Evaluate the policy after `iteration` iterations; return whether to stop for it.
+        """Evaluate the policy after `iteration` iterations; return True to stop training.
 
-        Only in the first process: False in others.
+        Evaluates only in the first process; False in others.
         """
         if not self._is_main_process:
             return False
@@ -381,14 +383,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     # Checkpoints.
 
     def save(self, path: str, infos=None) -> None:
-        """Write a checkpoint from which training resumes exactly; only the first process writes.
+        """Write a checkpoint for exact resume; only the first process writes.
 
         Args:
-            path: Where to; the file appears whole or not at all.
-            infos: Further plain data, which `load` returns.
+            path: Checkpoint file; the write is atomic.
+            infos: Further plain data, returned by `load`.
 
         Raises:
-            CheckpointError: it could not be written; an earlier file at `path` is intact.
+            CheckpointError: the file could not be written; an earlier file at `path` is intact.
         """
         if not self._is_main_process:
             return
@@ -401,7 +403,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         )
         replay = self._replay if self.cfg["algorithm"].get("save_replay") else None
         if replay is not None:
-            # First, so that the newest checkpoint always has one, whenever writing is interrupted.
+            # First, so that the newest checkpoint has a replay even if writing is interrupted.
             ReplayFiles(path).write(replay)
         save_checkpoint(checkpoint, path)
         if replay is not None:
@@ -416,23 +418,23 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict:
-        """Load a checkpoint, also one of rsl_rl or of an older layout.
+        """Load a checkpoint of mjlab or rsl_rl, legacy layouts included.
 
         Args:
-            path: The file.
-            load_cfg: Which parts to load (`actor`, `critic`, `student`, `teacher`, `optimizer`,
-                `iteration`, `rnd`);
-                None loads all, and `learn` then resumes the environments and the random number
-                generators too, if there are as many environments.
-            strict: Whether every parameter has to fit.
-            map_location: Without effect: tensors go where the networks are.
+            path: Checkpoint file.
+            load_cfg: Parts to load (`actor`, `critic`, `student`, `teacher`, `optimizer`,
+                `iteration`, `rnd`).
+                None: all; `learn` then also resumes the environments and the random number
+                generators, if the number of environments is the same.
+            strict: Require every parameter to fit.
+            map_location: Without effect: tensors are moved to the device of the networks.
 
         Returns:
-            The `infos` given to `save`.
+            The `infos` passed to `save`.
 
         Raises:
-            CheckpointError: the file is missing, corrupt, hostile, malformed, or of another
-                network; nothing was changed then.
+            CheckpointError: the file is missing, corrupt, hostile, malformed, or of a different
+                network. Nothing was changed.
         """
         checkpoint = migrate(load_checkpoint(path), str(path))
         if load_algorithm(self.alg, checkpoint, load_cfg, strict, str(path)):
@@ -451,10 +453,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         return infos
 
     def load_teacher(self, path: str) -> None:
-        """Load the teacher of a distillation: the policy of a checkpoint of PPO.
+        """Load the teacher of a distillation: the policy of a PPO checkpoint.
 
         Raises:
-            CheckpointError: the file is missing, corrupt, hostile, malformed, or of another network.
+            CheckpointError: the file is missing, corrupt, hostile, malformed, or of a different
+                network.
         """
         checkpoint = migrate(load_checkpoint(path), str(path))
         policy = checkpoint.get("actor_state_dict")
@@ -463,7 +466,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         algorithm.load({"actor_state_dict": policy}, {"teacher": True}, strict=True)
 
     def _save_checkpoint(self) -> None:
-        """Write a checkpoint into the run folder, and the policy as ONNX beside it."""
+        """Write a checkpoint and the policy as ONNX into the run folder."""
         if self._run_folder is None:
             return
         path = os.path.join(self._run_folder, f"model_{self.current_learning_iteration - 1}.pt")
@@ -473,11 +476,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._notify("on_checkpoint", path)
 
     def _progress(self, infos: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Return the entries of a checkpoint that say how far the run has got."""
+        """Return the checkpoint entries of the run's progress."""
         done = self.current_learning_iteration
         counter = getattr(self.env.unwrapped, "common_step_counter", 0)
         return {
-            # rsl_rl calls the last finished iteration "iter"; it cannot tell none from one.
+            # rsl_rl's index of the last finished iteration; 0 for both none and one.
             "iter": max(done - 1, 0),
             "iterations_finished": done,
             "infos": {**(infos or {}), "env_state": {"common_step_counter": int(counter)}},
@@ -492,21 +495,21 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     ) -> None:
         """Write the policy (normalizer, network, deterministic head) to `path`/`filename`.
 
-        Opset 18, batch size 1; input `obs`, output `actions`. Image models have one input more for
-        each group of images, by its name; recurrent ones have their state.
+        Opset 18, dynamic batch size; input `obs`, output `actions`. Image models have an additional
+        input per image group, by name; recurrent models their hidden state.
         """
         model = self.alg.get_policy().as_onnx(verbose=verbose)
         export_to_onnx(model, Path(path) / filename, verbose)
 
     def export_policy(self, path: str | None = None) -> str | None:
-        """Write the policy as ONNX with all that a deployment needs to know.
+        """Write the policy as ONNX with deployment metadata.
 
         Args:
-            path: The file; None: that of `_get_export_paths`.
+            path: ONNX file; None: that of `_get_export_paths`.
 
         Returns:
-            The file, or None if there is no run folder or the export failed. Failures are logged:
-            a run is not lost because its policy has no ONNX form.
+            The file, or None without a run folder or if the export failed. Failures are logged: a
+            run must not fail because its policy cannot be exported.
         """
         if path is None:
             if self._run_folder is None:
@@ -521,7 +524,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     @staticmethod
     def _get_export_paths(checkpoint_path: str) -> tuple[Path, str, Path]:
-        """Return folder, file name and path of the policy exported beside a checkpoint.
+        """Return folder, file name and path of the policy exported with a checkpoint.
 
         `<folder>/<folder's name>.onnx`; subclasses override it to export elsewhere.
         """
@@ -541,8 +544,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     # Processes, threads, observers.
 
     def _configure_multi_gpu(self) -> None:
-        """Join the other processes of the run, if there are any. In place of rsl_rl's, which knows
-        GPUs only."""
+        """Join the process group of the run, if any. Replaces rsl_rl's method, which supports only
+        GPUs."""
         rank = process_rank()
         self.is_distributed = not rank.is_alone
         self.gpu_world_size = rank.world_size
@@ -559,12 +562,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     @property
     def _is_main_process(self) -> bool:
-        """True in the first process, which alone writes files."""
+        """True in the first process, the only one that writes files."""
         return self.gpu_global_rank == 0
 
     @property
     def _run_folder(self) -> str | None:
-        """Run folder; None in processes that write nothing."""
+        """Run folder; None in processes that do not write files."""
         return self.logger.log_dir if self._is_main_process else None
 
     @property
@@ -575,9 +578,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _resolve_threads(self) -> int:
         if torch.device(self.device).type != "cpu":
             return torch.get_num_threads()
-        # An algorithm that learns beside the physics says how many it leaves.
-        if (own := getattr(self.alg, "num_threads", None)) is not None:
-            return own
+        # Algorithms that learn concurrently with the physics set the number of threads.
+        if (num_threads := getattr(self.alg, "num_threads", None)) is not None:
+            return num_threads
         parameters = sum(
             parameter.numel()
             for group in self.alg.optimizer.param_groups
@@ -593,19 +596,18 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
 
 class ExportingOnPolicyRunner(MjlabOnPolicyRunner):
-    """Trains as `MjlabOnPolicyRunner` does, and exports the policy whenever it saves."""
+    """`MjlabOnPolicyRunner` that exports the policy with every checkpoint."""
 
     exports_on_save = True
 
     def save(self, path: str, infos=None) -> None:
-        """Write a checkpoint, and the policy where `_get_export_paths` says.
+        """Write a checkpoint, and the policy to `_get_export_paths`.
 
-        The ONNX file carries what a deployment needs to know. An export that fails is logged, and
-        training goes on.
+        The ONNX file has deployment metadata. A failed export is logged, and training continues.
 
         Args:
-            path: Where to write the checkpoint.
-            infos: Further plain data, which `load` returns.
+            path: Checkpoint file.
+            infos: Further plain data, returned by `load`.
 
         Raises:
             CheckpointError: the checkpoint could not be written.

@@ -1,13 +1,12 @@
-"""Soft actor-critic over thousands of environments: learns beside the physics, from a replay.
+"""Soft actor-critic for thousands of environments, learning concurrently with the physics.
 
-The algorithm is that of Haarnoja et al. (arXiv 1812.05905), with what makes it work in massively
-parallel simulation (FastSAC, Seo et al., arXiv 2512.01996; FlashSAC, arXiv 2604.04539): large batches,
-layer normalization, critics that predict distributions, little noise at first, and noise that is held for
-several steps.
+The algorithm of Haarnoja et al. (arXiv 1812.05905), with changes for massively parallel simulation
+(FastSAC, Seo et al., arXiv 2512.01996; FlashSAC, arXiv 2604.04539): large batches, layer
+normalization, distributional critics, low initial exploration noise, and noise held for several steps.
 
-On the CPU one core steps the physics while another learns. They work in lock step: the updates that
-belong to one environment step see what was stored before it began, and the next step's actions wait for
-them. So the same seed gives the same weights, bit for bit, whichever core is faster.
+On the CPU one core steps the physics while another learns, in lock step: the updates of an environment
+step use the transitions stored before it started, and the actions of the next step wait for them. The
+same seed gives the same weights, bit for bit, independent of the speed of the cores.
 """
 
 from __future__ import annotations
@@ -34,17 +33,17 @@ from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 
-# Of returns whose scale is estimated, where no range of values is given.
+# Range of scaled returns if `value_range` is None.
 _SCALED_RANGE = (-5.0, 5.0)
-# What a checkpoint can be loaded in.
+# Loadable parts of a checkpoint.
 _PARTS = ("actor", "critic", "optimizer", "iteration")
 
 
 class SAC:
-    """Soft actor-critic, as rsl_rl's runners drive an algorithm.
+    """Soft actor-critic, with the interface of rsl_rl's algorithms.
 
-    `act`, `process_env_step`: once for each environment step. `update` only reports what was learned
-    in the steps since it was called before.
+    `act` and `process_env_step` are called once per environment step. `update` only returns the
+    metrics since its last call.
     """
 
     takes_final_observations = True
@@ -62,20 +61,20 @@ class SAC:
         multi_gpu_cfg: dict | None = None,
         grad_reduce_bucket_mb: float = 25,
     ) -> None:
-        """Take networks, replay, environments and settings.
+        """Set up from networks, replay buffer, environments and settings.
 
         Raises:
-            ValueError: a setting does not fit another one.
+            ValueError: settings are inconsistent.
         """
         self.cfg, self.device, self.storage = cfg, device, storage
         self.actor, self.critic = actor.to(device), critic.to(device)
         self._raw_actor, self._raw_critic = self.actor, self.critic
-        # Acts, and is what others see: it changes between two environment steps only.
+        # The acting policy, exposed by `get_policy`, changes only between environment steps.
         self._policy = copy.deepcopy(self.actor).requires_grad_(False)
         self._target = copy.deepcopy(self.critic).requires_grad_(False)
         self._log_alpha = nn.Parameter(torch.tensor(math.log(cfg.init_alpha), device=device))
-        # Fused: one call for all parameters, a quarter of the time. The second moments forget sooner
-        # than usual, because targets move (arXiv 2512.01996).
+        # The fused optimizer takes a quarter of the time. The decay of second moments is faster than
+        # usual, because targets move (arXiv 2512.01996).
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": list(self.critic.parameters()), "lr": cfg.critic_learning_rate},
@@ -92,7 +91,7 @@ class SAC:
         self._mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
         if self._mirror is not None and cfg.batch_size % 2:
             raise ValueError(
-                f"SAC batch_size: expected an even number, because half of it are mirror images, got "
+                f"SAC batch_size: expected an even number, because half of the batch is mirrored, got "
                 f"{cfg.batch_size}."
             )
         self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb
@@ -105,21 +104,21 @@ class SAC:
         self._num_steps = self._num_updates_made = 0
         self._actions = torch.zeros(env.num_envs, env.num_actions, device=device)
         self._started = False
-        # Of updates that are waited for, and of those before.
-        self._figures: list[dict[str, torch.Tensor]] = []
+        # Metrics of the updates in progress, and of finished ones.
+        self._metrics: list[dict[str, torch.Tensor]] = []
         self._finished: list[dict[str, torch.Tensor]] = []
         self._thread: ThreadPoolExecutor | None = None
         self._running: Future[None] | None = None
-        self._beside_physics = multi_gpu_cfg is None and torch.device(device).type == "cpu"
-        if self._beside_physics:
-            # For the thread that acts. More would wait for those of the physics.
+        self._is_concurrent = multi_gpu_cfg is None and torch.device(device).type == "cpu"
+        if self._is_concurrent:
+            # For the acting thread. More threads would wait for those of the physics.
             self.num_threads = 1
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> SAC:
-        """Build networks and replay from a `RslRlOffPolicyRunnerCfg` as a dict."""
+        """Build networks and replay buffer from a `RslRlOffPolicyRunnerCfg` as a dict."""
         alg_class, further = resolve_class(cfg["algorithm"])
-        # A subclass takes its further settings by keyword.
+        # Subclasses receive further settings as keyword arguments.
         own = {field.name for field in fields(RslRlSacAlgorithmCfg)} & further.keys()
         alg_cfg = RslRlSacAlgorithmCfg(**{name: further.pop(name) for name in own})
         actor_class, actor_cfg = resolve_class(cfg["actor"])
@@ -140,8 +139,9 @@ class SAC:
             shape = tuple(obs[teacher].shape[1:]) if teacher in obs else None
             if shape != (env.num_actions,):
                 raise ValueError(
-                    f"SAC teacher: expected an observation group of {env.num_actions} numbers, one for "
-                    f"each action, got {teacher!r}, of shape {shape}; groups are {sorted(obs.keys())}."
+                    f"SAC teacher: expected an observation group of shape ({env.num_actions},), one "
+                    f"value per action, got {teacher!r} of shape {shape}. Available: "
+                    f"{sorted(obs.keys())}."
                 )
             groups.append(teacher)
         storage = ReplayStorage(alg_cfg.replay_steps, obs.to(device), groups, env.num_actions)
@@ -153,11 +153,12 @@ class SAC:
     # Acting.
 
     def act(self, obs: TensorDict) -> torch.Tensor:
-        """Return actions (N, A), with exploration."""
+        """Return actions with exploration noise, (N, A)."""
         if not self._started:
             self.storage.start(obs)
             if self._multi_gpu is not None:
-                # A checkpoint has the state of the first process, and each draws batches of its own.
+                # A checkpoint has the state of the first process, but each process samples different
+                # batches.
                 self._generator.manual_seed(int(torch.randint(2**62, ())))
             self._started = True
         distribution = self._policy.distribution
@@ -172,9 +173,9 @@ class SAC:
     def process_env_step(
         self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, Any]
     ) -> None:
-        """Store a step, take over what was learned meanwhile, and begin to learn from it."""
+        """Store a step, update the acting policy, and start the next updates."""
         self._wait()
-        # Rollouts run in inference mode, and tensors made in it cannot be changed outside.
+        # Tensors created in the rollout's inference mode could not be modified outside it.
         with torch.inference_mode(False), torch.no_grad():
             self.storage.add(
                 self._actions,
@@ -189,7 +190,7 @@ class SAC:
                 model.update_normalization(obs)
             if self._reward_scale is not None:
                 self._reward_scale.update(rewards, dones, together=self._multi_gpu is not None)
-            # The policy takes over what was learned: parameters in part, observation statistics at once.
+            # Average the parameters of the acting policy; copy its observation statistics.
             for own, learned in zip(
                 self._policy.parameters(), self.actor.parameters(), strict=True
             ):
@@ -199,7 +200,7 @@ class SAC:
         self._num_steps += 1
         if self._num_steps < self.cfg.learning_starts:
             return
-        if self._beside_physics:
+        if self._is_concurrent:
             if self._thread is None:
                 self._thread = ThreadPoolExecutor(1, "learner", lambda: torch.set_num_threads(1))
             self._running = self._thread.submit(self._learn)
@@ -208,20 +209,20 @@ class SAC:
             self._learn()
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Do nothing: there are no returns of whole episodes."""
+        """Do nothing: SAC does not use returns of whole rollouts."""
 
     def update(self) -> dict[str, float]:
-        """Return means over the updates that were finished since the last call."""
-        figures, self._finished = self._finished, []
+        """Return the mean metrics over the updates finished since the last call."""
+        metrics, self._finished = self._finished, []
         return {
-            name: torch.stack([one[name] for one in figures if name in one]).mean().item()
-            for name in sorted(set().union(*figures))
+            name: torch.stack([one[name] for one in metrics if name in one]).mean().item()
+            for name in sorted(set().union(*metrics))
         }
 
     # Learning.
 
     def _learn(self) -> None:
-        """Make the updates of one environment step, from one sample of the replay."""
+        """Make the updates of one environment step, from one sample of the replay buffer."""
         cfg, parts = self.cfg, 1 if self._mirror is None else 2
         size = cfg.num_updates * cfg.batch_size // parts
         batch = self.storage.sample(size, cfg.gamma, cfg.num_steps_return, self._generator)
@@ -248,7 +249,7 @@ class SAC:
             }
         if self._teacher.weight(self._num_steps) > 0.0:
             inputs["teacher"] = before[self._teacher.group]
-        # Each update takes transitions together with their mirror images.
+        # Each update has transitions together with their mirrored copies.
         for rows in torch.arange(size * parts, device=self.device).view(
             parts, cfg.num_updates, -1
         ).transpose(0, 1).flatten(1):  # fmt: skip
@@ -256,10 +257,10 @@ class SAC:
 
     def _update(self, inputs: dict[str, torch.Tensor]) -> None:
         self.optimizer.zero_grad(set_to_none=True)
-        figures = self._critic_gradients(inputs)
+        metrics = self._critic_gradients(inputs)
         self._num_updates_made += 1
         if self._num_updates_made % self.cfg.policy_delay == 0:
-            figures |= self._actor_gradients(inputs)
+            metrics |= self._actor_gradients(inputs)
         if self._multi_gpu is not None:
             parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
             reduce_gradients_in_buckets(parameters, self._multi_gpu["world_size"], self._bucket_mb)
@@ -270,25 +271,25 @@ class SAC:
                 self._target.parameters(), self.critic.parameters(), strict=True
             ):
                 target.lerp_(source, self.cfg.tau)
-        self._figures.append(figures)
+        self._metrics.append(metrics)
 
     def _critic_gradients(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Let both critics predict y = R + discount (Q'(s', a') - alpha log p(a' | s'))."""
+        """Add the gradients of both critics for y = R + discount (Q'(s', a') - alpha log p(a' | s'))."""
         with torch.no_grad(), self._autocast():
             actions, log_prob = self._sample(inputs["next_actor"])
             values = self._target.values(inputs["next_critic"], actions)
             value = values.amin(dim=0) if self.cfg.pessimistic else values.mean(dim=0)
             value = value - self._log_alpha.exp() * log_prob
             target = inputs["returns"] + inputs["discounts"] * value
-            wanted = self.critic.distribution_of(target)
+            expected = self.critic.distribution_of(target)
         with self._autocast():
             logits = self.critic.logits(inputs["critic"], inputs["actions"])
-        losses = [-(wanted * torch.log_softmax(one, dim=-1)).sum(dim=-1) for one in logits]
+        losses = [-(expected * torch.log_softmax(one, dim=-1)).sum(dim=-1) for one in logits]
         loss = sum((loss * inputs["weights"]).mean() for loss in losses)
         assert isinstance(loss, torch.Tensor)
         loss.backward()
-        # Mass in the end atoms says that the range of values is too narrow.
-        ends = wanted[:, 0] + wanted[:, -1]
+        # Mass in the end atoms indicates that the range of values is too narrow.
+        ends = expected[:, 0] + expected[:, -1]
         return {
             "critic": loss.detach(),
             "value": target.mean(),
@@ -296,30 +297,30 @@ class SAC:
         }
 
     def _actor_gradients(self, inputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Let the policy maximize Q(s, a) - alpha log p(a | s), and alpha hold its entropy."""
+        """Add the gradients of the policy, which maximizes Q(s, a) - alpha log p(a | s), and of alpha."""
         with self._autocast():
             actions, log_prob = self._sample(inputs["actor"])
             values = self.critic.values(inputs["critic"], actions)
         value = values.amin(dim=0) if self.cfg.pessimistic else values.mean(dim=0)
         loss = (self._log_alpha.exp().detach() * log_prob - value).mean()
         distribution = self.actor.distribution
-        # Of actions that are seldom tried, critics know least. Without this, those of joints that
-        # matter little drift to their bounds, where tanh has no gradient that would lead back.
+        # Critics are inaccurate for rarely tried actions. Without this penalty, actions of joints with
+        # little effect drift to their bounds, where the gradient of tanh vanishes.
         loss = loss + self.cfg.mean_penalty * distribution.params[0].square().sum(dim=-1).mean()
-        figures = {}
+        metrics = {}
         if "teacher" in inputs:
-            # On states that the policy itself leads to (DAgger; Ross et al., arXiv 1011.0686).
+            # On states that the policy visits (DAgger; Ross et al., arXiv 1011.0686).
             distance = self._teacher.distance(inputs["teacher"], distribution.mean)
             loss = loss + self._teacher.weight(self._num_steps) * distance
-            figures["imitation"] = distance.detach()
+            metrics["imitation"] = distance.detach()
         entropy = distribution.entropy.detach().mean()
-        # Of a normal distribution with deviation `target_std` in each action.
-        wanted = math.log(self.cfg.target_std * math.sqrt(2 * math.pi * math.e))
-        alpha_loss = self._log_alpha.exp() * (entropy - distribution.output_dim * wanted)
-        # Not for the critic, whose gradients are those of its own loss.
+        # Entropy per action of a Gaussian with standard deviation `target_std`.
+        target = math.log(self.cfg.target_std * math.sqrt(2 * math.pi * math.e))
+        alpha_loss = self._log_alpha.exp() * (entropy - distribution.output_dim * target)
+        # Gradients of the critic come from the critic loss only.
         loss.backward(inputs=list(self.actor.parameters()))
         alpha_loss.backward()
-        return figures | {
+        return metrics | {
             "actor": loss.detach(),
             "entropy": entropy,
             "alpha": self._log_alpha.detach().exp(),
@@ -339,39 +340,39 @@ class SAC:
         return torch.autocast(kind, torch.bfloat16, enabled=self.cfg.use_mixed_precision)
 
     def _wait(self) -> None:
-        """Wait until what is being learned is learned; raise what went wrong with it."""
+        """Wait for the updates in progress; raise their errors."""
         running, self._running = self._running, None
         if running is not None:
             running.result()
-        self._finished += self._figures
-        self._figures = []
+        self._finished += self._metrics
+        self._metrics = []
 
     # Modes, files, processes.
 
     def train_mode(self) -> None:
-        """Let observation statistics be updated."""
+        """Enable updates of observation statistics."""
         self.actor.train()
         self.critic.train()
 
     def eval_mode(self) -> None:
-        """Finish learning from the last step, and hold observation statistics."""
+        """Finish the updates of the last step, and freeze observation statistics."""
         self._wait()
         self.actor.eval()
         self.critic.eval()
 
     def close(self) -> None:
-        """Finish learning, and end the thread in which it happens; another step starts one again."""
+        """Finish the updates and end their thread; the next step starts a new thread."""
         self._wait()
         if self._thread is not None:
             self._thread.shutdown()
             self._thread = None
 
     def get_policy(self) -> SacActorModel:
-        """Return the policy that acts."""
+        """Return the acting policy."""
         return self._policy
 
     def save(self) -> dict[str, Any]:
-        """Return all weights and states but the replay, as plain data."""
+        """Return all weights and states except the replay buffer, as plain data."""
         self._wait()
         return {
             "actor_state_dict": self._policy.state_dict(),
@@ -390,9 +391,9 @@ class SAC:
         }
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Load what `load_cfg` names (`actor`, `critic`, `optimizer`, `iteration`); None loads all.
+        """Load the parts in `load_cfg` (`actor`, `critic`, `optimizer`, `iteration`). None: all.
 
-        Returns whether the count of iterations is to be loaded.
+        Returns True if the iteration count is to be loaded.
         """
         self._wait()
         cfg = dict.fromkeys(_PARTS, True) if load_cfg is None else load_cfg
@@ -419,17 +420,17 @@ class SAC:
         return cfg.get("iteration", False)
 
     def broadcast_parameters(self) -> None:
-        """Give all processes the weights of the first."""
+        """Broadcast the weights of the first process to all processes."""
         for model in (self.actor, self.critic, self._policy, self._target):
             for tensor in model.state_dict().values():
                 torch.distributed.broadcast(tensor, src=0)
 
 
 class _HeldNoise:
-    """Standard normal noise (N, A), of which each environment keeps a draw for some steps.
+    """Standard normal noise (N, A), held for k steps per environment.
 
-    For how many is drawn from a Zipf distribution, P(k) ~ 1 / k^2 up to a largest k (FlashSAC, arXiv
-    2604.04539). Noise that is redrawn at every step averages out before a leg has moved.
+    k has a Zipf distribution, P(k) ~ 1 / k^2 up to a maximum k (FlashSAC, arXiv 2604.04539). Noise
+    resampled at every step averages out before a leg has moved.
     """
 
     def __init__(self, num_envs: int, num_actions: int, longest: int, device: str) -> None:
@@ -455,10 +456,10 @@ class _HeldNoise:
 
 
 class _ReturnScale:
-    """Factor for rewards by which discounted returns have a deviation of 1 and stay within the range.
+    """Reward factor that scales discounted returns to a standard deviation of 1, within the range.
 
-    1 / max(std(G), max|G| / 5), over all returns G that environments have run up so far (SimbaV2, Lee
-    et al., arXiv 2502.15280).
+    1 / max(std(G), max|G| / 5), over all running returns G of the environments so far (SimbaV2, Lee et
+    al., arXiv 2502.15280).
     """
 
     def __init__(self, num_envs: int, gamma: float, device: str) -> None:
@@ -469,7 +470,7 @@ class _ReturnScale:
         self.factor = torch.ones((), device=device)
 
     def update(self, rewards: torch.Tensor, dones: torch.Tensor, together: bool) -> None:
-        """Count a step; `together` with other processes, which then have the same factor."""
+        """Update with a step; `together`: use the same factor in all processes."""
         self._returns = rewards + self._gamma * self._returns
         count = self._count + len(rewards)
         shift = self._returns.mean() - self._mean
@@ -497,28 +498,28 @@ class _ReturnScale:
 
 
 class _Teacher:
-    """A controller that acts at first, and that the policy imitates.
+    """Controller that acts at first, and is imitated by the policy.
 
-    The observation group `group` shows its actions. Those outside (-1, 1) leave the policy free.
+    The observation group `group` holds its actions. Values outside (-1, 1) leave the policy free.
     """
 
     def __init__(self, cfg: RslRlSacAlgorithmCfg) -> None:
         steps = [step for step, _ in cfg.imitation]
         if not steps or steps != sorted(set(steps)):
             raise ValueError(
-                f"SAC imitation: expected points with rising steps, got {cfg.imitation}."
+                f"SAC imitation: expected points with increasing steps, got {cfg.imitation}."
             )
-        weighs = any(weight for _, weight in cfg.imitation)
-        if cfg.teacher is None and (cfg.teacher_steps > 0 or weighs):
+        has_weight = any(weight for _, weight in cfg.imitation)
+        if cfg.teacher is None and (cfg.teacher_steps > 0 or has_weight):
             raise ValueError(
-                "SAC teacher_steps, imitation: expected 0 without a teacher; set teacher to the group of "
-                "observations that shows its actions."
+                f"SAC teacher_steps, imitation: expected 0 without a teacher, got {cfg.teacher_steps} "
+                f"and {cfg.imitation}; set teacher to the observation group with its actions."
             )
         self.group = cfg.teacher
         self._steps, self._weights = zip(*cfg.imitation, strict=True)
 
     def act(self, obs: TensorDict, noise: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Return the controller's actions with `noise` before tanh; `actions` where it has none."""
+        """Return the controller's actions with `noise` before tanh, `actions` for free ones."""
         shown: Any = obs[self.group]
         near = torch.tanh(torch.atanh(shown) + noise)
         return torch.where(shown.abs() < 1.0, near, actions)
@@ -528,6 +529,6 @@ class _Teacher:
         return float(np.interp(num_steps, self._steps, self._weights))
 
     def distance(self, shown: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-        """Return the mean squared distance of `mean` (B, A) from the actions `shown` (B, A)."""
+        """Return the mean squared distance of `mean` (B, A) from the controller's `shown` (B, A)."""
         difference = torch.where(shown.abs() < 1.0, mean - shown, 0.0)
         return difference.square().sum(dim=-1).mean()

@@ -1,9 +1,9 @@
-"""Networks of the off-policy learner: a squashed Gaussian policy, and two critics of Q values.
+"""Networks of the off-policy learner: squashed Gaussian policy, twin Q critics.
 
-Layers are normalized (Ba et al., arXiv 1607.06450), which keeps critics stable that learn from
-their own predictions. A critic predicts the distribution of the return over a fixed row of values
-and is trained by cross-entropy instead of squared errors (Bellemare et al., arXiv 1707.06887;
-Farebrother et al., arXiv 2403.03950).
+Layer normalization (Ba et al., arXiv 1607.06450) stabilizes critics that learn from their own
+predictions. A critic predicts the distribution of the return over fixed atoms and is trained by
+cross-entropy instead of squared errors (Bellemare et al., arXiv 1707.06887; Farebrother et al.,
+arXiv 2403.03950).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 
 class SquashedGaussian(Distribution):
-    """Distribution of actions in (-1, 1): the tanh of a normal variable.
+    """Distribution of actions in (-1, 1): the tanh of a Gaussian variable u.
 
-    The network gives mean and standard deviation of u; the action is a = tanh(u). With the change of
+    The network outputs mean and standard deviation of u; the action is a = tanh(u). With the change of
     variables, log p(a) = log N(u; mean, std) - sum_i log(1 - tanh(u_i)^2) (Haarnoja et al., arXiv
     1801.01290, appendix C). `std` and `entropy` are those of u.
     """
@@ -36,12 +36,12 @@ class SquashedGaussian(Distribution):
         init_std: float = 0.15,
         log_std_range: Sequence[float] = (-5.0, 0.0),
     ) -> None:
-        """Take the number of actions.
+        """Set up the distribution.
 
         Args:
             output_dim: Number of actions.
-            init_std: Standard deviation of u, before any learning.
-            log_std_range: Smallest and largest logarithm of the standard deviation.
+            init_std: Initial standard deviation of u.
+            log_std_range: Range (low, high) of the logarithm of the standard deviation.
 
         Raises:
             ValueError: `init_std` is not within the range.
@@ -51,8 +51,7 @@ class SquashedGaussian(Distribution):
         if not self._low < math.log(init_std) < self._high:
             raise ValueError(
                 f"SquashedGaussian init_std: expected a number between {math.exp(self._low):.3g} and "
-                f"{math.exp(self._high):.3g}, which log_std_range {tuple(log_std_range)} allows, got "
-                f"{init_std}."
+                f"{math.exp(self._high):.3g} (log_std_range {tuple(log_std_range)}), got {init_std}."
             )
         self._init_std = init_std
         self._mean = self._log_std = torch.zeros(0)
@@ -62,7 +61,7 @@ class SquashedGaussian(Distribution):
         return 2 * self.output_dim
 
     def init_mlp_weights(self, mlp: nn.Module) -> None:
-        """Begin in the middle of the action range, whatever is observed (Seo et al., 2512.01996)."""
+        """Initialize to zero mean for any observation (Seo et al., arXiv 2512.01996)."""
         last = [layer for layer in mlp.modules() if isinstance(layer, nn.Linear)][-1]
         share = (math.log(self._init_std) - self._low) / (self._high - self._low)
         nn.init.zeros_(last.weight)
@@ -72,7 +71,7 @@ class SquashedGaussian(Distribution):
 
     def update(self, mlp_output: torch.Tensor) -> None:
         self._mean, raw = mlp_output.float().chunk(2, dim=-1)
-        # Bounded smoothly, because a clamped value has no gradient that would bring it back.
+        # A smooth bound, because a clamped value has zero gradient.
         share = 0.5 * (torch.tanh(raw) + 1.0)
         self._log_std = self._low + (self._high - self._low) * share
 
@@ -80,11 +79,11 @@ class SquashedGaussian(Distribution):
         return self.action_of(torch.randn_like(self._mean))
 
     def action_of(self, noise: torch.Tensor) -> torch.Tensor:
-        """Return the action (N, A) that standard normal `noise` (N, A) leads to."""
+        """Return the action (N, A) for standard normal `noise` (N, A)."""
         return torch.tanh(self._mean + self._log_std.exp() * noise)
 
     def action_and_log_prob(self, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the action (N, A) of `noise` (N, A) and its log-probability (N,)."""
+        """Return the action (N, A) for `noise` (N, A) and its log-probability (N,)."""
         u = self._mean + self._log_std.exp() * noise
         normal = -0.5 * (noise.square() + _LOG_2PI) - self._log_std
         # log(1 - tanh(u)^2), in a form that does not underflow.
@@ -126,7 +125,7 @@ class _TanhOfMean(nn.Module):
 def normalized_mlp(
     input_dim: int, output_dim: int, hidden_dims: Sequence[int], activation: str
 ) -> nn.Sequential:
-    """Return a perceptron whose hidden layers are normalized before their activation."""
+    """Return a multilayer perceptron with layer normalization before each activation."""
     layers: list[nn.Module] = []
     for width in hidden_dims:
         layers += [nn.Linear(input_dim, width), nn.LayerNorm(width)]
@@ -136,12 +135,12 @@ def normalized_mlp(
 
 
 class SacActorModel(MLPModel):
-    """Policy network: rsl_rl's, with normalized layers."""
+    """rsl_rl's policy network with layer normalization."""
 
     distribution: SquashedGaussian  # ty: ignore[incompatible-mutable-override]
 
     def __init__(self, *args: Any, hidden_dims: Sequence[int], activation: str, **kwargs: Any):
-        """Take the arguments of rsl_rl's `MLPModel`.
+        """Build with the arguments of rsl_rl's `MLPModel`.
 
         Raises:
             ValueError: the distribution is not a `SquashedGaussian`.
@@ -157,9 +156,9 @@ class SacActorModel(MLPModel):
 
 
 class TwinCriticModel(MLPModel):
-    """Two critics that predict the distribution of the return of a state and an action.
+    """Two critics that predict the distribution of the return for a state and an action.
 
-    The return is one of `num_atoms` values, evenly spaced over `value_range`.
+    The distribution is over `num_atoms` values, evenly spaced over `value_range`.
     """
 
     atoms: torch.Tensor
@@ -177,17 +176,17 @@ class TwinCriticModel(MLPModel):
         activation: str,
         obs_normalization: bool = False,
     ) -> None:
-        """Take the observations as rsl_rl's `MLPModel` does.
+        """Build with the observations, as rsl_rl's `MLPModel`.
 
         Raises:
-            ValueError: the range of values is empty, or there are fewer than two atoms.
+            ValueError: `value_range` is empty, or `num_atoms` < 2.
         """
         super().__init__(obs, obs_groups, obs_set, 1, (1,), activation, obs_normalization)
         low, high = value_range
         if not (low < high and num_atoms > 1):
             raise ValueError(
-                f"SAC value_range, num_atoms: expected a lower and a higher value and 2 atoms or "
-                f"more, got {value_range} and {num_atoms}."
+                f"SAC value_range, num_atoms: expected (low, high) with low < high and an integer >= 2, "
+                f"got {value_range} and {num_atoms}."
             )
         del self.mlp
         input_dim = self._get_latent_dim() + num_actions
@@ -197,22 +196,22 @@ class TwinCriticModel(MLPModel):
         self.register_buffer("atoms", torch.linspace(low, high, num_atoms), persistent=False)
 
     def logits(self, latent: torch.Tensor, actions: torch.Tensor) -> list[torch.Tensor]:
-        """Return for each critic the logits (N, atoms), of `latent` observations (N, numbers)."""
+        """Return the logits (N, atoms) of each critic for `latent` observations (N, size)."""
         inputs = torch.cat([latent, actions], dim=-1)
         return [critic(inputs).float() for critic in self.critics]
 
     def values(self, latent: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Return the expected return (2, N) that each critic predicts."""
+        """Return the expected return of each critic, (2, N)."""
         probabilities = torch.softmax(torch.stack(self.logits(latent, actions)), dim=-1)
-        # Not as a matrix product, which mixed precision would round to three digits.
+        # Not a matrix product, which mixed precision would round to three digits.
         return (probabilities * self.atoms).sum(dim=-1)
 
     def distribution_of(self, returns: torch.Tensor, spread: float = 0.75) -> torch.Tensor:
-        """Return probabilities (N, atoms) whose mean is `returns` (N,), for cross-entropy.
+        """Return probabilities (N, atoms) with mean `returns` (N,), for cross-entropy.
 
-        A normal distribution around the return, of `spread` times the distance of the atoms, with
-        the mass between neighboring midpoints given to the atom between them (HL-Gauss,
-        Farebrother et al., arXiv 2403.03950). Returns beyond the range count as its ends.
+        A Gaussian around the return, with standard deviation `spread` times the atom spacing; each
+        atom has the mass between its neighboring midpoints (HL-Gauss, Farebrother et al., arXiv
+        2403.03950). Returns are clamped to the range.
         """
         atoms = self.atoms
         distance = atoms[1] - atoms[0]

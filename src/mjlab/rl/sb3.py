@@ -1,4 +1,4 @@
-"""The environment as Stable-Baselines3 wants to see it.
+"""Stable-Baselines3 adapter for `ManagerBasedRlEnv`.
 
 Needs Stable-Baselines3 (`pip install "mjlab[sb3]"`). `examples/sb3_swing_up.py` trains with it.
 """
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 
 class Sb3VecEnv(VecEnv):
-    """Adapts a `ManagerBasedRlEnv` to Stable-Baselines3's `VecEnv`.
+    """Stable-Baselines3's `VecEnv` interface of a `ManagerBasedRlEnv`.
 
-    Where an episode ends, observations are those of the next one, and the environment's info has
-    `terminal_observation`, `TimeLimit.truncated` (the episode ran out of time and did not terminate), and
-    `episode` with its return `r`, length `l` and the seconds `t` since this was made, which
-    Stable-Baselines3 logs. No `VecMonitor` is needed.
+    When an episode ends, observations are those after the reset, and the environment's info has
+    `terminal_observation`, `TimeLimit.truncated` (time-out without termination), and `episode` with
+    its return `r`, length `l` and the time `t` (s) since construction, which Stable-Baselines3 logs.
+    A `VecMonitor` is not needed.
     """
 
     def __init__(
@@ -36,20 +36,20 @@ class Sb3VecEnv(VecEnv):
         """Adapt `env`.
 
         Args:
-            env: The environment, with `auto_reset`.
-            group: Observation group that is the observation. None: all, for a `MultiInputPolicy`.
-            clip_actions: Actions are clamped to plus and minus this, and the action space has these
-                bounds, without which Stable-Baselines3 takes no environment. SAC and TD3 map their
-                range of actions to it: give them about 1.
+            env: Environment, with `auto_reset`.
+            group: Observation group used as the observation. None: all, for a `MultiInputPolicy`.
+            clip_actions: Bound c: actions are clamped to [-c, c], also in the action space, because
+                Stable-Baselines3 requires bounds. SAC and TD3 map their actions to this range: use
+                about 1.
 
         Raises:
-            ValueError: no such group, `clip_actions` is not positive, or no `auto_reset`.
+            ValueError: the group is unknown, `clip_actions` is not positive, or `auto_reset` is off.
         """
         if not env.unwrapped.cfg.auto_reset:
             raise ValueError(
-                "auto_reset: expected True, got False; Stable-Baselines3 resets no environments."
+                "auto_reset: expected True, got False; Stable-Baselines3 does not reset environments."
             )
-        # First, because the constructor asks for attributes.
+        # First, because the base constructor reads attributes of the environment.
         self.env = env
         self._envs = gymnasium_env(env, group, clip_actions)
         self._seed: int | None = None
@@ -66,16 +66,16 @@ class Sb3VecEnv(VecEnv):
         return observations
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the next `reset`, one for all environments; return it for each."""
+        """Set the seed of the next `reset`, shared by all environments; return it once for each."""
         self._seed = super().seed(seed)[0]
         return [self._seed] * self.num_envs
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for `step_wait`."""
+        """Store the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Step; return observations, rewards (N,), dones (N,), and a dict for each environment."""
+        """Step; return observations, rewards (N,), dones (N,), and one info dict per environment."""
         observations, rewards, terminated, truncated, infos = self._envs.step(self._actions)
         each: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         dones = terminated | truncated
@@ -97,7 +97,7 @@ class Sb3VecEnv(VecEnv):
         return [getattr(self.env, attr_name)] * self._count(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the environment, which is that of all."""
+        """Set an attribute of the environment, shared by all `indices`."""
         setattr(self.env, attr_name, value)
 
     def env_method(
@@ -112,7 +112,7 @@ class Sb3VecEnv(VecEnv):
         return [False] * self._count(indices)
 
     def get_images(self) -> list[np.ndarray | None]:
-        """Return the image of the view of all environments, as a list of one."""
+        """Return one image of all environments, in a list."""
         return [self.env.render()]
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The environment as skrl wants to see it.
+"""skrl adapter for `ManagerBasedRlEnv`.
 
 Needs skrl (`pip install "mjlab[skrl]"`). `examples/skrl_swing_up.py` trains with it.
 """
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 class SkrlEnv(Wrapper):
-    """Adapts a `ManagerBasedRlEnv` to skrl's `Wrapper`, with tensors on the environment's device.
+    """skrl's `Wrapper` interface of a `ManagerBasedRlEnv`, with tensors on the environment's device.
 
-    Environments are reset in the step in which their episode ends. The observations that episodes
-    ended with are in the infos of that step, for agents made by `with_final_observations`.
+    Environments are reset in the step that ends their episode. The infos of that step have the
+    final observations, for agents made by `with_final_observations`.
     """
 
     def __init__(
@@ -36,20 +36,20 @@ class SkrlEnv(Wrapper):
         """Adapt `env`.
 
         Args:
-            env: The environment, with `auto_reset`.
-            group: Observation group that policies see.
-            state_group: Observation group that critics see (skrl's state); None: there is no state.
-            clip_actions: Actions are clamped to plus and minus this, and the action space has these
-                bounds. None: neither.
+            env: Environment, with `auto_reset`.
+            group: Observation group of the policy.
+            state_group: Observation group of the critic (skrl's state). None: no state.
+            clip_actions: Bound c: actions are clamped to [-c, c], also in the action space. None:
+                unbounded.
 
         Raises:
-            ValueError: no such group, `clip_actions` is not positive, or no `auto_reset`.
+            ValueError: a group is unknown, `clip_actions` is not positive, or `auto_reset` is off.
         """
         super().__init__(env)
         core = env.unwrapped
         if not core.cfg.auto_reset:
             raise ValueError(
-                "auto_reset: expected True, got False; skrl's trainers reset no environments."
+                "auto_reset: expected True, got False; skrl's trainers do not reset environments."
             )
         self._group, self._state_group, self._limit = group, state_group, clip_actions
         self._observation_space = observation_space(core, group)
@@ -65,7 +65,7 @@ class SkrlEnv(Wrapper):
 
     @property
     def state_space(self) -> gymnasium.Space | None:
-        """Space of what critics see in one environment; None without a state."""
+        """Space of one environment's critic observations; None without a state."""
         return self._state_space
 
     @property
@@ -85,14 +85,14 @@ class SkrlEnv(Wrapper):
         """Step all environments.
 
         Args:
-            actions: Shape (N, A).
+            actions: Actions, (N, A).
 
         Returns:
             Observations; rewards, terminated and truncated (N, 1); infos.
         """
         results = step_env(self._env, actions, self._limit)
         self._observations, rewards, terminated, truncated, extras = results
-        # skrl bootstraps wherever an episode is truncated, also where it failed in the same step.
+        # skrl bootstraps all truncated episodes, even those that terminated in the same step.
         truncated = truncated & ~terminated
         infos: dict[str, Any] = {"log": dict(extras["log"]), "num_envs": len(rewards)}
         if "final_ids" in extras:
@@ -106,13 +106,13 @@ class SkrlEnv(Wrapper):
         return self._observations[self._group], rewards, terminated, truncated, infos
 
     def state(self) -> torch.Tensor | None:
-        """Return what critics see, (N, ...); None without a state."""
+        """Return the critic observations, (N, ...); None without a state."""
         if self._state_group is None or self._observations is None:
             return None
         return self._observations[self._state_group]
 
     def render(self, *args: Any, **kwargs: Any) -> Any:
-        """Return the image of the view of all environments, or None without a render mode."""
+        """Return one image of all environments, or None without a render mode."""
         return self._env.render()
 
     def close(self) -> None:
@@ -121,11 +121,11 @@ class SkrlEnv(Wrapper):
 
 
 def with_final_observations(agent: type[Agent]) -> type[Agent]:
-    """Return a subclass of a class of agents that records the observations episodes ended with.
+    """Return a subclass of `agent` that records the final observations of episodes.
 
-    skrl's trainers pass on what `step` returns, which is the first observation of the next episode where
-    one ended. With `time_limit_bootstrap`, an agent would take its value for that of the end. The agent
-    has all environments; several agents that share them by scopes raise ValueError.
+    skrl's trainers pass on the results of `step`, with the first observation of the next episode after
+    an end. With `time_limit_bootstrap`, an agent would bootstrap from its value. The agent must have
+    all environments; several agents with scopes raise ValueError.
     """
 
     class WithFinalObservations(agent):
@@ -135,7 +135,7 @@ def with_final_observations(agent: type[Agent]) -> type[Agent]:
             if len(next_observations) != infos["num_envs"]:
                 raise ValueError(
                     f"with_final_observations: expected one agent for all {infos['num_envs']} "
-                    f"environments, got {len(next_observations)} of them; use no scopes."
+                    f"environments, got {len(next_observations)} of them; do not use scopes."
                 )
             if "final_ids" in infos:
                 ids = infos["final_ids"]

@@ -1,4 +1,4 @@
-"""Image encoders that tell where features are instead of how strong they are."""
+"""Image encoders with spatial softmax: positions of features instead of their activations."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tensordict import TensorDict
 from torch import nn
 
 SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
-"""Keys of a CNN config that are not for rsl_rl's CNN."""
+"""Keys of a CNN config that rsl_rl's CNN does not accept."""
 
 
 class SpatialSoftmax(nn.Module):
-    """The expected position of each channel's activation.
+    """Expected position of each channel's activation.
 
     With w = softmax(x / temperature) over the cells of a channel, the output is (sum w * row,
     sum w * column), rows and columns running from -1 to 1 (a side of length 1 is at -1).
@@ -26,7 +26,7 @@ class SpatialSoftmax(nn.Module):
     columns: torch.Tensor
 
     def __init__(self, height: int, width: int, temperature: float = 1.0) -> None:
-        """Take feature maps of `height` x `width` cells."""
+        """Set up for feature maps of `height` x `width` cells."""
         super().__init__()
         self.temperature = temperature
         rows, columns = torch.meshgrid(
@@ -36,7 +36,7 @@ class SpatialSoftmax(nn.Module):
         self.register_buffer("columns", columns.reshape(-1))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Map features (B, C, H, W) to (B, 2 C): row and column of channel 0, of channel 1, ..."""
+        """Map features (B, C, H, W) to (B, 2C): row and column of channel 0, of channel 1, ..."""
         weights = torch.softmax(x.flatten(2) / self.temperature, dim=-1)
         row = (weights * self.rows).sum(-1)
         column = (weights * self.columns).sum(-1)
@@ -44,7 +44,7 @@ class SpatialSoftmax(nn.Module):
 
 
 class SpatialSoftmaxCNN(nn.Module):
-    """rsl_rl's CNN, without pooling and flattening at its end, and a spatial softmax."""
+    """rsl_rl's CNN without final pooling and flattening, followed by a spatial softmax."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class SpatialSoftmaxCNN(nn.Module):
         temperature: float = 1.0,
         **cnn_kwargs: Any,
     ) -> None:
-        """Take images of `input_dim` (height, width); `cnn_kwargs` are those of rsl_rl's CNN."""
+        """Build for images of `input_dim` (height, width); `cnn_kwargs` go to rsl_rl's CNN."""
         super().__init__()
         cnn_kwargs = {**cnn_kwargs, "global_pool": "none", "flatten": False}
         cnn: Any = CNN(input_dim=input_dim, input_channels=input_channels, **cnn_kwargs)
@@ -64,12 +64,12 @@ class SpatialSoftmaxCNN(nn.Module):
 
     @property
     def output_channels(self) -> None:
-        """None: the output is flat, as rsl_rl's models ask."""
+        """None: rsl_rl's marker of a flat output."""
         return None
 
     @property
     def output_dim(self) -> int:
-        """Two numbers for each channel."""
+        """Output size: two values per channel."""
         return self._output_dim
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -78,7 +78,7 @@ class SpatialSoftmaxCNN(nn.Module):
 
 
 class SpatialSoftmaxCNNModel(CNNModel):
-    """rsl_rl's model for images and plain observations, with spatial softmax encoders."""
+    """rsl_rl's model for images and flat observations, with spatial softmax encoders."""
 
     def __init__(
         self,
@@ -93,13 +93,13 @@ class SpatialSoftmaxCNNModel(CNNModel):
         obs_normalization: bool = False,
         distribution_cfg: dict[str, Any] | None = None,
     ) -> None:
-        """Take rsl_rl's arguments.
+        """Build the model; arguments are those of rsl_rl's `CNNModel`.
 
-        `cnn_cfg` is one config for all image groups, or one for each by name; besides what
-        rsl_rl's CNN takes, it may have `spatial_softmax_temperature`. `cnns` are encoders to share.
+        `cnn_cfg` is one config for all image groups, or one per group by name; besides the keys of
+        rsl_rl's CNN it accepts `spatial_softmax_temperature`. `cnns` are shared encoders.
 
         Raises:
-            ValueError: `cnns`, or the names in `cnn_cfg`, are not those of the image groups.
+            ValueError: the names in `cnns` or `cnn_cfg` are not those of the image groups.
         """
         if cnns is None:
             self._get_obs_dim(obs, obs_groups, obs_set)
@@ -131,16 +131,16 @@ class SpatialSoftmaxCNNModel(CNNModel):
 def cnn_cfg_by_group(
     cnn_cfg: Mapping[str, Any], groups: Sequence[str], name: str = "cnn_cfg"
 ) -> dict[str, dict[str, Any]]:
-    """Return the CNN config of each image group; one config is that of all groups.
+    """Return the CNN config of each image group; a single config applies to all groups.
 
     Raises:
-        ValueError: `cnn_cfg`, called `name`, has configs for other groups.
+        ValueError: `cnn_cfg` has configs for other groups; `name` is its name in the message.
     """
     if not all(isinstance(value, dict) for value in cnn_cfg.values()):
         return {group: dict(cnn_cfg) for group in groups}
     if set(cnn_cfg) != set(groups):
         raise ValueError(
-            f"{name} has configs for {sorted(cnn_cfg)}, and the image groups are {sorted(groups)}; "
-            "give one for each, or one for all."
+            f"{name}: expected a config per image group {sorted(groups)}, or one config for all, got "
+            f"configs for {sorted(cnn_cfg)}."
         )
     return {group: dict(cnn_cfg[group]) for group in groups}

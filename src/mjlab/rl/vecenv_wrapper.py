@@ -1,4 +1,4 @@
-"""The environment as rsl_rl wants to see it."""
+"""rsl_rl adapter for `ManagerBasedRlEnv`."""
 
 from __future__ import annotations
 
@@ -19,20 +19,19 @@ if TYPE_CHECKING:
 
 
 class RslRlVecEnvWrapper(VecEnv):
-    """Adapts a `ManagerBasedRlEnv` (possibly wrapped) to rsl_rl's `VecEnv`.
+    """rsl_rl's `VecEnv` interface of a `ManagerBasedRlEnv` (possibly wrapped).
 
-    Observations become a TensorDict of groups with batch size [num_envs]; `terminated` and
-    `truncated` become one `dones`. Episodes that only ran out of time are marked in
-    `extras["time_outs"]`, so that the algorithm adds the value of what would have followed, unless
-    the task says that its horizon is finite.
+    Observations are a TensorDict of groups with batch size [num_envs]; `terminated` and `truncated`
+    are combined to `dones`. Time-outs without termination are marked in `extras["time_outs"]`, for
+    bootstrapping by the algorithm, unless the task has a finite horizon.
     """
 
     def __init__(self, env: ManagerBasedRlEnv, clip_actions: float | None = None):
         """Wrap `env` and reset it once.
 
         Args:
-            env: The environment.
-            clip_actions: Actions are clamped to plus and minus this before `env` sees them.
+            env: Environment.
+            clip_actions: Bound c: actions are clamped to [-c, c] before `env`. None: unbounded.
 
         Raises:
             ValueError: `clip_actions` is not positive.
@@ -84,14 +83,14 @@ class RslRlVecEnvWrapper(VecEnv):
 
     @property
     def unwrapped(self) -> ManagerBasedRlEnv:
-        """The environment below all wrappers."""
+        """Environment without wrappers."""
         return self.env.unwrapped
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the last reset, shape (num_envs,), int64.
+        """Number of steps since the last reset, (num_envs,), int64.
 
-        Assigning copies into the environment's own tensor, so that references to it stay valid.
+        Assignment copies into the environment's tensor, so that references to it stay valid.
         """
         return self.unwrapped.episode_length_buf
 
@@ -100,11 +99,11 @@ class RslRlVecEnvWrapper(VecEnv):
         self.unwrapped.episode_length_buf.copy_(value)
 
     def observe_ends(self, enabled: bool = True) -> None:
-        """Have `step` return the observations in which episodes run out of time.
+        """Enable final observations of episodes that time out.
 
-        They are `extras["final_observations"]`, a TensorDict of batch size [k], and
-        `extras["final_ids"]` (k,), in steps in which k episodes do. Does nothing if time-outs are
-        not bootstrapped (`is_finite_horizon`) or the environment cannot observe them.
+        In steps with k time-outs, `step` returns `extras["final_observations"]`, a TensorDict of batch
+        size [k], and `extras["final_ids"]` (k,). Without effect if time-outs are not bootstrapped
+        (`is_finite_horizon`) or the environment cannot observe them.
         """
         env = self.unwrapped
         if hasattr(env, "observes_ends"):
@@ -129,7 +128,7 @@ class RslRlVecEnvWrapper(VecEnv):
         """Step all environments.
 
         Args:
-            actions: Shape (num_envs, num_actions).
+            actions: Actions, (num_envs, num_actions).
 
         Returns:
             Observations; rewards (num_envs,); dones (num_envs,) int64; extras.
@@ -139,8 +138,8 @@ class RslRlVecEnvWrapper(VecEnv):
         observations, rewards, terminated, truncated, extras = self.env.step(actions)
         dones = (terminated | truncated).to(dtype=torch.long)
         if not self.cfg.is_finite_horizon:
-            # An episode that ended in a terminal state has no future to bootstrap from, even when
-            # it ran out of time in the same step.
+            # A terminal state has no future to bootstrap from, even if the episode timed out in the
+            # same step.
             extras["time_outs"] = truncated & ~terminated
         if "final_observations" in extras:
             extras["final_observations"] = TensorDict(

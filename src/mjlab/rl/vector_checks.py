@@ -1,7 +1,7 @@
-"""Checks of a Gymnasium vector environment against what Gymnasium says of them.
+"""Checks of vector environments against Gymnasium's interface.
 
-Gymnasium's `check_env` is for single environments. This one is for any `VectorEnv`, not only those of
-mjlab.
+Gymnasium's `check_env` is for single environments. `check_vector_env` supports any `VectorEnv`, not
+only those of mjlab.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ _FINAL = ("final_obs", "final_info")
 
 
 class VectorEnvError(AssertionError):
-    """Raised for a vector environment that breaks Gymnasium's interface; the text names all faults."""
+    """Violation of Gymnasium's vector interface; the message lists all faults."""
 
 
 def check_vector_env(
     env: VectorEnv, steps: int = 100, seed: int = 0, action_limit: float = 1.0
 ) -> None:
-    """Raise VectorEnvError, with all faults, unless `env` keeps to Gymnasium's vector interface.
+    """Check that `env` conforms to Gymnasium's vector interface.
 
-    It resets and steps the environment with random actions. Checked are spaces, shapes, types and bounds;
-    that one seed gives one trajectory; that arrays which were returned are left alone; what happens where
-    an episode ends, by the autoreset mode; and masks of infos.
+    Resets and steps the environment with random actions, and checks spaces, shapes, types and bounds;
+    that a seed determines the trajectory; that returned arrays are not modified; the ends of episodes, by
+    the autoreset mode; and masks of infos.
 
     Args:
-        env: The environment. It is not closed.
-        steps: Steps, in which some episode has to end.
+        env: Environment; it is not closed.
+        steps: Number of steps; at least one episode must end in them.
         seed: Seed of the environment and of the actions.
-        action_limit: Bound of random actions where the space has none.
+        action_limit: Bound of random actions if the space is unbounded.
 
     Raises:
-        VectorEnvError: something is wrong.
+        VectorEnvError: the interface is violated; the message lists all faults.
         ValueError: no episode ended.
     """
     check = _Check(env, action_limit)
@@ -46,8 +46,8 @@ def check_vector_env(
     if not check.faults:
         if not any(ended.any() for ended in check.ends):
             raise ValueError(
-                f"No episode ended in {steps} steps, so that resets were not checked; use more steps "
-                "or shorter episodes."
+                f"No episode ended in {steps} steps, so resets were not checked; use more steps or "
+                "shorter episodes."
             )
         second = check.run(steps, seed)
         for step, (one, other) in enumerate(zip(first, second, strict=True)):
@@ -60,7 +60,7 @@ def check_vector_env(
 
 
 class _Check:
-    """Runs of one environment, and the faults that they showed: the first of each kind."""
+    """Runs of one environment, and the first fault of each kind."""
 
     def __init__(self, env: VectorEnv, action_limit: float) -> None:
         self.env = env
@@ -68,8 +68,8 @@ class _Check:
         self.ends: list[np.ndarray] = []
         self._limit = action_limit
         self._mode: AutoresetMode | None = None
-        # Of the last step: its first four results, copies of them, and where episodes ended.
-        self._given: Any = None
+        # First four results of the last step, copies of them, and mask of ended episodes.
+        self._returned: Any = None
         self._copies: Any = None
         self._ended = np.zeros(0, dtype=bool)
         self._stale, self._unreset, self._still = _Always(), _Always(), False
@@ -78,7 +78,7 @@ class _Check:
         self.faults.setdefault(kind, text)
 
     def run(self, steps: int, seed: int) -> list[Any]:
-        """Reset and step; return copies of all that was returned, as far as nothing was wrong."""
+        """Reset and step; return copies of all results, an empty list after a fault."""
         self._check_attributes()
         if self.faults:
             return []
@@ -92,7 +92,7 @@ class _Check:
             if self._mode is AutoresetMode.DISABLED and self._ended.any():
                 self._reset_ended()
             returned.append(self._step(actions.sample()))
-        # Where observations stand still anyway, one that does shows nothing.
+        # Equal observations are faults only if observations change from step to step.
         if self._stale and not self._still:
             self.fault("stale final_obs", "it is the observation before the last step")
         if self._unreset and not self._still:
@@ -100,20 +100,20 @@ class _Check:
         return returned
 
     def _reset(self, **kwargs: Any) -> Any:
-        """Reset, check what is returned, and return a copy of the observations."""
+        """Reset, check the results, and return a copy of the observations."""
         result = self.env.reset(**kwargs)
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
             self.fault("reset", f"expected (observations, infos), got {_kind(result)}")
             return None
         self._check_observations("reset", result[0])
         self._check_masks(result[1])
-        self._given = result[:1]
-        self._copies = _copied(self._given)
+        self._returned = result[:1]
+        self._copies = _copied(self._returned)
         self._ended = np.zeros(self.env.num_envs, dtype=bool)
         return self._copies[0]
 
     def _reset_ended(self) -> None:
-        """Reset where episodes ended, which are to change, and nowhere else."""
+        """Reset environments with ended episodes, and check that only their observations change."""
         ended, before = self._ended, self._rows(self._copies[0])
         self._reset(options={"reset_mask": ended.copy()})
         if self.faults:
@@ -125,23 +125,24 @@ class _Check:
                 self._unreset.see(True, same)
             elif not same:
                 self.fault(
-                    "reset_mask", "expected a reset where it is true, got one where it is false"
+                    "reset_mask",
+                    "expected resets only of environments with a true mask, got one with a false mask",
                 )
 
     def _step(self, action: Any) -> Any:
-        """Step, check what is returned, and return copies of its first four results."""
+        """Step, check the results, and return copies of the first four."""
         result = self.env.step(action)
         if not (isinstance(result, tuple) and len(result) == 5 and isinstance(result[4], dict)):
             self.fault("step", f"expected five results, the last a dict, got {_kind(result)}")
             return None
-        if not _same(self._given, self._copies):
-            self.fault("aliasing", "what was returned is changed by the next step; return copies")
+        if not _same(self._returned, self._copies):
+            self.fault("aliasing", "the next step modifies returned arrays; return copies")
         self._check_step(result)
         if self.faults:
             return None
         before, ended_before = self._rows(self._copies[0]), self._ended
-        self._given, infos = result[:4], result[4]
-        self._copies = _copied(self._given)
+        self._returned, infos = result[:4], result[4]
+        self._copies = _copied(self._returned)
         after, rewards, terminated, truncated = self._copies
         self._ended = ended = terminated | truncated
         self.ends.append(ended)
@@ -153,7 +154,7 @@ class _Check:
         elif "final_obs" in infos:
             self.fault("final_obs", f"expected none with {self._mode}, got infos['final_obs']")
         if self._mode is AutoresetMode.NEXT_STEP:
-            # A step after the end of an episode only resets.
+            # The step after the end of an episode only resets.
             if (rewards[ended_before] != 0).any():
                 self.fault(
                     "autoreset", "expected reward 0 in the step after an end, which only resets"
@@ -201,41 +202,41 @@ class _Check:
             ("terminations", terminated, "b"),
             ("truncations", truncated, "b"),
         ):
-            wanted = "floats" if kinds == "f" else "bool"
+            expected = "floats" if kinds == "f" else "bool"
             if not isinstance(value, np.ndarray | torch.Tensor):
-                self.fault(name, f"expected an array {shape} of {wanted}, got {_kind(value)}")
+                self.fault(name, f"expected an array {shape} of {expected}, got {_kind(value)}")
                 continue
             array = _array(value)
             if array.shape != shape or array.dtype.kind not in kinds:
                 self.fault(
-                    name, f"expected {shape} of {wanted}, got {array.shape} of {array.dtype}"
+                    name, f"expected {shape} of {expected}, got {array.shape} of {array.dtype}"
                 )
             elif kinds == "f" and not np.isfinite(array).all():
                 self.fault(name, "expected finite numbers")
         self._check_masks(infos)
 
     def _check_masks(self, infos: dict[str, Any], path: str = "infos") -> None:
-        """Check that each entry has its mask, and one value for each environment.
+        """Check that each entry has a mask, and one value per environment.
 
-        Entries of an entry may go by its mask: those of Gymnasium's own wrappers do.
+        Nested entries may share the mask of their parent, as in Gymnasium's wrappers.
         """
         for name, value in infos.items():
             if name.startswith("_"):
                 continue
             mask = infos.get(f"_{name}")
-            label = f"{path}[{name!r}]"
+            entry = f"{path}[{name!r}]"
             if (mask is not None or path == "infos") and not (
                 isinstance(mask, np.ndarray | torch.Tensor)
                 and tuple(mask.shape) == (self.env.num_envs,)
                 and _array(mask).dtype == np.bool_
             ):
                 self.fault(
-                    "infos", f"expected a mask ({self.env.num_envs},) bool '_{name}' of {label}"
+                    "infos", f"expected a mask ({self.env.num_envs},) bool '_{name}' of {entry}"
                 )
             if isinstance(value, dict):
-                self._check_masks(value, label)
+                self._check_masks(value, entry)
             elif len(getattr(value, "shape", ())) < 1 or value.shape[0] != self.env.num_envs:
-                self.fault("infos", f"expected an array of {self.env.num_envs} values in {label}")
+                self.fault("infos", f"expected an array of {self.env.num_envs} values in {entry}")
 
     def _check_final(
         self,
@@ -245,14 +246,14 @@ class _Check:
         before: list[Any],
         after: list[Any],
     ) -> None:
-        """Check what a step that resets says of the episodes that ended in it."""
+        """Check the final observations and infos of a step that ends and resets episodes."""
         for name in _FINAL:
             mask = infos.get(f"_{name}")
             shown = np.zeros_like(ended) if mask is None else _array(mask)
             if not np.array_equal(shown, ended):
                 self.fault(
                     name,
-                    f"expected infos['_{name}'] to be true where an episode ended "
+                    f"expected infos['_{name}'] to be true for ended episodes "
                     f"({np.flatnonzero(ended).tolist()}), got {np.flatnonzero(shown).tolist()}",
                 )
                 return
@@ -263,7 +264,7 @@ class _Check:
             self.fault("final_obs", f"expected an object array, got {_kind(final)}")
             return
         if any(final[row] is not None for row in np.flatnonzero(~ended)):
-            self.fault("final_obs", "expected None where no episode ended")
+            self.fault("final_obs", "expected None for episodes that did not end")
         single = self.env.single_observation_space
         for row in np.flatnonzero(ended):
             for text in _mismatches(single, final[row], "final_obs"):
@@ -274,7 +275,7 @@ class _Check:
 
 
 class _Always:
-    """Observation that is true of all ends of one kind, terminations or time-outs, or is not."""
+    """Property that holds for all ends of one kind: terminations or time-outs."""
 
     def __init__(self) -> None:
         self._seen: dict[bool, list[bool]] = {}
@@ -287,7 +288,7 @@ class _Always:
 
 
 def _bounded(space: gymnasium.Space, limit: float) -> gymnasium.Space:
-    """Return `space` with bounds to draw from: unbounded ones draw far beyond what a robot can do."""
+    """Return `space` with finite bounds: samples of unbounded spaces are too large for a robot."""
     if not isinstance(space, gymnasium.spaces.Box):
         return space
     low, high = np.maximum(space.low, -limit), np.minimum(space.high, limit)
@@ -298,28 +299,28 @@ def _bounded(space: gymnasium.Space, limit: float) -> gymnasium.Space:
     )
 
 
-def _mismatches(space: gymnasium.Space, value: Any, label: str) -> Iterator[str]:
-    """Yield, one text each, where `value` is not of `space`."""
+def _mismatches(space: gymnasium.Space, value: Any, name: str) -> Iterator[str]:
+    """Yield a message for each mismatch between `value` and `space`."""
     if isinstance(space, gymnasium.spaces.Dict):
         if not isinstance(value, dict) or set(value) != set(space):
             found = sorted(value) if isinstance(value, dict) else _kind(value)
-            yield f"{label}: expected a dict of {sorted(space)}, got {found}"
+            yield f"{name}: expected a dict of {sorted(space)}, got {found}"
             return
-        for name, inner in space.items():
-            yield from _mismatches(inner, value[name], f"{label}[{name!r}]")
+        for key, inner in space.items():
+            yield from _mismatches(inner, value[key], f"{name}[{key!r}]")
         return
     if isinstance(value, torch.Tensor):
         value = _array(value)
     if not isinstance(value, np.ndarray) and space.shape:
-        yield f"{label}: expected an array {space.shape}, got {_kind(value)}"
+        yield f"{name}: expected an array {space.shape}, got {_kind(value)}"
     elif isinstance(value, np.ndarray) and (value.shape, value.dtype) != (space.shape, space.dtype):
         yield (
-            f"{label}: expected {space.shape} of {space.dtype}, got {value.shape} of {value.dtype}"
+            f"{name}: expected {space.shape} of {space.dtype}, got {value.shape} of {value.dtype}"
         )
     elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and not np.isfinite(value).all():
-        yield f"{label}: expected finite numbers"
+        yield f"{name}: expected finite numbers"
     elif not space.contains(value):
-        yield f"{label}: values are outside of the bounds of the space"
+        yield f"{name}: values are outside the bounds of the space"
 
 
 def _array(value: Any) -> np.ndarray:

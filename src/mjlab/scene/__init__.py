@@ -1,4 +1,4 @@
-"""The scene: terrain, entities and sensors in one MuJoCo spec."""
+"""Scenes: terrain, entities and sensors composed into one `MjSpec`."""
 
 from mjlab.scene.scene import Scene as Scene
 from mjlab.scene.scene import SceneCfg as SceneCfg

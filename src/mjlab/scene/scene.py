@@ -1,8 +1,8 @@
-"""The scene: terrain, entities and sensors, composed into one MuJoCo spec.
+"""Scenes: terrain, entities and sensors composed into one `MjSpec`.
 
-`MujocoCfg` decides every simulation option that it has a field for, whatever the XML of an entity
-says; its flags are added to those of the XML. Other options come from the XML, unless entities or
-`SceneCfg.spec_fn` contradict each other.
+The fields of `MujocoCfg` override the simulation options in the XML of entities; its flags are
+added to those of the XML. Other options come from the XML, unless entities or `SceneCfg.spec_fn`
+conflict.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from mjlab.utils.state import stateful
 
 TERRAIN = "terrain"
 
-# Options that `MujocoCfg` decides, and its flags, which are added to those of the XML.
-_DECIDED = frozenset(field.name for field in dataclasses.fields(MujocoCfg)) - set(BIT_FIELDS)
+# Options that `MujocoCfg` overrides, and its flags. Flags are added to those of the XML.
+_OVERRIDDEN = frozenset(field.name for field in dataclasses.fields(MujocoCfg)) - set(BIT_FIELDS)
 _FLAGS = ("disableflags", "enableflags")
 
 logger = logging.getLogger(__name__)
@@ -49,27 +49,27 @@ logger = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class SceneCfg:
-    """Describes what is in the world, and in how many environments."""
+    """Scene configuration: terrain, entities, sensors and number of environments."""
 
     num_envs: int = 1
     """Number of environments."""
     env_spacing: float = 2.0
-    """Distance between the origins of environments on a plane, in metres."""
+    """Distance between environment origins on a plane (m)."""
     terrain: TerrainEntityCfg | None = None
-    """The ground. Without one there is none, and all environments have the same origin."""
+    """Terrain. None: no ground, and all environments share the world's origin."""
     entities: dict[str, EntityCfg] = field(default_factory=dict)
-    """Entities by name. In the scene their elements are called `<entity>/<element>`."""
+    """Entities by name. Scene names of their elements are `<entity>/<element>`."""
     sensors: tuple[SensorCfg, ...] = ()
-    """Sensors to add. Those of the entities' XML are available as `<entity>/<sensor>` anyway."""
+    """Sensors to add. Sensors in the XML of entities are available as `<entity>/<sensor>`."""
     extent: float | None = None
-    """Size of the scene for viewers, in metres; None lets MuJoCo compute it."""
+    """Scene extent for viewers (m). None: computed by MuJoCo."""
     spec_fn: Callable[[mujoco.MjSpec], None] | None = None
-    """Edits the scene's spec last, before it is compiled."""
+    """Function that edits the composed spec before compilation."""
 
 
 @stateful
 class Scene:
-    """What is in the world. Built from its config, then tied to a simulation by `initialize`."""
+    """Terrain, entities and sensors composed into one `MjSpec`. `initialize` binds a simulation."""
 
     _transient = {"_env_origins", "_device", "_updated_sensors", "_sensors_by_stage"}
 
@@ -77,8 +77,7 @@ class Scene:
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
 
         Raises:
-            ValueError: the config makes no sense; entities or sensors cannot be built, or two
-                sensors have one name.
+            ValueError: invalid config, entity or sensor, or duplicate sensor name.
         """
         check_count("SceneCfg.num_envs", scene_cfg.num_envs)
         self._cfg = scene_cfg
@@ -92,7 +91,7 @@ class Scene:
         self.entity_options = merge_entity_options(
             {name: entity.options for name, entity in self._entities.items()}
         )
-        """Simulation options that entities ask for and nobody in the scene contradicts."""
+        """Simulation options requested by entities without conflict in the scene."""
         write_requests(self._spec.option, self.entity_options)
         self._add_sensors()
         if scene_cfg.spec_fn is not None:
@@ -105,7 +104,7 @@ class Scene:
 
     def _add_entities(self) -> None:
         if self._cfg.terrain is not None:
-            # A copy, because the user's config says what was asked for and stays as it is.
+            # A copy, because the user's config must not change.
             terrain_cfg = dataclasses.replace(
                 self._cfg.terrain, num_envs=self._cfg.num_envs, env_spacing=self._cfg.env_spacing
             )
@@ -114,8 +113,8 @@ class Scene:
         for name, cfg in self._cfg.entities.items():
             if not name or "/" in name or name in self._entities:
                 raise ValueError(
-                    f"Entity name {name!r}: it must be a word without '/', and 'terrain' is taken "
-                    "where the scene has a terrain."
+                    f"Entity name {name!r}: expected a nonempty name without '/', other than "
+                    "'terrain' in a scene with a terrain."
                 )
             try:
                 entity = cfg.build()
@@ -126,8 +125,8 @@ class Scene:
     def _attach(self, name: str, entity: Entity, prefix: str) -> None:
         self._entities[name] = entity
         entity.snapshot_spec()
-        # MuJoCo would carry the entity's keyframe over, padded with the other entities' qpos0. The
-        # scene's own holds the initial state of all.
+        # MuJoCo would copy the entity's keyframe, padded with qpos0 of the other entities. The
+        # keyframe of the scene holds the initial state of all entities.
         for key in list(entity.spec.keys):
             entity.spec.delete(key)
         make_asset_paths_absolute(entity.spec)
@@ -138,17 +137,17 @@ class Scene:
             name = cfg.prefixed_name
             if name in self._sensors:
                 raise ValueError(
-                    f"Two sensors are called {name!r}. Names must be unique in SceneCfg.sensors: "
-                    "rename one of them."
+                    f"SceneCfg.sensors: expected unique names, got {name!r} twice; rename one of "
+                    "the sensors."
                 )
             sensor = cfg.build()
             sensor.edit_spec(self._spec, self._entities)
             self._sensors[name] = sensor
         for mj_sensor in self._spec.sensors:
-            # A sensor without a name cannot be asked for.
+            # A sensor without a name cannot be looked up.
             if mj_sensor.name and mj_sensor.name not in self._sensors:
                 self._sensors[mj_sensor.name] = BuiltinSensor.from_existing(mj_sensor.name)
-        # Those of MuJoCo show the simulation itself, and have nothing to keep up to date.
+        # Data of built-in sensors is a live view of the simulation, without a cache to update.
         self._updated_sensors = [
             sensor for sensor in self._sensors.values() if type(sensor) is not BuiltinSensor
         ]
@@ -165,24 +164,24 @@ class Scene:
     # Access.
 
     def __getitem__(self, key: str) -> Any:
-        """Return the sensor, else the entity, of that name; KeyError lists what there is."""
+        """Return the sensor, else the entity, with this name. Raises `KeyError` with all names."""
         if key in self._sensors:
             return self._sensors[key]
         if key in self._entities:
             return self._entities[key]
         raise UnknownNameError(
-            f"The scene has no {key!r}. Entities: {list(self._entities)}. "
+            f"Unknown entity or sensor {key!r}. Entities: {list(self._entities)}. "
             f"Sensors: {list(self._sensors)}."
         )
 
     @property
     def cfg(self) -> SceneCfg:
-        """The config the scene was built from."""
+        """Scene configuration."""
         return self._cfg
 
     @property
     def spec(self) -> mujoco.MjSpec:
-        """The composed spec."""
+        """Composed spec."""
         return self._spec
 
     @property
@@ -197,17 +196,17 @@ class Scene:
 
     @property
     def env_spacing(self) -> float:
-        """Distance between environments on a plane, in metres."""
+        """Distance between environment origins on a plane (m)."""
         return self._cfg.env_spacing
 
     @property
     def env_origins(self) -> torch.Tensor:
-        """(N, 3) world positions of the environments' origins."""
+        """World positions of the environment origins (m), (N, 3)."""
         return self._env_origins if self._terrain is None else self._terrain.env_origins
 
     @property
     def terrain(self) -> TerrainEntity | None:
-        """The terrain, which is also `entities["terrain"]`."""
+        """Terrain, also available as `entities["terrain"]`."""
         return self._terrain
 
     @property
@@ -222,14 +221,14 @@ class Scene:
 
     @property
     def sensor_context(self) -> SensorContext | None:
-        """What evaluates camera and ray sensors, once initialized; None if there are none."""
+        """Context of camera and ray sensors. None without such sensors or before `initialize`."""
         return self._sensor_context
 
     @property
     def needs_substep(self) -> bool:
-        """True if an actuator or a sensor acts at every physics substep.
+        """True if an actuator or a sensor must be updated every physics substep.
 
-        Sensors with `recorded_fields` do not.
+        Sensors with `recorded_fields` do not count.
         """
         return any(entity.needs_substep for entity in self._entities.values()) or any(
             sensor.needs_substep and not sensor.recorded_fields for sensor in self._sensors.values()
@@ -237,12 +236,12 @@ class Scene:
 
     @property
     def recorded_fields(self) -> tuple[str, ...]:
-        """Data fields of which sensors need the values after every physics substep."""
+        """Data fields to record after every physics substep for sensors."""
         fields = (field for sensor in self._sensors.values() for field in sensor.recorded_fields)
         return tuple(dict.fromkeys(fields))
 
     def collect_variant_info(self) -> list[Any]:
-        """Return the entities whose meshes differ between environments."""
+        """Return name and variant metadata of entities with per-environment meshes."""
         return [
             (name, entity.variant_metadata)
             for name, entity in self._entities.items()
@@ -250,11 +249,11 @@ class Scene:
         ]
 
     def report_overruled_options(self, cfg: MujocoCfg) -> None:
-        """Log the options that `cfg` decides otherwise than the XML of an entity, or `spec_fn`.
+        """Log options of entity XMLs or `spec_fn` that `cfg` overrides with other values.
 
-        `MujocoCfg` decides every option that it has; the others are on `spec.option` since the
-        scene was built, as the XML asks, and so are flags, to which those of `cfg` are added. Flags
-        of an XML that `cfg` lacks are logged too.
+        `MujocoCfg` overrides every option it has a field for. The scene's spec already has the
+        other options and the flags of the XML; the flags of `cfg` are added to them. Flags of an
+        XML that are missing in `cfg` are logged too.
         """
         stated = {f"the XML of {name!r}": e.options for name, e in self._entities.items()}
         if self._cfg.spec_fn is not None:
@@ -268,16 +267,15 @@ class Scene:
         return compile_composed(self._spec)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any) -> None:
-        """Tie terrain, entities and sensors to a simulation.
+        """Bind terrain, entities and sensors to a simulation.
 
         Args:
-            mj_model: The model compiled from `spec`.
-            model: The simulation's model fields.
-            data: The simulation's data fields.
+            mj_model: Model compiled from `spec`.
+            model: Model fields of the simulation.
+            data: Data fields of the simulation.
         """
         if any(body.id < 0 for body in self._spec.bodies):
-            # The model came from a copy of the spec, so that elements without a name do not know
-            # their ids yet.
+            # The model was compiled from a copy of the spec, so unnamed elements have no ids yet.
             compile_composed(self._spec)
         for part in (*self._entities.values(), *self._sensors.values()):
             part.initialize(mj_model, model, data, self._device)
@@ -287,7 +285,7 @@ class Scene:
             self._sensor_context = SensorContext(mj_model, model, data, cameras, rays, self._device)
 
     def reset(self, env_ids: EnvIds = None) -> None:
-        """Reset targets, delays, histories and sensors of environments; None means all."""
+        """Reset targets, delays, histories and sensors of `env_ids` (None: all)."""
         for entity in self._entities.values():
             entity.reset(env_ids)
         for sensor in self._updated_sensors:
@@ -296,9 +294,9 @@ class Scene:
     def update(
         self, dt: float, recorded: dict[str, torch.Tensor] | None = None, substeps: int = 1
     ) -> None:
-        """Tell actuators and sensors that the simulation has advanced by `substeps` times `dt` s.
+        """Update actuators and sensors after `substeps` physics substeps of `dt` seconds each.
 
-        With more than one substep, `recorded` has the values of `recorded_fields` after each.
+        With more than one substep, `recorded` holds `recorded_fields` after each substep.
         """
         for entity in self._entities.values():
             entity.update(substeps * dt)
@@ -310,14 +308,14 @@ class Scene:
                 sensor.update(substeps * dt)
 
     def write_data_to_sim(self, env_ids: EnvIds = None) -> None:
-        """Turn the entities' targets into controls; with `env_ids`, only in environments just reset."""
+        """Convert actuator targets into `ctrl`; with `env_ids`, only in environments just reset."""
         for entity in self._entities.values():
             entity.write_data_to_sim(env_ids)
 
     def take_moved_envs(self) -> torch.Tensor | None:
-        """Return the environments in which something was placed since the last substep, (N,) bool.
+        """Return environments with an entity placed since the last substep, (N,) bool.
 
-        They are forgotten then. None if nothing was: see `EntityData.moved_envs`.
+        Clears them. None if no entity was placed: see `EntityData.moved_envs`.
         """
         moved = None
         for entity in self._entities.values():
@@ -327,20 +325,20 @@ class Scene:
         return moved
 
     def invalidate_sensor_caches(self, stage: Stage = "acc") -> None:
-        """Drop the data of sensors that a forward pass up to `stage` has changed."""
+        """Invalidate cached data of sensors that a forward pass up to `stage` has changed."""
         for sensor in self._sensors_by_stage[stage]:
             sensor.invalidate_cache()
 
     # Files.
 
     def write(self, output_dir: Path, *, zip: bool = False) -> None:
-        """Write `scene.xml` and the files it refers to into a folder, or `<output_dir>.zip`."""
+        """Write `scene.xml` and its assets into a folder, or into `<output_dir>.zip`."""
         export_spec(self._spec, Path(output_dir), zip=zip)
 
     def to_zip(self, path: Path) -> None:
         """Deprecated: call `write(path, zip=True)`."""
         warnings.warn(
-            "Scene.to_zip is an older name of Scene.write(path, zip=True).",
+            "Scene.to_zip is deprecated; use Scene.write(path, zip=True).",
             DeprecationWarning,
             stacklevel=2,
         )
@@ -351,7 +349,7 @@ class Scene:
 def make_base_spec(extent: float | None) -> mujoco.MjSpec:
     """Return a spec without elements or options, with mjlab's visual defaults.
 
-    `extent` is the size of the scene for viewers, in metres; None lets the compiler compute it.
+    `extent`: scene extent for viewers (m). None: computed by the compiler.
     """
     spec = mujoco.MjSpec()
     spec.modelname = "mjlab scene"
@@ -383,35 +381,37 @@ def make_base_spec(extent: float | None) -> mujoco.MjSpec:
 
 @dataclass(frozen=True)
 class OptionRequest:
-    """A value for a simulation option, and the entities that ask for it."""
+    """Value of a simulation option, and the entities that request it."""
 
     value: Any
     entities: tuple[str, ...]
 
 
 def merge_entity_options(options: dict[str, EntityOptions]) -> dict[str, OptionRequest]:
-    """Return what the entities ask for together, beyond what `MujocoCfg` decides.
+    """Return the options requested by entities, except the fields of `MujocoCfg`.
 
-    Fields about which entities disagree are left out, and reported by one `UserWarning`. Of sets of
-    switches (flags), only the switches are left out about which they disagree.
+    Conflicting requests are dropped, with one `UserWarning`. For flags, only the conflicting bits
+    are dropped.
     """
     merged: dict[str, OptionRequest] = {}
     conflicts: list[str] = []
     names = dict.fromkeys(name for own in options.values() for name in own.values)
-    for name in (name for name in names if name not in _DECIDED):
-        wishes = {entity: own.values[name] for entity, own in options.items() if name in own.values}
-        if len(set(wishes.values())) == 1:
-            merged[name] = OptionRequest(next(iter(wishes.values())), tuple(wishes))
+    for name in (name for name in names if name not in _OVERRIDDEN):
+        requested = {
+            entity: own.values[name] for entity, own in options.items() if name in own.values
+        }
+        if len(set(requested.values())) == 1:
+            merged[name] = OptionRequest(next(iter(requested.values())), tuple(requested))
         else:
-            wanted = ", ".join(f"{show(name, v)} ({entity})" for entity, v in wishes.items())
-            conflicts.append(f"  {name}: {wanted}")
+            values = ", ".join(f"{show(name, v)} ({entity})" for entity, v in requested.items())
+            conflicts.append(f"  {name}: {values}")
     for name in BIT_FIELDS:
         _merge_switches(name, options, merged, conflicts)
     if conflicts:
         warnings.warn(
-            "Entities ask in their XML for different simulation options. A scene has one of each, "
-            "so these are not applied:\n" + "\n".join(conflicts) + "\nSet flags in MujocoCfg, and "
-            "the others in SceneCfg.spec_fn.",
+            "Conflicting simulation options in the XML of entities are not applied:\n"
+            + "\n".join(conflicts)
+            + "\nSet flags in MujocoCfg, and other options in SceneCfg.spec_fn.",
             UserWarning,
             stacklevel=3,
         )
@@ -424,33 +424,33 @@ def _merge_switches(
     merged: dict[str, OptionRequest],
     conflicts: list[str],
 ) -> None:
-    wishes = {e: own.switches[name] for e, own in options.items() if name in own.switches}
-    wanted = unwanted = 0
-    for bits, stated in wishes.values():
-        wanted |= bits
-        unwanted |= stated & ~bits
-    contested = wanted & unwanted
-    for entity, (bits, stated) in wishes.items():
+    requested = {e: own.switches[name] for e, own in options.items() if name in own.switches}
+    enabled = disabled = 0
+    for bits, stated in requested.values():
+        enabled |= bits
+        disabled |= stated & ~bits
+    contested = enabled & disabled
+    for entity, (bits, stated) in requested.items():
         if stated & contested:
             yes, no = show(name, bits & contested), show(name, stated & ~bits & contested)
             conflicts.append(f"  {name}: {entity} sets {yes} and clears {no}")
-    if wanted & ~contested:
-        entities = tuple(e for e, (bits, _) in wishes.items() if bits & ~contested)
-        merged[name] = OptionRequest(wanted & ~contested, entities)
+    if enabled & ~contested:
+        entities = tuple(e for e, (bits, _) in requested.items() if bits & ~contested)
+        merged[name] = OptionRequest(enabled & ~contested, entities)
 
 
 def write_requests(option: Any, requests: dict[str, OptionRequest]) -> None:
-    """Write requests onto the option block of the scene's spec."""
+    """Write requests to `option` of the scene's spec."""
     for name, request in requests.items():
         write_option(option, name, request.value)
         logger.info(
-            "Option %s = %s, as the XML of %s asks.",
+            "Option %s = %s, from the XML of %s.",
             name, show(name, request.value), ", ".join(request.entities),
         )  # fmt: skip
 
 
 def drop_overridden(option: Any, requests: dict[str, OptionRequest]) -> dict[str, OptionRequest]:
-    """Return the requests that the scene's `spec_fn` left as they were; report the others."""
+    """Return the requests that the scene's `spec_fn` left unchanged; warn about the others."""
     kept, changed = {}, []
     for name, request in requests.items():
         current = getattr(option, name)
@@ -458,13 +458,12 @@ def drop_overridden(option: Any, requests: dict[str, OptionRequest]) -> dict[str
             kept[name] = request
         else:
             changed.append(
-                f"  {name}: {show(name, current)}, not {show(name, request.value)} as "
-                f"{', '.join(request.entities)}"
+                f"  {name}: {show(name, current)} instead of {show(name, request.value)} "
+                f"({', '.join(request.entities)})"
             )
     if changed:
         warnings.warn(
-            "SceneCfg.spec_fn sets options otherwise than the XML of an entity asks:\n"
-            + "\n".join(changed),
+            "SceneCfg.spec_fn overrides options from the XML of entities:\n" + "\n".join(changed),
             UserWarning,
             stacklevel=3,
         )
@@ -474,18 +473,18 @@ def drop_overridden(option: Any, requests: dict[str, OptionRequest]) -> dict[str
 def report_overruled(
     cfg: MujocoCfg, stated: dict[str, EntityOptions], requests: dict[str, OptionRequest]
 ) -> None:
-    """Log what `cfg` decides otherwise than XMLs state, one line each with the assignment to copy.
+    """Log options that `cfg` overrides, one line each with the assignment to copy.
 
     Flags that XMLs set in addition to those of `cfg` apply, and are logged too.
 
     Args:
-        cfg: The options that are in force.
-        stated: Options by where they are stated, such as "the XML of 'robot'".
-        requests: Options of entities that are applied to the scene.
+        cfg: Options in force.
+        stated: Options by source, e.g. "the XML of 'robot'".
+        requests: Options of entities that the scene applies.
     """
     for source, options in stated.items():
         for name, value in options.values.items():
-            if name not in _DECIDED:
+            if name not in _OVERRIDDEN:
                 continue
             current, wanted = getattr(cfg, name), _config_value(name, value)
             if not np.array_equal(np.asarray(current), np.asarray(wanted)):
@@ -509,8 +508,8 @@ def report_overruled(
                 if set(flag_names(name, stated[s].switches[name][0])) & set(added)
             ]
             logger.warning(
-                "Option %s is %r, from MujocoCfg, plus %r, from %s, which applies to the whole "
-                "scene; to state it in the config, set sim.mujoco.%s = %r",
+                "Option %s is %r, from MujocoCfg, plus %r, from %s (applied to the whole scene); "
+                "to configure it, set sim.mujoco.%s = %r",
                 name, current, added, " and ".join(adding), name, current + added,
             )  # fmt: skip
 
@@ -523,12 +522,12 @@ def _report(source: str, name: str, current: Any, wanted: Any) -> None:
 
 
 def show(name: str, value: Any) -> str:
-    """Return an option's value as people write it."""
+    """Return an option's value for messages, e.g. enum names instead of numbers."""
     return str(flag_names(name, value) if name in _FLAGS else _config_value(name, value))
 
 
 def _config_value(name: str, value: Any) -> Any:
-    """Return MuJoCo's value of an option as `MujocoCfg` gives it."""
+    """Convert MuJoCo's value of an option to the format of `MujocoCfg`."""
     if name not in OPTION_ENUMS:
         return tuple(value) if isinstance(value, np.ndarray) else value
     enum, prefix = OPTION_ENUMS[name]

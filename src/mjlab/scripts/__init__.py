@@ -1,6 +1,6 @@
-"""Command lines. Each parses its arguments and wires objects together; none knows a task.
+"""Command lines: parse arguments and wire objects together, independent of the task.
 
-Commands can be run by `python -m mjlab.scripts.<name>` too.
+Commands also run as `python -m mjlab.scripts.<name>`.
 """
 
 import os
@@ -8,13 +8,13 @@ import sys
 
 
 def prepare_threads() -> None:
-    """Let idle threads of torch sleep: spinning, they take the cores from the physics threads.
+    """Let idle torch threads sleep: spinning threads take cores from the physics threads.
 
     Takes effect only before torch is loaded.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
-# `python -m` names itself so while it looks for the module, whose imports may load torch.
+# argv[0] is "-m" while `python -m` locates the module, whose imports may load torch.
 if sys.argv[:1] == ["-m"]:
     prepare_threads()

@@ -1,7 +1,7 @@
 """The command `mjlab`: table of subcommands, dispatch, and errors as one message each.
 
-`train`, `play` and some others are also commands of their own. Nothing beyond the standard library
-is imported before a command runs, so that `--help` and a mistyped task name answer at once.
+`train`, `play` and some others are also installed as separate commands. Only the standard library is
+imported before a command runs, so that `--help` and a mistyped task name answer at once.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mjlab.utils.processes import OtherProcessError
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
-# Messages of Python, the dynamic loader, MuJoCo and torch (CPU, GPU) about too little memory.
+# Out-of-memory messages of Python, the dynamic loader, MuJoCo and torch (CPU, GPU).
 _OUT_OF_MEMORY = (
     "can't start new thread",
     "failed to map segment",
@@ -46,13 +46,13 @@ class Command:
     function: str
     """Implementation as "module:function", called as `function(argv, prog)`."""
     argument: str | None = None
-    """First argument, which is required: TASK, a registered task, or another word."""
+    """Required first argument: TASK (a registered task) or another placeholder. None: optional."""
     details: str = ""
-    """Text of `--help`. Without it and without `argument`, the function answers `--help`."""
+    """Text of `--help`. Without `details` and `argument`, the function handles `--help`."""
     examples: tuple[str, ...] = ()
     """Command lines, without `uv run`."""
     unknown_task_status: int = 1
-    """Exit status for a task that is not registered."""
+    """Exit status for an unregistered task."""
 
     def usage(self, prog: str) -> str:
         """Return the help printed by `prog --help`."""
@@ -88,11 +88,11 @@ COMMANDS = (
     Command(
         "train-seeds",
         "Learning",
-        "Train a task with several seeds, one after the other.",
+        "Train a task with several seeds, sequentially.",
         "mjlab.scripts.train_seeds:command",
         "TASK",
-        "Train a task once for each seed 1, 2, ..., N (5 unless --seeds says otherwise), each run to "
-        "its last\niteration. All other flags are those of `train`.",
+        "Train a task once for each seed 1, 2, ..., N (--seeds N, default 5), each run to its last\n"
+        "iteration. All other flags are those of `train`.",
         (
             "train-seeds Mjlab-Cartpole-Swingup --num-envs 512 --agent.max-iterations 100",
             "plot-seeds logs/rsl_rl/cartpole/*_seed_? --output swingup.png",
@@ -110,8 +110,8 @@ COMMANDS = (
         "Train one seed and compare its curve with reference runs.",
         "mjlab.scripts.verify:command",
         "TASK",
-        "Train a task with one seed and say whether its learning curve lies within the band of the "
-        "reference runs\nthat ship with the package. Exit status: 0 within, 1 outside, 2 for a bad call.",
+        "Train a task with one seed and check that its learning curve lies within the band of the "
+        "reference runs\nbundled with the package. Exit status: 0 within, 1 outside, 2 invalid command line.",
         (
             "verify Mjlab-Cartpole-Swingup",
             "verify Mjlab-Velocity-Flat-Unitree-Go1 --device cpu --seed 1",
@@ -125,7 +125,7 @@ COMMANDS = (
         "mjlab.scripts.evaluate:command",
         "TASK",
         "Play episodes with a trained policy, one per environment, and print the mean return with a "
-        "95 % interval,\nand the success rate where the task defines success.",
+        "95 % interval,\nand the success rate if the task defines success.",
         (
             "evaluate Mjlab-Cartpole-Swingup",
             "evaluate Mjlab-Cartpole-Swingup --num-episodes 1024 --json True",
@@ -137,8 +137,7 @@ COMMANDS = (
         "Watch a policy in the browser, in MuJoCo's window, or as a video.",
         "mjlab.scripts.play:command",
         "TASK",
-        "Show a trained policy (the newest, unless one is named) in the browser, in MuJoCo's window, or "
-        "as a video.",
+        "Show a trained policy (default: the newest) in the browser, in MuJoCo's window, or as a video.",
         (
             "play Mjlab-Cartpole-Swingup",
             "play Mjlab-Cartpole-Swingup --checkpoint-file logs/rsl_rl/cartpole/model_500.pt",
@@ -152,7 +151,7 @@ COMMANDS = (
         "Watch a bundled policy: a walking quadruped or humanoid.",
         "mjlab.scripts.demo:command",
         details="""\
-Play a robot that follows velocity commands, in the browser and offline: a Unitree Go1 (quadruped,
+Play a robot that tracks velocity commands, in the browser and offline: a Unitree Go1 (quadruped,
 `go1`, the default) or G1 (humanoid, `g1`). Flags are those of `play`.""",
         examples=(
             "demo",
@@ -170,10 +169,10 @@ Play a robot that follows velocity commands, in the browser and offline: a Unitr
     Command(
         "profile-env",
         "Tasks",
-        "Measure the time of a step by phase and term.",
+        "Measure the step time by phase and term.",
         "mjlab.scripts.profile_env:command",
         "TASK",
-        "Step a task with random actions, and print the time of a step by phase (physics, forward, each "
+        "Step a task with random actions, and print the step time by phase (physics, forward, each "
         "manager)\nand by term.",
         (
             "profile-env Mjlab-Cartpole-Swingup",
@@ -187,15 +186,15 @@ Play a robot that follows velocity commands, in the browser and offline: a Unitr
         "mjlab.scripts.export_scene:command",
         "TARGET",
         """\
-Write scene.xml and the files it refers to, for MuJoCo's own viewer and other programs.
+Write scene.xml and its assets, for MuJoCo's viewer and other programs.
 
 TARGET is the name of a task (`mjlab list-envs`), a robot (g1, go1, yam), or module:function, a function
-that returns an EntityCfg.
+without arguments that returns an EntityCfg.
 
 flags:
-    --output-dir DIR    folder to write into, which must be new or empty (default: export)
+    --output-dir DIR    output folder, must be new or empty (default: export)
     --zip               write the archive DIR.zip instead of a folder
-    --overwrite         replace an earlier export there; other files are left alone""",
+    --overwrite         replace an earlier export; other files are kept""",
         (
             "export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat",
             "export-scene g1 --zip",
@@ -214,23 +213,23 @@ flags:
         "mjlab.scripts.viz_nan:command",
         "DUMP",
         """\
-Show the states that led to a NaN. DUMP is a file that `train --enable-nan-guard True` wrote, such as
+Show the states that led to a NaN. DUMP is a file written by `train --enable-nan-guard True`, such as
 nan_dump_latest.npz; the model is read from the same folder.
 
 flags:
-    --host ADDRESS      address to serve on; 0.0.0.0 is the whole network (default: 127.0.0.1)
-    --port N            port to serve on; the next free one where it is taken (default: 8080)""",
+    --host ADDRESS      address to serve on; 0.0.0.0: all interfaces (default: 127.0.0.1)
+    --port N            port to serve on; the next free port if taken (default: 8080)""",
         ("viz-nan /tmp/mjlab/nan_dumps/nan_dump_latest.npz",),
     ),
     Command(
         "csv-to-npz",
         "Data",
-        "Convert recorded joint angles into a motion to track.",
+        "Convert recorded joint angles to a reference motion.",
         "mjlab.scripts.csv_to_npz:command",
         "--input-file FILE",
         """\
-Turn a CSV of the retargeted LAFAN1 sets (one pose a line: position of the root, its quaternion x y z w,
-all joint angles) into the .npz that motion tracking reads; or an .npz into one of another rate.
+Convert a CSV of the retargeted LAFAN1 sets (one pose per line: root position, root quaternion x y z w,
+all joint angles) to the .npz that motion tracking reads, or resample an .npz to another rate.
 `--help` with another flag lists all flags.""",
         (
             "mjlab csv-to-npz --input-file dance1_subject2.csv",
@@ -251,7 +250,7 @@ ALIASES = (
     "train", "train-seeds", "plot-seeds", "verify", "evaluate", "play", "demo", "list-envs",
     "list_envs", "profile-env", "export-scene", "viz-nan",
 )  # fmt: skip
-"""Commands that are installed by themselves as well."""
+"""Commands that are also installed as separate executables."""
 
 _BY_NAME = {command.name: command for command in COMMANDS}
 
@@ -279,7 +278,7 @@ def _dispatch(argv: list[str]) -> None:
 
 
 def overview() -> str:
-    """Return what `mjlab --help` prints: all commands, by group."""
+    """Return the text of `mjlab --help`: all commands by group."""
     lines = ["usage: mjlab COMMAND [arguments]", ""]
     lines += ["Train and evaluate robot policies in thousands of parallel MuJoCo environments.", ""]
     width = max(map(len, _BY_NAME))
@@ -296,7 +295,7 @@ def overview() -> str:
 def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
     """Run a subcommand. Its first argument is checked before heavy modules are imported."""
     argument = command.argument
-    # After its first argument, `--help` lists all flags.
+    # `--help` after the first argument lists all flags.
     asks_help = argv[:1] in (["-h"], ["--help"]) and (argument or command.details)
     if asks_help or (argument and not argv):
         print(command.usage(prog))
@@ -320,7 +319,7 @@ def run_alias(name: str) -> NoReturn:
     run_command(lambda argv: run_subcommand(_BY_NAME[name], argv, name))
 
 
-# Entry points of the commands that are installed by themselves as well.
+# Entry points of commands that are also installed as separate executables.
 
 
 def train() -> None:
@@ -384,11 +383,11 @@ def viz_nan() -> None:
 def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     """Run `command` with the command line's arguments and exit.
 
-    An error that a user can fix (`MjlabError`, `ValueError`, `OSError`) is printed as one message,
-    and the exit status is that of the error, or 1. Other errors keep their traceback.
+    Errors that a user can fix (`MjlabError`, `ValueError`, `OSError`) are printed as one message;
+    the exit status is `MjlabError.exit_status`, else 1. Other errors keep their traceback.
     """
     prepare_threads()
-    # Plain messages of the libraries, and warnings as one line each.
+    # Plain library messages; one line per warning.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("mjlab").setLevel(logging.INFO)
     logging.captureWarnings(True)
@@ -398,33 +397,33 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
-        # The reader (`| head`) has closed the pipe. Python would complain at exit about buffered
-        # output that cannot be written.
+        # The reader (`| head`) closed the pipe. Python would report unwritten buffered output at
+        # exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
         if isinstance(error, MemoryError) or any(text in str(error) for text in _OUT_OF_MEMORY):
-            # The original message says where the memory ended, not that it did.
+            # The original message names the failed call, not the lack of memory.
             error = UserError(
-                f"Memory or threads are not enough ({_text(error)}). Use fewer environments, or raise "
-                "the limits (ulimit)."
+                f"Out of memory or threads ({_message(error)}). Use fewer environments, or raise the "
+                "limits (ulimit)."
             )
         elif not isinstance(error, (MjlabError, ValueError, OSError)):
             raise
         if os.environ.get(TRACEBACK_VARIABLE):
             traceback.print_exc()
         rank = os.environ.get("RANK", "0")
-        # Of several processes, only the one that failed and the first report.
+        # Only the failed process and rank 0 report.
         if rank == "0" or not isinstance(error, OtherProcessError):
             process = "" if rank == "0" else f" in process {rank}"
-            print(f"error{process}: {_text(error)}", file=sys.stderr)
-            print(f"(Set {TRACEBACK_VARIABLE}=1 for where it came from.)", file=sys.stderr)
+            print(f"error{process}: {_message(error)}", file=sys.stderr)
+            print(f"(Set {TRACEBACK_VARIABLE}=1 for the traceback.)", file=sys.stderr)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     sys.exit(0)
 
 
-def _text(error: BaseException) -> str:
-    # A KeyError shows its text in quotes.
+def _message(error: BaseException) -> str:
+    # str(KeyError) is quoted.
     text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
     return shorten(text) if text else type(error).__name__
 

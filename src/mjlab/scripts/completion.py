@@ -7,15 +7,15 @@ from mjlab.utils.errors import BadCallError
 _USAGE = """\
 usage: mjlab completion bash|zsh|fish
 
-Print a script that completes subcommands and task names. Add one of these lines to the start-up file
-of the shell:
+Print a script that completes subcommands and task names. Add one of these lines to the startup file of
+the shell:
 
     eval "$(mjlab completion bash)"        # ~/.bashrc
     eval "$(mjlab completion zsh)"         # ~/.zshrc, after compinit
     mjlab completion fish | source         # ~/.config/fish/config.fish"""
 
-# The shell asks `mjlab completion --candidates WORD...`; the last word is the one to complete. Words
-# of `train`, `play` and so on are those of `mjlab train` and `mjlab play`.
+# The shell calls `mjlab completion --candidates WORD...` and completes the last word. `train`, `play`
+# and so on are passed as words of `mjlab train` and `mjlab play`.
 _BASH = """\
 _mjlab_complete() {
     local words=("${COMP_WORDS[@]:1:COMP_CWORD}")
@@ -37,7 +37,7 @@ for name in """
 
 
 def candidates(words: list[str]) -> list[str]:
-    """Return the completions of the last of `words`, which follow `mjlab` on a command line."""
+    """Return the completions of the last of `words`, the words after `mjlab` on a command line."""
     from mjlab.scripts.cli import COMMANDS
 
     *before, partial = words or [""]

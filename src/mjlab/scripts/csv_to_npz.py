@@ -1,4 +1,4 @@
-"""Turn joint angles into a motion: `mjlab csv-to-npz --input-file FILE`."""
+"""Convert joint angles to a reference motion: `mjlab csv-to-npz --input-file FILE`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _WANDB_PROJECT = "csv_to_npz"
 _ARTIFACT_TYPE = "motions"
-# As mjlab 1.6 calls it, so that its `play` finds it.
+# File name of mjlab 1.6, so that its `play` finds the motion.
 _ARTIFACT_FILE = "motion.npz"
 _VIDEO_SIZE = (480, 640)
 
@@ -46,32 +46,31 @@ class CsvToNpzConfig:
     """Flags of `csv_to_npz`."""
 
     input_file: str = ""
-    """The recording: a .csv of poses, or a motion (.npz)."""
+    """Recording: a .csv of poses, or a motion (.npz)."""
     output_file: str | None = None
-    """Where the motion goes. None: beside the working folder's other files, as `output_name`."""
+    """Path of the motion. None: `output_name` in the working folder."""
     output_name: str | None = None
-    """Name of the motion, and of the artifact that is uploaded. None: that of the input."""
+    """Name of the motion and of the uploaded artifact. None: name of the input."""
     input_fps: float = 30.0
-    """Poses per second of a .csv; an .npz says so itself."""
+    """Frame rate of a .csv (Hz); an .npz contains its frame rate."""
     output_fps: float = 50.0
-    """Frames per second of the motion: the task's control rate."""
+    """Frame rate of the motion (Hz): the control rate of the task."""
     line_range: tuple[int, int] | None = None
-    """First and last line (or frame) to take, counted from 1; both are taken. None takes all."""
+    """First and last line (or frame), counted from 1, inclusive. None: all."""
     robot: str = "g1"
-    """The robot: g1, go1, or `module:function` that returns its EntityCfg."""
+    """Robot: g1, go1, or `module:function` that returns an EntityCfg."""
     render: bool = False
     """Record the motion as a video beside the output."""
     view: bool = False
     """Serve a page in the browser that plays the motion."""
     port: int = 8080
-    """Port of that page; the next free one where it is taken."""
+    """Port of the page; the next free port if taken."""
     host: str = field(default="127.0.0.1", kw_only=True)
-    """Address that it is served on; 0.0.0.0 serves the whole network."""
+    """Address of the page. 0.0.0.0: all interfaces."""
     upload: bool = False
-    """Upload the motion to Weights & Biases as an artifact, and link it into the registry."""
+    """Upload the motion to Weights & Biases as an artifact, and link the artifact into the registry."""
     device: str | None = None
-    """Without effect, for scripts that were written for mjlab 1.6: the conversion is a matter of
-    seconds on the CPU."""
+    """Ignored; accepted for scripts written for mjlab 1.6. The conversion takes seconds on the CPU."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -80,14 +79,14 @@ def command(argv: list[str], prog: str) -> None:
 
 
 def convert(cfg: CsvToNpzConfig) -> Path:
-    """Convert as `cfg` says; return the path of the motion.
+    """Convert a recording and return the path of the motion.
 
     Raises:
-        UserError, ValueError: a flag makes no sense.
-        MotionFileError: the input is no recording of this robot.
+        UserError, ValueError: invalid flag value.
+        MotionFileError: the input is not a recording of this robot.
     """
     if not cfg.input_file:
-        raise UserError("--input-file names the recording, a .csv or an .npz.")
+        raise UserError("--input-file: expected a recording (.csv or .npz), got none.")
     for name in ("input_fps", "output_fps"):
         check_positive(f"--{name.replace('_', '-')}", getattr(cfg, name))
     if cfg.view:
@@ -97,7 +96,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     name = cfg.output_name or source.stem
     target = npz_path(cfg.output_file or f"{name}.npz")
     if target.resolve() == source.resolve():
-        raise UserError(f"The output {target} would overwrite the input; give --output-file.")
+        raise UserError(f"--output-file: expected a path other than the input, got {target}.")
     recording = _read(cfg, source, robot)
     model = robot.compile()
     motion = make_motion(
@@ -113,7 +112,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     if cfg.upload:
         _upload(path, name)
     if cfg.view:
-        show_motion(motion, _stage(robot), cfg.host, cfg.port)
+        show_motion(motion, _display_model(robot), cfg.host, cfg.port)
     return path
 
 
@@ -127,8 +126,8 @@ def _read(cfg: CsvToNpzConfig, source: Path, robot: Entity) -> Recording:
     first, last = cfg.line_range
     if not 1 <= first < last <= len(recording):
         raise UserError(
-            f"--line-range is {cfg.line_range}; {source} has frames 1 to {len(recording)}, of which "
-            "at least two are needed."
+            f"--line-range: expected at least 2 of the frames 1 to {len(recording)} of {source}, got "
+            f"{cfg.line_range}."
         )
     kept = slice(first - 1, last)
     return Recording(
@@ -140,7 +139,7 @@ def _read(cfg: CsvToNpzConfig, source: Path, robot: Entity) -> Recording:
 
 
 def _robot(name: str) -> Entity:
-    """Return the robot of that name, or of `module:function`."""
+    """Build the robot called `name`, or configured by `module:function`."""
     from mjlab.asset_zoo.robots import get_g1_robot_cfg, get_go1_robot_cfg
 
     known: dict[str, Callable[[], Any]] = {"g1": get_g1_robot_cfg, "go1": get_go1_robot_cfg}
@@ -149,8 +148,8 @@ def _robot(name: str) -> Entity:
     module, colon, function = name.partition(":")
     if not colon:
         raise UserError(
-            f"--robot is {name!r}; it is one of {', '.join(known)}, or `module:function` that "
-            "returns an EntityCfg."
+            f"--robot: expected one of {list(known)}, or `module:function` that returns an EntityCfg, "
+            f"got {name!r}."
         )
     try:
         make = getattr(importlib.import_module(module), function)
@@ -159,8 +158,8 @@ def _robot(name: str) -> Entity:
     return make().build()
 
 
-def _stage(robot: Entity) -> mujoco.MjModel:
-    """Return the robot on a floor, to look at."""
+def _display_model(robot: Entity) -> mujoco.MjModel:
+    """Return the model of the robot with a floor and a light."""
     spec = robot.cfg.build().spec
     floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE)
     floor.size, floor.rgba = (10.0, 10.0, 0.1), (0.75, 0.78, 0.82, 1.0)
@@ -173,7 +172,7 @@ def record_motion(motion: Motion, robot: Entity, path: Path) -> None:
     from mjlab.utils.wrappers.video_recorder import ClipWriter
     from mjlab.viewer.offscreen_renderer import open_renderer
 
-    model = _stage(robot)
+    model = _display_model(robot)
     data, camera, option = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvOption()
     camera.distance, camera.azimuth, camera.elevation = 3.0, 120.0, -10.0
     renderer = open_renderer(model, *_VIDEO_SIZE)
@@ -191,7 +190,7 @@ def record_motion(motion: Motion, robot: Entity, path: Path) -> None:
 
 
 def pose(model: mujoco.MjModel, data: mujoco.MjData, motion: Motion, frame: int) -> None:
-    """Put a robot, whose free joint comes first, onto a frame of its motion."""
+    """Set the pose of a frame of the motion. The first joint of the robot must be free."""
     data.qpos[:3], data.qpos[3:7] = motion.body_pos_w[frame, 0], motion.body_quat_w[frame, 0]
     data.qpos[7:] = motion.joint_pos[frame]
     mujoco.mj_kinematics(model, data)
@@ -199,10 +198,10 @@ def pose(model: mujoco.MjModel, data: mujoco.MjData, motion: Motion, frame: int)
 
 
 def _upload(path: Path, name: str) -> None:
-    """Upload a motion as an artifact, and link it into the registry of motions.
+    """Upload a motion as an artifact, and link the artifact into the registry of motions.
 
     Raises:
-        UserError: Weights & Biases does not take it.
+        UserError: the upload failed.
     """
     import wandb
 
@@ -216,12 +215,12 @@ def _upload(path: Path, name: str) -> None:
         finally:
             run.finish()
     except Exception as error:
-        # wandb raises errors of many kinds, of its own and of what it is built on.
-        raise UserError(f"{path} cannot be uploaded to Weights & Biases: {error}") from error
+        # wandb raises errors of many types, including those of its dependencies.
+        raise UserError(f"{path}: upload to Weights & Biases failed: {error}") from error
     print_notice(f"Uploaded as wandb-registry-{_ARTIFACT_TYPE}/{name}.")
 
 
-# The page.
+# Page.
 
 
 def show_motion(motion: Motion, model: mujoco.MjModel, host: str, port: int) -> None:
@@ -241,15 +240,15 @@ def show_motion(motion: Motion, model: mujoco.MjModel, host: str, port: int) -> 
 
 
 class MotionPage:
-    """Shows a robot on a frame of a motion, which runs by itself or follows a slider."""
+    """Page that plays a motion, or shows the frame selected by a slider."""
 
     def __init__(self, server: viser.ViserServer, motion: Motion, model: mujoco.MjModel) -> None:
         """Add robot and controls.
 
         Args:
-            server: The page's server.
-            motion: The motion.
-            model: Its robot, whose free joint comes first, with whatever stands around it.
+            server: Server of the page.
+            motion: Motion to play.
+            model: Model of the robot and its surroundings. The first joint must be the robot's free joint.
         """
         self._motion, self._model = motion, model
         self._data = mujoco.MjData(model)
@@ -257,17 +256,17 @@ class MotionPage:
         self._playing = server.gui.add_checkbox("Play", True)
         self._speed = server.gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
         self._slider = server.gui.add_slider("Frame", 0, motion.num_frames - 1, 1, 0)
-        self._slider.on_update(self._chosen)
+        self._slider.on_update(self._on_slider)
         self._frame = 0.0
         self._shown: int | None = None
 
     @property
     def frame(self) -> int:
-        """The frame that is shown."""
+        """Index of the current frame."""
         return int(self._frame)
 
     def advance(self, seconds: float) -> None:
-        """Show the frame that is due after so much time; the motion begins anew at its end."""
+        """Advance the motion by `seconds` and show the current frame; restart at the end."""
         if self._playing.value:
             self._frame += seconds * (self._motion.fps or 50.0) * self._speed.value
             self._frame %= self._motion.num_frames
@@ -277,8 +276,8 @@ class MotionPage:
             pose(self._model, self._data, self._motion, self.frame)
             self._scene.update_from_mjdata(self._data)
 
-    def _chosen(self, event: Any) -> None:
-        # What the page itself sets has no client.
+    def _on_slider(self, event: Any) -> None:
+        # Updates made by the page itself have client None.
         if event.client is not None:
             self._playing.value = False
             self._frame = float(self._slider.value)

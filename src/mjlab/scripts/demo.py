@@ -1,4 +1,4 @@
-"""Watch a policy that comes with the package: `uv run demo`, `uv run demo g1`."""
+"""Play a bundled policy: `uv run demo`, `uv run demo g1`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _FOLDER = Path(__file__).parents[1] / "demo"
 
 @dataclass(frozen=True)
 class Demo:
-    """A policy that comes with the package; the README beside it says how it was made."""
+    """Bundled policy. The README beside the policy documents its training."""
 
     task: str
-    """The task that it was trained for."""
+    """Task of the policy."""
     profile: str | None
-    """The profile of the task that its observations and actions are of."""
+    """Profile that defines the observations and actions of the policy."""
     policy: Path
-    """The exported policy."""
+    """Path of the exported policy."""
 
 
 DEMOS = {
@@ -34,14 +34,14 @@ DEMOS = {
 
 
 def demo_cfg(demo: Demo) -> PlayConfig:
-    """Return what `demo` plays unless flags say otherwise: one robot, on the CPU, in the browser."""
+    """Return the default flags of `demo`: one robot, on the CPU, in the browser."""
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.policy import policy_env_cfg
     from mjlab.sensor import RayCastSensorCfg
 
     env = policy_env_cfg(demo.task, demo.profile, purpose="play")
     for sensor in env.scene.sensors:
-        # A first look is at the robot, not at what its sensors see.
+        # Rays would distract from the robot.
         if isinstance(sensor, RayCastSensorCfg):
             sensor.debug_vis = False
     return PlayConfig(
@@ -55,18 +55,18 @@ def demo_cfg(demo: Demo) -> PlayConfig:
 
 
 def run_demo(demo: Demo, cfg: PlayConfig) -> None:
-    """Play `cfg`.
+    """Play a demo with the flags `cfg`.
 
     Raises:
-        UserError: the policy is not there, or what was asked for cannot be done.
+        UserError: bundled policy not found, or see `run_play`.
     """
     from mjlab.scripts.play import run_play
 
-    plays_its_own = cfg.agent == "trained" and cfg.checkpoint_file == str(demo.policy)
-    if plays_its_own and not demo.policy.is_file():
+    uses_bundled_policy = cfg.agent == "trained" and cfg.checkpoint_file == str(demo.policy)
+    if uses_bundled_policy and not demo.policy.is_file():
         raise UserError(
-            f"The demo's policy {demo.policy} does not exist. Name a policy of {demo.task} with "
-            "--checkpoint-file FILE.onnx; `train` leaves one in the folder of every run."
+            f"Bundled policy {demo.policy} not found; use --checkpoint-file FILE.onnx with a policy of "
+            f"{demo.task}. `train` exports one to the folder of every run."
         )
     run_play(demo.task, cfg)
 

@@ -1,4 +1,4 @@
-"""Torch devices of commands: the one named, else a GPU if there is one; one GPU per process."""
+"""Torch devices of commands: the requested device, else a GPU if available; one GPU per process."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _EGL_VARIABLE = "MUJOCO_EGL_DEVICE_ID"
 
 
 def resolve_device(device: str | None) -> str:
-    """Return the torch device to use: the one asked for, else a GPU where there is one.
+    """Return the torch device: `device`, or for None a GPU if available, else the CPU.
 
     Raises:
-        UserError: a CUDA device without a usable GPU, or a name that torch does not know.
+        UserError: CUDA device without a usable GPU, or unknown device name.
     """
     import torch
 
@@ -29,22 +29,21 @@ def resolve_device(device: str | None) -> str:
         kind = torch.device(device).type
     except RuntimeError as error:
         raise UserError(
-            f"{device!r} is not a device. Use cpu, cuda, or cuda:0, cuda:1, ..."
+            f"--device: expected cpu, cuda, or cuda:0, cuda:1, ..., got {device!r}."
         ) from error
     if kind == "cuda" and not torch.cuda.is_available():
         raise UserError(
-            f"--device {device} was asked for, but torch finds no CUDA GPU here "
-            f"(torch {torch.__version__}). Use --device cpu, or install a driver and a CUDA build "
-            "of torch."
+            f"--device {device}: no CUDA GPU found by torch {torch.__version__}; use --device cpu, or "
+            "install a driver and a CUDA build of torch."
         )
     return "cuda:0" if device == "cuda" else device
 
 
 def gpus_to_share(cfg: TrainConfig) -> list[int | str]:
-    """Return the entries of `CUDA_VISIBLE_DEVICES` for a run on several GPUs of this machine.
+    """Return the entries of `CUDA_VISIBLE_DEVICES` for a multi-GPU run on this machine.
 
-    Empty where there is no more than one to use, and in a process that a launcher started: which
-    GPUs there are was decided there.
+    Empty if at most one GPU is usable, and in processes of a launcher: the launcher has selected the
+    GPUs.
     """
     if cfg.device is not None or not process_rank().is_alone:
         return []
@@ -53,48 +52,47 @@ def gpus_to_share(cfg: TrainConfig) -> list[int | str]:
 
 
 def training_device(cfg: TrainConfig, rank: ProcessRank) -> str:
-    """Return the torch device of this process; rendering goes to the same GPU.
+    """Return the torch device of this process, and render on the same GPU.
 
     Raises:
-        UserError: there are fewer GPUs than processes, or all were given the same one.
-        ValueError: `gpu_ids` names a GPU that is not there.
+        UserError: fewer GPUs than processes, or one GPU for all processes.
+        ValueError: `gpu_ids` contains an unavailable GPU.
     """
-    device = _only_device(cfg) if rank.is_alone else _device_of(cfg, rank)
+    device = _single_process_device(cfg) if rank.is_alone else _device_of(cfg, rank)
     if device.startswith("cuda"):
-        # EGL numbers all GPUs of the machine, and torch those that are visible.
+        # EGL counts all GPUs of the machine, torch only visible GPUs.
         physical = egl_device_id(int(device.partition(":")[2] or 0))
         if physical is not None:
             os.environ.setdefault(_EGL_VARIABLE, str(physical))
     return device
 
 
-def _only_device(cfg: TrainConfig) -> str:
+def _single_process_device(cfg: TrainConfig) -> str:
     if cfg.device is not None:
         return resolve_device(cfg.device)
     selected, count = select_gpus(cfg.gpu_ids)
     if count > 1:
         raise UserError(
-            f"--gpu-ids names {count} GPUs, and this is one process. The command `train` starts one "
-            "for each GPU, and so does torchrun; a program that calls `launch_training` trains on "
-            "one GPU."
+            f"--gpu-ids: expected one GPU, because `launch_training` trains in one process, got {count}; "
+            "use the command `train` or torchrun, which start one process per GPU."
         )
     if selected is None:
         return "cpu"
-    # torch numbers the GPUs that are visible, and so does --gpu-ids.
+    # Both torch and --gpu-ids count visible GPUs only.
     index = 0 if cfg.gpu_ids in ("all", None) else cfg.gpu_ids[0]
     return resolve_device(f"cuda:{index}")
 
 
 def _device_of(cfg: TrainConfig, rank: ProcessRank) -> str:
-    """Return the device of one process among several."""
+    """Return the device of a process in a multi-process run."""
     if cfg.device is not None and not cfg.device.startswith("cuda"):
         return resolve_device(cfg.device)
     if cfg.device is not None and ":" in cfg.device and rank.local_world_size > 1:
         raise UserError(
-            f"--device {cfg.device} is one GPU, and this machine has {rank.local_world_size} "
-            "processes of the run. Give --device cuda for one GPU each, or --device cpu."
+            f"--device {cfg.device}: expected one GPU for each of the {rank.local_world_size} processes "
+            "of the run on this machine, got one GPU; use --device cuda or --device cpu."
         )
-    # One GPU is the default where there is one process, so it says nothing where there are more.
+    # One GPU is the default of single-process runs; ignored in multi-process runs.
     named = cfg.gpu_ids if isinstance(cfg.gpu_ids, list) and len(cfg.gpu_ids) > 1 else "all"
     if cfg.device is None:
         selected, count = select_gpus(None if cfg.gpu_ids is None else named)
@@ -105,7 +103,7 @@ def _device_of(cfg: TrainConfig, rank: ProcessRank) -> str:
         count = select_gpus(named)[1]
     if rank.local_rank >= count:
         raise UserError(
-            f"This machine has {rank.local_world_size} processes of the run and {count} GPUs to "
-            f"use. Start at most {count} here, or give --device cpu."
+            f"Expected at most {count} processes of the run on this machine, one per GPU, got "
+            f"{rank.local_world_size}; start fewer, or use --device cpu."
         )
     return f"cuda:{rank.local_rank if named == 'all' else named[rank.local_rank]}"

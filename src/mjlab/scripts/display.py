@@ -1,4 +1,4 @@
-"""Training in the terminal: a live panel, or plain lines in a log file; results at the end."""
+"""Terminal display of training: live panel, or plain lines for log files; list of results."""
 
 from __future__ import annotations
 
@@ -29,37 +29,37 @@ if TYPE_CHECKING:
     from mjlab.scripts.run_folder import NewRunFolder
     from mjlab.scripts.train_config import TrainConfig
 
-# Plain lines are for log files: often enough to follow, rarely enough to read.
+# Period of plain lines, for log files.
 _SECONDS_BETWEEN_LINES = 5.0
 
 
 def show_training(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder) -> None:
-    """Let `runner` show its training in the terminal, with `--live` in the browser too.
+    """Add observers to `runner` that show training in the terminal, and with `--live` in the browser.
 
-    The folder is kept once training has started.
+    Training that starts keeps `folder`.
     """
     if cfg.live:
         from mjlab.scripts.live import LiveView
 
-        # First, because the display keeps the terminal to itself once it has started.
+        # Before the display, which owns the terminal once started.
         runner.observers.insert(0, LiveView(task, cfg, runner))
     runner.observers += [KeepRunFolder(folder), TrainingDisplay(task)]
 
 
-class _LastingConsole(Console):
-    """A console whose reader may leave: `train | tee log` saves although Ctrl-C ends `tee` first."""
+class _PipeSafeConsole(Console):
+    """Console that survives a closed pipe: Ctrl-C in `train | tee log` ends `tee` before the save."""
 
     def on_broken_pipe(self) -> None:
-        """Send what follows nowhere."""
+        """Redirect further output to /dev/null."""
         pipe = os.fstat(1)
-        _let_go_of(lambda file: os.path.samestat(file, pipe))
+        _redirect_to_devnull(lambda file: os.path.samestat(file, pipe))
 
 
 class TrainingDisplay(TrainingObserver):
-    """Shows progress, time left, speed, reward and episode length, updated every iteration."""
+    """Progress, time left, speed, reward and episode length, updated every iteration."""
 
     def __init__(self, title: str, console: Console | None = None) -> None:
-        self._console = console or _LastingConsole()
+        self._console = console or _PipeSafeConsole()
         self._title = title
         self._live: Live | None = None
         self._progress = Progress(
@@ -72,7 +72,7 @@ class TrainingDisplay(TrainingObserver):
         self._started = time.perf_counter()
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
-        """Begin the panel; `first_iteration` iterations were done before."""
+        """Open the panel. `first_iteration` is the number of iterations already finished."""
         self._started = time.perf_counter()
         self._bar = self._progress.add_task(
             "", total=total_iterations, completed=first_iteration, left="?"
@@ -82,7 +82,7 @@ class TrainingDisplay(TrainingObserver):
             self._live.start()
 
     def on_iteration(self, stats: IterationStats) -> None:
-        """Show the figures of an iteration."""
+        """Show the statistics of an iteration."""
         left = duration(stats.time_left)
         self._progress.update(self._bar, completed=stats.iteration, left=left)
         if self._live is not None:
@@ -96,42 +96,42 @@ class TrainingDisplay(TrainingObserver):
                 f"[{stats.iteration}/{stats.total_iterations}] "
                 f"{stats.steps_per_second:,.0f} steps/s "
                 f"(collection {stats.collection_time:.2f} s, learning {stats.learning_time:.2f} s), "
-                f"mean reward {_figure(stats.mean_reward)}, "
-                f"episode length {_figure(stats.mean_episode_length)}, "
+                f"mean reward {_format_mean(stats.mean_reward)}, "
+                f"episode length {_format_mean(stats.mean_episode_length)}, "
                 f"step reward {stats.mean_step_reward:.3f}, {left} left"
             )
-            # A bracket begins markup.
+            # Brackets are rich markup.
             self._console.print(line.replace("[", r"\[", 1), highlight=False, soft_wrap=True)
 
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
-        """Tell how an evaluation went."""
+        """Print the result of an evaluation."""
         verdict = "within all bounds" if solved else "not solved yet"
-        self._tell_evaluation(iteration, "episodes", result, verdict)
+        self._print_evaluation(iteration, "episodes", result, verdict)
 
     def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
-        """Tell how the evaluation went on which training stops or goes on."""
+        """Print the result of the evaluation that decides whether training stops."""
         verdict = "solved" if solved else "not confirmed, so training goes on"
-        self._tell_evaluation(iteration, "fresh episodes", result, verdict)
+        self._print_evaluation(iteration, "fresh episodes", result, verdict)
 
-    def _tell_evaluation(
+    def _print_evaluation(
         self, iteration: int, episodes: str, result: EvaluationResult, verdict: str
     ) -> None:
-        figures = [f"mean return {result.mean_return:.1f} over {result.num_episodes} {episodes}"]
-        figures += [f"{name} {value.mean:.3f}" for name, value in result.metrics.items()]
+        metrics = [f"mean return {result.mean_return:.1f} over {result.num_episodes} {episodes}"]
+        metrics += [f"{name} {value.mean:.3f}" for name, value in result.metrics.items()]
         if result.failure_rate and result.failure_interval is not None:
             low, high = result.failure_interval
-            figures.append(f"{result.failure_rate:.1%} failed ({low:.1%} to {high:.1%})")
+            metrics.append(f"{result.failure_rate:.1%} failed ({low:.1%} to {high:.1%})")
         self._console.print(
-            f"Evaluation after {iteration} iterations: {', '.join(figures)}, {verdict}.",
+            f"Evaluation after {iteration} iterations: {', '.join(metrics)}, {verdict}.",
             highlight=False,
             soft_wrap=True,
         )
 
     def on_stop_requested(self, signal_name: str) -> None:
-        """Tell that a signal arrived and what happens now."""
+        """Print the received signal and the reaction to it."""
         if signal_name == "SIGHUP":
-            # A terminal that was closed is none to `isatty`, but still a character device.
-            _let_go_of(lambda file: stat.S_ISCHR(file.st_mode))
+            # `isatty` is False for a closed terminal, which remains a character device.
+            _redirect_to_devnull(lambda file: stat.S_ISCHR(file.st_mode))
         self._console.print(
             f"{signal_name}: finishing this iteration, then saving. Once more to stop at once.",
             highlight=False,
@@ -153,8 +153,8 @@ class TrainingDisplay(TrainingObserver):
             ("steps in total", f"{stats.total_steps:,}"),
             ("collection", f"{stats.collection_time:.3f} s"),
             ("learning", f"{stats.learning_time:.3f} s"),
-            ("mean reward", _figure(stats.mean_reward)),
-            ("mean episode length", _figure(stats.mean_episode_length)),
+            ("mean reward", _format_mean(stats.mean_reward)),
+            ("mean episode length", _format_mean(stats.mean_episode_length)),
             ("mean step reward", f"{stats.mean_step_reward:.3f}"),
             ("action noise", f"{stats.action_std:.3f}"),
         ]
@@ -166,23 +166,23 @@ class TrainingDisplay(TrainingObserver):
         return Panel(Group(self._progress, table), title=self._title, title_align="left")
 
 
-def _let_go_of(is_gone: Callable[[os.stat_result], bool]) -> None:
-    """Send standard output and error nowhere where `is_gone` holds for their file.
+def _redirect_to_devnull(is_gone: Callable[[os.stat_result], bool]) -> None:
+    """Redirect stdout and stderr to /dev/null if `is_gone` is True for their file.
 
-    Otherwise the next line would raise, before there is a checkpoint.
+    Otherwise the next line would raise before the checkpoint is written.
     """
-    # In a signal handler nothing may be raised, such as for a descriptor that is closed.
+    # Signal handlers must not raise, e.g. for a closed descriptor.
     with open(os.devnull, "wb") as nowhere, contextlib.suppress(OSError):
         for number in [number for number in (1, 2) if is_gone(os.fstat(number))]:
             os.dup2(nowhere.fileno(), number)
 
 
-def _figure(value: float | None) -> str:
+def _format_mean(value: float | None) -> str:
     return "none finished yet" if value is None else f"{value:.2f}"
 
 
 def duration(seconds: float) -> str:
-    """Return seconds as a person writes them: `8.4 s`, `3:05 min`, `2:10 h`."""
+    """Format seconds: `8.4 s`, `3:05 min`, `2:10 h`."""
     if round(seconds, 1) < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -193,7 +193,7 @@ def duration(seconds: float) -> str:
 
 
 class KeepRunFolder(TrainingObserver):
-    """Keeps the run's folder once training has started."""
+    """Observer that keeps the run folder once training has started."""
 
     def __init__(self, folder: NewRunFolder) -> None:
         self._folder = folder
@@ -204,7 +204,7 @@ class KeepRunFolder(TrainingObserver):
 
 
 def report_divergence(env: ManagerBasedRlEnv) -> None:
-    """Print how many environments diverged, and MuJoCo's warnings."""
+    """Print the number of diverged environments, and MuJoCo's warnings."""
     episodes = int(env.nan_resets.sum())
     if episodes > 0:
         environments = int((env.nan_resets > 0).sum())
@@ -216,12 +216,12 @@ def report_divergence(env: ManagerBasedRlEnv) -> None:
         print(f"MuJoCo warned {count:,} times: {kind}")
 
 
-def leave_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> None:
-    """Draw the learning curve and, if asked to, record the trained policy; list the files."""
+def write_results(task: str, cfg: TrainConfig, run_dir: Path, device: str) -> None:
+    """Plot the learning curve, record the trained policy if `cfg.result_video`, and list the files."""
     from mjlab.rl.checkpoint import latest_checkpoint
     from mjlab.rl.plot import plot_run
 
-    # A run that is solved as it is resumed has no iteration of its own.
+    # A run solved at resume has no iterations.
     with contextlib.suppress(ValueError):
         plot_run(run_dir, run_dir / "learning_curve.png", title=task)
     checkpoint = latest_checkpoint(run_dir)

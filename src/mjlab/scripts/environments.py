@@ -1,4 +1,4 @@
-"""Environments and runners of a task, as commands build them."""
+"""Construction of environments and runners for commands."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def make_env(
     render_mode: str | None = None,
     profile: str | None = None,
 ) -> Any:
-    """Return the wrapped environment of `cfg`; what is None is left as `cfg` has it.
+    """Return the wrapped environment of `cfg`; arguments that are None keep the value in `cfg`.
 
-    Actions are clipped as the learner's config of the task says, under `profile`.
+    Actions are clipped to `clip_actions` of the learner config of the task under `profile`.
     """
     prepare_torch(device)
     cfg = copy.deepcopy(cfg)
@@ -51,9 +51,9 @@ def make_env(
 
 
 def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) -> Any:
-    """Return the wrapped environment to train in; `--video` records it into `run_dir`."""
+    """Return the wrapped training environment; with `--video`, record clips into `run_dir`."""
     records = cfg.video and rank.is_first
-    with _core_for_learner(cfg, device, rank):
+    with _reserve_learner_core(cfg, device, rank):
         env: Any = ManagerBasedRlEnv(
             cfg.env, device=device, render_mode="rgb_array" if records else None
         )
@@ -71,11 +71,10 @@ def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank
 
 
 @contextlib.contextmanager
-def _core_for_learner(cfg: TrainConfig, device: str, rank: ProcessRank) -> Generator[None]:
-    """Let the physics built within the block leave one core to SAC, which learns at the same time.
+def _reserve_learner_core(cfg: TrainConfig, device: str, rank: ProcessRank) -> Generator[None]:
+    """Reserve one core for SAC, which learns during collection, in physics built within the block.
 
-    The config is unchanged afterwards, so that evaluations, during which nothing is learned, have all
-    cores.
+    The config is restored afterwards: evaluations do not learn, and use all cores.
     """
     sim = cfg.env.sim
     if sim.num_threads != 0 or learner_of(cfg.agent) != "sac":
@@ -92,15 +91,15 @@ def _core_for_learner(cfg: TrainConfig, device: str, rank: ProcessRank) -> Gener
 def training_runner(
     task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str
 ) -> MjlabOnPolicyRunner:
-    """Return the runner of `task`, with new networks."""
+    """Return the runner of `task`, with newly initialized networks."""
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
     if cfg.agent.logger == "wandb":
         add_wandb_tags(cfg.agent.wandb_tags)
-    # Seeded again, so that the initial networks depend on the seed alone and not on how many random
-    # numbers the environment drew while it was built.
+    # Reseed, so that the initial networks depend on the seed alone, not on the random numbers drawn
+    # to build the environment.
     seed_rng(cfg.agent.seed)
-    further = options_of(task, cfg).runner_kwargs()
-    runner = runner_cls(env, asdict(cfg.agent), str(run_dir), device, **further)
+    runner_kwargs = options_of(task, cfg).runner_kwargs()
+    runner = runner_cls(env, asdict(cfg.agent), str(run_dir), device, **runner_kwargs)
     if (source := task_source(task)) is not None and hasattr(runner, "add_git_repo_to_log"):
         runner.add_git_repo_to_log(source)
     return runner

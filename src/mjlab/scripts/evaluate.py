@@ -1,4 +1,4 @@
-"""Score a policy: `uv run evaluate TASK [flags]`."""
+"""Evaluate a policy: `uv run evaluate TASK [flags]`."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class EvaluateConfig(PolicyFlags):
     """Flags of `evaluate`."""
 
     num_episodes: int = 256
-    """Episodes to play, one per environment; in rounds if --env.scene.num-envs is set lower."""
+    """Number of episodes, one per environment; in rounds if --env.scene.num-envs is lower."""
     max_steps: int | None = None
-    """Steps after which an episode is cut off, and is no success; None is the episode length of
-    evaluations."""
+    """Maximum episode length in steps; longer episodes are truncated and not a success. None: episode
+    length of evaluations."""
     seed: int = 0
     """Seed of the evaluation."""
     json: bool = False
@@ -46,12 +46,11 @@ def command(argv: list[str], prog: str) -> None:
 
 
 def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False) -> dict[str, Any]:
-    """Score a policy of `task`, print the figures, and return them.
+    """Evaluate a policy of `task`, print the metrics, and return them.
 
-    The environments are those of evaluations in training (`EvaluationCfg.prepare_env`): those of the
-    task's training config where it has none, because the time limit is part of the task. There is
-    one for each episode, unless `cfg.env` has another number of them than the task, or
-    `keep_num_envs` says that its number was chosen.
+    Environments are those of evaluations in training (`EvaluationCfg.prepare_env`), or those of the
+    training config if the task defines none, because the time limit is part of the task. Their
+    number is `num_episodes`; that of `cfg.env` if it differs from the task, or if `keep_num_envs`.
     """
     from mjlab.rl.evaluation import evaluate_policy, required_return, success_definition
 
@@ -59,8 +58,8 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
-    usual = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
-    is_chosen = keep_num_envs or env_cfg.scene.num_envs != usual
+    default = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
+    is_chosen = keep_num_envs or env_cfg.scene.num_envs != default
     num_envs = None if is_chosen else cfg.num_episodes
     solved = load_rl_cfg(task, profile=cfg.profile).evaluation
     env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, profile=cfg.profile)
@@ -81,7 +80,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
         num_envs = env.num_envs
     finally:
         env.close()
-    figures = {
+    metrics = {
         "task": task,
         "policy": cfg.agent if checkpoint is None else str(checkpoint),
         "physics": physics,
@@ -90,36 +89,36 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
         "success_definition": success_definition(solved),
         **result.to_dict(),
     }
-    print(json.dumps(figures, indent=2) if cfg.json else _table(figures))
-    return figures
+    print(json.dumps(metrics, indent=2) if cfg.json else _table(metrics))
+    return metrics
 
 
-def _table(figures: dict[str, Any]) -> str:
+def _table(metrics: dict[str, Any]) -> str:
     lines = [
-        f"Task         {figures['task']}",
-        f"Policy       {figures['policy']}",
-        f"Physics      {figures['physics']}",
-        f"Episodes     {figures['num_episodes']} in {figures['num_envs']} environments, "
-        f"mean length {figures['mean_length']:.1f} steps",
-        f"Mean return  {figures['mean_return']:.2f}   {_interval(figures['return_interval'], '.2f')}"
-        f"   range [{figures['min_return']:.2f}, {figures['max_return']:.2f}]",
+        f"Task         {metrics['task']}",
+        f"Policy       {metrics['policy']}",
+        f"Physics      {metrics['physics']}",
+        f"Episodes     {metrics['num_episodes']} in {metrics['num_envs']} environments, "
+        f"mean length {metrics['mean_length']:.1f} steps",
+        f"Mean return  {metrics['mean_return']:.2f}   {_interval(metrics['return_interval'], '.2f')}"
+        f"   range [{metrics['min_return']:.2f}, {metrics['max_return']:.2f}]",
         "             (sum over the episode of the weighted reward before scaling by the time step)",
     ]
-    if figures["success_rate"] is not None:
+    if metrics["success_rate"] is not None:
         lines.append(
-            f"Success      {figures['success_rate']:.1%}   "
-            f"{_interval(figures['success_interval'], '.1%')}   ({figures['success_definition']})"
+            f"Success      {metrics['success_rate']:.1%}   "
+            f"{_interval(metrics['success_interval'], '.1%')}   ({metrics['success_definition']})"
         )
-    if figures["failure_rate"] is not None:
-        ended = [f"{name} {rate:.1%}" for name, rate in figures["terminations"].items() if rate]
+    if metrics["failure_rate"] is not None:
+        ended = [f"{name} {rate:.1%}" for name, rate in metrics["terminations"].items() if rate]
         lines.append(
-            f"Failures     {figures['failure_rate']:.1%}   "
-            f"{_interval(figures['failure_interval'], '.1%')}   "
+            f"Failures     {metrics['failure_rate']:.1%}   "
+            f"{_interval(metrics['failure_interval'], '.1%')}   "
             f"(ended by: {', '.join(ended) or 'nothing'})"
         )
-    for name, value in figures["metrics"].items():
+    for name, value in metrics["metrics"].items():
         lines.append(f"{name:<12} {value['mean']:.4g}   {_interval(value['interval'], '.4g')}")
-    lines += [f"Note         {note}" for note in figures["notes"]]
+    lines += [f"Note         {note}" for note in metrics["notes"]]
     return "\n".join(lines)
 
 

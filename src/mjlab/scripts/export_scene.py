@@ -1,4 +1,4 @@
-"""Write a task's scene, or a robot, as MuJoCo XML: `uv run export-scene TARGET [flags]`."""
+"""Export the scene of a task, or a robot, as MuJoCo XML: `uv run export-scene TARGET [flags]`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mjlab.sim import MujocoCfg
 
 ROBOTS = {"g1": "get_g1_robot_cfg", "go1": "get_go1_robot_cfg", "yam": "get_yam_robot_cfg"}
-"""Short names of robots, and the functions of `mjlab.asset_zoo.robots` that configure them."""
+"""Functions of `mjlab.asset_zoo.robots` by short robot name."""
 
 _XML, _ASSETS = "scene.xml", "assets"
 
@@ -33,11 +33,11 @@ class ExportSceneConfig:
     """Flags of `export-scene`."""
 
     output_dir: str = "export"
-    """Folder to write into; it must be new or empty."""
+    """Output folder. Must be new or empty."""
     zip: bool = False
     """Write the archive `<output_dir>.zip` instead of a folder."""
     overwrite: bool = False
-    """Replace an earlier export at that place; other files are left alone."""
+    """Replace an earlier export; other files are kept."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -50,11 +50,10 @@ def command(argv: list[str], prog: str) -> None:
 def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
     """Write the scene of `target` and return the folder or archive.
 
-    The physics options (time step, solver, cone, ...) with which an environment would simulate it
-    are in the file.
+    The file contains the physics options (timestep, solver, cone, ...) of the environment.
 
     Raises:
-        UserError: an unknown target, or a place that is taken.
+        UserError: unknown target, or the output exists.
     """
     from mjlab.scene import Scene
 
@@ -73,7 +72,7 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
 
 
 def _load(target: str) -> tuple[SceneCfg, MujocoCfg]:
-    """Return the scene and physics options of a task, a robot's short name or `module:function`."""
+    """Return scene and physics options of a task, a robot (short name) or `module:function`."""
     from mjlab.scene import SceneCfg
     from mjlab.sim import MujocoCfg
 
@@ -101,7 +100,7 @@ def _needs_arguments(make: Callable[..., Any]) -> bool:
     except TypeError:
         return True
     except ValueError:
-        # Functions of other languages may not tell.
+        # Functions of extension modules may lack a signature.
         return False
     return False
 
@@ -111,7 +110,7 @@ def _from_function(target: str) -> EntityCfg:
 
     module_name, _, name = target.partition(":")
     if os.getcwd() not in sys.path:
-        # As `python -m` does, so that a file in this folder is found.
+        # As `python -m` does: modules in the working folder can be imported.
         sys.path.append(os.getcwd())
     try:
         make = getattr(importlib.import_module(module_name), name)
@@ -119,44 +118,42 @@ def _from_function(target: str) -> EntityCfg:
         raise UserError(f"{target!r} cannot be imported: {error}.") from error
     if callable(make) and _needs_arguments(make):
         raise UserError(
-            f"{target!r} takes arguments, and export-scene takes functions that return an EntityCfg "
-            "without any."
+            f"{target!r}: expected a function without required arguments that returns an EntityCfg."
         )
     made = make() if callable(make) else make
     if not isinstance(made, EntityCfg):
         raise UserError(
-            f"{target!r} made a {type(made).__name__}, and export-scene takes functions that "
-            "return an EntityCfg."
+            f"{target!r}: expected a function that returns an EntityCfg, got {type(made).__name__}."
         )
     return made
 
 
 def _destination(cfg: ExportSceneConfig) -> tuple[Path, Path]:
-    """Return the folder to write, and the folder or archive that it ends as, which must be free."""
+    """Return the folder to write, and the resulting folder or archive. Raises if the latter is taken."""
     folder = Path(cfg.output_dir)
     if cfg.zip:
         folder = folder.with_suffix("") if folder.suffix == ".zip" else folder
-        # An archive needs a name, which these paths do not say: `.`, `..`, `/`.
+        # An archive needs a name; the paths `.`, `..` and `/` have none.
         folder = folder.resolve() if folder.name in ("", "..") else folder
         if not folder.name:
             raise UserError(
-                f"--output-dir {cfg.output_dir} has no name that an archive could have."
+                f"--output-dir: expected a path with a name for the archive, got {cfg.output_dir}."
             )
     result = folder.with_name(f"{folder.name}.zip") if cfg.zip else folder
     if not cfg.zip and result.exists() and not result.is_dir():
-        raise UserError(f"{result} is a file. Choose another --output-dir.")
+        raise UserError(f"--output-dir: expected a folder, got the file {result}.")
     is_free = not result.exists() or (result.is_dir() and not any(result.iterdir()))
     if not is_free and not cfg.overwrite:
-        taken = f"The archive {result} exists" if cfg.zip else f"The folder {result} is not empty"
+        taken = f"archive {result} exists" if cfg.zip else f"folder {result} is not empty"
         raise UserError(
-            f"{taken}. Choose another --output-dir, or give --overwrite True to replace an earlier "
-            "export there."
+            f"--output-dir: {taken}; use another folder, or --overwrite True to replace an earlier "
+            "export."
         )
     return folder, result
 
 
 def _write_folder(scene: Scene, folder: Path) -> None:
-    """Write beside the folder first, so that it never holds half an export."""
+    """Write the scene into a temporary folder and rename, so that `folder` never holds half an export."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".export-") as temporary:
         made = Path(temporary) / "scene"

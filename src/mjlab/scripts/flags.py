@@ -1,9 +1,9 @@
 """Flags of the commands: from `argv` to a config.
 
 - tyro reads the flags of a dataclass; `--env.rewards.<term> None` switches a term off.
-- `--profile` and `--learner` decide which other flags exist and their defaults, so that they are
-  read first. A command that continues a run takes those of the run.
-- Tasks add flags of their own (`mjlab.tasks.registry.TaskOptions`).
+- `--profile` and `--learner` are parsed first, because the other flags and their defaults depend on
+  them. A command that resumes a run uses those of the run.
+- Tasks can add flags (`mjlab.tasks.registry.TaskOptions`).
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ C = TypeVar("C")
 CPU_PROFILE = "cpu"
 """Name of the profile that `train` suggests on a CPU."""
 _CHOICES = ("profile", "learner")
-# Field that holds the options of a task.
+# Field of the task options.
 _FIELD = "options"
-# Fields that hold terms by name. Observation terms are below their group, as `terms`.
+# Dicts of terms by name. Observation terms are in `terms` of their group.
 _TERM_DICTS = frozenset(
     (
         "observations",
@@ -70,10 +70,10 @@ _SEQUENCES = (tuple, list)
 
 
 def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
-    """Return `default` with the fields replaced that `flags` name; exits on an unknown flag.
+    """Return `default` updated by `flags`; exits on an unknown flag.
 
-    `--env.rewards.<term> None`, and the like for every other kind of term, switches the term off;
-    `None` also removes a config inside another where the field may be None, such as a term's noise.
+    `--env.rewards.<term> None` removes the term (same for all other kinds of terms). `None` also
+    removes a nested config if the field may be None, such as the noise of a term.
     """
     arguments = _arguments(config_type, default, flags, prog)
     return tyro.cli(config_type, **arguments)
@@ -82,7 +82,7 @@ def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -
 def parse_known_flags(
     config_type: type[C], default: C, flags: list[str], prog: str
 ) -> tuple[C, list[str]]:
-    """Return what `parse_flags` does, and the flags that are unknown, which have no effect."""
+    """Return the result of `parse_flags`, and the ignored unknown flags."""
     arguments = _arguments(config_type, default, flags, prog)
     return tyro.cli(config_type, return_unknown_args=True, **arguments)
 
@@ -99,12 +99,12 @@ def _arguments(config_type: Any, default: Any, flags: list[str], prog: str) -> d
 
 
 def is_given(flag: str, flags: list[str]) -> bool:
-    """Return whether the command line `flags` sets `flag`, with `-` or `_` between its words."""
+    """Return True if the command line `flags` sets `flag`, spelled with `-` or `_`."""
     return any(word.partition("=")[0].replace("_", "-") == flag for word in flags)
 
 
 def _with_explicit_switches(config_type: Any, flags: list[str]) -> list[str]:
-    """Read a bare `--video` as `--video True`, for the switches of `config_type` itself."""
+    """Expand a bare `--video` to `--video True`, for top-level bool fields of `config_type`."""
     switches = {
         "--" + field.name.replace("_", "-")
         for field in dataclasses.fields(config_type)
@@ -129,36 +129,35 @@ def parse_with_choices(
     flags: list[str],
     prog: str,
 ) -> C:
-    """Return what `flags` make of the defaults under the choices that they name.
+    """Return the defaults under the requested profile and learner, updated by `flags`.
 
     Args:
-        make_default: Returns the defaults under choices, given as keywords; those not given are the
-            task's.
-        recorded: Returns the choices of the run at hand that differ from the task's. Its arguments
-            are what the flags make of the defaults, and the choices that they name, which it need
-            not look for.
-        flags: The command line.
-        prog: The command, for messages.
+        make_default: Returns the defaults for choices passed as keywords; missing choices are those of
+            the task.
+        recorded: Returns the choices of the selected run that differ from the task's. Its arguments
+            are the defaults updated by the flags, and the choices in the flags, which it can skip.
+        flags: Command line.
+        prog: Name of the command, for messages.
 
     Raises:
-        UnknownProfileError: the task has no such profile; the message lists those it has.
-        ValueError: the learner is unknown.
+        UnknownProfileError: unknown profile; the message lists the profiles of the task.
+        ValueError: unknown learner.
     """
-    given = asked_choices(flags)
-    default = make_default(**given)
-    if len(given) == len(_CHOICES):
+    requested = requested_choices(flags)
+    default = make_default(**requested)
+    if len(requested) == len(_CHOICES):
         return parse_flags(type(default), default, flags, prog)
-    # The learner of the run at hand may have flags that the task's has not.
+    # The learner of the selected run may have flags that the task's learner lacks.
     cfg, unknown = parse_known_flags(type(default), default, flags, prog)
-    choices = {**recorded(cfg, given), **given}
-    if choices == given and not unknown:
+    choices = {**recorded(cfg, requested), **requested}
+    if choices == requested and not unknown:
         return cfg
     default = make_default(**choices)
     return parse_flags(type(default), default, flags, prog)
 
 
-def asked_choices(flags: list[str]) -> dict[str, str | None]:
-    """Return the choices that `flags` name; None where they say `None`."""
+def requested_choices(flags: list[str]) -> dict[str, str | None]:
+    """Return the profile and learner set by `flags`; None for the value `None`."""
     choices: dict[str, str | None] = {}
     for position, flag in enumerate(flags):
         name, equals, value = flag.partition("=")
@@ -166,28 +165,28 @@ def asked_choices(flags: list[str]) -> dict[str, str | None]:
         if name not in _CHOICES or name == flag:
             continue
         if not equals:
-            # Without a value, the parser has a message for it.
+            # The parser reports a missing value.
             value = flags[position + 1] if position + 1 < len(flags) else "None"
         choices[name] = None if value == "None" else value
     return choices
 
 
 def profile_of_run(task: str, run_dir: Path) -> str | None:
-    """Return the profile of `task` that the run in `run_dir` was made with, or None."""
+    """Return the profile of `task` that the run in `run_dir` used, or None."""
     profile = read_run_info(run_dir).get("profile")
     if not isinstance(profile, str):
         return None
     if profile not in list_profiles(task):
         print_notice(
-            f"The run in {run_dir} was made with the profile {profile!r}, which {task} does not "
-            "have; the task's own settings are used."
+            f"The run in {run_dir} used the profile {profile!r}, unknown to {task}; using the default "
+            "settings of the task."
         )
         return None
     return profile
 
 
 def suggest_profile(task: str, profile: str | None, device: str) -> None:
-    """Say in one line that there is a profile for training on a CPU, if it is of use here."""
+    """Print a hint to the `cpu` profile when training on the CPU without a profile."""
     if profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task):
         print_notice(
             f"Training on the CPU: `train {task} --profile {CPU_PROFILE}` has settings for a "
@@ -195,33 +194,33 @@ def suggest_profile(task: str, profile: str | None, device: str) -> None:
         )
 
 
-def tell_foreign_learner(task: str, profile: str | None, learner: str) -> None:
-    """Say in one line that a profile has no settings for a learner, if it has those of another."""
+def report_untuned_learner(task: str, profile: str | None, learner: str) -> None:
+    """Print a notice if `profile` has settings for a learner other than `learner`."""
     from mjlab.rl.learners import learner_of
 
-    # A student is made like the profile's teacher.
+    # A student uses the settings of the teacher's profile.
     if profile is None or learner == "distillation":
         return
     tuned = learner_of(load_rl_cfg(task, profile=profile))
     if tuned != learner:
         print_notice(
-            f"The profile {profile!r} of {task} has settings for the learner {tuned!r}: its environment "
-            f"is used, while networks, algorithm and iterations of {learner!r} are those without it."
+            f"The profile {profile!r} of {task} has settings for the learner {tuned!r}: using its "
+            f"environment, and the default networks, algorithm and iterations of {learner!r}."
         )
 
 
-# Flags of tasks.
+# Task flags.
 
 
 def with_task_options(cfg: C, task: str) -> C:
-    """Return the flags of a command with those of the task's own, if it has any.
+    """Return the flags of a command extended by the options of the task.
 
     Args:
-        cfg: A dataclass, the flags with their defaults.
+        cfg: Dataclass of flags with their defaults.
         task: Name of the task.
 
     Raises:
-        UnknownTaskError, TaskImportError: there is no such task, or its options cannot be imported.
+        UnknownTaskError, TaskImportError: unknown task, or its options cannot be imported.
         ValueError: an option of the task has the name of a flag of the command.
     """
     options = load_options_cls(task)
@@ -232,10 +231,10 @@ def with_task_options(cfg: C, task: str) -> C:
     taken = sorted({field.name for field in dataclasses.fields(options)} & values.keys())
     if taken:
         raise ValueError(
-            f"The options of task {task!r} ({options.__name__}) have {taken}, which are flags of "
-            "the command already; give them other names."
+            f"Options {options.__name__} of task {task!r}: expected names other than the flags of the "
+            f"command, got {taken}; rename these fields."
         )
-    # Without a prefix, as if the fields were the command's own.
+    # No prefix: options look like flags of the command.
     annotation: Any = Annotated[options, tyro.conf.arg(name="")]  # ty: ignore[invalid-type-form]
     kind: Any = dataclasses.make_dataclass(
         type(cfg).__name__,
@@ -247,7 +246,7 @@ def with_task_options(cfg: C, task: str) -> C:
 
 
 def options_of(task: str, cfg: Any) -> TaskOptions:
-    """Return the task's options in the flags of a command, or their defaults."""
+    """Return the task options in the flags of a command, or their defaults."""
     options = getattr(cfg, _FIELD, None)
     if options is not None:
         return options
@@ -261,29 +260,29 @@ def prepare_env_cfg(
     checkpoint: Path | None,
     wandb_run_path: str | None = None,
 ) -> None:
-    """Let the task get what it needs before its environment is built; `env_cfg` is edited.
+    """Let the task options edit `env_cfg` in place before the environment is built.
 
     Args:
         task: Name of the task.
-        cfg: The flags of the command, or None for the task's defaults.
-        env_cfg: The environment's config.
-        checkpoint: The checkpoint of the policy that is to act, if there is one.
-        wandb_run_path: Where the checkpoint was fetched from, if it was.
+        cfg: Flags of the command, or None for the defaults of the task.
+        env_cfg: Environment config, edited in place.
+        checkpoint: Checkpoint of the acting policy, or None.
+        wandb_run_path: Weights & Biases run of a downloaded checkpoint, or None.
 
     Raises:
-        ValueError: what the task needs is not there.
+        ValueError: a resource of the task, such as a motion, was not found.
     """
     origin = PolicyOrigin(task, checkpoint, wandb_run_path)
     options_of(task, cfg).prepare(env_cfg, origin)
 
 
-# Terms switched off.
+# Removal of terms.
 
 
 def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
-    """Return `default` without the terms and configs `flags` set to None, and the remaining flags.
+    """Return a copy of `default` without the terms and configs set to None, and the remaining flags.
 
-    All other flags remain, for tyro to judge. `default` itself is not modified.
+    tyro checks the remaining flags.
     """
     config = copy.deepcopy(default)
     remaining: list[str] = []
@@ -299,9 +298,10 @@ def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
 
 
 def _flag_values(flags: list[str]) -> Iterator[tuple[str, str | None, list[str]]]:
-    """Yield every flag with its value, and the words that it was made of.
+    """Yield each flag with its value, and its words on the command line.
 
-    `--flag value` and `--flag=value` mean the same; values after the first are words of their own.
+    `--flag value` and `--flag=value` are equivalent; values after the first are yielded as separate
+    words.
     """
     position = 0
     while position < len(flags):
@@ -318,7 +318,7 @@ def _flag_values(flags: list[str]) -> Iterator[tuple[str, str | None, list[str]]
 
 
 def _term_at(config: Any, flag: str) -> tuple[Any, str]:
-    """Return the dict or config that holds what `flag` names, and its key; (None, "") if none does."""
+    """Return the dict or config that contains the entry `flag`, and its key; (None, "") if not found."""
     if not flag.startswith("--"):
         return None, ""
     holder: Any = None
@@ -328,7 +328,7 @@ def _term_at(config: Any, flag: str) -> tuple[Any, str]:
         if holder is None:
             return None, ""
         names = list(holder) if isinstance(holder, Mapping) else list(vars(holder))
-        # tyro writes `smooth_reward` as `smooth-reward` and takes both.
+        # tyro prints `smooth_reward` as `smooth-reward` and accepts both.
         spelled = {str(name).replace("_", "-"): name for name in reversed(names)}
         key = spelled.get(part.replace("_", "-"))
         if not isinstance(key, str):
@@ -341,24 +341,24 @@ def _term_at(config: Any, flag: str) -> tuple[Any, str]:
 
 
 def _may_be_none(holder: Any, key: str) -> bool:
-    """Return True if field `key` of a config is declared as a config, or a dict of one, or None."""
+    """Return True if field `key` of a config is an optional config or dict."""
     if not is_dataclass(holder):
         return False
     try:
         options = get_args(get_type_hints(type(holder)).get(key))
     except NameError:
-        # A class annotated with names that only type checkers import says nothing here.
+        # Annotations imported under TYPE_CHECKING cannot be resolved.
         return False
     return NoneType in options and any(
         is_dataclass(option) or get_origin(option) is dict for option in options
     )
 
 
-# Values that tyro alone does not read: lists for tuples, and tensors.
+# Parsing rules added to tyro: lists for tuples, and tensors.
 
 
 def flag_rules() -> ConstructorRegistry:
-    """Return the rules, for `tyro.cli(registry=...)`."""
+    """Return the parsing rules, for `tyro.cli(registry=...)`."""
     registry = ConstructorRegistry()
     registry.primitive_rule(_tensor_rule)
     registry.primitive_rule(_SequenceRule())
@@ -366,7 +366,7 @@ def flag_rules() -> ConstructorRegistry:
 
 
 def _tensor_rule(info: PrimitiveTypeInfo) -> _Spec:
-    # A command whose flags are no tensors need not import torch for its `--help`.
+    # Commands without tensor flags must not import torch for `--help`.
     torch = sys.modules.get("torch")
     if torch is None or info.type is not torch.Tensor:
         return None
@@ -389,19 +389,19 @@ def _tensor(text: str) -> torch.Tensor:
 
 
 class _SequenceRule:
-    """tyro's own rule for tuples and lists, given the brackets that the declared type wants."""
+    """tyro's rule for tuples and lists, with brackets converted to the declared type."""
 
     def __init__(self) -> None:
-        self._is_asking_tyro = False
+        self._in_tyro_rule = False
 
     def __call__(self, info: PrimitiveTypeInfo) -> _Spec:
-        if self._is_asking_tyro or info.type_origin not in _SEQUENCES:
+        if self._in_tyro_rule or info.type_origin not in _SEQUENCES:
             return None
-        self._is_asking_tyro = True
+        self._in_tyro_rule = True
         try:
             spec = ConstructorRegistry.get_primitive_spec(info)
         finally:
-            self._is_asking_tyro = False
+            self._in_tyro_rule = False
         if not isinstance(spec, PrimitiveConstructorSpec):
             return spec
         read = spec.instance_from_str
@@ -419,7 +419,7 @@ def _bracketed(declared: Any, text: str) -> str:
 
 
 def _converted(declared: Any, value: Any) -> Any:
-    """Return `value` with its sequences as tuples and lists, as the type `declared` has them."""
+    """Return `value` with its sequences converted to the tuples and lists of the type `declared`."""
     kind, elements = get_origin(declared), get_args(declared)
     if kind not in _SEQUENCES or not isinstance(value, _SEQUENCES):
         return value

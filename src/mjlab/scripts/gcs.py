@@ -1,4 +1,4 @@
-"""The module where 1.6 fetched what its demo needs; here that ships with the package."""
+"""Download module of mjlab 1.6; demo assets are now bundled with the package."""
 
 from mjlab.compat import older_names
 

@@ -9,11 +9,11 @@ from mjlab.scripts.cli import run_alias
 
 
 def list_environments(keyword: str | None = None) -> list[str]:
-    """Return the names of all tasks that contain `keyword`, whatever the case."""
+    """Return the names of all tasks that contain `keyword`, ignoring case."""
     from mjlab.tasks.registry import list_tasks
 
-    wanted = (keyword or "").lower()
-    return [name for name in list_tasks() if wanted in name.lower()]
+    pattern = (keyword or "").lower()
+    return [name for name in list_tasks() if pattern in name.lower()]
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -21,11 +21,11 @@ def command(argv: list[str], prog: str) -> None:
     parser = argparse.ArgumentParser(
         prog=prog, description="List the registered tasks and their profiles."
     )
-    parser.add_argument("--keyword", help="show only tasks whose name contains this")
+    parser.add_argument("--keyword", help="show only tasks whose name contains KEYWORD")
     args = parser.parse_args(argv)
     names = list_environments(args.keyword)
     if not names:
-        print(f"No task's name contains {args.keyword!r}.", file=sys.stderr)
+        print(f"No task name contains {args.keyword!r}.", file=sys.stderr)
         sys.exit(1)
     from mjlab.tasks.registry import list_profiles
 

@@ -1,8 +1,8 @@
-"""`train --live`: shows the policy as it learns, from a process that training does not wait for.
+"""`train --live`: view of the policy during training, served asynchronously by a separate process.
 
-Training hands over the newest weights through a file, at the end of an iteration and only while a
-browser is connected. All else, the page, an environment of its own and the policy in it, lives in
-the other process (`mjlab.scripts.live_view`), which takes processor time that training leaves.
+Training writes the newest weights to a file at the end of an iteration, only while a browser is
+connected. The page, a separate environment and the policy run in the view process
+(`mjlab.scripts.live_view`) at low priority.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Handing over weights takes some milliseconds. Iterations can be shorter than that, so it is done
-# at most this often, and never for more than this share of the time.
+# Writing weights takes some milliseconds, and iterations can be shorter: limit the rate and the
+# share of training time.
 _SECONDS_BETWEEN_WEIGHTS = 1.0
-_LARGEST_SHARE = 0.01
+_MAX_TIME_SHARE = 0.01
 
 _PREFIX = "mjlab-live-"
-# Held by training, so that the folder of one that was killed can be told.
+# Held by training; the folder of a killed training process has an unheld lock.
 _LOCK = "lock"
 _NUM_ENVS = 4
 _SECONDS_TO_START = 20.0
 _SECONDS_TO_END = 3.0
-# What would make the view's process one of the training processes of `torchrun`.
+# Variables of `torchrun` that would make the view process a training process.
 _DISTRIBUTED = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "TORCHELASTIC_RUN_ID")
 
 
 class LiveView(TrainingObserver):
-    """Runs the view's process and keeps it supplied. Whatever happens to it, training goes on."""
+    """Observer that starts the view process and writes weights. Failures do not stop training."""
 
     def __init__(self, task: str, cfg: TrainConfig, runner: MjlabOnPolicyRunner) -> None:
         """Start the process.
 
         Args:
             task: Name of the task.
-            cfg: The run's configuration; it is left as it is.
-            runner: The runner whose policy is shown.
+            cfg: Configuration of the run; not modified.
+            runner: Runner of the shown policy.
 
         Raises:
-            UserError: the configuration cannot be handed to another process.
+            UserError: the configuration cannot be pickled.
         """
         self._runner = runner
-        job = _pickled(LiveJob(task, _env_to_show(cfg), cfg.agent, type(runner)))
+        job = _pickled(LiveJob(task, _view_env_cfg(cfg), cfg.agent, type(runner)))
         _remove_abandoned_folders()
         self._folder = tempfile.TemporaryDirectory(prefix=_PREFIX)
         self._lock = create_locked(Path(self._folder.name) / _LOCK)
@@ -78,7 +78,7 @@ class LiveView(TrainingObserver):
             self._give_up_if_ended()
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
-        """Say where the page is; leave the weights that training starts from."""
+        """Print the URL of the page; write the initial weights."""
         self._write_weights(None)
         limit = time.perf_counter() + _SECONDS_TO_START
         while time.perf_counter() < limit and not self._give_up_if_ended():
@@ -89,7 +89,7 @@ class LiveView(TrainingObserver):
             time.sleep(0.02)
 
     def on_iteration(self, stats: IterationStats) -> None:
-        """Leave the newest weights, if anyone is watching."""
+        """Write the newest weights if a browser is connected."""
         begin = time.perf_counter()
         if begin < self._next_weights or self._give_up_if_ended():
             return
@@ -98,9 +98,9 @@ class LiveView(TrainingObserver):
         try:
             self._write_weights(stats)
         except OSError as error:
-            logger.warning("The live view gets no new weights: %s", error)
+            logger.warning("Live view: writing weights failed: %s", error)
         end = time.perf_counter()
-        self._next_weights = end + max(_SECONDS_BETWEEN_WEIGHTS, (end - begin) / _LARGEST_SHARE)
+        self._next_weights = end + max(_SECONDS_BETWEEN_WEIGHTS, (end - begin) / _MAX_TIME_SHARE)
 
     def on_end(self, reason: str) -> None:
         """End the process."""
@@ -115,14 +115,14 @@ class LiveView(TrainingObserver):
         self._exchange.write_weights(self._runner.alg.get_policy(), num_steps, stats)
 
     def _give_up_if_ended(self) -> bool:
-        """Return whether there is no process; say so when it is first noticed."""
+        """Return True if the process has ended; log it the first time."""
         if self._process is None:
             return True
         if self._process.poll() is None:
             return False
         self._process = None
         reason = (self._exchange.log.read_text(errors="replace").strip().splitlines() or [""])[-1]
-        logger.warning("The live view has ended; training goes on. %s", reason)
+        logger.warning("Live view: process ended; training continues. %s", reason)
         return True
 
 
@@ -131,15 +131,15 @@ def _remove_abandoned_folders() -> None:
     if os.name != "posix":
         return
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        # Other users may plant what they like there.
+        # Other users can create files in the temporary folder.
         with contextlib.suppress(OSError):
             is_own = folder.lstat().st_uid == os.geteuid() and not folder.is_symlink()
             if is_own and remove_abandoned(folder / _LOCK):
                 shutil.rmtree(folder)
 
 
-def _env_to_show(cfg: TrainConfig) -> Any:
-    """Return the run's environment as it is shown: few of it, on one thread, writing no files."""
+def _view_env_cfg(cfg: TrainConfig) -> Any:
+    """Return the config of the shown environments: few, single-threaded, without file output."""
     env = copy.deepcopy(cfg.env)
     env.scene.num_envs = min(_NUM_ENVS, env.scene.num_envs)
     env.sim.engine = "native"
@@ -150,22 +150,21 @@ def _env_to_show(cfg: TrainConfig) -> Any:
 
 
 def _pickled(job: LiveJob) -> bytes:
-    # Configs hold lambdas, and classes of the program that calls us, which only this pickles.
+    # Only cloudpickle pickles lambdas and classes of `__main__`.
     import cloudpickle
 
     try:
         return cloudpickle.dumps(job)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise UserError(
-            "--live cannot hand this task to another process, because something in its config "
-            f"cannot be pickled: {error}. Build such things in functions that the config names, "
-            "or train without --live."
+            f"--live: expected a task config that can be pickled, got {error}; build such objects in "
+            "functions referenced by the config, or train without --live."
         ) from error
 
 
 def _start(exchange: Exchange, host: str, port: int) -> subprocess.Popen:
     environment = {k: v for k, v in os.environ.items() if k not in _DISTRIBUTED}
-    # The GPU is the training's, and so are all threads but one.
+    # Training keeps the GPU and all threads but one.
     environment |= {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "MJLAB_TORCH_THREADS": "1"}
     with open(exchange.log, "wb") as log:
         return subprocess.Popen(
@@ -177,14 +176,14 @@ def _start(exchange: Exchange, host: str, port: int) -> subprocess.Popen:
             stdout=log,
             stderr=log,
             env=environment,
-            # Ctrl-C is for training, which ends the view. A session of its own would do that too,
-            # but Linux shares processors out by session first, and by priority only within one.
+            # A process group keeps Ctrl-C from the view; training ends the view. Not a new session:
+            # Linux schedules by session first, and by priority only within a session.
             process_group=0 if os.name == "posix" else None,
         )
 
 
 def _end(process: subprocess.Popen) -> None:
-    """Let the process end by closing its standard input; kill it if it does not."""
+    """End the process by closing its standard input; kill it after a timeout."""
     assert process.stdin is not None
     with contextlib.suppress(OSError):
         process.stdin.close()

@@ -1,9 +1,9 @@
-"""The process behind `train --live`: the page of the policy that another process trains.
+"""View process of `train --live`: page of a policy that another process trains.
 
-It is started by `mjlab.scripts.live`, reads what to show from its standard input, and ends when
-that is closed, however the other process came to its end. It builds its environment when the first
-browser connects, and steps it, at the lowest priority, only while one is. Until then, nothing heavy
-is imported.
+Started by `mjlab.scripts.live`; reads a pickled `LiveJob` from standard input, and ends when standard
+input is closed, even if training was killed. The environment is built when the first browser connects,
+and stepped at the lowest priority only while a browser is connected. Heavy modules are not imported
+before.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
     from mjlab.rl.run_logger import IterationStats
 
-_WAITING = 0.25
+_POLL_PERIOD = 0.25
 _LOWEST_PRIORITY = 19
 
 
 def main() -> None:
-    """Show what standard input says; the arguments are the exchange's folder, address and port."""
-    # Training decides what Ctrl-C means.
+    """Show the job from standard input. Arguments: exchange folder, address, port."""
+    # Training handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     size = int.from_bytes(sys.stdin.buffer.read(8), "little")
     pickled = sys.stdin.buffer.read(size)
@@ -45,37 +45,36 @@ def main() -> None:
 
 
 def lower_priority() -> None:
-    """Leave the processors to training, as far as the system can do that.
+    """Give training precedence over this process, if the system supports priorities.
 
-    On Linux the lowest priority is 1.5 % of a processor that others want all of, and what is left
-    of one that they do not. (The idle class would be next to nothing instead: where all
-    processors are busy, the page would stand still.)
+    On Linux the lowest priority gets 1.5 % of a busy core, and all idle time. (The idle scheduling
+    class would get almost nothing: with all cores busy, the page would freeze.)
     """
     with contextlib.suppress(OSError, AttributeError):
         os.nice(_LOWEST_PRIORITY)
 
 
 def show(pickled: bytes, exchange: Exchange, host: str, port: int) -> None:
-    """Serve the page of a pickled `LiveJob`; build what it shows when the first browser connects.
+    """Serve the page of a pickled `LiveJob`; build its environment when the first browser connects.
 
-    Until then, neither torch nor the task are imported.
+    Neither torch nor the task is imported before.
     """
     server = serve_page(host, port)
     with replacing(exchange.url) as file:
         file.write(page_url(server).encode())
     note = server.gui.add_markdown("Preparing the view …")
     while not server.get_clients():
-        time.sleep(_WAITING)
+        time.sleep(_POLL_PERIOD)
     exchange.watched.touch()
     viewer = make_viewer(pickle.loads(pickled), exchange, server)
-    # Not before: at that priority, building would take minutes where all processors are busy.
+    # After building: at low priority, building would take minutes with all cores busy.
     lower_priority()
     note.remove()
     viewer.run(catch_sigint=False)
 
 
 def make_viewer(job: LiveJob, exchange: Exchange, server: viser.ViserServer) -> Any:
-    """Return the viewer of a job, with an environment and a network of its own."""
+    """Return the viewer of a job, with a new environment and network."""
     import torch
 
     from mjlab.envs import ManagerBasedRlEnv
@@ -107,52 +106,52 @@ def make_viewer(job: LiveJob, exchange: Exchange, server: viser.ViserServer) -> 
 
 @dataclass
 class LiveJob:
-    """What the view's process is to show."""
+    """Job of the view process."""
 
     task: str
     """Name of the task."""
     env: Any
-    """Config of the environment."""
+    """Environment config."""
     agent: Any
-    """Config of the learner."""
+    """Learner config."""
     runner_cls: Any
-    """Class of the runner, which builds the policy's network."""
+    """Runner class. Builds the policy network."""
 
 
 class Exchange:
-    """The folder in which training and the view leave things for each other."""
+    """Folder for file exchange between training and the view process."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.url = folder / "url"
-        """Where the page is, once it is there."""
+        """URL of the page, written once the page is served."""
         self.watched = folder / "watched"
         """Exists while a browser is connected."""
         self.weights = folder / "weights.pt"
-        """The newest policy and the figures of its iteration; it appears whole or not at all."""
+        """Newest policy and statistics of its iteration, replaced atomically."""
         self.log = folder / "log.txt"
-        """What the view's process printed."""
+        """Output of the view process."""
 
     def write_weights(self, policy: Any, num_steps: int, stats: IterationStats | None) -> None:
-        """Leave a policy's state.
+        """Write the state of a policy.
 
         Args:
-            policy: The network.
-            num_steps: Steps that each environment has made, which curricula go by.
-            stats: Figures of the iteration that the policy comes from, if there was one.
+            policy: Policy network.
+            num_steps: Steps per environment, the input of curricula.
+            stats: Statistics of the policy's iteration; None before the first iteration.
         """
         import torch
 
         content = io.BytesIO()
-        figures = None if stats is None else asdict(stats)
+        stats_dict = None if stats is None else asdict(stats)
         policy_state = policy.state_dict()
-        torch.save({"policy": policy_state, "num_steps": num_steps, "stats": figures}, content)
+        torch.save({"policy": policy_state, "num_steps": num_steps, "stats": stats_dict}, content)
         with replacing(self.weights) as file:
             file.write(content.getbuffer())
 
 
 class NewestWeights:
-    """Loads the weights that training leaves into a network."""
+    """Loader of the newest weights written by training."""
 
     def __init__(self, exchange: Exchange, network: Any, env: Any) -> None:
         self._path = exchange.weights
@@ -161,7 +160,7 @@ class NewestWeights:
         self._seen: tuple[int, int] | None = None
 
     def take(self) -> dict[str, Any] | None:
-        """Load the newest weights; return the figures of their iteration, or None if not new."""
+        """Load the newest weights; return the statistics of their iteration, or None if unchanged."""
         import torch
 
         try:
@@ -174,13 +173,13 @@ class NewestWeights:
             return None
         self._seen = mark
         self._network.load_state_dict(content["policy"])
-        # Curricula get to where they are in training.
+        # Curricula must match those of training.
         self._env.common_step_counter = content["num_steps"]
         return content["stats"]
 
 
 def _end_with_parent() -> None:
-    """End this process when its standard input is closed, whatever it is doing."""
+    """End this process as soon as its standard input is closed."""
     with contextlib.suppress(OSError):
         sys.stdin.buffer.read()
     os._exit(0)

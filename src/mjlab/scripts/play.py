@@ -1,4 +1,4 @@
-"""Watch a policy: `uv run play TASK [flags]`."""
+"""Play a policy: `uv run play TASK [flags]`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class PlayConfig(PolicyFlags):
     """Flags of `play`."""
 
     num_envs: int | None = None
-    """Number of environments; None keeps the task's."""
+    """Number of environments. None: number of the task."""
     video: bool = False
     """Record a clip instead of opening a viewer."""
     video_length: int = 200
@@ -48,20 +48,20 @@ class PlayConfig(PolicyFlags):
     video_width: int | None = None
     """Width of the clip, in pixels."""
     camera: int | str | None = None
-    """Camera of the model to record from, by name or index; None is the task's own view."""
+    """Model camera to record from, name or index. None: viewer camera of the task."""
     viewer: Literal["auto", "native", "viser", "none"] = "auto"
-    """`viser` is a page in the browser, `native` is MuJoCo's window, `none` steps without looking.
-    `auto` takes the window where there is a display, else the page."""
+    """Viewer: `viser` (page in the browser), `native` (MuJoCo's window) or `none` (headless). `auto`:
+    `native` if a display is available, else `viser`."""
     num_steps: int | None = None
-    """Environment steps to take; None plays until stopped."""
+    """Number of environment steps. None: play until stopped."""
     host: str = "127.0.0.1"
-    """Address that the page is served on; 0.0.0.0 serves the whole network."""
+    """Address of the page. 0.0.0.0: all interfaces."""
     port: int = 8080
-    """Port that the page is served on."""
+    """Port of the page."""
     open_browser: bool = False
-    """Open the page in this machine's browser, if there is a display."""
+    """Open the page in a browser on this machine, if a display is available."""
     no_terminations: bool = False
-    """Switch off every termination, the time limit included."""
+    """Remove all terminations, including the time limit."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -71,16 +71,18 @@ def command(argv: list[str], prog: str) -> None:
 
 
 def run_play(task: str, cfg: PlayConfig) -> None:
-    """Play `task` as `cfg` says.
+    """Play `task` with the flags `cfg`.
 
     Raises:
         UserError, ValueError, OSError, CheckpointError, EngineUnavailableError,
-        RenderingUnavailableError: what was asked for cannot be done.
+        RenderingUnavailableError: the request cannot be fulfilled.
     """
     if cfg.num_steps is not None:
         check_count("--num-steps", cfg.num_steps)
     if cfg.viewer == "none" and cfg.num_steps is None and not cfg.video:
-        raise UserError("--viewer none needs --num-steps, because nothing else would end it.")
+        raise UserError(
+            "--viewer none: expected --num-steps, because nothing else would end playing, got none."
+        )
     check_count("--video-length", cfg.video_length)
     check_address(cfg.host, cfg.port, "--")
     device = resolve_device(cfg.device)
@@ -153,7 +155,7 @@ def _has_display() -> bool:
 
 
 def _can_open_browser() -> bool:
-    # Without a display, Linux would open a browser for the terminal, in this terminal.
+    # Without a display, Linux would open a text browser in this terminal.
     return sys.platform in ("darwin", "win32") or _has_display()
 
 

@@ -1,4 +1,4 @@
-"""Finding and loading a trained policy, for `play`, `evaluate` and recordings."""
+"""Selection and loading of policies for `play`, `evaluate` and recordings."""
 
 from __future__ import annotations
 
@@ -38,28 +38,28 @@ from mjlab.utils.os import get_wandb_checkpoint_path
 
 @dataclass
 class PolicyFlags:
-    """Flags that say whose actions are taken, and on what they are computed."""
+    """Flags that select the policy, the device and the engine."""
 
     agent: Literal["zero", "random", "trained"] = "trained"
-    """Who acts: all-zero actions, uniform ones in [-1, 1], or a trained policy."""
+    """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
     checkpoint_file: str | None = None
-    """Checkpoint of the trained policy, or its export (`.onnx`); None takes the task's newest."""
+    """Checkpoint of the trained policy, or its export (`.onnx`). None: newest checkpoint of the task."""
     wandb_run_path: str | None = None
-    """Weights & Biases run to take the policy from, as entity/project/run."""
+    """Weights & Biases run of the policy, as entity/project/run."""
     wandb_checkpoint_name: str | None = None
-    """Checkpoint of that run; None takes the newest."""
+    """Checkpoint of the Weights & Biases run. None: newest."""
     device: str | None = None
-    """Torch device; None takes a GPU where there is one."""
+    """Torch device. None: a GPU if available."""
     engine: Literal["auto", "native", "warp"] | None = None
     """Physics engine."""
     log_root: str = "logs/rsl_rl"
-    """Folder of all runs."""
+    """Root folder of all runs."""
     profile: str | None = None
-    """Named settings of the task, such as `cpu`. None: those that the policy was trained with."""
+    """Task profile, such as `cpu`. None: profile that the policy was trained with."""
     learner: Learner | None = None
-    """Learner that the policy is of, to take the newest one of it. None: any."""
+    """Learner of the policy; selects its newest run. None: any."""
     env: ManagerBasedRlEnvCfg | None = None
-    """The environment; None takes the task's config."""
+    """Environment. None: config of the task."""
 
 
 F = TypeVar("F", bound=PolicyFlags)
@@ -69,31 +69,31 @@ Purpose = Literal["play", "evaluate", "train"]
 def parse_policy_flags(
     kind: type[F], flags: list[str], task: str, command: str, *, purpose: Purpose
 ) -> F:
-    """Return what `flags` make of the defaults of `kind`, under the profile of the policy they name.
+    """Return the defaults of `kind` under the profile of the selected policy, updated by `flags`.
 
     Args:
-        kind: The flags of `command`.
-        flags: The command line, after the task.
+        kind: Class of the flags of `command`.
+        flags: Command line after the task.
         task: Name of the task.
-        command: The command, for messages.
-        purpose: What the environments are for; see `policy_env_cfg`.
+        command: Name of the command, for messages.
+        purpose: Purpose of the environments; see `policy_env_cfg`.
 
     Raises:
-        UnknownProfileError: the task has no such profile.
-        BadCallError: a checkpoint is named for an agent that has none.
+        UnknownProfileError: unknown profile.
+        BadCallError: checkpoint set with an untrained agent.
     """
 
     def make_default(profile: str | None = None, learner: str | None = None) -> F:
-        # The learner changes no flags here, so that it is left to the parser.
+        # The learner does not change the flags, so the parser handles it.
         env_cfg = policy_env_cfg(task, profile, purpose=purpose)
         return with_task_options(kind(env=env_cfg, profile=profile), task)
 
-    def recorded(cfg: F, given: Mapping[str, str | None]) -> dict[str, str | None]:
-        profile = None if "profile" in given else profile_of_policy(task, cfg)
+    def recorded(cfg: F, requested: Mapping[str, str | None]) -> dict[str, str | None]:
+        profile = None if "profile" in requested else profile_of_policy(task, cfg)
         return {} if profile is None else {"profile": profile}
 
     cfg = parse_with_choices(make_default, recorded, flags, prog=f"{command} {task}")
-    # A task may read more than a policy from a run at Weights & Biases.
+    # --wandb-run-path is valid with any agent: a task may read other files from the run.
     for flag in ("--checkpoint-file", "--wandb-checkpoint-name"):
         if cfg.agent != "trained" and is_given(flag, flags):
             raise BadCallError(
@@ -102,16 +102,16 @@ def parse_policy_flags(
     return cfg
 
 
-# Finding the policy.
+# Policy selection.
 
 
 def find_checkpoint(task: str, flags: PolicyFlags) -> Path | None:
-    """Return the checkpoint that the flags name, or the newest one of the task.
+    """Return the checkpoint selected by the flags, by default the newest of the task.
 
-    None where the flags ask for no trained policy.
+    None if the agent is not trained.
 
     Raises:
-        UserError: there is none, or another learner than the flags name wrote it.
+        UserError: checkpoint not found, or written by a learner other than `flags.learner`.
     """
     if flags.agent != "trained":
         return None
@@ -141,8 +141,8 @@ def _newest_checkpoint(task: str, flags: PolicyFlags) -> Path:
         if flags.learner is not None:
             by, choice = f" by the learner {flags.learner!r}", f" --learner {flags.learner}"
         raise UserError(
-            f"No checkpoint was named, and {experiment} has none of {task}{by}. Run `train "
-            f"{task}{choice}` first, or give --checkpoint-file or --wandb-run-path."
+            f"No checkpoint of {task}{by} found in {experiment}; run `train {task}{choice}` first, or use "
+            "--checkpoint-file or --wandb-run-path."
         )
     print_notice(f"Checkpoint: {path}")
     return path
@@ -153,9 +153,9 @@ def _experiment(task: str, flags: PolicyFlags) -> Path:
 
 
 def profile_of_policy(task: str, flags: PolicyFlags) -> str | None:
-    """Return the profile that the policy which the flags name was trained with, if it is known.
+    """Return the training profile of the policy selected by the flags, or None if unknown.
 
-    That of a Weights & Biases run is not: its files come without what the run says about itself.
+    The profile of a Weights & Biases run is unknown: downloads do not include `run.json`.
     """
     if flags.agent != "trained":
         return None
@@ -167,23 +167,23 @@ def profile_of_policy(task: str, flags: PolicyFlags) -> str | None:
         try:
             path = resolve_checkpoint(Path(flags.checkpoint_file), task)
         except UserError:
-            # It is told when the policy is looked for in earnest.
+            # `find_checkpoint` reports the error.
             return None
     return None if path is None else profile_of_run(task, path.parent)
 
 
-# Its environment.
+# Environment of a policy.
 
 
 def env_cfg_of(
     task: str, flags: PolicyFlags, checkpoint: Path | None, *, purpose: Purpose
 ) -> ManagerBasedRlEnvCfg:
-    """Return the environment config in `flags`, or the task's own for this purpose.
+    """Return the environment config in `flags`, or that of the task for `purpose`.
 
-    The task has got what it needs for the policy in `checkpoint`.
+    The task options have prepared the config for the policy in `checkpoint`.
 
     Raises:
-        ValueError: something that the task needs is not there.
+        ValueError: a resource of the task was not found.
     """
     if flags.env is None:
         cfg = policy_env_cfg(task, flags.profile, purpose=purpose)
@@ -197,15 +197,15 @@ def env_cfg_of(
 def policy_env_cfg(task: str, profile: str | None, *, purpose: Purpose) -> ManagerBasedRlEnvCfg:
     """Return the environment config for a policy trained under `profile`.
 
-    It has as many environments as the task has without the profile: how many of them learning takes
-    says nothing about how many to look at.
+    The number of environments is that of the task without the profile: a number chosen for learning
+    is unrelated to the number to play.
 
     Args:
         task: Name of the task.
-        profile: The profile, or None.
-        purpose: `train` for the config of training; `evaluate` for that of evaluations in training;
-            `play` for the task's own to play with, in which what the profile makes easier for
-            learning is as hard as it is in evaluations.
+        profile: Profile, or None.
+        purpose: `train` for the training config; `evaluate` for the config of evaluations in
+            training; `play` for the play config of the task, with simplifications of the profile
+            undone as in evaluations.
     """
     play = purpose == "play"
     cfg = load_env_cfg(task, play=play, profile=profile)
@@ -218,7 +218,7 @@ def policy_env_cfg(task: str, profile: str | None, *, purpose: Purpose) -> Manag
     return cfg
 
 
-# Loading it.
+# Policy loading.
 
 
 def make_policy(
@@ -229,7 +229,7 @@ def make_policy(
     device: str,
     profile: str | None = None,
 ) -> Any:
-    """Return the policy in `checkpoint`, or where there is none the constant one of `agent`.
+    """Return the policy in `checkpoint`, or the constant policy of `agent` if `checkpoint` is None.
 
     Raises:
         CheckpointError: see `load_policy`.
@@ -246,13 +246,13 @@ def load_policy(
 
     Args:
         task: Name of the task.
-        env: The wrapped environment.
-        checkpoint: A checkpoint, or an exported policy (`.onnx`).
+        env: Wrapped environment.
+        checkpoint: Checkpoint, or exported policy (`.onnx`).
         device: Torch device of the policy.
-        profile: Profile of the task that it was trained with.
+        profile: Task profile used for training.
 
     Raises:
-        CheckpointError: the file is missing, damaged, or holds another network.
+        CheckpointError: the file is missing, damaged, or of a different network.
     """
     if checkpoint.suffix == ".onnx":
         from mjlab.rl.exporter_utils import load_onnx_policy
@@ -267,7 +267,7 @@ def load_policy(
         runner = runner_cls(env, agent_cfg, None, device)
     except (RuntimeError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"The networks of {checkpoint} cannot be built as params/agent.yaml beside it says: {error}"
+            f"{checkpoint}: building its networks from params/agent.yaml failed: {error}"
         ) from error
     network = "student" if learner == "distillation" else "actor"
     runner.load(str(checkpoint), load_cfg={network: True}, strict=True, map_location=device)
@@ -275,7 +275,7 @@ def load_policy(
 
 
 def constant_policy(env: Any, kind: str) -> Any:
-    """Return a policy that does not look: `zero` actions, or `random` ones in [-1, 1]."""
+    """Return a policy that ignores observations: `zero` or `random` actions in [-1, 1]."""
     shape = (env.num_envs, env.num_actions)
     if kind == "zero":
         zeros = torch.zeros(shape, dtype=torch.float32, device=env.device)
@@ -288,9 +288,9 @@ def constant_policy(env: Any, kind: str) -> Any:
 def _agent_cfg(
     task: str, checkpoint: Path, profile: str | None = None, learner: Learner | None = None
 ) -> dict[str, Any]:
-    """Return the learner's config of `task`, with the networks that the checkpoint's run had.
+    """Return the learner config of `task`, with the network settings of the checkpoint's run.
 
-    The command line may have given them other sizes and classes than the task and its profile do.
+    Flags of the run may have changed sizes and classes of the networks.
     """
     rl_cfg = load_rl_cfg(task, profile=profile, learner=learner)
     cfg = acting_cfg(rl_cfg)
@@ -302,10 +302,10 @@ def _agent_cfg(
 
 
 def _saved_settings(saved: Mapping[str, Any], network: str, model: RslRlModelCfg) -> dict[str, Any]:
-    """Return the settings of a run's network that have the types of the fields of `model`.
+    """Return the settings of a run's network that match the field types of `model`.
 
-    rsl_rl imports and calls what a setting like "module:function" names, and a run may come from
-    a stranger: only class names of networks of this package and of the task itself are taken.
+    rsl_rl imports and calls settings like "module:function", and runs may be untrusted: only class
+    names of networks in this package and of the task are accepted.
     """
     settings = saved.get(network)
     if not isinstance(settings, dict):
@@ -316,12 +316,12 @@ def _saved_settings(saved: Mapping[str, Any], network: str, model: RslRlModelCfg
         for name, value in settings.items()
         if name in types
         and _has_type(value, types[name])
-        and (_names_nothing_to_import(value) or (name == "class_name" and _is_own(value, model)))
+        and (_is_import_free(value) or (name == "class_name" and _is_trusted_class(value, model)))
     }
 
 
 def _has_type(value: Any, declared: Any) -> bool:
-    """Return whether `value`, read from YAML, is of the `declared` type; tuples are lists there."""
+    """Return True if `value`, read from YAML, has the type `declared`. YAML stores tuples as lists."""
     origin, arguments = get_origin(declared), get_args(declared)
     if origin is UnionType:
         return any(_has_type(value, option) for option in arguments)
@@ -330,16 +330,16 @@ def _has_type(value: Any, declared: Any) -> bool:
     return type(value) is (origin or declared)
 
 
-def _names_nothing_to_import(value: Any) -> bool:
+def _is_import_free(value: Any) -> bool:
     if isinstance(value, dict):
-        return all(_names_nothing_to_import(item) for item in (*value, *value.values()))
+        return all(_is_import_free(item) for item in (*value, *value.values()))
     if isinstance(value, list):
-        return all(_names_nothing_to_import(item) for item in value)
+        return all(_is_import_free(item) for item in value)
     return not isinstance(value, str) or value.isidentifier()
 
 
-def _is_own(class_name: str, model: RslRlModelCfg) -> bool:
-    """Return whether `class_name` is that of `model`, or of a network of this package."""
+def _is_trusted_class(class_name: str, model: RslRlModelCfg) -> bool:
+    """Return True if `class_name` is that of `model`, or of a network in this package."""
     if class_name == model.class_name:
         return True
     module, _, name = class_name.partition(":")
@@ -353,35 +353,35 @@ def _is_own(class_name: str, model: RslRlModelCfg) -> bool:
 
 
 def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Path | None) -> None:
-    """Settle checkpoint and network of a distillation's teacher, in place; else do nothing.
+    """Resolve checkpoint and network of the teacher in a distillation config, in place.
 
-    The network is that of the teacher's run. A `resumed` run has its teacher already.
+    The network is that of the teacher's run. A `resumed` run keeps its teacher. Other configs are
+    unchanged.
 
     Raises:
-        UserError: there is no such checkpoint, or it is not one of PPO and of this task; or the
-            resumed run has another teacher.
+        UserError: checkpoint not found, or not a PPO checkpoint of this task; or the resumed run
+            has a different teacher.
         CheckpointError: the checkpoint is damaged.
     """
     if not isinstance(cfg, RslRlDistillationRunnerCfg):
         return
-    flag, given = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
+    flag, teacher = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
     if resumed is not None:
         saved, network = read_agent_params(resumed.parent), "teacher"
         recorded = saved.get("teacher_checkpoint")
-        if given is not None and given != recorded:
+        if teacher is not None and teacher != recorded:
             raise UserError(
-                f"{flag}: expected that of the resumed run, {recorded}, got {given}; leave it out."
+                f"{flag}: expected {recorded} of the resumed run, got {teacher}; leave it out."
             )
         cfg.teacher_checkpoint = recorded if isinstance(recorded, str) else None
-    elif given is not None:
-        path = resolve_checkpoint(Path(given), task)
+    elif teacher is not None:
+        path = resolve_checkpoint(Path(teacher), task)
         if (learner := learner_of_checkpoint(path)) != "ppo":
             raise UserError(
-                f"{flag}: expected a checkpoint of the learner 'ppo', got {path}, which {learner!r} "
-                "wrote."
+                f"{flag}: expected a checkpoint of the learner 'ppo', got {path} of {learner!r}."
             )
         if (trained := read_run_info(path.parent).get("task", task)) != task:
-            raise UserError(f"{flag}: expected a checkpoint of {task}, got {path}, of {trained}.")
+            raise UserError(f"{flag}: expected a checkpoint of {task}, got {path} of {trained}.")
         cfg.teacher_checkpoint = str(path)
         saved, network = read_agent_params(path.parent), "actor"
     else:

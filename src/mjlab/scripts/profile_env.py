@@ -1,4 +1,4 @@
-"""See where the time of a task's steps goes: `uv run profile-env TASK [flags]`."""
+"""Profile the environment step of a task: `uv run profile-env TASK [flags]`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mjlab.utils.torch import threads_for_policy
 if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
 
-# Methods of the simulation and the scene that a step calls, and the phase that each belongs to.
+# Phase of each method of simulation and scene called in a step.
 _SIMULATION = {
     "step": "physics",
     "forward": "forward",
@@ -37,7 +37,7 @@ _SIMULATION = {
     "reset": "reset",
 }
 _SCENE = {"write_data_to_sim": "actuators", "update": "sensors", "reset": "reset"}
-# Methods of each manager that a step calls; the phase is named after the manager.
+# Manager methods called in a step, by phase.
 _MANAGERS = {
     "actions": ("action_manager", ("process_action", "apply_action", "reset")),
     "terminations": ("termination_manager", ("compute", "reset")),
@@ -52,14 +52,14 @@ _MANAGERS = {
         ("record_pre_reset", "record_post_reset", "record_post_step"),
     ),
 }
-# Methods of terms that are objects, by manager.
+# Methods of class-based terms, by manager.
 _TERM_METHODS = {
     "actions": ("process_actions", "apply_actions", "reset"),
     "commands": ("compute", "reset"),
     "recorders": ("record_pre_reset", "record_post_reset", "record_post_step"),
 }
-# A term that takes more than this part of a step is worth a look.
-_MUCH = 5.0
+# Share of the step time (%) above which a term is reported as expensive.
+_EXPENSIVE = 5.0
 
 
 @dataclass
@@ -67,13 +67,13 @@ class ProfileConfig(PolicyFlags):
     """Flags of `profile-env`."""
 
     agent: Literal["zero", "random", "trained"] = "random"
-    """Who acts: all-zero actions, uniform ones in [-1, 1], or a trained policy."""
+    """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
     num_envs: int = 1024
     """Number of environments."""
     steps: int = 100
     """Environment steps to time."""
     warm_up: int = 20
-    """Environment steps before that."""
+    """Environment steps before timing."""
     seed: int = 0
     """Seed of states and actions."""
     json: bool = False
@@ -88,13 +88,13 @@ def command(argv: list[str], prog: str) -> None:
 
 
 def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
-    """Time the steps of `task`, print the figures, and return them.
+    """Time the steps of `task`, print the times, and return them.
 
-    The environment is that of the task's training config, at random points of its episodes, so
-    that resets come as often as they do while training.
+    Environments use the training config and start at random episode times, so that resets are as
+    frequent as in training.
     """
-    for name, least in (("num_envs", 1), ("steps", 1), ("warm_up", 0)):
-        check_count(f"--{name.replace('_', '-')}", getattr(cfg, name), least)
+    for name, minimum in (("num_envs", 1), ("steps", 1), ("warm_up", 0)):
+        check_count(f"--{name.replace('_', '-')}", getattr(cfg, name), minimum)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env = make_env(
@@ -118,7 +118,7 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
         physics = env.unwrapped.sim.capabilities.description
     finally:
         env.close()
-    figures = {
+    times = {
         "task": task,
         "num_envs": cfg.num_envs,
         "physics": physics,
@@ -126,30 +126,30 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
         "step_ms": 1e3 * seconds / cfg.steps,
         **profile_rows(profile),
     }
-    print(json.dumps(figures, indent=2) if cfg.json else _text(figures))
-    return figures
+    print(json.dumps(times, indent=2) if cfg.json else _format_times(times))
+    return times
 
 
 def _step(env: Any, policy: Any, count: int) -> float:
-    """Take `count` steps and return the seconds that stepping the environment took."""
+    """Take `count` steps and return the time spent in `env.step` (s)."""
     seconds = 0.0
     for _ in range(count):
         actions = policy(env.get_observations())
-        _wait_for(env.device)
+        _synchronize(env.device)
         begin = time.perf_counter()
         env.step(actions)
-        _wait_for(env.device)
+        _synchronize(env.device)
         seconds += time.perf_counter() - begin
     return seconds
 
 
-def _wait_for(device: Any) -> None:
+def _synchronize(device: Any) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def profile_rows(profile: StepProfile) -> dict[str, Any]:
-    """Return a profile as milliseconds of a step and percent of it, the largest first."""
+    """Return a profile in milliseconds per step and percent of the step, largest first."""
 
     def row(seconds: float, **names: str) -> dict[str, Any]:
         return {**names, "ms": profile.milliseconds(seconds), "percent": profile.percent(seconds)}
@@ -171,29 +171,29 @@ def profile_rows(profile: StepProfile) -> dict[str, Any]:
     }
 
 
-def _text(figures: dict[str, Any]) -> str:
-    step, profiled = figures["step_ms"], figures["profiled_step_ms"]
-    per_second = figures["num_envs"] / (step * 1e-3)
+def _format_times(times: dict[str, Any]) -> str:
+    step, profiled = times["step_ms"], times["profiled_step_ms"]
+    per_second = times["num_envs"] / (step * 1e-3)
     lines = [
-        f"Task     {figures['task']}, {figures['num_envs']} environments",
-        f"Physics  {figures['physics']}",
+        f"Task     {times['task']}, {times['num_envs']} environments",
+        f"Physics  {times['physics']}",
         f"Step     {step:.3f} ms, {per_second:,.0f} environment steps per second; "
-        f"{profiled:.3f} ms while timed in parts, over {figures['steps']} steps",
+        f"{profiled:.3f} ms while timed in parts, over {times['steps']} steps",
         "",
-        *_table(("phase",), [((row["name"],), row) for row in figures["phases"]]),
+        *_table(("phase",), [((row["name"],), row) for row in times["phases"]]),
         "",
         *_table(
             ("manager", "term"),
-            [((row["manager"], row["name"]), row) for row in figures["terms"]],
+            [((row["manager"], row["name"]), row) for row in times["terms"]],
         ),
         "",
     ]
-    much = [row for row in figures["terms"] if row["percent"] > _MUCH]
-    names = (f"{row['manager']}/{row['name']} ({row['percent']:.1f} %)" for row in much)
-    if much:
-        lines.append(f"More than {_MUCH:g} % of the step: {', '.join(names)}.")
+    expensive = [row for row in times["terms"] if row["percent"] > _EXPENSIVE]
+    names = (f"{row['manager']}/{row['name']} ({row['percent']:.1f} %)" for row in expensive)
+    if expensive:
+        lines.append(f"More than {_EXPENSIVE:g} % of the step: {', '.join(names)}.")
     else:
-        lines.append(f"No term takes more than {_MUCH:g} % of the step.")
+        lines.append(f"No term takes more than {_EXPENSIVE:g} % of the step.")
     return "\n".join(lines)
 
 
@@ -213,48 +213,47 @@ def _table(
     return lines + [line(names, f"{row['ms']:.3f}", f"{row['percent']:.1f}") for names, row in rows]
 
 
-# Timing of the methods that a step calls.
+# Timing of methods called in a step.
 
 
 @dataclass
 class StepProfile:
-    """Seconds spent in environment steps, in sum over all steps.
+    """Time spent in environment steps (s), summed over all steps.
 
-    What is done within a phase counts for that phase: a `forward` that a command asks for is time of
-    the commands. So phases add up to no more than the steps, and the terms of a manager to no more
-    than the manager. A sensor that computes its data when it is read counts for the term that reads
-    it first.
+    Nested calls count for the outer phase: a `forward` called by a command is time of the commands.
+    So the sum of phases is at most the step time, and the sum of a manager's terms at most the time of
+    the manager. Lazily computed sensor data counts for the first term that reads it.
     """
 
     num_steps: int = 0
-    """Steps that were timed."""
+    """Number of timed steps."""
     step_time: float = 0.0
-    """Seconds of all steps."""
+    """Time of all steps (s)."""
     phases: dict[str, float] = field(default_factory=dict)
-    """Seconds of each phase; those of managers are named after them (`rewards`)."""
+    """Time of each phase (s). Phases of managers are named after the manager (`rewards`)."""
     terms: dict[str, dict[str, float]] = field(default_factory=dict)
-    """For each manager, the seconds of each of its terms."""
+    """Time of each term (s), by manager and term."""
 
     def milliseconds(self, seconds: float) -> float:
-        """Return `seconds` of all steps as milliseconds of one."""
+        """Convert `seconds` of all steps to milliseconds per step."""
         return 1e3 * seconds / max(self.num_steps, 1)
 
     def percent(self, seconds: float) -> float:
-        """Return `seconds` as a part of all steps, in percent."""
+        """Return `seconds` in percent of the time of all steps."""
         return 100.0 * seconds / self.step_time if self.step_time else 0.0
 
     @property
     def other(self) -> float:
-        """Seconds of the steps that are of no phase."""
+        """Step time outside all phases (s)."""
         return max(self.step_time - sum(self.phases.values()), 0.0)
 
 
 @contextlib.contextmanager
 def profiled_steps(env: ManagerBasedRlEnv) -> Generator[StepProfile]:
-    """Time the steps that `env` makes within the block, also through wrappers around it.
+    """Time the steps of `env` within the block, also those through wrappers.
 
-    On a GPU every part is waited for, so that its time is its own; steps take longer for that. The
-    environment is as it was after the block, whichever way that ends.
+    On a GPU every part is synchronized to attribute times correctly; this slows down the steps. The
+    environment is restored after the block, also on errors.
     """
     stopwatch = _Stopwatch(env.device)
     with contextlib.ExitStack() as undo:
@@ -263,18 +262,18 @@ def profiled_steps(env: ManagerBasedRlEnv) -> Generator[StepProfile]:
 
 
 class _Stopwatch:
-    """Wraps calls so that their time is added to a profile."""
+    """Timer that wraps calls and adds their time to a profile."""
 
     def __init__(self, device: str) -> None:
         self.profile = StepProfile()
-        self._waits = torch.device(device).type == "cuda"
+        self._is_cuda = torch.device(device).type == "cuda"
         self._device = device
         self._is_in_step = False
         self._phase: str | None = None
         self._term: str | None = None
 
     def step(self, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return `call`, timed as a step."""
+        """Return `call` timed as a step."""
 
         def timed(*args: Any, **kwargs: Any) -> Any:
             self._is_in_step = True
@@ -290,7 +289,7 @@ class _Stopwatch:
         return timed
 
     def phase(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return `call`, timed as the phase `name` where it is called by a step itself."""
+        """Return `call` timed as the phase `name`, if called directly by a step."""
         seconds = self.profile.phases
         seconds.setdefault(name, 0.0)
 
@@ -308,7 +307,7 @@ class _Stopwatch:
         return timed
 
     def term(self, phase: str, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return `call`, timed as the term `name` where its manager calls it in its phase."""
+        """Return `call` timed as the term `name`, if called by its manager in `phase`."""
         seconds = self.profile.terms.setdefault(phase, {})
         seconds.setdefault(name, 0.0)
 
@@ -326,13 +325,13 @@ class _Stopwatch:
         return timed
 
     def _now(self) -> float:
-        if self._waits:
+        if self._is_cuda:
             torch.cuda.synchronize(self._device)
         return time.perf_counter()
 
 
 class _TimedFunction:
-    """Stands in for a term's function: calls it through a stopwatch, and is like it otherwise."""
+    """Proxy of a term's function that is called through a stopwatch."""
 
     def __init__(self, function: Any, timed: Callable[..., Any]) -> None:
         object.__setattr__(self, "_function", function)
@@ -349,7 +348,7 @@ class _TimedFunction:
 
 
 class _Instrumentation:
-    """Puts a stopwatch around what a step calls, and registers with `undo` what takes it off."""
+    """Wraps the methods called in a step by a stopwatch, and registers their restoration in `undo`."""
 
     def __init__(
         self, env: ManagerBasedRlEnv, stopwatch: _Stopwatch, undo: contextlib.ExitStack
@@ -359,7 +358,7 @@ class _Instrumentation:
         self._undo = undo
 
     def install(self) -> None:
-        """Put it around everything."""
+        """Wrap all methods."""
         self._replace(self._env, "step", self._stopwatch.step)
         for owner, methods in ((self._env.sim, _SIMULATION), (self._env.scene, _SCENE)):
             for method, phase in methods.items():
@@ -398,7 +397,7 @@ class _Instrumentation:
     def _replace(
         self, owner: Any, name: str, wrap: Callable[[Callable[..., Any]], Callable[..., Any]]
     ) -> None:
-        """Put what `wrap` makes of a method of `owner` over it."""
+        """Replace the method `name` of `owner` by its wrapped version."""
         own = vars(owner)
         if name in own:
             self._undo.callback(setattr, owner, name, own[name])

@@ -1,4 +1,4 @@
-"""Record a policy as a video."""
+"""Video recording of policies."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.scripts.environments import make_env
 from mjlab.scripts.policy import make_policy
 from mjlab.utils.wrappers.video_recorder import ClipWriter
-from mjlab.viewer.base import ended, forget
+from mjlab.viewer.base import done_mask, reset_policy
 
 
 @dataclass(frozen=True)
 class VideoCfg:
-    """What a recording looks like."""
+    """Recording configuration."""
 
     length: int = 200
-    """Frames, one an environment step."""
+    """Number of frames, one per environment step."""
     height: int | None = None
-    """Height in pixels; None keeps the task's."""
+    """Height (pixels). None: height of the task."""
     width: int | None = None
-    """Width in pixels; None keeps the task's."""
+    """Width (pixels). None: width of the task."""
     suffix: Literal["mp4", "gif"] = "mp4"
-    """Format of the file."""
+    """File format."""
     camera: int | str | None = None
-    """Camera of the model, by name or index; None is the task's own view."""
+    """Model camera, name or index. None: viewer camera of the task."""
     num_envs: int | None = None
-    """Number of environments; None keeps the task's."""
+    """Number of environments. None: number of the task."""
     engine: Any = None
-    """Physics engine; None keeps the task's."""
+    """Physics engine. None: engine of the task."""
     agent: str = "trained"
-    """Who acts where there is no checkpoint: `zero` or `random`."""
+    """Policy without a checkpoint: `zero` or `random`."""
     profile: str | None = None
-    """Profile of the task that the policy was trained with."""
+    """Task profile used for training."""
 
 
 def record_policy(
@@ -51,7 +51,7 @@ def record_policy(
     """Record one clip into `folder` and return its path.
 
     Raises:
-        RenderingUnavailableError: this machine cannot render; the message says what to install.
+        RenderingUnavailableError: rendering is not available; the message names packages to install.
     """
     video = video or VideoCfg()
     env_cfg = copy.deepcopy(env_cfg)
@@ -74,7 +74,7 @@ def record_policy(
         )
         with torch.inference_mode():
             for _ in range(video.length):
-                forget(policy, ended(env.step(policy(env.get_observations()))))
+                reset_policy(policy, done_mask(env.step(policy(env.get_observations()))))
                 writer.add(env.unwrapped.render(video.camera))
         path = writer.close()
     finally:

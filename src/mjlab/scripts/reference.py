@@ -1,7 +1,7 @@
-"""Reference runs: learning curves of several seeds as JSON, and the band they give a new seed.
+"""Reference runs: learning curves of several seeds as JSON, and the prediction band of a new seed.
 
-The files ship with the package, so that `verify` works without a checkout. `benchmarks/reference.py`
-makes them, and the page of the documentation from them.
+The files are bundled with the package, so that `verify` works without a checkout.
+`benchmarks/reference.py` writes the files and their documentation page.
 """
 
 from __future__ import annotations
@@ -27,52 +27,52 @@ if TYPE_CHECKING:
 Kind = Literal["cpu", "gpu"]
 
 DATA = Path(__file__).parents[1] / "reference"
-"""Folder of the references that ship with the package."""
-FIGURE = "mean_return"
-"""Figure of evaluations that is compared: the one that every task has, and that learning raises."""
+"""Folder of the bundled references."""
+METRIC = "mean_return"
+"""Evaluation metric to compare. Every task has it, and learning increases it."""
 FALSE_ALARMS = 0.05
-"""Upper bound on the probability that a healthy seed is called outside."""
-# Probability `a` of the bounds below. Three times that is the bound on false alarms.
+"""Upper bound on the probability that a healthy seed is classified as outside."""
+# Probability `a` of the bounds below. 3 a bounds the false alarms.
 _TAIL = FALSE_ALARMS / 3
 ENDED = ("solved", "finished")
-"""Reasons of the end after which nothing is left to train."""
-# Points of a curve that are kept, and significant digits: tens of kilobytes a task.
+"""Stop reasons of completed training."""
+# Points and significant digits per stored curve: tens of kilobytes per task.
 _POINTS = 60
 _DIGITS = 5
-# Points, equally spaced in samples, at which a curve is compared.
+# Number of comparison points, equally spaced in samples.
 _GRID = 101
 # Upper bound of `samples_limit`, in multiples of the slowest seed's samples.
-_PATIENCE = 4.0
+_MAX_SLOWDOWN = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """Evaluations of a training run, over all of its sessions."""
+    """Evaluations of a training run, over all sessions."""
 
     ended: str
-    """Reason of the end: `solved`, `finished` (last iteration), `minutes` (time limit), ..."""
+    """Stop reason: `solved`, `finished` (last iteration), `minutes` (time limit), ..."""
     iterations: int
-    """Iterations finished."""
+    """Number of finished iterations."""
     samples: int
-    """Environment steps, over all environments."""
+    """Number of environment steps, over all environments."""
     seconds: float
     """Wall-clock time of collecting and learning (s), without evaluations."""
     samples_at: list[int]
     """Environment steps at each evaluation, (P,)."""
     seconds_at: list[float]
-    """Seconds at each evaluation, (P,)."""
+    """Wall-clock time at each evaluation (s), (P,)."""
     figures: dict[str, list[float]]
-    """Figures of the evaluations by name, each (P,)."""
+    """Evaluation metrics by name, each (P,)."""
     num_episodes: int
-    """Episodes of each evaluation."""
+    """Number of episodes per evaluation."""
 
     @property
     def steps_per_second(self) -> float:
         """Environment steps per second of collecting and learning."""
         return self.samples / max(self.seconds, 1e-9)
 
-    def curve(self, name: str = FIGURE) -> Curve:
-        """Return samples and a figure of the evaluations, each (P,)."""
+    def curve(self, name: str = METRIC) -> Curve:
+        """Return samples and the metric `name` of the evaluations, each (P,)."""
         import numpy as np
 
         return np.array(self.samples_at, dtype=float), np.array(self.figures[name], dtype=float)
@@ -85,27 +85,27 @@ class RunRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class SeedRecord:
-    """A seed of a reference."""
+    """Training run of one seed."""
 
     seed: int
     """Seed of the training."""
     commit: str
     """Last commit that changed the code."""
     versions: dict[str, str]
-    """Versions of the libraries that the figures depend on, by name of the distribution."""
+    """Library versions that affect the results, by distribution name."""
     machine: dict[str, Any]
     """Machine: `cores`, `processor`, `gpu`."""
     minutes_limit: float
-    """Minutes of training after which the run was to end."""
+    """Training time limit (min)."""
     run: RunRecord
-    """The training."""
+    """Training run."""
     evaluation: dict[str, Any]
-    """Output of `evaluate --json True` for the last policy, on a seed that was not trained with."""
+    """Output of `evaluate --json True` for the last policy, on a seed not used for training."""
 
 
 @dataclass(kw_only=True)
 class Reference:
-    """A task, trained with several seeds on a kind of device."""
+    """Training runs of a task with several seeds on a kind of device."""
 
     task: str
     """Name of the task."""
@@ -120,12 +120,12 @@ class Reference:
 
     @property
     def train_flags(self) -> list[str]:
-        """Flags of `train` that repeat a seed, but for the seed."""
+        """Flags of `train` that reproduce a run, except the seed."""
         return [*(["--profile", self.profile] if self.profile else []), *self.flags]
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the return in one evaluation of a trained policy."""
+        """Standard error of the mean return in one evaluation of a trained policy."""
         errors = [
             (seed.evaluation["std_return"] or 0.0) / math.sqrt(seed.run.num_episodes)
             for seed in self.seeds
@@ -138,9 +138,9 @@ class Reference:
         self.seeds = sorted([*others, record], key=lambda seed: seed.seed)
 
     def save(self, folder: Path) -> Path:
-        """Write the reference into `folder`, whole or not at all; return the file."""
+        """Write the reference into `folder` atomically; return the file."""
         path = reference_path(folder, self.task, self.kind)
-        # Not indented: smaller, and not meant to be read.
+        # No indentation, to keep the file small.
         text = json.dumps(_rounded(dataclasses.asdict(self))) + "\n"
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
@@ -162,7 +162,7 @@ class Reference:
             return cls(**content)
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise UserError(
-                f"{path}: expected a reference, as `make reference` writes it, got {error!r}."
+                f"{path}: expected a reference written by `make reference`, got {error!r}."
             ) from error
 
 
@@ -172,7 +172,7 @@ def reference_path(folder: Path, task: str, kind: Kind) -> Path:
 
 
 def referenced_tasks(folder: Path) -> dict[str, list[str]]:
-    """Return the tasks that have references in `folder`, and on which kinds of device."""
+    """Return the kinds of device with references in `folder`, by task."""
     tasks: dict[str, list[str]] = {}
     for path in sorted(folder.glob("*.json")):
         task, _, kind = path.stem.rpartition(".")
@@ -181,18 +181,18 @@ def referenced_tasks(folder: Path) -> dict[str, list[str]]:
 
 
 class NotEvaluatedError(UserError):
-    """Raised for a run that ended before its first evaluation."""
+    """Run that ended before its first evaluation."""
 
 
 def read_run(run_dir: Path) -> RunRecord:
     """Return the evaluations of the run in `run_dir` from its event files.
 
-    Where sessions overlap, because one was killed after its last checkpoint, the later one counts.
+    If sessions overlap, because one was killed after its last checkpoint, the later session counts.
 
     Raises:
         NotEvaluatedError: the run was not evaluated.
-        UserError: the folder of an earlier session is gone.
-        ValueError: there are no event files.
+        UserError: folder of an earlier session not found.
+        ValueError: event files not found.
     """
     seconds, evaluations = _read_sessions(run_dir)
     if not evaluations:
@@ -202,10 +202,10 @@ def read_run(run_dir: Path) -> RunRecord:
         )
     agent, env = read_agent_params(run_dir), read_env_params(run_dir)
     per_iteration = agent["num_steps_per_env"] * env["scene"]["num_envs"]
-    # Figures that all evaluations have; a task's own runner may add others.
-    names = set.intersection(*(set(figures) for figures in evaluations.values()))
+    # Metrics common to all evaluations; custom runners may add others.
+    names = set.intersection(*(set(metrics) for metrics in evaluations.values()))
     evaluated = sorted(evaluations)
-    passed = dict(
+    elapsed = dict(
         zip(sorted(seconds), accumulate(seconds[i] for i in sorted(seconds)), strict=True)
     )
     last = max(seconds)
@@ -213,16 +213,16 @@ def read_run(run_dir: Path) -> RunRecord:
         ended=str(end_of(run_dir)),
         iterations=last + 1,
         samples=(last + 1) * per_iteration,
-        seconds=passed[last],
+        seconds=elapsed[last],
         samples_at=[(i + 1) * per_iteration for i in evaluated],
-        seconds_at=[passed[i] for i in evaluated],
+        seconds_at=[elapsed[i] for i in evaluated],
         figures={name: [evaluations[i][name] for i in evaluated] for name in sorted(names)},
         num_episodes=agent["evaluation"]["num_episodes"],
     )
 
 
 def end_of(run_dir: Path) -> str | None:
-    """Return why a run ended: `finished` too where Ctrl-C came in its last iteration; None if unknown."""
+    """Return the stop reason of a run; None if unknown. Ctrl-C in the last iteration is `finished`."""
     info = read_run_info(run_dir)
     ended = info.get("ended")
     if (
@@ -234,19 +234,19 @@ def end_of(run_dir: Path) -> str | None:
 
 
 def trained_seconds(run_dir: Path) -> float:
-    """Return the time of collecting and learning of all sessions of a run (s), evaluated or not."""
+    """Return the time of collecting and learning of all sessions of a run (s)."""
     return sum(_read_sessions(run_dir)[0].values())
 
 
 def _read_sessions(run_dir: Path) -> tuple[dict[int, float], dict[int, dict[str, float]]]:
-    """Return the seconds of iterations, and the figures of evaluations, by iteration from 0."""
+    """Return iteration times (s) and evaluation metrics, by iteration from 0."""
     from mjlab.rl.plot import read_all_scalars
 
     seconds: dict[int, float] = {}
     evaluations: dict[int, dict[str, float]] = {}
     for session in sessions_of(run_dir):
         curves = read_all_scalars(session)
-        # A session that was solved as it began has evaluations only.
+        # Sessions solved at their start have evaluations only.
         if "Perf/collection_time" in curves:
             iterations, collecting = curves["Perf/collection_time"]
             learning = curves["Perf/learning_time"][1]
@@ -263,7 +263,7 @@ def _read_sessions(run_dir: Path) -> tuple[dict[int, float], dict[int, dict[str,
 
 
 def thinned(run: RunRecord, points: int = _POINTS) -> RunRecord:
-    """Return `run` with at most `points` evaluations, the first and the last among them."""
+    """Return `run` with at most `points` evaluations, including the first and the last."""
     count = len(run.samples_at)
     if count <= points:
         return run
@@ -279,24 +279,24 @@ def thinned(run: RunRecord, points: int = _POINTS) -> RunRecord:
 def band(
     curves: Sequence[Curve], at: np.ndarray, standard_error: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and half width of the prediction interval for one more curve, at samples `at` (P,).
+    """Return mean and half width of the prediction interval of a new curve, at samples `at` (P,).
 
-    Of n seeds with mean m and sample deviation s, a further one lies within
+    Given n seeds with mean m and sample standard deviation s, a new seed lies within
 
         m +- t_{n-1, 1-a/2} s sqrt(1 + 1/n)
 
-    with probability 1 - a, if seeds are normally distributed. Student's t makes up for s itself being
-    uncertain: for n = 3 and a = 1/60 it is 7.6, where the normal distribution has 2.4. Seeds agree
-    by chance now and then, so s is not taken for less than `standard_error`, that of one evaluation.
+    with probability 1 - a, if seeds are normally distributed. Student's t accounts for the uncertainty
+    of s: for n = 3 and a = 1/60, t = 7.6 instead of 2.4 for the normal distribution. Seeds may agree
+    by chance, so s is at least `standard_error`, that of one evaluation.
 
     Raises:
-        ValueError: there are fewer than two curves, which have no deviation.
+        ValueError: fewer than two curves; their deviation is undefined.
     """
     import numpy as np
 
     if len(curves) < 2:
         raise ValueError(
-            f"reference seeds: expected at least 2, got {len(curves)}; train more of them."
+            f"reference seeds: expected at least 2, got {len(curves)}; train more seeds."
         )
     values = np.stack([np.interp(at, *curve) for curve in curves])
     deviation = np.maximum(values.std(axis=0, ddof=1), standard_error)
@@ -304,11 +304,11 @@ def band(
 
 
 def samples_limit(runs: Sequence[RunRecord]) -> float | None:
-    """Return the samples within which a further seed is solved; None unless all `runs` were.
+    """Return the upper bound on the samples until a new seed is solved; None unless all `runs` were.
 
-    It is the upper end of a one-sided prediction interval, as in `band`, for the logarithm of the
-    samples, and at most four times what the slowest seed took. The deviation is not taken for less
-    than what lies between two evaluations.
+    The bound is the upper end of a one-sided prediction interval, as in `band`, for the logarithm of
+    the samples, and at most four times the samples of the slowest seed. The deviation is at least the
+    distance between two evaluations.
     """
     import numpy as np
 
@@ -318,11 +318,11 @@ def samples_limit(runs: Sequence[RunRecord]) -> float | None:
     steps = [1.0 - (run.samples_at[-2:-1] or [0])[0] / run.samples_at[-1] for run in runs]
     deviation = max(logarithms.std(ddof=1), float(np.mean(steps)))
     limit = math.exp(logarithms.mean() + _width(len(runs), 1.0 - _TAIL) * deviation)
-    return min(limit, _PATIENCE * max(run.samples for run in runs))
+    return min(limit, _MAX_SLOWDOWN * max(run.samples for run in runs))
 
 
 def _width(count: int, probability: float) -> float:
-    """Return t_{n-1} sqrt(1 + 1/n) for `count` n: the end of a prediction interval in deviations."""
+    """Return t_{n-1} sqrt(1 + 1/n), n = `count`: half width of a prediction interval in deviations."""
     from scipy.special import stdtrit
 
     return float(stdtrit(count - 1, probability)) * math.sqrt(1.0 + 1.0 / count)
@@ -330,45 +330,45 @@ def _width(count: int, probability: float) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A run and the band of a reference, at P samples.
+    """Comparison of a run with the band of a reference, at P samples.
 
-    Compared up to the end of the shortest reference run: later values are constant, so that their band
+    The comparison ends with the shortest reference run: later values are constant, so that their band
     would be too narrow.
     """
 
     samples: np.ndarray
     """Samples, equally spaced, (P,)."""
     values: np.ndarray
-    """The curve, (P,)."""
+    """Values of the run, (P,)."""
     mean: np.ndarray
-    """Middle of the band, (P,)."""
+    """Center of the band, (P,)."""
     half: np.ndarray
     """Half width of the band, (P,)."""
     limit: float | None
-    """Samples within which the run is to be solved; None: where it is to end in the band."""
+    """Maximum number of samples until solved. None: the run must end in the band."""
     solved_at: int | None
-    """Samples after which the run was solved; None if it was not."""
+    """Number of samples until solved. None: not solved."""
 
     @property
     def within(self) -> np.ndarray:
-        """True where the curve is within the band, (P,) bool. NaN is not."""
+        """True where the run is within the band, (P,) bool. False for NaN."""
         return abs(self.values - self.mean) <= self.half
 
     @property
     def ends_within(self) -> bool:
-        """True if solved within `limit`; where that is None, if the last point is in the band."""
+        """True if solved within `limit`; for `limit` None, if the last point is in the band."""
         if self.limit is None:
             return bool(self.within[-1])
         return self.solved_at is not None and self.solved_at <= self.limit
 
     @property
     def is_within(self) -> bool:
-        """True if the run ends within, and is in the band for at least half of the way.
+        """True if the run ends within, and at least half of its points are in the band.
 
-        A healthy seed is outside with a probability of at most `FALSE_ALARMS` = 3 a, however the
-        points of a curve depend on each other: the part of its way that lies outside is a on average,
-        so that it is over 1/2 with a probability of at most 2 a (Markov), and it ends outside with a
-        probability of a.
+        A healthy seed is outside with probability at most `FALSE_ALARMS` = 3 a, for any dependence
+        between the points of a curve: the expected fraction of points outside is a, so the fraction
+        exceeds 1/2 with probability at most 2 a (Markov), and the run ends outside with probability
+        a.
         """
         return self.ends_within and bool(self.within.mean() >= 0.5)
 
@@ -376,8 +376,8 @@ class Comparison:
 def compare(runs: Sequence[RunRecord], run: RunRecord, standard_error: float) -> Comparison:
     """Return the comparison of `run` with the `runs` of a reference.
 
-    A run that was solved before the end of the way keeps its last value. One that has not ended is
-    compared as far as it got.
+    A run solved before the end of the reference keeps its last value. An unfinished run is compared up
+    to its last evaluation.
     """
     import numpy as np
 

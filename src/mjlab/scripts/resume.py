@@ -1,4 +1,4 @@
-"""Which run `--agent.resume True` goes on from, and whether and how it does."""
+"""Resume: selection of the run, and its profile, learner, number of environments and seed."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 
 def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
-    """Return the checkpoint that `cfg` asks to go on from, or None if it asks for a new run.
+    """Return the checkpoint to resume, or None for a new run.
 
-    It is the one with the highest number in the run of `task`, by the learner that `cfg` names, that
-    was changed last, of those that the patterns let through. Runs that do not name their task count
-    as runs of any task; those that do not name their learner, as runs of any learner.
+    The checkpoint is the one with the highest number in the most recently changed run of `task` and the
+    learner of `cfg` that matches the patterns. Runs without a recorded task match any task; runs
+    without a recorded learner match any learner.
 
     Raises:
-        UserError: the run asked for is of another task or learner, or a pattern is no regular
+        UserError: the matching runs are of other tasks or learners, or a pattern is not a regular
             expression.
-        ValueError: there is no such run or checkpoint; the message says what there is.
+        ValueError: run or checkpoint not found; the message lists the available ones.
     """
     if not cfg.agent.resume:
         return None
@@ -52,13 +52,13 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
             raise UserError(
                 f"--agent.load-{flag}: expected a regular expression, got {pattern!r}: {error}."
             ) from error
-    # By the rule of `get_checkpoint_path`, newest first.
+    # Matching rule of `get_checkpoint_path`, newest first.
     runs = run_folders(experiment)
     matching = [run for run in runs if re.fullmatch(agent.load_run, run.name)]
     matching = matching or [run for run in runs if re.match(agent.load_run, run.name)]
-    others = {run.name: why for run in matching if (why := _other_kind(run, task, cfg.learner))}
+    others = {run.name: why for run in matching if (why := _mismatch(run, task, cfg.learner))}
     if others and len(others) == len(matching):
-        raise UserError(_only_others(task, cfg.learner, agent.load_run, experiment, others))
+        raise UserError(_mismatch_message(task, cfg.learner, agent.load_run, experiment, others))
     for run in matching:
         if run.name not in others:
             with contextlib.suppress(ValueError):
@@ -69,12 +69,12 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
 
 
 def choices_to_resume(
-    task: str, cfg: TrainConfig, given: Mapping[str, str | None]
+    task: str, cfg: TrainConfig, requested: Mapping[str, str | None]
 ) -> dict[str, str | None]:
-    """Return profile and learner of the run that `cfg` asks to go on from, but for those `given`.
+    """Return profile and learner of the run to resume, except those in `requested`.
 
-    The profile is left out if the run had none, and the learner if the task chooses it anyway. Those
-    of a Weights & Biases run are not known before it is fetched.
+    The profile is omitted if the run had none, and the learner if it is the default of the task. Both
+    are unknown for a Weights & Biases run before the download.
     """
     choices: dict[str, str | None] = {}
     if cfg.wandb_run_path is not None:
@@ -85,18 +85,19 @@ def choices_to_resume(
             return choices
         learner = learner_of_checkpoint(checkpoint)
     except (UserError, ValueError, OSError, CheckpointError):
-        # It is told when training is to start, after what else may be wrong with the flags.
+        # Reported when training starts, after other errors in the flags.
         return choices
-    if "profile" not in given and (profile := profile_of_run(task, checkpoint.parent)) is not None:
+    if (
+        "profile" not in requested
+        and (profile := profile_of_run(task, checkpoint.parent)) is not None
+    ):
         choices["profile"] = profile
-        if _speaks_for_the_run():
-            print_notice(
-                f"Resuming with the profile {profile!r}, as before; --profile gives another."
-            )
-    usual = load_rl_cfg(task, profile=choices.get("profile", cfg.profile))
-    if "learner" not in given and learner != learner_of(usual):
+        if _is_reporting_process():
+            print_notice(f"Resuming with the profile {profile!r}, as before; --profile overrides.")
+    default = load_rl_cfg(task, profile=choices.get("profile", cfg.profile))
+    if "learner" not in requested and learner != learner_of(default):
         choices["learner"] = learner
-        if _speaks_for_the_run():
+        if _is_reporting_process():
             print_notice(f"Resuming with the learner {learner!r}, as before.")
     return choices
 
@@ -107,51 +108,51 @@ def check_learner_resumes(cfg: TrainConfig, checkpoint: Path) -> None:
     Raises:
         CheckpointError: the checkpoint cannot be read.
     """
-    wanted, found = learner_of(cfg.agent), learner_of_checkpoint(checkpoint)
-    if wanted != found:
+    expected, found = learner_of(cfg.agent), learner_of_checkpoint(checkpoint)
+    if expected != found:
         raise UserError(
-            f"--learner: expected {found!r}, which wrote {checkpoint}, got {wanted!r}; use "
-            f"--learner {found}, or choose another run by --agent.load-run."
+            f"--learner: expected {found!r}, which wrote {checkpoint}, got {expected!r}; use "
+            f"--learner {found}, or select another run with --agent.load-run."
         )
 
 
-def _speaks_for_the_run() -> bool:
-    """Return whether what concerns all processes of a run is for this one to tell.
+def _is_reporting_process() -> bool:
+    """Return True if this process prints the messages of the run.
 
-    All of them read the flags. Our launcher has told it before it started the others.
+    All processes parse the flags; our launcher has printed the messages before starting the others.
     """
     return STORE_VARIABLE not in os.environ and process_rank().is_first
 
 
-def keep_number_of_environments(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
-    """Go on with as many environments as the resumed run had, unless the flags give a number.
+def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
+    """Set the number of environments to that of the resumed run, unless set by flags.
 
-    With fewer of them, a policy that took hours is spoilt within a few iterations.
+    Fewer environments can ruin a policy of several hours within a few iterations.
 
     Raises:
         CheckpointError: the checkpoint cannot be read.
     """
     scene = cfg.env.scene
-    usual = load_env_cfg(task, profile=cfg.profile).scene.num_envs
-    if cfg.num_envs is not None or scene.num_envs != usual:
+    default = load_env_cfg(task, profile=cfg.profile).scene.num_envs
+    if cfg.num_envs is not None or scene.num_envs != default:
         return
     count = _saved_num_envs(checkpoint)
     if count is None:
         print_notice(
-            f"{checkpoint} does not say how many environments its run had; the task's "
-            f"{scene.num_envs} are used. --num-envs gives another number."
+            f"{checkpoint} does not record the number of environments; using {scene.num_envs}, the "
+            "default of the task. --num-envs overrides."
         )
         return
     scene.num_envs = count
-    print(f"Resuming with {count} environments, as before; --num-envs gives another number.")
+    print(f"Resuming with {count} environments, as before; --num-envs overrides.")
 
 
 def choose_seed(checkpoint: Path | None) -> int:
-    """Return the seed of the resumed run, or a new one, and print which."""
+    """Return and print the seed of the resumed run, or a random seed."""
     if checkpoint is not None:
         seed: Any = read_agent_params(checkpoint.parent).get("seed")
         if isinstance(seed, int) and seed >= 0:
-            print(f"Seed:    {seed}, as before; --agent.seed gives another")
+            print(f"Seed:    {seed}, as before; --agent.seed overrides")
             return seed
     seed = draw_seed()
     print(f"Seed:    {seed}, drawn; --agent.seed {seed} repeats the run")
@@ -159,21 +160,20 @@ def choose_seed(checkpoint: Path | None) -> int:
 
 
 def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path) -> bool:
-    """Return whether the loaded run has all its iterations already, and say so if it has."""
+    """Return True, and print a message, if the loaded run has finished all iterations."""
     done, total = runner.current_learning_iteration, cfg.agent.max_iterations
     if done < total:
         return False
     print(
-        f"Nothing to train: {checkpoint} has finished {done} iterations, and "
-        f"--agent.max-iterations, which counts them in, is {total}. Raise it to train on "
-        f"(--agent.max-iterations {done + 100}, say)."
+        f"Nothing to train: {checkpoint} has finished {done} iterations, and --agent.max-iterations "
+        f"is {total}, including these. To continue, use e.g. --agent.max-iterations {done + 100}."
     )
     return True
 
 
 def _saved_num_envs(checkpoint: Path) -> int | None:
-    """Return how many environments the run of `checkpoint` had; None if nothing says so."""
-    # Runs of other tools keep no such state, but may have written down their config.
+    """Return the number of environments of the run of `checkpoint`; None if not recorded."""
+    # Runs of other tools lack the training state, but may have saved their config.
     for holder in (
         load_checkpoint(checkpoint).get("training_state"),
         read_env_params(checkpoint.parent).get("scene"),
@@ -184,8 +184,8 @@ def _saved_num_envs(checkpoint: Path) -> int | None:
     return None
 
 
-def _other_kind(run_dir: Path, task: str, learner: str | None) -> str | None:
-    """Return in words why a run is not of `task` and `learner`; None if it is, or may be."""
+def _mismatch(run_dir: Path, task: str, learner: str | None) -> str | None:
+    """Describe why a run is not of `task` and `learner`; None if it is, or if not recorded."""
     info = read_run_info(run_dir)
     if (found := info.get("task", task)) != task:
         return f"of {found}"
@@ -194,14 +194,14 @@ def _other_kind(run_dir: Path, task: str, learner: str | None) -> str | None:
     return None
 
 
-def _only_others(
+def _mismatch_message(
     task: str, learner: str | None, pattern: str, experiment: Path, others: dict[str, str]
 ) -> str:
     runs = [f"{name} is {why}" for name, why in list(others.items())[:3]]
     more = f", and {len(others) - 3} more" if len(others) > 3 else ""
-    asked = "" if pattern == ".*" else f" that matches --agent.load-run {pattern!r}"
-    asked = f" by the learner {learner!r}{asked}" if learner is not None else asked
+    filters = "" if pattern == ".*" else f" that matches --agent.load-run {pattern!r}"
+    filters = f" by the learner {learner!r}{filters}" if learner is not None else filters
     return (
-        f"There is no run of {task} in {experiment}{asked}: {', '.join(runs)}{more}. Resume a run "
-        "with the task and the learner that it was trained with."
+        f"No run of {task} in {experiment}{filters} found: {', '.join(runs)}{more}; resume a run with "
+        "its task and learner."
     )

@@ -1,4 +1,4 @@
-"""Making run folders, what they say about their run, and finding checkpoints in them."""
+"""Run folders: creation, run metadata, and checkpoint lookup."""
 
 from __future__ import annotations
 
@@ -25,34 +25,34 @@ _CHECKPOINT = re.compile(r"model_(\d+)\.pt")
 
 
 class NewRunFolder:
-    """A context in which a run gets a folder of its own: `<experiment>/<time>[_<run name>]`.
+    """Context manager that creates the folder of a run: `<experiment>/<time>[_<run name>]`.
 
-    A run that never begins leaves no folder behind: at the end of the context it is removed with
-    all that is in it, unless `keep` was called.
+    On exit the folder and its content are removed, unless `keep` was called: a run that fails before
+    its start leaves no folder.
     """
 
     def __init__(self, experiment: Path, run_name: str) -> None:
         self._experiment = experiment
         self._run_name = run_name
         self.is_kept = False
-        """True once the run has begun."""
+        """True once the run has started."""
         self.path = experiment
-        """The folder; it is there once the context is entered."""
+        """Run folder. Exists once the context is entered."""
 
     def keep(self) -> None:
-        """Leave the folder where it is: the run has begun."""
+        """Keep the folder on exit: the run has started."""
         self.is_kept = True
 
     def __enter__(self) -> NewRunFolder:
-        """Make the folder.
+        """Create the folder.
 
         Raises:
-            RunFolderError: it cannot be made or written to.
+            RunFolderError: the folder cannot be created or written.
         """
         from mjlab.rl.checkpoint import ensure_writable_folder
 
         ensure_writable_folder(self._experiment)
-        # Of runs that were killed.
+        # Killed runs leave temporary files.
         for run_dir in run_folders(self._experiment):
             for folder in (run_dir, run_dir / "params", *run_dir.glob("videos/*")):
                 remove_temporary_files(folder)
@@ -61,7 +61,7 @@ class NewRunFolder:
             name += f"_{self._run_name}"
         self.path, number = self._experiment / name, 2
         while True:
-            # Making the folder is what claims it: another run may start in the same second.
+            # mkdir claims the name atomically: another run may start in the same second.
             try:
                 self.path.mkdir(parents=True)
             except FileExistsError:
@@ -70,17 +70,17 @@ class NewRunFolder:
                 return self
 
     def __exit__(self, *exception: object) -> None:
-        # A checkpoint is worth more than tidiness, whoever wrote it.
+        # Never remove checkpoints.
         if not self.is_kept and not checkpoints_in(self.path):
             shutil.rmtree(self.path, ignore_errors=True)
 
 
 @contextlib.contextmanager
 def exit_by_signal(unless: Callable[[], bool]) -> Generator[None]:
-    """Let SIGTERM and SIGHUP leave the block by SystemExit, so that it is cleaned up behind them.
+    """Convert SIGTERM and SIGHUP to SystemExit within the block, so that the block cleans up.
 
-    Where `unless` returns True they do what they always did. Those that are handled or ignored
-    already are left alone, and so are all outside the main thread.
+    If `unless` returns True, the default action runs. Signals already handled or ignored are unchanged,
+    and so are all signals outside the main thread.
     """
     previous: dict[int, Any] = {}
 
@@ -97,33 +97,33 @@ def exit_by_signal(unless: Callable[[], bool]) -> Generator[None]:
     try:
         yield
     finally:
-        # A handler that the block has installed stays.
+        # Keep handlers installed within the block.
         restore_handlers({n: old for n, old in previous.items() if signal.getsignal(n) is handle})
 
 
 class SharedRunFolder:
-    """The run's folder as the processes see it that did not make it, with the methods they need."""
+    """Run folder in processes other than the first, with the interface of `NewRunFolder` they need."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        """The folder that the first process made."""
+        """Run folder created by the first process."""
 
     def keep(self) -> None:
         """Do nothing: the first process decides."""
 
 
 def write_run_info(run_dir: Path, **info: Any) -> None:
-    """Add entries to what `run_dir` says about its run (`run.json`)."""
+    """Add entries to the metadata of a run (`run.json`)."""
     text = json.dumps({**read_run_info(run_dir), **info}, indent=2)
     with replacing(run_dir / _INFO_FILE) as file:
         file.write(f"{text}\n".encode())
 
 
 def write_resumed(run_dir: Path, checkpoint: Path) -> None:
-    """Record in `run_dir` that its run goes on from `checkpoint`."""
+    """Record in the metadata of a run that it resumes `checkpoint`."""
     experiment = run_dir.resolve().parent
     checkpoint = checkpoint.resolve()
-    # Relative, so that an experiment's folder can be moved.
+    # Relative path, so that the folder of an experiment can be moved.
     is_beside = checkpoint.is_relative_to(experiment)
     path = checkpoint.relative_to(experiment) if is_beside else checkpoint
     write_run_info(run_dir, resumed=str(path))
@@ -133,11 +133,11 @@ def sessions_of(run_dir: Path) -> list[Path]:
     """Return the folders of a run that was resumed, from its first session to `run_dir`.
 
     Raises:
-        UserError: the folder of an earlier session is gone.
+        UserError: folder of an earlier session not found.
     """
     sessions = [run_dir.resolve()]
     while (resumed := read_run_info(sessions[0]).get("resumed")) is not None:
-        # Joined to an absolute path, that path is the result.
+        # `/` also handles an absolute `resumed`.
         earlier = (sessions[0].parent / str(resumed)).parent
         if not earlier.is_dir() or earlier in sessions:
             raise UserError(
@@ -149,12 +149,12 @@ def sessions_of(run_dir: Path) -> list[Path]:
 
 
 def is_run_folder(folder: Path) -> bool:
-    """Return whether training made `folder`, rather than somebody who keeps policies in it."""
+    """Return True if `folder` was created by training, not just used to store policies."""
     return (folder / _INFO_FILE).is_file() or (folder / "params").is_dir()
 
 
 def read_run_info(run_dir: Path) -> dict[str, Any]:
-    """Return what `run_dir` says about its run; nothing if it says nothing readable."""
+    """Return the metadata of a run; empty if missing or unreadable."""
     try:
         info = json.loads((run_dir / _INFO_FILE).read_text())
     except (OSError, ValueError, RecursionError):
@@ -163,18 +163,18 @@ def read_run_info(run_dir: Path) -> dict[str, Any]:
 
 
 def write_params(run_dir: Path, env: Any, agent: Any) -> None:
-    """Write the configs that a run was made with, for people and for `read_env_params`."""
+    """Write the configs of a run, for users and for `read_env_params`."""
     dump_yaml(run_dir / "params" / "env.yaml", dataclasses.asdict(env))
     dump_yaml(run_dir / "params" / "agent.yaml", dataclasses.asdict(agent))
 
 
 def read_agent_params(run_dir: Path) -> dict[str, Any]:
-    """Return the learner's config that a run was made with; empty if the folder does not say."""
+    """Return the learner config of a run; empty if missing or unreadable."""
     return _read_params(run_dir / "params" / "agent.yaml")
 
 
 def read_env_params(run_dir: Path) -> dict[str, Any]:
-    """Return the environment's config of a run, likewise."""
+    """Return the environment config of a run; empty if missing or unreadable."""
     return _read_params(run_dir / "params" / "env.yaml")
 
 
@@ -199,12 +199,12 @@ def _number(checkpoint: Path) -> int:
 
 
 def newest_checkpoint(experiment: Path, task: str, learner: str | None = None) -> Path | None:
-    """Return the last checkpoint of the newest run of `task` that has one; None if there is none.
+    """Return the last checkpoint of the newest run of `task` with checkpoints; None if not found.
 
-    `learner` limits it to runs of that learner.
+    `learner` restricts the search to runs of that learner.
     """
     for run_dir in run_folders(experiment):
-        # Runs that do not name their task were made by other tools, and may be of this one.
+        # Runs of other tools do not record their task, and match any task.
         info = read_run_info(run_dir)
         if info.get("task", task) == task and learner in (None, info.get("learner", learner)):
             checkpoints = checkpoints_in(run_dir)
@@ -214,13 +214,13 @@ def newest_checkpoint(experiment: Path, task: str, learner: str | None = None) -
 
 
 def resolve_checkpoint(path: Path, task: str) -> Path:
-    """Return the checkpoint at `path`, which may leave out the run's folder.
+    """Return the checkpoint at `path`. The path may omit the run folder.
 
-    `logs/rsl_rl/cartpole/model_500.pt` is then that file of the newest run of `task`, or the last
-    checkpoint of that run if it ended, solved or finished, before it got so far.
+    `logs/rsl_rl/cartpole/model_500.pt` then refers to that file of the newest run of `task`, or to the
+    last checkpoint of that run if it was solved or finished before iteration 500.
 
     Raises:
-        UserError: there is no such file; the message lists what there is.
+        UserError: file not found; the message lists the available checkpoints.
     """
     if path.is_file():
         return path
@@ -237,15 +237,15 @@ def resolve_checkpoint(path: Path, task: str) -> Path:
             )
             return newest
     folders = [path.parent, *run_folders(path.parent)[:1]]
-    there = [str(file) for folder in folders for file in checkpoints_in(folder)[-3:]]
-    hint = f" There are: {', '.join(there)}." if there else f" `train {task}` makes some."
-    raise UserError(f"There is no checkpoint {path}.{hint}")
+    available = [str(file) for folder in folders for file in checkpoints_in(folder)[-3:]]
+    hint = f"Available: {', '.join(available)}." if available else f"Use `train {task}` first."
+    raise UserError(f"Checkpoint {path} not found. {hint}")
 
 
 def run_folders(experiment: Path) -> list[Path]:
-    """Return the run folders of an experiment, the one whose checkpoints were changed last first.
+    """Return the run folders of an experiment, most recently changed checkpoints first.
 
-    Names, which begin with the time of the start, decide between equals and without checkpoints.
+    Ties, and runs without checkpoints, are sorted by name, i.e. by start time.
     """
     if not experiment.is_dir():
         return []

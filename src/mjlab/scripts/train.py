@@ -1,4 +1,4 @@
-"""Train a task: `uv run train TASK [flags]`. From the flags to the folder of the run."""
+"""Train a task: `uv run train TASK [flags]`."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from mjlab.rl.distributed import (
 )
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import gpus_to_share, training_device
-from mjlab.scripts.display import leave_results, report_divergence, show_training
+from mjlab.scripts.display import report_divergence, show_training, write_results
 from mjlab.scripts.environments import training_env, training_runner
 from mjlab.scripts.flags import (
     parse_with_choices,
     prepare_env_cfg,
+    report_untuned_learner,
     suggest_profile,
-    tell_foreign_learner,
     with_task_options,
 )
 from mjlab.scripts.policy import prepare_teacher
@@ -36,7 +36,7 @@ from mjlab.scripts.resume import (
     choices_to_resume,
     choose_seed,
     is_finished,
-    keep_number_of_environments,
+    restore_num_envs,
 )
 from mjlab.scripts.run_folder import (
     NewRunFolder,
@@ -54,7 +54,7 @@ __getattr__ = older_names(__name__)
 
 
 def command(argv: list[str], prog: str) -> None:
-    """Run `train`; with several GPUs, start a process for each."""
+    """Run `train`; with several GPUs, start one process per GPU."""
     task, *flags = argv
     cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
     check_typed_flags(cfg, flags)
@@ -63,39 +63,39 @@ def command(argv: list[str], prog: str) -> None:
         launch_training(task, cfg)
         return
     check_flags(cfg)
-    # Of the GPUs that they see, the processes use all.
+    # CUDA_VISIBLE_DEVICES restricts the workers to the selected GPUs.
     workers = [sys.executable, "-m", "mjlab.scripts.train", task, *flags, "--gpu-ids", "all"]
     launch_workers(workers, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
 
 
 def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
-    """Return the configuration of `task` with what `flags` change; exits on an unknown flag.
+    """Return the configuration of `task` updated by `flags`; exits on an unknown flag.
 
     Raises:
-        UnknownProfileError: the task has no such profile.
-        ValueError: the learner is unknown, or is not for this task.
+        UnknownProfileError: unknown profile.
+        ValueError: the learner is unknown, or not supported by the task.
     """
     return parse_with_choices(
         lambda **choices: with_task_options(TrainConfig.from_task(task, **choices), task),
-        lambda cfg, given: choices_to_resume(task, cfg, given),
+        lambda cfg, requested: choices_to_resume(task, cfg, requested),
         flags,
         prog,
     )
 
 
 def launch_training(task: str, cfg: TrainConfig) -> Path:
-    """Train `task` as `cfg` says; return the run's folder.
+    """Train `task` with the flags `cfg`; return the run folder.
 
-    Nothing is trained where the run to resume has all its iterations; that run's folder is then
-    returned. A run that fails before its first iteration leaves no folder.
+    If the run to resume has finished all iterations, return its folder without training. A run that
+    fails before its first iteration leaves no folder.
 
     Raises:
-        UserError, ValueError, OSError, CheckpointError, EngineUnavailableError: what was asked for
-            cannot be done; raised before training starts wherever that can be known.
+        UserError, ValueError, OSError, CheckpointError, EngineUnavailableError: the request cannot be
+            fulfilled; raised before training starts if possible.
     """
     end_with_launcher()
     rank = process_rank()
-    # Of all processes, the first alone says which device there is. All say for whom they wait.
+    # Only the first process prints the device. All report the processes they wait for.
     with output_of(rank):
         device = training_device(cfg, rank)
     with joined_processes(device), output_of(rank) as output:
@@ -111,18 +111,18 @@ run_train = launch_training
 def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
-    # The checkpoint is looked for before there is a new folder to be found, and by one process.
+    # One process looks up the checkpoint, before the new run folder could be found.
     checkpoint = broadcast_from_first(lambda: checkpoint_to_resume(task, cfg))
     if cfg.agent.seed == -1:
         cfg.agent.seed = broadcast_from_first(lambda: choose_seed(checkpoint))
     cfg.apply_short_forms(rank)
     if checkpoint is not None:
         check_learner_resumes(cfg, checkpoint)
-        keep_number_of_environments(task, cfg, checkpoint)
+        restore_num_envs(task, cfg, checkpoint)
     else:
         suggest_profile(task, cfg.profile, device)
         if rank.is_first:
-            tell_foreign_learner(task, cfg.profile, cfg.learner_name)
+            report_untuned_learner(task, cfg.profile, cfg.learner_name)
     with fail_together():
         prepare_teacher(task, cfg.agent, checkpoint)
     with _run_folder(cfg, rank, output) as folder:
@@ -161,7 +161,7 @@ def _train(
         finally:
             env.close()
     if rank.is_first:
-        leave_results(task, cfg, folder.path, device)
+        write_results(task, cfg, folder.path, device)
     return folder.path
 
 
@@ -169,7 +169,7 @@ def _train(
 def _run_folder(
     cfg: TrainConfig, rank: ProcessRank, output: ProcessOutput | None
 ) -> Generator[NewRunFolder | SharedRunFolder]:
-    """Be in the run's folder, which the first process makes for all."""
+    """Enter the run folder. The first process creates it for all."""
     experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
     with contextlib.ExitStack() as stack:
         new = NewRunFolder(experiment, cfg.agent.run_name)
@@ -189,11 +189,10 @@ def _learn(
     show_training(task, cfg, runner, folder)
     try:
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
-        # A task's own runner may have its own loop, which need not tell that it starts.
+        # A custom runner may have a custom loop that does not call `on_start`.
         folder.keep()
     finally:
-        # On a full disk, what the folder says about its end is not worth hiding the error that
-        # says which checkpoint is intact.
+        # On a full disk, do not mask the error that names the intact checkpoint.
         with contextlib.suppress(OSError):
             write_run_info(
                 folder.path,

@@ -1,4 +1,4 @@
-"""Flags of `train`, and the checks of them that need nothing built."""
+"""Flags of `train`, and checks that run before anything is built."""
 
 from __future__ import annotations
 
@@ -39,59 +39,58 @@ class TrainConfig:
     """Flags of `train`."""
 
     env: ManagerBasedRlEnvCfg
-    """The task."""
+    """Environment."""
     agent: RslRlBaseRunnerCfg
-    """The learner."""
+    """Learner."""
     profile: str | None = None
-    """Named settings of the task, such as `cpu`, that all other flags start from; `list-envs` shows
-    which there are. None: the task's own, or where a run is resumed, that run's."""
+    """Task profile, such as `cpu`, that sets the defaults of all other flags; listed by `list-envs`.
+    None: the defaults of the task, or the profile of the resumed run."""
     learner: Learner | None = None
-    """Learner, which decides what flags there are under --agent.: `ppo`; `sac`, which learns from a
-    replay (soft actor-critic); or `distillation`, a student of --agent.teacher-checkpoint. None: that of
-    the resumed run, else that of the profile or task."""
+    """Learner: `ppo`, `sac` (soft actor-critic with a replay buffer) or `distillation` (a student of
+    --agent.teacher-checkpoint). Determines the flags under --agent. None: learner of the resumed run, or
+    of the profile or task."""
     num_envs: int | None = None
-    """Number of environments, of each process; short for --env.scene.num-envs."""
+    """Number of environments per process; short for --env.scene.num-envs."""
     device: str | None = None
-    """Torch device: cpu, cuda:0, ... None takes a GPU where there is one; several processes take
-    one each."""
+    """Torch device: cpu, cuda:0, ... None: a GPU if available; one GPU per process in multi-GPU runs."""
     engine: Literal["auto", "native", "warp"] | None = None
     """Physics engine; short for --env.sim.engine."""
     video: bool = False
     """Record clips while training."""
     video_length: int = 200
-    """Frames of a clip."""
+    """Number of frames per clip."""
     video_interval: int = 2000
-    """Environment steps from the start of one clip to the next."""
+    """Number of environment steps between the starts of clips."""
     result_video: bool = False
     """Record a clip of the trained policy at the end."""
     enable_nan_guard: bool = False
-    """Dump the states that lead to NaN."""
+    """Dump the states that led to a NaN."""
     log_root: str = "logs/rsl_rl"
-    """Folder of all runs."""
+    """Root folder of all runs."""
     torchrunx_log_dir: str | None = None
-    """Folder for what processes other than the first print; None is `torchrunx` in the run's
-    folder, and an empty name drops it. The variable TORCHRUNX_LOG_DIR wins."""
+    """Folder for the output of processes other than the first. None: `torchrunx` in the run folder;
+    empty: discard the output. The environment variable TORCHRUNX_LOG_DIR takes precedence."""
     wandb_run_path: str | None = None
-    """With --agent.resume True: the Weights & Biases run to resume, as entity/project/run."""
+    """Weights & Biases run to resume, as entity/project/run. Requires --agent.resume True."""
     wandb_checkpoint_name: str | None = None
-    """Checkpoint of that run; None takes the newest."""
+    """Checkpoint of the Weights & Biases run. None: newest."""
     live: bool = False
-    """Serve a page in the browser that shows the policy as it learns."""
+    """Serve a page in the browser that shows the policy during training."""
     live_port: int = 8080
-    """Port of that page; the next free one where it is taken."""
+    """Port of the live page; the next free port if taken."""
     live_host: str = field(default="127.0.0.1", kw_only=True)
-    """Address that it is served on; 0.0.0.0 serves the whole network."""
+    """Address of the live page. 0.0.0.0: all interfaces."""
     gpu_ids: list[int] | Literal["all"] | None = field(default_factory=lambda: [0])
-    """Indices of the GPUs to use where --device is not given, or `all`; with several, a process
-    for each is started. None trains on the CPU."""
+    """GPU indices, or `all`, used without --device; with several, one process per GPU is started.
+    None: train on the CPU."""
 
     @staticmethod
     def from_task(
         task: str, profile: str | None = None, learner: Learner | None = None
     ) -> TrainConfig:
-        """Return the configuration that a task was registered with, under one of its profiles.
+        """Return the registered configuration of a task under a profile.
 
-        `learner` takes the place of the one that the task or the profile chooses.
+        `learner` overrides the learner of the task or profile.
         """
         return TrainConfig(
             env=load_env_cfg(task, profile=profile),
@@ -102,11 +101,11 @@ class TrainConfig:
 
     @property
     def learner_name(self) -> Learner:
-        """Learner that `agent` configures."""
+        """Learner configured by `agent`."""
         return learner_of(self.agent)
 
     def apply_short_forms(self, rank: ProcessRank) -> None:
-        """Write the short flags into `env`, and the seed of this process into `env` and `agent`."""
+        """Copy the short flags to `env`, and the seed of this process to `env` and `agent`."""
         if self.num_envs is not None:
             self.env.scene.num_envs = self.num_envs
         if self.engine is not None:
@@ -118,83 +117,81 @@ class TrainConfig:
 
 
 def check_flags(cfg: TrainConfig) -> None:
-    """Raise UserError or ValueError for wrong flags that can be told without building anything."""
+    """Raise UserError or ValueError for flags that are invalid before anything is built."""
     _check_numbers(cfg)
-    # Names that would put the run's folder elsewhere than below that of all runs.
+    # The run folder must not be placed outside `log_root`.
     run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
     if any(separator in run_name for separator in _SEPARATORS):
         raise UserError(
-            f"--agent.run-name is {run_name!r}; it is part of one folder's name and may not hold "
-            "a path separator. Runs are grouped by --agent.experiment-name."
+            f"--agent.run-name: expected a name without path separators, got {run_name!r}; use "
+            "--agent.experiment-name to group runs."
         )
     if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
         raise UserError(
-            f"--agent.experiment-name is {experiment!r}; it names a folder within --log-root, so "
-            "it may be neither absolute nor contain '..'. Choose another place with --log-root."
+            f"--agent.experiment-name: expected a folder within --log-root, not absolute and without "
+            f"'..', got {experiment!r}; use --log-root for another location."
         )
     if cfg.live:
         check_address(cfg.live_host, cfg.live_port, "--live-")
 
 
 def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
-    """Raise BadCallError for a flag of the command line `flags` that would be ignored."""
+    """Raise BadCallError for a flag on the command line that would be ignored."""
     for flag in ("--wandb-run-path", "--agent.load-run", "--agent.load-checkpoint"):
         if is_given(flag, flags) and not cfg.agent.resume:
             raise BadCallError(
-                f"{flag}: expected a run to resume, got a new one; use --agent.resume True with it."
+                f"{flag}: expected a run to resume, got a new run; use --agent.resume True."
             )
     if is_given("--wandb-checkpoint-name", flags) and cfg.wandb_run_path is None:
         raise BadCallError(
-            "--wandb-checkpoint-name: expected a run at Weights & Biases, got none; use "
-            "--wandb-run-path with it."
+            "--wandb-checkpoint-name: expected a Weights & Biases run, got none; use --wandb-run-path."
         )
     if is_given("--gpu-ids", flags) and cfg.gpu_ids is not None:
         if cfg.device is not None and (
             process_rank().is_alone or not cfg.device.startswith("cuda")
         ):
             raise BadCallError(
-                f"--gpu-ids: expected no --device beside it, got {cfg.device!r}; leave out one of "
-                "them."
+                f"--gpu-ids: expected no --device, got --device {cfg.device}; leave out one of them."
             )
         if select_gpus(cfg.gpu_ids) == (None, 0):
             raise BadCallError(
-                f"--gpu-ids: expected a GPU, got {cfg.gpu_ids} where none is visible; leave it out "
-                "to train on the CPU."
+                f"--gpu-ids: expected a visible GPU, got {cfg.gpu_ids} without visible GPUs; leave it "
+                "out to train on the CPU."
             )
-    # Networks and algorithms are chosen by their class names, and the runner by the task.
+    # Class names select networks and algorithms; the task selects the runner.
     kinds = {field.name: field.default for field in dataclasses.fields(cfg.agent)}
     name = getattr(cfg.agent, "class_name", None)
     if is_given("--agent.class-name", flags) and name != kinds["class_name"]:
         raise BadCallError(
-            f"--agent.class-name: expected {kinds['class_name']!r}, got {name!r}, which nothing reads; "
+            f"--agent.class-name: expected {kinds['class_name']!r}, got {name!r} (unused); "
             "use runner_cls of register_mjlab_task for a runner, or --learner."
         )
 
 
 def _check_numbers(cfg: TrainConfig) -> None:
-    """Refuse counts that could only fail once training runs; the environment checks its own."""
+    """Check numbers that would otherwise fail during training. The environment checks its config."""
     agent: Any = cfg.agent
     counts = {f"--agent.{name}": getattr(agent, name) for name in _AGENT_COUNTS}
     for name in _ALGORITHM_COUNTS:
-        # Each algorithm has some of them.
+        # Each algorithm has a subset of these fields.
         counts[f"--agent.algorithm.{name}"] = getattr(getattr(agent, "algorithm", None), name, 1)
     gradient_length = getattr(agent.algorithm, "gradient_length", None)
     steps = agent.num_steps_per_env * getattr(agent.algorithm, "num_learning_epochs", 1)
     if gradient_length is not None and gradient_length > steps:
         raise UserError(
             f"--agent.algorithm.gradient-length: expected at most {steps}, the steps of an iteration "
-            f"times its epochs, got {gradient_length}; with it nothing is learned."
+            f"times its epochs, got {gradient_length}; otherwise the policy is never updated."
         )
     learning_starts = getattr(agent.algorithm, "learning_starts", 0)
     if learning_starts > (total := agent.num_steps_per_env * agent.max_iterations):
         raise UserError(
             f"--agent.algorithm.learning-starts: expected at most {total}, the environment steps of "
-            f"the run, got {learning_starts}; with it nothing is learned."
+            f"the run, got {learning_starts}; otherwise learning never starts."
         )
     counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
     for flag, value in counts.items():
         check_count(flag.replace("_", "-"), value)
-    # An infinite bound, as of gradients, is one that is not there.
+    # Infinite bounds are valid: e.g. no gradient clipping.
     for name, value in vars(agent.algorithm).items():
         if isinstance(value, float) and (
             math.isnan(value) or (name.endswith("learning_rate") and math.isinf(value))

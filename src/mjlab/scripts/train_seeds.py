@@ -1,4 +1,4 @@
-"""Train a task over several seeds: `uv run train-seeds TASK [--seeds N] [flags of train]`."""
+"""Train a task with several seeds: `uv run train-seeds TASK [--seeds N] [flags of train]`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
 from mjlab.utils.signals import FORWARDED, handled_signals
 
-_SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, one after the other (default: 5)."
+_SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, sequentially (default: 5)."
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -30,14 +30,14 @@ def command(argv: list[str], prog: str) -> None:
     experiment = _experiment(task, flags, prog)
     for seed in range(1, count + 1):
         print(f"\nSeed {seed} of {count}", flush=True)
-        # Curves to be averaged must be of one length, so that no run may stop when it is solved,
-        # whatever that means for the task. Flags given by hand come last and win.
+        # Averaged curves must have equal length, so runs must not stop when solved. User flags come
+        # last and take precedence.
         arguments = [sys.executable, "-m", "mjlab.scripts.train", task]
         arguments += ["--agent.evaluation.stop-when-solved", "False"]
         arguments += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
         before = set(run_folders(experiment))
         status, stopped = run_forwarding_signals(arguments)
-        # A signal that went to the training process alone ends it with 0 as well.
+        # A training process interrupted by a signal also exits with 0.
         if stopped or (status == 0 and _interrupted(experiment, before, seed)):
             print(f"Stopped during seed {seed} of {count}; no other seed is trained.")
             return
@@ -46,7 +46,7 @@ def command(argv: list[str], prog: str) -> None:
 
 
 def _take_count(flags: list[str]) -> tuple[int, list[str]]:
-    """Take `--seeds N` or `--seeds=N` out of `flags`; return N, 5 without it, and the rest."""
+    """Extract `--seeds N` or `--seeds=N` from `flags`; return N (default 5) and the remaining flags."""
     for position, flag in enumerate(flags):
         name, equals, value = flag.partition("=")
         if name == "--seeds":
@@ -61,7 +61,7 @@ def _take_count(flags: list[str]) -> tuple[int, list[str]]:
 
 
 def _experiment(task: str, flags: list[str], prog: str) -> Path:
-    """Return the folder that the runs go to. Mistaken flags end the command here, `--help` too."""
+    """Return the folder of the runs. Exits on invalid flags and on `--help`."""
     from mjlab.scripts.train import parse_train_flags
     from mjlab.scripts.train_config import check_typed_flags
 
@@ -70,24 +70,24 @@ def _experiment(task: str, flags: list[str], prog: str) -> Path:
     for flag in ("--agent.seed", "--agent.run-name"):
         if is_given(flag, flags):
             raise BadCallError(
-                f"{flag}: expected none, because each run is named by its seed, 1, 2, ..., got one; "
-                "use --seeds N for their number, or `train` for one run."
+                f"{flag}: expected no value, because runs use the seeds 1, 2, ... and are named after them; "
+                "use --seeds N for the number of seeds, or `train` for one run."
             )
     return Path(cfg.log_root).resolve() / cfg.agent.experiment_name
 
 
 def _interrupted(experiment: Path, before: set[Path], seed: int) -> bool:
-    """Return whether the run of `seed`, which is not one of the folders `before`, was stopped."""
+    """Return True if the new run of `seed`, not in `before`, was interrupted."""
     name = re.compile(rf".*_seed_{seed}(-\d+)?")
     new = (run for run in run_folders(experiment) if run not in before and name.fullmatch(run.name))
     return any(read_run_info(run).get("ended") == "interrupted" for run in new)
 
 
 def run_forwarding_signals(command: list[str], seconds: float | None = None) -> tuple[int, bool]:
-    """Run `command` to its end; return its status, and whether this process was told to stop.
+    """Run `command`; return its exit status, and True if this process received a stop signal.
 
-    SIGINT, SIGTERM and SIGHUP do not end this process: each goes on to `command`, once, and what
-    it then does, such as saving, is waited for. After `seconds` it gets SIGINT.
+    SIGINT, SIGTERM and SIGHUP do not end this process: each is forwarded to `command` once, and this
+    process waits until `command` has ended, e.g. saved. After `seconds`, `command` receives SIGINT.
     """
     child: subprocess.Popen[bytes] | None = None
     early: list[int] = []
@@ -102,8 +102,8 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
             child.send_signal(FORWARDED[number])
 
     with handled_signals(forward, FORWARDED):
-        # A session of its own, because a terminal sends Ctrl-C to all processes of its session,
-        # and a second signal tells training to stop at once.
+        # New session: a terminal sends Ctrl-C to all processes of its session, and a second signal
+        # would stop training without saving.
         child = subprocess.Popen(
             command,
             env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
@@ -124,16 +124,16 @@ def plot_command(argv: list[str], prog: str) -> None:
     """Run `plot-seeds`."""
     parser = argparse.ArgumentParser(
         prog=prog,
-        description="Draw the mean over runs, with one sample standard deviation shaded.",
+        description="Plot the mean over runs, with one sample standard deviation shaded.",
     )
-    parser.add_argument("runs", nargs="+", type=Path, help="folders of the runs")
-    parser.add_argument("--output", type=Path, default=Path("seeds.png"), help="PNG to write")
-    parser.add_argument("--tag", help="figure to draw, as TensorBoard calls it")
+    parser.add_argument("runs", nargs="+", type=Path, help="run folders")
+    parser.add_argument("--output", type=Path, default=Path("seeds.png"), help="output PNG")
+    parser.add_argument("--tag", help="TensorBoard tag of the metric to plot")
     parser.add_argument("--title", help="title of the plot")
     args = parser.parse_args(argv)
     missing = [str(run) for run in args.runs if not run.is_dir()]
     if missing:
-        raise UserError(f"Not folders of runs: {', '.join(missing)}.")
+        raise UserError(f"RUN: expected run folders, got {', '.join(missing)}.")
     from mjlab.rl.plot import DEFAULT_TAG, plot_seeds
 
     path = plot_seeds(args.runs, args.output, tag=args.tag or DEFAULT_TAG, title=args.title)

@@ -1,4 +1,4 @@
-"""Check an installation: `uv run verify TASK [flags]` trains a seed and compares it with a reference."""
+"""Verify an installation: train a seed and compare with a reference (`uv run verify TASK [flags]`)."""
 
 from __future__ import annotations
 
@@ -45,50 +45,49 @@ class VerifyConfig:
     """Flags of `verify`."""
 
     seed: int = 0
-    """Seed to train with. References have the seeds from 1 on, so that 0 is a new one."""
+    """Training seed. References use seeds >= 1, so 0 is a new seed."""
     device: str | None = None
-    """Torch device: cpu, cuda:0, ... None takes a GPU where there is one."""
+    """Torch device: cpu, cuda:0, ... None: a GPU if available."""
     reference: str | None = None
-    """Reference to compare with, a JSON file that `make reference` wrote. None: the one of the task
-    that ships with the package."""
+    """Reference, a JSON file written by `make reference`. None: bundled reference of the task."""
     resume: bool = False
-    """Go on with the newest `verify` run of this task and seed, which was interrupted."""
+    """Resume the newest interrupted `verify` run of this task and seed."""
     log_root: str = "logs/rsl_rl"
-    """Folder of all runs."""
+    """Root folder of all runs."""
 
 
 def load_reference(task: str, cfg: VerifyConfig) -> Reference:
-    """Return the reference that `cfg` asks for.
+    """Return the reference selected by `cfg`.
 
     Raises:
-        UserError: there is none; the message lists those there are. Or it has too few seeds.
+        UserError: reference not found, with a list of available ones; or of another task.
     """
     if cfg.reference is not None:
         reference = Reference.load(Path(cfg.reference))
         if reference.task != task:
-            raise UserError(f"--reference: expected one of {task}, got one of {reference.task}.")
+            raise UserError(f"--reference: expected a reference of {task}, got {reference.task}.")
         return reference
     available = referenced_tasks(DATA)
-    # Before torch is imported, which looking for a GPU takes.
+    # Checked first, because the search for a GPU imports torch.
     if task in available:
         kind: Kind = "gpu" if resolve_device(cfg.device).startswith("cuda") else "cpu"
         if kind in available[task]:
             return Reference.load(reference_path(DATA, task, kind))
         missing = f"a reference of {task} on this kind of device, {kind}"
-        use = f"--device {'cpu' if kind == 'gpu' else 'cuda'}, which has one"
+        use = f"--device {'cpu' if kind == 'gpu' else 'cuda'}"
     else:
-        missing, use = f"a task with a reference, got {task!r}", "one that has"
+        missing, use = f"a task with a reference, got {task!r}", "another task"
     listed = ", ".join(f"{name} ({', '.join(kinds)})" for name, kinds in available.items())
     raise UserError(
         f"verify: expected {missing}; use {use}. Available: {listed or 'none'}. In a checkout of "
-        f"mjlab, `make reference TASKS={task}` makes one, and --reference FILE takes it from a file."
+        f"mjlab, `make reference TASKS={task}` creates one; --reference FILE reads it from a file."
     )
 
 
 def _prepare(
     task: str, flags: list[str], prog: str
 ) -> tuple[VerifyConfig, Reference, TrainConfig, Path | None]:
-    """Return what to compare, the training, and the finished run if there is nothing to train."""
+    """Return flags, reference, training config, and the run folder if it has finished training."""
     cfg = parse_flags(VerifyConfig, VerifyConfig(), flags, f"{prog} {task}")
     reference = load_reference(task, cfg)
     resolve_device(cfg.device)
@@ -98,8 +97,8 @@ def _prepare(
             f"`make reference TASKS={task}` for more."
         )
     if cfg.seed in (seed.seed for seed in reference.seeds):
-        # Allowed, since on another machine or with other libraries it is a new curve.
-        print(f"Seed {cfg.seed} is one of the reference's, so that its curve may be the same.")
+        # Allowed: the curve differs on other machines or with other library versions.
+        print(f"Seed {cfg.seed} is part of the reference; its curve may be identical.")
     from mjlab.scripts.train import parse_train_flags
 
     train_flags = [*reference.train_flags, "--agent.seed", str(cfg.seed)]
@@ -109,7 +108,7 @@ def _prepare(
     done = None
     if cfg.resume:
         run_dir = _newest_run(task, cfg)
-        # A session that is gone would be missed after training only.
+        # Raises for a missing session before training instead of after.
         sessions_of(run_dir)
         train_flags += ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
         done = run_dir if end_of(run_dir) in ENDED else None
@@ -117,7 +116,7 @@ def _prepare(
 
 
 def _iterations(reference: Reference) -> int:
-    """Return the iterations until a healthy seed is solved; else, those of the shortest run."""
+    """Return the iterations until a healthy seed is solved, or those of the shortest run."""
     runs = [seed.run for seed in reference.seeds]
     limit = samples_limit(runs)
     if limit is None:
@@ -135,12 +134,12 @@ def _newest_run(task: str, cfg: VerifyConfig) -> Path:
             return run_dir
     raise UserError(
         f"--resume: expected a run of `verify {task}` with seed {cfg.seed} in {experiment}, got "
-        "none; leave --resume out to begin one."
+        "none; leave out --resume to start a new run."
     )
 
 
 def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
-    """Return the comparison as text."""
+    """Format the comparison."""
     versions, machines, commits = (
         "; ".join(dict.fromkeys(texts))
         for texts in (
@@ -206,7 +205,7 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
 
 
 def command(argv: list[str], prog: str) -> None:
-    """Run `verify`: exits 0 if the curve is within the band, 1 if not, 2 for a bad call."""
+    """Run `verify`: exits 0 if the curve is within the band, 1 if not, 2 for invalid arguments."""
     task, *flags = argv
     try:
         cfg, reference, train_cfg, run_dir = _prepare(task, flags, prog)

@@ -1,4 +1,4 @@
-"""Look at terrains in the browser: `mjlab visualize-terrain pyramid_stairs`."""
+"""Show terrains in the browser: `mjlab visualize-terrain pyramid_stairs`."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from mjlab.viewer.viser.scene import MjlabViserScene
 
 RobotName = Literal["unitree_go1", "unitree_g1", "none"]
 Kind = Literal["number", "count", "range", "switch", "choice"]
-# What the page, not a control, decides, or what no slider can express.
+# Fields set by the page, or not representable by a slider.
 _NOT_CONTROLS = {"proportion", "size", "flat_patch_sampling"}
-# Sizes of pixels: near 0 a height field would have millions of them.
+# Pixel sizes: near 0 a height field would have millions of pixels.
 _PIXELS = {"horizontal_scale", "vertical_scale", "resolution"}
 ALL = "all"
 ROBOTS: tuple[RobotName, ...] = ("unitree_go1", "unitree_g1", "none")
@@ -41,17 +41,17 @@ class VisualizeTerrainConfig:
     terrain: Annotated[str, tyro.conf.Positional] = "pyramid_stairs"
     """A preset of `mjlab.terrains.config`, or `all`."""
     num_levels: int = 5
-    """Number of difficulties, from 0 to 1."""
+    """Number of difficulty levels in [0, 1]."""
     size: float = 8.0
-    """Extent of each terrain along x and y, in metres."""
+    """Extent of each terrain along x and y (m)."""
     seed: int = 0
     """Seed of the terrain."""
     robot: RobotName = "unitree_go1"
-    """Robot to place at each start, for scale."""
+    """Robot placed at each origin, for scale."""
     host: str = "127.0.0.1"
-    """Address to serve on; `0.0.0.0` serves the whole network."""
+    """Address of the page. `0.0.0.0`: all interfaces."""
     port: int = 8080
-    """Port to serve on; the next free one where it is taken."""
+    """Port of the page; the next free port if taken."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -64,8 +64,7 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
     """Serve the page until Ctrl-C.
 
     Raises:
-        ValueError: no such preset, or figures that no terrain can have; or the page cannot be served
-            at that address.
+        ValueError: unknown preset, parameter out of range, or invalid address.
     """
     check_address(cfg.host, cfg.port, "--")
     check_exists("terrain preset", cfg.terrain, (ALL, *ALL_TERRAIN_PRESETS))
@@ -82,9 +81,9 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
 
 
 class TerrainPage:
-    """Shows one preset, or all of them side by side, at rising difficulty along x.
+    """Page that shows one preset, or all presets side by side, with difficulty increasing along x.
 
-    The page's controls only ask for a new terrain; it is built in the thread that calls `run`.
+    Controls only request a new terrain; the thread that calls `run` builds the terrain.
     """
 
     def __init__(
@@ -96,19 +95,19 @@ class TerrainPage:
         seed: int = 0,
         robot: RobotName = "unitree_go1",
     ) -> None:
-        """Add the controls. The terrain is built by `rebuild`.
+        """Add the controls. `rebuild` builds the terrain.
 
         Args:
-            server: The page's server.
+            server: Server of the page.
             terrain: Preset to show first, or `all`.
-            num_levels: Number of difficulties.
-            size: Extent of each cell, in metres.
+            num_levels: Number of difficulty levels.
+            size: Extent of each cell (m).
             seed: Seed of the terrain.
-            robot: Robot that stands at the origin of each cell.
+            robot: Robot placed at the origin of each cell.
         """
         self.server = server
         self.scene: TerrainScene | None = None
-        """What is shown, or None before the first `rebuild`."""
+        """Current scene; None before the first `rebuild`."""
         self._changed = threading.Event()
         self._changed.set()
         self._aimed_at: tuple[Any, ...] | None = None
@@ -122,28 +121,28 @@ class TerrainPage:
         self._seed = gui.add_number("Seed", initial_value=seed, min=0, step=1)
         self._robot = gui.add_dropdown("Robot", ROBOTS, initial_value=robot)
         self._folder = gui.add_folder("Parameters")
-        # The sliders, and which preset they belong to, change together.
+        # Sliders and preset must change together.
         self._lock = threading.Lock()
         self._handles: dict[str, Any] = {}
         self._preset = terrain
         for handle in (self._levels, self._size, self._seed, self._robot):
-            handle.on_update(self._ask)
-        self._terrain.on_update(self._choose)
+            handle.on_update(self._request_rebuild)
+        self._terrain.on_update(self._on_preset)
         self._add_controls()
 
     @property
     def status(self) -> str:
-        """The text above the controls: what is shown, or why it cannot be."""
+        """Status text: size of the terrain, or the build error."""
         return self._status.content
 
     def run(self) -> None:
-        """Show what is asked for, until Ctrl-C."""
+        """Rebuild the terrain on request, until Ctrl-C."""
         while True:
             if self._changed.wait(timeout=0.2):
                 self.rebuild()
 
     def rebuild(self) -> None:
-        """Build and show the terrain that the controls describe; the last one if it cannot be."""
+        """Build and show the terrain set by the controls; keep the previous terrain on errors."""
         self._changed.clear()
         self._status.content = "Building ..."
         try:
@@ -180,22 +179,22 @@ class TerrainPage:
             view = CameraView(None, (0.0, 0.0, 0.0), 0.8 * extent, 60.0, -35.0, None)
             shown = MjlabViserScene(self.server, scene.model, len(positions), view=view)
             shown.update_from_arrays(positions, rotations)
-            # Where the person looks from is theirs, unless the grid is another one.
+            # Keep the view of the user unless the grid has changed.
             if (levels, kinds, size) != self._aimed_at:
                 shown.aim()
         self._aimed_at = (levels, kinds, size)
 
-    # Controls. They are called from the server's threads.
+    # Callbacks of controls, called from server threads.
 
-    def _ask(self, _: Any = None) -> None:
+    def _request_rebuild(self, _: Any = None) -> None:
         self._changed.set()
 
-    def _choose(self, _: Any) -> None:
+    def _on_preset(self, _: Any) -> None:
         self._add_controls()
-        self._ask()
+        self._request_rebuild()
 
     def _add_controls(self) -> None:
-        """Replace the sliders by those of the chosen preset."""
+        """Replace the sliders by those of the selected preset."""
         with self._lock, self._folder:
             for handle in self._handles.values():
                 handle.remove()
@@ -204,7 +203,7 @@ class TerrainPage:
                 return
             for control in controls_of(ALL_TERRAIN_PRESETS[self._preset]()):
                 handle = self._add_control(control)
-                handle.on_update(self._ask)
+                handle.on_update(self._request_rebuild)
                 self._handles[control.field] = handle
 
     def _add_control(self, control: FieldControl) -> Any:
@@ -221,29 +220,29 @@ class TerrainPage:
         return gui.add_slider(label, control.low, control.high, step, control.value)
 
 
-# The terrain.
+# Terrain.
 
 
 @dataclass(frozen=True)
 class TerrainScene:
-    """A compiled terrain with one robot, and where to draw the robot."""
+    """Compiled terrain with one robot, and the positions to draw the robot at."""
 
     model: mujoco.MjModel
-    """The terrain, and the robot if there is one."""
+    """Model of the terrain and the robot, if any."""
     origins: np.ndarray
-    """(levels, kinds, 3) spawn points."""
+    """Spawn points, (levels, kinds, 3)."""
     num_polygons: int
-    """Triangles of the terrain's surface."""
+    """Number of triangles of the terrain surface."""
 
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (n, nbody, 3) positions and (n, nbody, 3, 3) rotations, one for each origin."""
+        """Return body positions (n, nbody, 3) and rotations (n, nbody, 3, 3) for n origins."""
         data = mujoco.MjData(self.model)
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, data, 0)
         mujoco.mj_kinematics(self.model, data)
         origins = self.origins.reshape(-1, 3)
         positions = np.repeat(data.xpos[None], len(origins), axis=0)
-        # The world and the terrain stay where they are.
+        # World and terrain are static.
         moving = self.model.body_weldid > 0
         positions[:, moving] += origins[:, None]
         return positions, np.repeat(data.xmat.reshape(1, -1, 3, 3), len(origins), axis=0)
@@ -252,11 +251,11 @@ class TerrainScene:
 def build_terrain_scene(
     kinds: dict[str, SubTerrainCfg], size: float, num_levels: int, seed: int, robot: RobotName
 ) -> TerrainScene:
-    """Build a grid with one column for each kind and rows of rising difficulty.
+    """Build a grid with one column per kind and rows of increasing difficulty.
 
     Args:
         kinds: Sub-terrains by name.
-        size: Extent of each cell, in metres.
+        size: Extent of each cell (m).
         num_levels: Number of rows.
         seed: Seed of the terrain.
         robot: Robot to place.
@@ -291,34 +290,34 @@ def count_polygons(model: mujoco.MjModel) -> int:
         elif kind == mujoco.mjtGeom.mjGEOM_MESH:
             total += int(model.mesh_facenum[shape])
         else:
-            # A box.
+            # Box.
             total += 12
     return total
 
 
-# Fields that can be changed on the page.
+# Controls of config fields.
 
 
 @dataclass(frozen=True)
 class FieldControl:
-    """One field of a config, and how it is shown."""
+    """Control of a config field."""
 
     field: str
     """Name of the field."""
     kind: Kind
-    """A float, an int, a pair of floats, a bool, or one of several words."""
+    """Kind of value: float, int, pair of floats, bool, or one of several strings."""
     value: Any
-    """What it is now."""
+    """Current value."""
     low: float = 0.0
-    """Lowest value of a slider."""
+    """Minimum of the slider."""
     high: float = 1.0
-    """Highest value of a slider."""
+    """Maximum of the slider."""
     options: tuple[str, ...] = ()
-    """The words of a choice."""
+    """Options of a choice."""
 
 
 def controls_of(cfg: SubTerrainCfg) -> list[FieldControl]:
-    """Return the controls of a config, in the order of its fields. Fields that are None have none."""
+    """Return the controls of a config in field order. Fields that are None are skipped."""
     hints = typing.get_type_hints(type(cfg))
     controls = []
     for field in dataclasses.fields(cfg):
@@ -348,7 +347,7 @@ def _control(name: str, value: Any, hint: Any) -> FieldControl | None:
 
 
 def with_values(cfg: SubTerrainCfg, values: dict[str, Any]) -> SubTerrainCfg:
-    """Return a copy of the config with the values of controls."""
+    """Return a copy of the config with the fields set to `values`."""
     typed = {name: tuple(v) if isinstance(v, (list, tuple)) else v for name, v in values.items()}
     return dataclasses.replace(cfg, **typed)
 

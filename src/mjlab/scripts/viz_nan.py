@@ -1,4 +1,4 @@
-"""Look at what led to a NaN, in the browser: `uv run viz-nan DUMP`."""
+"""Show the states that led to a NaN in the browser: `uv run viz-nan DUMP`."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class VizNanConfig:
     """Flags of `viz-nan`."""
 
     host: str = "127.0.0.1"
-    """Address to serve on; `0.0.0.0` serves the whole network."""
+    """Address of the page. `0.0.0.0`: all interfaces."""
     port: int = 8080
-    """Port to serve on; the next free one where it is taken."""
+    """Port of the page; the next free port if taken."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -45,8 +45,8 @@ def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
     """Serve the page of the dump at `path` until Ctrl-C.
 
     Raises:
-        UserError: the dump or its model is missing or cannot be read.
-        ValueError: the page cannot be served at that address.
+        UserError: the dump or its model is missing or unreadable.
+        ValueError: invalid address.
     """
     check_address(cfg.host, cfg.port, "--")
     dump, model = load_dump(path)
@@ -61,10 +61,10 @@ def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
 
 
 def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
-    """Return a dump and the model it was recorded with.
+    """Return a dump and its model.
 
     Raises:
-        UserError: either is missing or cannot be read; the text says which and why.
+        UserError: dump or model is missing or unreadable.
     """
     try:
         dump = NanDump.load(path)
@@ -72,66 +72,65 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
         raise UserError(str(error)) from error
     except FileNotFoundError:
         raise UserError(
-            f"There is no dump {path}. `train --enable-nan-guard True` writes one when a NaN "
-            "appears, and says where."
+            f"Dump {path} not found; use `train --enable-nan-guard True` to write a dump when a NaN "
+            "occurs."
         ) from None
     if not dump.steps:
-        raise UserError(f"The dump {path} holds no states.")
+        raise UserError(f"Dump {path}: expected recorded states, got none.")
     if not dump.model_file.is_file():
         raise UserError(
-            f"The dump {path} needs its model, {dump.model_file.name}, in the same folder. Copy "
-            "both."
+            f"Dump {path}: expected its model {dump.model_file.name} in the same folder, got none; "
+            "copy both files."
         )
     digest = hashlib.sha256(dump.model_file.read_bytes()).hexdigest()
-    # MuJoCo itself reads most damaged models without a word. Earlier dumps do not say.
+    # MuJoCo loads most damaged models without an error. Older dumps lack the digest.
     if dump.metadata.get("model_sha256", digest) != digest:
         raise UserError(
-            f"The model {dump.model_file} is not that of the dump {path}: it was changed or damaged. "
-            "Copy both again."
+            f"Model {dump.model_file}: expected the model of the dump {path}, got a changed or damaged "
+            "file; copy both files again."
         )
     try:
         model = mujoco.MjModel.from_binary_path(str(dump.model_file))
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise UserError(
-            f"The model {dump.model_file} cannot be read by MuJoCo {mujoco.__version__}; it has to "
-            f"be the version that wrote it. {error}"
+            f"Model {dump.model_file}: expected a model written by MuJoCo {mujoco.__version__}, got "
+            f"{error}; use the MuJoCo version that wrote the model."
         ) from error
     try:
         size = mujoco.mj_stateSize(model, dump.metadata["state_spec"])
         if size != dump.metadata["state_size"]:
-            raise ValueError(f"its states have {dump.metadata['state_size']} numbers, not {size}")
+            raise ValueError(f"expected states of size {size}, got {dump.metadata['state_size']}")
         written, data = copy.copy(model), mujoco.MjData(model)
         for step in dump.steps:
             dump.apply(step, 0, written, data)
     except Exception as error:
         raise UserError(
-            f"The dump {path} and its model {dump.model_file.name} are not of the same simulation: "
-            f"{error}."
+            f"Dump {path}: expected states of the model {dump.model_file.name}, got states of another "
+            f"simulation: {error}."
         ) from error
     return dump, model
 
 
 class NanPage:
-    """Shows the recorded states of one environment, with sliders for substep and environment.
+    """Page that shows the recorded states, with sliders for substep and environment.
 
-    Controls only ask for another state; it is set, computed and drawn in the thread that calls
-    `run`.
+    Controls only request a state; the thread that calls `run` computes and draws the state.
     """
 
     def __init__(self, server: viser.ViserServer, dump: NanDump, model: mujoco.MjModel) -> None:
-        """Build the page, and show the last state: the one that led to the NaN.
+        """Build the page and show the last state, which led to the NaN.
 
         Args:
-            server: The page's server.
-            dump: The dump.
-            model: The model it was recorded with; a copy is made, into which the values of the
-                environment in view are written.
+            server: Server of the page.
+            dump: Dump to show.
+            model: Model of the dump. Copied; the copy receives the model values of the shown
+                environment.
         """
         self.dump = dump
         self.model = host_model(model)
         self.data = mujoco.MjData(self.model)
         self._envs: list[int] = dump.metadata["dumped_env_ids"]
-        self._looks_differ = any(
+        self._has_visual_changes = any(
             name.removeprefix("model_") in VIEWER_MODEL_FIELDS
             for name in dump.arrays
             if name.startswith("model_")
@@ -153,7 +152,7 @@ class NanPage:
             )  # fmt: skip
             self._env = gui.add_slider(
                 "Environment", 0, max(len(self._envs) - 1, 1), 1, 0,
-                visible=len(self._envs) > 1, hint="Which of the recorded environments.",
+                visible=len(self._envs) > 1, hint="Recorded environment.",
             )  # fmt: skip
             with gui.add_folder("Scene"):
                 self.scene.create_scene_gui(show_debug_viz_control=False)
@@ -167,27 +166,27 @@ class NanPage:
 
     @property
     def status(self) -> str:
-        """The text above the controls."""
+        """Status text above the controls."""
         return self._status.content
 
     def run(self) -> None:
-        """Show what is asked for, until Ctrl-C."""
+        """Show requested states, until Ctrl-C."""
         while True:
             if self._changed.wait(timeout=0.2):
                 self.show()
 
     def show(self) -> None:
-        """Show the state that the sliders name."""
+        """Show the state selected by the sliders."""
         self._changed.clear()
         index = min(int(self._step.value), len(self.dump.steps) - 1)
         row = min(int(self._env.value), len(self._envs) - 1)
         mujoco.mj_resetData(self.model, self.data)
         self.dump.apply(self.dump.steps[index], row, self.model, self.data)
-        # MuJoCo refuses to compute from a state that is not finite; where bodies are is unknown.
+        # MuJoCo does not compute from non-finite states, so body poses are unknown.
         is_finite = all(np.isfinite(getattr(self.data, name)).all() for name in ("qpos", "qvel"))
         if is_finite:
             mujoco.mj_forward(self.model, self.data)
-            if row != self._row_shown and self._looks_differ:
+            if row != self._row_shown and self._has_visual_changes:
                 self.scene.rebuild_visual_handles()
             self._row_shown = row
             self.scene.update_from_mjdata(self.data)
@@ -197,7 +196,7 @@ class NanPage:
         metadata, env = self.dump.metadata, self._envs[row]
         ids = metadata["nan_env_ids"]
         shown = ", ".join(map(str, ids[:_SHOWN_ENVS])) + (" ..." if len(ids) > _SHOWN_ENVS else "")
-        # What is not finite in the state, or else what is largest.
+        # Non-finite fields, or the largest values.
         bad = [name for name in _FIELDS if not np.isfinite(getattr(self.data, name)).all()]
         if bad:
             findings = [f"Not finite here: {', '.join(bad)}"]

@@ -1,4 +1,4 @@
-"""Sensors: what is measured in the simulation, besides the state of entities."""
+"""Sensors: contact, camera, ray-cast, terrain-height and MuJoCo's built-in sensors."""
 
 from mjlab.sensor.builtin_sensor import BuiltinSensor as BuiltinSensor
 from mjlab.sensor.builtin_sensor import BuiltinSensorCfg as BuiltinSensorCfg

@@ -1,4 +1,4 @@
-"""Sensors that MuJoCo computes itself: any element of an MJCF `<sensor>` section."""
+"""Built-in sensors: elements of MJCF's `<sensor>` section, computed by MuJoCo."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ _TERRAIN = "terrain"
 
 _FRAME = ("body", "xbody", "geom", "site", "camera")
 
-# Kinds that MJCF and MuJoCo's headers name differently; both names are taken.
+# MJCF names of sensor types whose `mjtSensor` constant has another name; both are accepted.
 _ENUM_NAMES = {"jointactuatorfrc": "jointactfrc", "tendonactuatorfrc": "tendonactfrc"}
 
-# What each kind of sensor may be attached to, by the start of its name; the first that fits counts.
+# Allowed object types by prefix of the sensor type; the first matching prefix applies.
 _OBJECTS: dict[str, tuple[str, ...]] = {
     "frame": _FRAME,
     "subtree": ("body",),
@@ -54,36 +54,35 @@ _OBJECTS: dict[str, tuple[str, ...]] = {
 
 @dataclass
 class ObjRef:
-    """An element of the scene."""
+    """Reference to an element of the scene."""
 
     type: ObjType
-    """Kind of the element. `body` means its inertial frame, `xbody` its regular frame."""
+    """Element type. `body` is the inertial frame of a body, `xbody` its regular frame."""
     name: str
-    """Name, without the prefix of its entity."""
+    """Element name without entity prefix."""
     entity: str | None = None
-    """The entity that the element belongs to, `terrain` included; None takes `name` as it is in the
-    scene."""
+    """Name of the element's entity (`terrain` included). None: `name` is the full scene name."""
 
     def prefixed_name(self) -> str:
-        """Return the element's name in the scene, except that a terrain has no prefix there."""
+        """Return `<entity>/<name>`. Terrain elements have no prefix in the scene."""
         return f"{self.entity}/{self.name}" if self.entity else self.name
 
 
 @dataclass
 class BuiltinSensorCfg(SensorCfg):
-    """Describes a MuJoCo sensor to add to the scene.
+    """Configuration of a MuJoCo sensor to add to the scene.
 
-    The scene keeps it, and MuJoCo calls it, `<entity>/<name>` if `obj` belongs to an entity.
+    Its name in the scene and in MuJoCo is `<entity>/<name>` if `obj` belongs to an entity.
     """
 
     sensor_type: SensorType
-    """MuJoCo's name of the kind of sensor."""
+    """MuJoCo sensor type."""
     obj: ObjRef | None = None
-    """What the sensor is attached to."""
+    """Element the sensor is attached to."""
     ref: ObjRef | None = None
-    """Frame in which a frame sensor reports; None for the world."""
+    """Reference frame of a frame sensor. None: world."""
     cutoff: float = 0.0
-    """Bound on the absolute value of the data; 0 for none."""
+    """Bound on the absolute value of the data. 0: no bound."""
 
     def __post_init__(self) -> None:
         check_one_of(f"Sensor {self.name!r} sensor_type", self.sensor_type, get_args(SensorType))
@@ -92,19 +91,20 @@ class BuiltinSensorCfg(SensorCfg):
         if self.ref is not None:
             if not self.sensor_type.startswith("frame"):
                 raise ValueError(
-                    f"Sensor {self.name!r}: a {self.sensor_type} takes no ref; only frame sensors "
-                    "(framepos, framequat, ...) report in another frame."
+                    f"Sensor {self.name!r} ref: expected None for sensor_type "
+                    f"{self.sensor_type!r}, got type {self.ref.type!r}; only frame sensors "
+                    "(framepos, framequat, ...) have a reference frame."
                 )
             self._check(self.ref, "ref", _FRAME)
 
     def _check(self, obj: ObjRef | None, field: str, allowed: tuple[str, ...]) -> None:
-        given = None if obj is None else obj.type
-        if given in allowed or (not allowed and obj is None):
+        value = None if obj is None else obj.type
+        if value in allowed or (not allowed and obj is None):
             return
-        wanted = f"an ObjRef of type {' or '.join(allowed)}" if allowed else "None"
+        expected = f"an ObjRef of type {' or '.join(allowed)}" if allowed else "None"
         raise ValueError(
-            f"Sensor {self.name!r}: {field} of a {self.sensor_type} must be {wanted}, got "
-            f"{'None' if obj is None else f'type {given!r}'}."
+            f"Sensor {self.name!r} {field}: expected {expected} for sensor_type "
+            f"{self.sensor_type!r}, got {'None' if obj is None else f'type {value!r}'}."
         )
 
     @property
@@ -120,18 +120,18 @@ class BuiltinSensorCfg(SensorCfg):
 
 
 class BuiltinSensor(Sensor[torch.Tensor]):
-    """A MuJoCo sensor. Its data is (N, dimension), in MuJoCo's units and frames.
+    """MuJoCo sensor. Data is (N, dimension), in MuJoCo's units and frames.
 
-    The data is a view of the simulation, which changes it at every step and `forward`.
+    The data is a live view of the simulation: every step and every `forward` overwrite it.
     """
 
     _transient = {"_sensordata"}
 
     def __init__(self, cfg: BuiltinSensorCfg | None = None, name: str | None = None) -> None:
-        """Stand for a sensor to add (`cfg`), or for one that the spec has already (`name`)."""
+        """Wrap a sensor to add (`cfg`) or an existing MuJoCo sensor (`name`)."""
         super().__init__()
         if (cfg is None) == (name is None):
-            raise ValueError("Give BuiltinSensor exactly one of `cfg` and `name`.")
+            raise ValueError("BuiltinSensor: expected exactly one of `cfg` and `name`.")
         self.cfg = cfg
         self._name = cfg.prefixed_name if cfg is not None else name
         self._sim_data: Any = None
@@ -140,15 +140,15 @@ class BuiltinSensor(Sensor[torch.Tensor]):
 
     @classmethod
     def from_existing(cls, name: str) -> BuiltinSensor:
-        """Return the sensor that stands for a MuJoCo sensor of the spec, by its full name."""
+        """Wrap the MuJoCo sensor with this full name."""
         return cls(name=name)
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]) -> None:
-        """Add the sensor to the scene's spec, if it is not there already.
+        """Add the sensor to the scene's spec, unless it wraps an existing one.
 
         Raises:
-            ValueError: the spec has a sensor of this name, or the entity or element named does
-                not exist; lists those that do.
+            ValueError: duplicate sensor name, or unknown entity or element (with the available
+                names).
         """
         cfg = self.cfg
         if cfg is None:
@@ -157,8 +157,8 @@ class BuiltinSensor(Sensor[torch.Tensor]):
         if any(sensor.name == name for sensor in scene_spec.sensors):
             where = f"entity {cfg.obj.entity!r}" if cfg.obj and cfg.obj.entity else "the scene"
             raise ValueError(
-                f"Sensor {name!r} exists already in {where}: its XML defines it, or two configs "
-                "do. Rename one, or drop the config: sensors of the XML are available anyway."
+                f"Sensor {name!r} already exists in {where}: defined by its XML or by two configs. "
+                "Rename one, or remove the config: sensors of the XML are available without one."
             )
         kind = _ENUM_NAMES.get(cfg.sensor_type, cfg.sensor_type)
         sensor = scene_spec.add_sensor(
@@ -172,33 +172,33 @@ class BuiltinSensor(Sensor[torch.Tensor]):
                 setattr(sensor, f"{kind}name", find_in_scene(f"Sensor {name!r}", ref, names))
                 setattr(sensor, f"{kind}type", getattr(mujoco.mjtObj, f"mjOBJ_{ref.type.upper()}"))
         if cfg.sensor_type == "rangefinder":
-            # Of what a rangefinder can report, the distance alone.
+            # Distance only: a rangefinder can also report direction, origin, point, normal, depth.
             sensor.intprm[0] = 1 << int(mujoco.mjtRayDataField.mjRAYDATA_DIST)
         if cfg.cutoff > 0.0:
             sensor.cutoff = cfg.cutoff
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Find the sensor in the compiled model."""
+        """Locate the sensor in `sensordata`."""
         sensor = mj_model.sensor(self._name)
         start = int(sensor.adr[0])
         self._columns = (start, start + int(sensor.dim[0]))
         self._sim_data = data
 
     def _compute_data(self) -> torch.Tensor:
-        # Asking for `sensordata` makes the engine copy it out, so only a sensor that is read does.
+        # Accessing `sensordata` makes the engine copy it out; unread sensors avoid that cost.
         if self._sensordata is None:
             self._sensordata = self._sim_data.sensordata[:, slice(*self._columns)]
         return self._sensordata
 
 
 def check_entity(owner: str, ref: ObjRef, entities: dict[str, Entity]) -> None:
-    """Raise `ValueError`, which opens with `owner`, unless the entity of `ref` exists."""
+    """Raise `ValueError` unless the entity of `ref` exists. The message opens with `owner`."""
     if ref.entity and ref.entity not in entities:
         raise ValueError(f"{owner}: unknown entity {ref.entity!r}; {suggest(ref.entity, entities)}")
 
 
 def find_in_scene(owner: str, ref: ObjRef, names: Sequence[str]) -> str:
-    """Return the name in the scene of the element that `ref` refers to.
+    """Return the full scene name of the element `ref` refers to.
 
     Args:
         owner: Start of the message.
@@ -206,13 +206,13 @@ def find_in_scene(owner: str, ref: ObjRef, names: Sequence[str]) -> str:
         names: Names of all elements of its type in the scene.
 
     Raises:
-        ValueError: the entity, or the scene, does not have the element.
+        ValueError: unknown element.
     """
     prefix = f"{ref.entity}/" if ref.entity else ""
     offered = {name.removeprefix(prefix): name for name in names if name.startswith(prefix)}
     if ref.entity == _TERRAIN:
-        # A name with a prefix belongs to another entity. Where there is no terrain, an entity may
-        # be called so, and has its prefix.
+        # Terrain elements have no prefix; a prefixed name belongs to another entity. In a scene
+        # without terrain, an entity may be named 'terrain' and then has its prefix.
         offered = {name: name for name in names if name and "/" not in name} | offered
     offered.pop("", None)
     if ref.name not in offered:

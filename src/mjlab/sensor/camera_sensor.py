@@ -1,4 +1,4 @@
-"""Camera sensors: images of the scene, in colours, depths and objects."""
+"""Camera sensors: RGB, depth and segmentation images."""
 
 from __future__ import annotations
 
@@ -29,44 +29,43 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Fields of view of perspective cameras, in degrees.
+# Vertical fields of view of perspective cameras (deg).
 _DEFAULT_FOVY = 45.0
 _MAX_FOVY = 180.0
 
 
 @dataclass
 class CameraSensorCfg(SensorCfg):
-    """Describes a camera sensor."""
+    """Camera sensor configuration."""
 
     camera_name: str | None = None
-    """Camera of the scene to look through, with the prefix of its entity. None adds a camera, which
-    has the name of the sensor."""
+    """Existing camera to use, with entity prefix. None: add a camera named after the sensor."""
     parent_body: str | None = None
-    """Body, with the prefix of its entity, that carries the added camera. None: the world."""
+    """Parent body of the added camera, with entity prefix. None: world."""
     pos: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Position of the added camera in the frame of its body, in metres."""
+    """Position of the added camera in its body's frame (m)."""
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Orientation (w, x, y, z) of the added camera. It looks along its -z axis, and +y is up."""
+    """Orientation (w, x, y, z) of the added camera, which looks along -z with +y up."""
     fovy: float | None = None
-    """Vertical field of view in degrees; of an orthographic camera, the height of what it sees, in
-    metres. None leaves an existing camera as it is, and is 45 for an added one. An existing camera
-    that has a focal length and a sensor size loses them if this is set."""
+    """Vertical field of view (deg); for orthographic cameras, vertical extent (m). None: unchanged
+    for an existing camera, 45 for an added one. A value removes the focal length and the sensor
+    size of an existing camera."""
     width: int = 160
-    """Columns of the image."""
+    """Image width (pixels)."""
     height: int = 120
-    """Rows of the image."""
+    """Image height (pixels)."""
     data_types: tuple[CameraDataType, ...] = ("rgb",)
-    """What is measured, of `rgb`, `depth` and `segmentation`. The rest is not computed."""
+    """Image types to render, of `rgb`, `depth` and `segmentation`."""
     use_textures: bool = True
-    """Whether surfaces show the textures of their materials."""
+    """Render material textures."""
     use_shadows: bool = False
-    """Whether a light that something stands before counts 0.3 times."""
+    """Scale the contribution of occluded lights by 0.3."""
     enabled_geom_groups: tuple[int, ...] = (0, 1, 2)
-    """Groups of the geoms that the camera sees."""
+    """Visible geom groups."""
     orthographic: bool = False
-    """Whether rays of the camera are parallel. False leaves an existing camera as it is."""
+    """Use orthographic projection. False leaves an existing camera unchanged."""
     clone_data: bool = False
-    """Whether images that were read stay as they are, and the next ones come in new tensors."""
+    """Return copies of the images, which later renderings do not overwrite."""
 
     def build(self) -> CameraSensor:
         """Build the sensor."""
@@ -75,29 +74,28 @@ class CameraSensorCfg(SensorCfg):
 
 @dataclass
 class CameraSensorData:
-    """Images of all environments B; None for what the config does not ask for.
+    """Images of B environments. Types not in `cfg.data_types` are None.
 
     Row 0 is the top row, and column 0 is on the left.
     """
 
     rgb: torch.Tensor | None = None
-    """Colours, (B, height, width, 3) uint8."""
+    """RGB colors, (B, height, width, 3) uint8."""
     depth: torch.Tensor | None = None
-    """Distances along the optical axis in metres, (B, height, width, 1) float32; 0 where there is
-    nothing."""
+    """Distance along the optical axis (m), (B, height, width, 1) float32. Background: 0."""
     segmentation: torch.Tensor | None = None
-    """Ids and types (`mjtObj`; 5 for a geom) of objects, (B, height, width, 2) int32; -1 and -1
-    where there is nothing."""
+    """Object id and type (`mjtObj`; 5 for a geom), (B, height, width, 2) int32. Background: -1."""
 
 
 class CameraSensor(Sensor[CameraSensorData]):
-    """Sees geoms of some groups, by rays through the centres of pixels.
+    """Camera sensor: renders geoms of the enabled groups by rays through pixel centers.
 
-    Images are rendered by `sim.sense()`: once per environment step, after resets and commands. So
-    observations see the current state, and rewards and terminations the images of the step before.
+    `sim.sense()` renders the images once per environment step, after resets and commands. So
+    observations read images of the current state, rewards and terminations those of the previous
+    step.
 
-    A camera sees surfaces from outside only, and no geom with an alpha of 0; others are opaque.
-    Several sensors may look through one camera, with images of other sizes and of other geom groups.
+    Surfaces are visible from outside only. Geoms with alpha 0 are invisible, all others opaque.
+    Several sensors may share one camera, with different image sizes and geom groups.
     """
 
     _transient = {"_camera_idx", "_view"}
@@ -106,8 +104,7 @@ class CameraSensor(Sensor[CameraSensorData]):
         """Check the config.
 
         Raises:
-            ValueError: an image without pixels; no or unknown data types; no geom groups or such
-                as do not exist; a field of view that makes no sense.
+            ValueError: invalid image size, data types, geom groups or field of view.
         """
         super().__init__()
         self.cfg = cfg
@@ -130,12 +127,14 @@ class CameraSensor(Sensor[CameraSensorData]):
         for kind in cfg.data_types:
             check_one_of(f"{owner} data_types", kind, CAMERA_DATA_TYPES)
         if len(set(cfg.data_types)) < len(cfg.data_types):
-            raise ValueError(f"{owner} data_types={cfg.data_types!r} names one of them twice.")
+            raise ValueError(
+                f"{owner} data_types: expected distinct names, got {cfg.data_types!r}."
+            )
         groups = range(NUM_GEOM_GROUPS)
         if not cfg.enabled_geom_groups:
             raise ValueError(
-                f"{owner} enabled_geom_groups is empty, so that the camera would see nothing; give "
-                f"some of {list(groups)}."
+                f"{owner} enabled_geom_groups: expected at least one of {list(groups)}, got "
+                f"{cfg.enabled_geom_groups!r}."
             )
         for group in cfg.enabled_geom_groups:
             check_one_of(f"{owner} enabled_geom_groups", group, groups)
@@ -149,18 +148,18 @@ class CameraSensor(Sensor[CameraSensorData]):
 
     def _unknown_camera(self, name: str, cameras: Iterable[str]) -> ValueError:
         return self._error(
-            f"unknown camera {name!r} (names have the prefix of their entity, such as "
-            f"'robot/wrist'); {suggest(name, filter(None, cameras))}"
+            f"unknown camera {name!r} (names include the entity prefix, e.g. 'robot/wrist'); "
+            f"{suggest(name, filter(None, cameras))}"
         )
 
     # Construction.
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]) -> None:
-        """Add the camera, or change the existing one's projection if the config says so.
+        """Add the camera, or apply `fovy` and `orthographic` to the existing one.
 
         Raises:
-            ValueError: there is no such body or camera (with those there are), or the name of an
-                added camera is taken.
+            ValueError: unknown body or camera (with the available names), or duplicate name of an
+                added camera.
         """
         cfg = self.cfg
         if cfg.camera_name is None:
@@ -168,8 +167,8 @@ class CameraSensor(Sensor[CameraSensorData]):
             return
         if cfg.parent_body is not None:
             raise self._error(
-                f"parent_body={cfg.parent_body!r} is for a camera that the sensor adds, but it looks "
-                f"through the existing camera {cfg.camera_name!r}. Leave out one of them."
+                f"parent_body={cfg.parent_body!r} applies to added cameras only, but "
+                f"camera_name={cfg.camera_name!r} selects an existing one; leave out one of them."
             )
         if cfg.fovy is not None or cfg.orthographic:
             camera = scene_spec.camera(cfg.camera_name)
@@ -186,13 +185,13 @@ class CameraSensor(Sensor[CameraSensorData]):
             if body is None:
                 names = [body.name for body in scene_spec.bodies]
                 raise self._error(
-                    f"unknown body {cfg.parent_body!r} (names have the prefix of their entity); "
+                    f"unknown body {cfg.parent_body!r} (names include the entity prefix); "
                     f"{suggest(cfg.parent_body, names)}"
                 )
         if scene_spec.camera(cfg.name) is not None:
             raise self._error(
-                f"the scene has a camera {cfg.name!r} already. Give the sensor another name, or look "
-                f"through that camera by camera_name={cfg.name!r}."
+                f"the scene already has a camera {cfg.name!r}; rename the sensor, or use the "
+                f"existing camera with camera_name={cfg.name!r}."
             )
         camera = body.add_camera(name=cfg.name, pos=cfg.pos, quat=cfg.quat)
         camera.resolution = [cfg.width, cfg.height]
@@ -200,10 +199,10 @@ class CameraSensor(Sensor[CameraSensorData]):
         _set_projection(camera, fovy, orthographic=cfg.orthographic)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Find the camera in the compiled model; its images are empty until `sim.sense()`.
+        """Look up the camera in the compiled model. Images are empty until `sim.sense()`.
 
         Raises:
-            ValueError: there is no such camera; the message lists those there are.
+            ValueError: unknown camera (with the available names).
         """
         kind = mujoco.mjtObj.mjOBJ_CAMERA
         self._camera_idx = mujoco.mj_name2id(mj_model, kind, self.camera_name)
@@ -215,8 +214,8 @@ class CameraSensor(Sensor[CameraSensorData]):
         if not rendered_geoms(mj_model, groups):
             present = sorted(set(mj_model.geom_group.clip(0, 5).tolist()))
             log.warning(
-                "Camera sensor %r sees nothing: no geom of the scene is in enabled_geom_groups=%s. "
-                "There are geoms in the groups %s.",
+                "Camera sensor %r sees nothing: enabled_geom_groups=%s contain no geoms of the "
+                "scene. Groups with geoms: %s.",
                 cfg.name, groups, present,
             )  # fmt: skip
         self._view = CameraView(
@@ -231,13 +230,13 @@ class CameraSensor(Sensor[CameraSensorData]):
         self.set_images(Images.empty(self._view, data.qpos.shape[0], device))
 
     def set_context(self, ctx: object) -> None:
-        """Take note of what will evaluate the sensor; the sensor needs nothing of it."""
+        """Do nothing: the sensor does not use its context."""
 
-    # What there is.
+    # Properties.
 
     @property
     def camera_idx(self) -> int:
-        """Id of the camera in the model, once the sensor is initialized."""
+        """Camera id in the model. -1 before `initialize`."""
         return self._camera_idx
 
     @property
@@ -247,30 +246,30 @@ class CameraSensor(Sensor[CameraSensorData]):
 
     @property
     def view(self) -> CameraView:
-        """What is asked of the engine.
+        """Render request for the engine.
 
         Raises:
-            RuntimeError: the sensor is not initialized.
+            RuntimeError: called before `initialize`.
         """
         if self._view is None:
-            raise WrongStateError(f"Camera sensor {self.cfg.name!r} has not been initialized.")
+            raise WrongStateError(f"Camera sensor {self.cfg.name!r} is not initialized.")
         return self._view
 
     # Sensing.
 
     def update(self, dt: float) -> None:
-        """Do nothing: images stay until new ones are rendered."""
+        """Do nothing: images stay valid until the next rendering."""
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Do nothing, likewise."""
+        """Do nothing: images stay valid until the next rendering."""
 
     @property
     def needs_substep(self) -> bool:
-        """Whether a subclass does something in `update` after all."""
+        """True if a subclass overrides `update`."""
         return type(self).update is not CameraSensor.update
 
     def set_images(self, images: Images) -> None:
-        """Take what was rendered. The tensors are those that the next rendering overwrites."""
+        """Store rendered images. The next rendering overwrites the same tensors."""
         self._rgb, self._depth = images.rgb, images.depth
         self._segmentation = images.segmentation
         self.invalidate_cache()
@@ -283,7 +282,7 @@ class CameraSensor(Sensor[CameraSensorData]):
 
 
 def _set_projection(camera: mujoco.MjsCamera, fovy: float | None, *, orthographic: bool) -> None:
-    """Change the projection of a camera; None and False leave it as it is."""
+    """Set the projection of a camera. `fovy=None` and `orthographic=False` change nothing."""
     if orthographic:
         camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
     if fovy is not None:

@@ -52,7 +52,7 @@ _OBJECT_TYPES = {
 }
 _PLURALS = {"geom": "geoms", "body": "bodies", "subtree": "bodies"}
 
-# An entry of `exclude` with one of these characters is a regular expression.
+# Entries of `exclude` with one of these characters are regular expressions.
 _REGEX_CHARACTERS = frozenset(r".*+?[]{}()\|^$")
 
 # Debug drawing. Sizes are in units of the model's mean body size, force arrows in m/N as MuJoCo's
@@ -188,7 +188,7 @@ class ContactSensor(Sensor[ContactData]):
 
     Each primary has one MuJoCo sensor `<name>_<primary>` with all fields, so the data of all
     primaries is one contiguous block of `sensordata`: primary by primary, slot by slot, field by
-    field. One MuJoCo sensor per field would cost both engines as much again.
+    field. One MuJoCo sensor per field would double the cost on both engines.
     """
 
     earliest_stage = "acc"
@@ -238,16 +238,16 @@ class ContactSensor(Sensor[ContactData]):
                 sensor name that is already taken.
         """
         cfg = self.cfg
-        where = f"Contact sensor {cfg.name!r}"
-        primaries = _resolve_match(f"{where}: primary", cfg.primary, scene_spec, entities)
-        secondary = self._resolve_secondary(where, scene_spec, entities)
+        owner = f"Contact sensor {cfg.name!r}"
+        primaries = _resolve_match(f"{owner}: primary", cfg.primary, scene_spec, entities)
+        secondary = self._resolve_secondary(owner, scene_spec, entities)
         self._primary_names = [primary.name for primary in primaries]
         taken = {sensor.name for sensor in scene_spec.sensors}
         names = (cfg.name, *map(self._element_name, self._primary_names))
         if clashes := sorted(taken.intersection(names)):
             raise ValueError(
-                f"{where}: the scene already has MuJoCo sensors of the names {clashes}. Rename "
-                "this sensor."
+                f"{owner}: the scene already has MuJoCo sensors named {clashes}; rename this "
+                "sensor."
             )
         field_bits = sum(1 << i for i, name in enumerate(FIELD_SIZES) if name in self._fields)
         # MuJoCo numbers its reductions in this order.
@@ -264,16 +264,16 @@ class ContactSensor(Sensor[ContactData]):
             element.intprm[:3] = [field_bits, reduction, cfg.num_slots]
 
     def _resolve_secondary(
-        self, where: str, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]
+        self, owner: str, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]
     ) -> _MatchedElement | None:
         cfg = self.cfg
         if cfg.secondary is None or cfg.secondary_policy == "any":
             return None
-        found = _resolve_match(f"{where}: secondary", cfg.secondary, scene_spec, entities)
+        found = _resolve_match(f"{owner}: secondary", cfg.secondary, scene_spec, entities)
         if len(found) > 1 and cfg.secondary_policy == "error":
             raise ValueError(
-                f"{where}: secondary pattern {cfg.secondary.pattern!r} matches "
-                f"{[one.name for one in found]}. Narrow it to one, or set secondary_policy to "
+                f"{owner}: secondary pattern {cfg.secondary.pattern!r}: expected one match, got "
+                f"{[one.name for one in found]}; narrow the pattern, or set secondary_policy to "
                 "'first' or 'any'."
             )
         return found[0]
@@ -294,8 +294,8 @@ class ContactSensor(Sensor[ContactData]):
         if cfg.track_air_time:
             self._clocks = _ContactTimers(num_envs, len(self._primary_names), device)
         if self.needs_substep:
-            # Read in the middle of a step for the first time, it would show a newer state than it
-            # does from then on.
+            # A view first created in the middle of a step would show a newer state than in later
+            # steps.
             self._block()
 
     # Life cycle.
@@ -317,7 +317,7 @@ class ContactSensor(Sensor[ContactData]):
             for block in blocks:
                 self._history.record(block)
         if self._clocks is not None:
-            # Contacts fill the slots in order: the first slot tells if there is any.
+            # Contacts fill the slots in order: the first slot is nonzero if any slot is.
             column = self._offsets[self._fields.index("found")]
             found = blocks[..., column :: self.cfg.num_slots * self._slot_width]
             for in_contact in found > 0.0:
@@ -342,7 +342,7 @@ class ContactSensor(Sensor[ContactData]):
     def _block(self) -> torch.Tensor:
         """Return the live (N, width) view of the sensor's part of `sensordata`."""
         if self._source is None:
-            # Asking for `sensordata` makes the engine copy it out, so only a sensor in use does.
+            # Accessing `sensordata` makes the engine copy it out; unread sensors avoid that cost.
             self._source = self._sim_data.sensordata.narrow(1, self._start, self._width)
         return self._source
 
@@ -356,7 +356,7 @@ class ContactSensor(Sensor[ContactData]):
         return views
 
     def _compute_data(self) -> ContactData:
-        # A copy, so that what a term keeps of one step does not change in the next.
+        # A copy, so that values kept by a term do not change in the next step.
         values = self._in_configured_frame(self._split(self._block().clone()))
         data = ContactData(**{name: values[name] for name in self.cfg.fields})
         if self._history is not None:
@@ -430,7 +430,7 @@ class ContactSensor(Sensor[ContactData]):
             for column in fields["found"][env].cpu().nonzero().flatten().tolist():
                 start, label = points[column], f"{self.cfg.name}_{column}"
                 visualizer.add_sphere(start, _POINT_RADIUS * size, _POINT_COLOR, label)
-                # The force on the primary is the opposite of what is sensed.
+                # The force on the primary is the opposite of the sensed force.
                 end = start - _FORCE_SCALE * forces[column]
                 visualizer.add_arrow(start, end, _FORCE_COLOR, _FORCE_WIDTH * size, label)
 
@@ -439,8 +439,8 @@ class ContactSensor(Sensor[ContactData]):
 class _ContactTimers:
     """Air and contact times in float64: float32 drifts by seconds per hour.
 
-    A phase of n substeps is reported as (n + 1) dt: the substep in which a phase ends counts as
-    part of it, and as the first one of the next.
+    A phase of n substeps is reported as (n + 1) dt: the last substep of a phase is also the first
+    substep of the next.
     """
 
     _transient = {"_running", "_last", "_idle", "_ended", "_contact_is_idle", "_zero"}
@@ -450,7 +450,7 @@ class _ContactTimers:
         # Running air, running contact, last air, last contact.
         self._times = torch.zeros(4, *shape, dtype=torch.float64, device=device)
         self._running, self._last = self._times[:2], self._times[2:]
-        # Buffers: phases, air and contact, that are idle now, and those that have just ended.
+        # Buffers: idle phases (air, contact), and phases that ended in this substep.
         self._idle = torch.zeros(2, *shape, dtype=torch.bool, device=device)
         self._ended = torch.zeros(2, *shape, dtype=torch.bool, device=device)
         # Air is idle in contact (True), contact is idle in the air (False).
@@ -531,19 +531,19 @@ class _MatchedElement:
 
 
 def _resolve_match(
-    where: str, match: ContactMatch, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]
+    owner: str, match: ContactMatch, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]
 ) -> list[_MatchedElement]:
     """Resolve `match` to elements in spec order; raise on patterns without a match.
 
-    Without an entity, names are literal and elements come in the order given. `where` opens messages.
+    Without an entity, names are literal and elements are in pattern order. `owner` opens messages.
     """
     if not match.patterns or "" in match.patterns:
-        raise ValueError(f"{where} pattern: expected at least one name, got {match.pattern!r}.")
+        raise ValueError(f"{owner} pattern: expected at least one name, got {match.pattern!r}.")
     if not match.entity:
-        return _resolve_literal(where, match, scene_spec)
+        return _resolve_literal(owner, match, scene_spec)
     if match.entity not in entities:
         raise ValueError(
-            f"{where}: unknown entity {match.entity!r}; {suggest(match.entity, entities)}"
+            f"{owner}: unknown entity {match.entity!r}; {suggest(match.entity, entities)}"
         )
     spec = entities[match.entity].spec
     # bodies[0] is the world body.
@@ -552,44 +552,44 @@ def _resolve_match(
         compile_pattern(pattern).fullmatch("") for pattern in match.patterns
     ):
         logger.warning(
-            "%s: %d %s of entity %r have no name, so their contacts are not sensed. Name them, or "
-            "use mode 'body'.",
-            where, unnamed, _PLURALS[match.mode], match.entity,
+            "%s: contacts of %d unnamed %s of entity %r are not sensed; name the elements, or use "
+            "mode 'body'.",
+            owner, unnamed, _PLURALS[match.mode], match.entity,
         )  # fmt: skip
     prefix = f"{match.entity}/"
     named = [_MatchedElement(e.name, e.name.removeprefix(prefix)) for e in elements if e.name]
-    found = _match_patterns(where, match, named)
+    found = _match_patterns(owner, match, named)
     kept = [one for one in found if not _is_excluded(one, match.exclude)]
     if not kept:
         raise ValueError(
-            f"{where}: exclude={match.exclude!r} leaves nothing of what {match.pattern!r} matches: "
+            f"{owner}: exclude={match.exclude!r} removes all matches of {match.pattern!r}: "
             f"{name_list([one.name for one in found], near=())}."
         )
     return kept
 
 
 def _resolve_literal(
-    where: str, match: ContactMatch, scene_spec: mujoco.MjSpec
+    owner: str, match: ContactMatch, scene_spec: mujoco.MjSpec
 ) -> list[_MatchedElement]:
     elements = scene_spec.geoms if match.mode == "geom" else scene_spec.bodies
     names = [element.name for element in elements if element.name]
     for name in match.patterns:
         if name not in names:
             raise ValueError(
-                f"{where}: unknown {match.mode} {name!r} (without ContactMatch.entity, names are "
+                f"{owner}: unknown {match.mode} {name!r} (without ContactMatch.entity, names are "
                 f"literal); {suggest(name, names)}"
             )
     if len(set(match.patterns)) != len(match.patterns):
-        raise ValueError(f"{where} names an element twice: {match.pattern!r}.")
+        raise ValueError(f"{owner} pattern: expected distinct names, got {match.pattern!r}.")
     if match.exclude:
-        logger.warning("%s: exclude has no effect without ContactMatch.entity.", where)
+        logger.warning("%s: exclude has no effect without ContactMatch.entity.", owner)
     return [_MatchedElement(name, name) for name in match.patterns]
 
 
 def _match_patterns(
-    where: str, match: ContactMatch, elements: list[_MatchedElement]
+    owner: str, match: ContactMatch, elements: list[_MatchedElement]
 ) -> list[_MatchedElement]:
-    """Return the elements that match one pattern each, in the order given."""
+    """Return the elements that match exactly one pattern, in spec order."""
     owners: dict[_MatchedElement, str] = {}
     for pattern in match.patterns:
         # A literal name may contain characters that a regular expression reads differently.
@@ -599,15 +599,15 @@ def _match_patterns(
             matching = [one for one in elements if any(map(fullmatch, one.candidate_names))]
         if not matching:
             raise ValueError(
-                f"{where} pattern {pattern!r} matches none of the {_PLURALS[match.mode]} of entity "
-                f"{match.entity!r}. A pattern must match a whole name; "
+                f"{owner} pattern {pattern!r} matches none of the {_PLURALS[match.mode]} of entity "
+                f"{match.entity!r} (patterns must match whole names); "
                 f"{suggest(pattern, [one.name for one in elements])}"
             )
         for one in matching:
             if one in owners:
                 raise ValueError(
-                    f"{where}: {one.name!r} is matched by both {owners[one]!r} and {pattern!r}. "
-                    "Each name may be matched by one pattern only."
+                    f"{owner}: patterns {owners[one]!r} and {pattern!r} both match {one.name!r}; "
+                    "use patterns that do not overlap."
                 )
             owners[one] = pattern
     return [one for one in elements if one in owners]

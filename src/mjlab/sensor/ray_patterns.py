@@ -1,7 +1,6 @@
 """Ray patterns: origins and directions of the rays of one frame.
 
-A pattern gives offsets (n, 3) in metres and unit directions (n, 3), both in the aligned frame of a
-ray sensor.
+A pattern returns offsets (m) and unit directions in the aligned frame of a ray sensor, (n, 3) each.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import torch
 from mjlab.utils.errors import check_exists, check_field, check_fields_positive
 
 Rays = tuple[torch.Tensor, torch.Tensor]
-"""Offsets (n, 3) and unit directions (n, 3) in the aligned frame."""
+"""Offsets (m) and unit directions in the aligned frame, (n, 3) each."""
 _DOWN = (0.0, 0.0, -1.0)
 
 
@@ -23,22 +22,22 @@ _DOWN = (0.0, 0.0, -1.0)
 class GridPatternCfg:
     """Parallel rays from a rectangular grid in the frame's xy plane.
 
-    The rays are at `-size / 2 + k resolution`, as far as `size / 2` (with half a `resolution` to
-    spare), x fastest. So the grid is centred where `size` is a multiple of `resolution`.
+    Rays start at `-size / 2 + k resolution`, up to `size / 2` plus a margin of half a `resolution`,
+    x fastest. So the grid is centered if `size` is a multiple of `resolution`.
     """
 
     size: tuple[float, float] = (1.0, 1.0)
-    """Extent along x and y, in metres; 0 gives one row."""
+    """Extent along x and y (m). 0: a single row."""
     resolution: float = 0.1
-    """Distance between neighbouring rays, in metres."""
+    """Distance between neighboring rays (m)."""
     direction: tuple[float, float, float] = _DOWN
-    """Direction of all rays; of any length."""
+    """Direction of all rays, not necessarily normalized."""
 
     def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
-        """Return offsets and directions, index `row * columns + column` with x along a row.
+        """Return offsets and directions; ray `row * columns + column`, x along a row.
 
         Raises:
-            ValueError: a resolution that is not positive, a negative size, no direction.
+            ValueError: resolution <= 0, negative size, or zero direction.
         """
         check_fields_positive(self, "resolution")
         is_extent = all(side >= 0.0 and math.isfinite(side) for side in self.size)
@@ -56,25 +55,25 @@ class GridPatternCfg:
 
 @dataclass
 class PinholeCameraPatternCfg:
-    """Rays through the centres of the pixels of a pinhole camera that looks along -z, with +y up.
+    """Rays through the centers of the pixels of a pinhole camera that looks along -z, with +y up.
 
-    Row 0 is the top of the image; the rays go row by row, from left to right.
+    Row 0 is the top row; rays are in row-major order, left to right.
     """
 
     width: int = 16
-    """Pixels in a row."""
+    """Image width (pixels)."""
     height: int = 12
-    """Rows."""
+    """Image height (pixels)."""
     fovy: float = 45.0
-    """Vertical field of view, in degrees."""
+    """Vertical field of view (deg)."""
     _camera_name: str | None = None
 
     @classmethod
     def from_mujoco_camera(cls, camera_name: str) -> PinholeCameraPatternCfg:
-        """Take resolution and field of view from a camera of the scene, by its full name.
+        """Return a pattern with the resolution and intrinsics of a camera, by its full scene name.
 
-        Focal length, sensor size and principal point count where the camera has them. The pose of
-        the camera does not: that is the sensor's `frame`.
+        Focal length, sensor size and principal point apply if the camera defines them. The camera
+        pose is ignored; the sensor's `frame` defines the pose.
         """
         return cls(_camera_name=camera_name)
 
@@ -82,28 +81,28 @@ class PinholeCameraPatternCfg:
     def from_intrinsic_matrix(
         cls, intrinsic_matrix: list[float], width: int, height: int
     ) -> PinholeCameraPatternCfg:
-        """Take the vertical field of view `2 atan(height / (2 fy))` from a camera matrix.
+        """Return a pattern with the vertical field of view `2 atan(height / (2 fy))`.
 
         Args:
-            intrinsic_matrix: (fx, 0, cx, 0, fy, cy, 0, 0, 1) in pixels; only fy counts.
-            width: Pixels in a row.
-            height: Rows.
+            intrinsic_matrix: (fx, 0, cx, 0, fy, cy, 0, 0, 1) (pixels). Only fy is used.
+            width: Image width (pixels).
+            height: Image height (pixels).
         """
         if len(intrinsic_matrix) != 9 or not intrinsic_matrix[4] > 0.0:
             raise ValueError(
-                "from_intrinsic_matrix takes the nine numbers fx, 0, cx, 0, fy, cy, 0, 0, 1 with a "
-                f"positive fy, got {intrinsic_matrix}."
+                "from_intrinsic_matrix: expected nine numbers (fx, 0, cx, 0, fy, cy, 0, 0, 1) with "
+                f"fy > 0, got {intrinsic_matrix}."
             )
         fovy = 2.0 * math.degrees(math.atan(height / (2.0 * intrinsic_matrix[4])))
         return cls(width=width, height=height, fovy=fovy)
 
     def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
-        """Return offsets (all zero) and directions, index `row * width + column`.
+        """Return zero offsets and directions; ray `row * width + column`.
 
         Raises:
-            ValueError: no pixels, a field of view outside (0, 180), or no such camera.
+            ValueError: image without pixels, field of view outside (0, 180), or unknown camera.
         """
-        width, height, half_x, half_y, centre = self._image_plane(mj_model)
+        width, height, half_x, half_y, center = self._image_plane(mj_model)
         if width < 1 or height < 1:
             raise ValueError(
                 f"PinholeCameraPatternCfg: expected at least 1 x 1 pixels, got {width} x {height}."
@@ -111,7 +110,7 @@ class PinholeCameraPatternCfg:
         u = (torch.arange(width, dtype=torch.float64) + 0.5) * 2.0 / width - 1.0
         v = 1.0 - (torch.arange(height, dtype=torch.float64) + 0.5) * 2.0 / height
         grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
-        x, y = grid_u * half_x + centre[0], grid_v * half_y + centre[1]
+        x, y = grid_u * half_x + center[0], grid_v * half_y + center[1]
         directions = torch.stack((x, y, -torch.ones_like(x)), dim=-1).flatten(0, 1)
         directions = torch.nn.functional.normalize(directions, dim=-1).to(device, torch.float32)
         return torch.zeros_like(directions), directions
@@ -119,13 +118,14 @@ class PinholeCameraPatternCfg:
     def _image_plane(
         self, mj_model: mujoco.MjModel | None
     ) -> tuple[int, int, float, float, tuple[float, float]]:
-        """Return width, height, and half extents and centre of the image at distance 1."""
+        """Return image width and height (pixels), half extents and center at distance 1."""
         if self._camera_name is None:
             half_y = _tan_half(self.fovy)
             return self.width, self.height, half_y * self.width / self.height, half_y, (0.0, 0.0)
         if mj_model is None:
             raise ValueError(
-                f"The pattern of the camera {self._camera_name!r} needs the compiled model."
+                f"PinholeCameraPatternCfg of camera {self._camera_name!r}: expected the compiled "
+                "mj_model, got None."
             )
         names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
         check_exists("camera", self._camera_name, names)
@@ -136,33 +136,33 @@ class PinholeCameraPatternCfg:
             half_y = _tan_half(float(mj_model.cam_fovy[camera]))
             return width, height, half_y * width / height, half_y, (0.0, 0.0)
         fx, fy, cx, cy = (float(value) for value in mj_model.cam_intrinsic[camera])
-        # The principal point shifts the image as it does in MuJoCo's camera frustum.
-        centre = (cx / fx, -cy / fy)
-        return width, height, float(sensor[0]) / (2 * fx), float(sensor[1]) / (2 * fy), centre
+        # Sign convention of the principal point: MuJoCo's camera frustum.
+        center = (cx / fx, -cy / fy)
+        return width, height, float(sensor[0]) / (2 * fx), float(sensor[1]) / (2 * fy), center
 
 
 @dataclass
 class Ring:
-    """One ring of parallel rays, the first on the x axis, then counter-clockwise."""
+    """Ring of parallel rays, counterclockwise from the x axis."""
 
     radius: float = 0.1
-    """Radius, in metres."""
+    """Radius (m)."""
     num_samples: int = 8
     """Number of rays."""
 
 
 @dataclass
 class RingPatternCfg:
-    """Parallel rays from concentric rings in the frame's xy plane: the centre first, then by ring."""
+    """Parallel rays from concentric rings in the frame's xy plane: center first, then by ring."""
 
     Ring = Ring
 
     rings: tuple[Ring, ...]
-    """The rings, in the order of their rays."""
+    """Rings in ray order."""
     include_center: bool = True
-    """Whether one ray starts at the frame's origin."""
+    """Add a ray at the frame's origin."""
     direction: tuple[float, float, float] = _DOWN
-    """Direction of all rays; of any length."""
+    """Direction of all rays, not necessarily normalized."""
 
     @classmethod
     def single_ring(
@@ -172,28 +172,29 @@ class RingPatternCfg:
         include_center: bool = True,
         direction: tuple[float, float, float] = _DOWN,
     ) -> RingPatternCfg:
-        """Return a pattern of one ring."""
+        """Return a pattern with one ring."""
         return cls((Ring(radius, num_samples),), include_center, direction)
 
     def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
-        """Return offsets and directions: centre, then ring by ring.
+        """Return offsets and directions: center, then ring by ring.
 
         Raises:
-            ValueError: a negative radius, a ring without rays, no rays at all, no direction.
+            ValueError: negative radius, ring without rays, pattern without rays, or zero direction.
         """
         points = [(0.0, 0.0, 0.0)] if self.include_center else []
         for ring in self.rings:
             if ring.num_samples < 1 or not (ring.radius >= 0.0 and math.isfinite(ring.radius)):
                 raise ValueError(
-                    f"RingPatternCfg has a ring of {ring.num_samples} rays with radius "
-                    f"{ring.radius}; it takes at least 1 ray and a radius of 0 or more (metres)."
+                    "RingPatternCfg rings: expected num_samples >= 1 and a finite radius >= 0 m, "
+                    f"got num_samples {ring.num_samples} and radius {ring.radius}."
                 )
             for k in range(ring.num_samples):
                 angle = 2.0 * math.pi * k / ring.num_samples
                 points.append((ring.radius * math.cos(angle), ring.radius * math.sin(angle), 0.0))
         if not points:
             raise ValueError(
-                "RingPatternCfg has no rays: give rings, or include_center=True for a single ray."
+                f"RingPatternCfg rings: expected at least one ring, got {self.rings!r}; use "
+                "include_center=True for a single ray."
             )
         offsets = torch.tensor(points, dtype=torch.float32, device=device)
         return offsets, _parallel(self.direction, len(points), "RingPatternCfg", device)
@@ -207,13 +208,13 @@ def _parallel(direction: tuple[float, ...], count: int, owner: str, device: str)
     length = float(vector.norm())
     if vector.shape != (3,) or not (math.isfinite(length) and length > 1e-9):
         raise ValueError(
-            f"{owner}.direction is {direction}; it takes three numbers that are not all 0."
+            f"{owner}.direction: expected three finite numbers, not all 0, got {direction}."
         )
-    # One row a ray, so that patterns of parallel and of diverging rays are treated alike.
+    # One row per ray, the layout of patterns of diverging rays.
     return (vector / length).to(device, torch.float32).repeat(count, 1)
 
 
 def _tan_half(fovy: float) -> float:
     if not 0.0 < fovy < 180.0:
-        raise ValueError(f"The field of view is {fovy} degrees; it has to be between 0 and 180.")
+        raise ValueError(f"Field of view: expected degrees in (0, 180), got {fovy}.")
     return math.tan(math.radians(fovy) / 2.0)

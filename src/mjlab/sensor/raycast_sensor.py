@@ -1,4 +1,4 @@
-"""Ray sensors: distances from frames to surrounding geometry, along a pattern of rays.
+"""Ray-cast sensors: distance to surrounding geometry along a pattern of rays.
 
 Data has N environments, F frames and n rays per frame; ray `f n + r` is ray r of frame f.
 """
@@ -54,55 +54,55 @@ _FRAMES = {
     "geom": ("geom_xpos", "geom_xmat", mujoco.mjtObj.mjOBJ_GEOM),
 }
 
-# Below this horizontal length of the frame's x axis, its y axis says where the frame points.
+# Horizontal length of the frame's x axis below which the y axis defines the heading.
 _STEEP = 0.1
 _TINY = 1e-12
 
 
 @dataclass
 class VizCfg:
-    """How rays are drawn. Lengths are multiples of the model's mean size, colours RGBA."""
+    """Colors (RGBA) and sizes of drawn rays. Lengths are multiples of the model's mean size."""
 
     hit_color: Color = (0.0, 1.0, 0.0, 0.8)
-    """Colour of rays that hit something."""
+    """Color of rays that hit a geom."""
     miss_color: Color = (1.0, 0.0, 0.0, 0.4)
-    """Colour of rays that hit nothing."""
+    """Color of rays that miss."""
     hit_sphere_color: Color = (0.0, 1.0, 1.0, 1.0)
-    """Colour of the spheres at the points that are hit."""
+    """Color of the spheres at hit points."""
     hit_sphere_radius: float = 0.5
-    """Radius of these spheres."""
+    """Radius of the spheres at hit points."""
     show_rays: bool = False
-    """Whether to draw the rays as arrows."""
+    """Draw the rays as arrows."""
     show_normals: bool = False
-    """Whether to draw surface normals at the points that are hit."""
+    """Draw surface normals at hit points."""
     normal_color: Color = (1.0, 1.0, 0.0, 1.0)
-    """Colour of the normals."""
+    """Color of surface normals."""
     normal_length: float = 5.0
-    """Length of the normals."""
+    """Length of surface normals."""
 
 
 @dataclass
 class RayCastSensorCfg(SensorCfg):
-    """Describes a ray sensor."""
+    """Ray-cast sensor configuration."""
 
     VizCfg = VizCfg
 
     frame: ObjRef | tuple[ObjRef, ...]
-    """Body, site or geom from which the pattern is cast; or several, also of several entities."""
+    """Body, site or geom the rays start from; or several, possibly of different entities."""
     pattern: PatternCfg = field(default_factory=GridPatternCfg)
-    """The rays of each frame."""
+    """Ray pattern of each frame."""
     ray_alignment: RayAlignment = "base"
-    """How the pattern turns with its frame: `base` fully, `yaw` about the vertical, `world` not."""
+    """Pattern rotation with its frame: `base` full, `yaw` about the vertical only, `world` none."""
     max_distance: float = 10.0
-    """Reach of the rays, in metres. What lies beyond is a miss."""
+    """Range of the rays (m). Geometry beyond it is a miss."""
     exclude_parent_body: bool = True
-    """Whether the geoms of the body that carries the frame (of that body alone) are invisible."""
+    """Exclude the geoms of the frame's body (not those of its descendants)."""
     include_geom_groups: tuple[int, ...] | None = (0, 1, 2)
-    """Geom groups, 0 to 5, that are visible; None for all."""
+    """Visible geom groups, of 0 to 5. None: all."""
     debug_vis: bool = False
-    """Whether viewers draw the rays."""
+    """Draw the rays in viewers."""
     viz: VizCfg = field(default_factory=VizCfg)
-    """How they draw them."""
+    """Colors and sizes of drawn rays."""
 
     def build(self) -> RayCastSensor:
         """Build the sensor."""
@@ -111,35 +111,35 @@ class RayCastSensorCfg(SensorCfg):
 
 @dataclass
 class RayCastData:
-    """What a ray sensor with F frames of n rays has measured; ray `f n + r` is ray r of frame f."""
+    """Data of a ray-cast sensor with F frames of n rays; ray `f n + r` is ray r of frame f."""
 
     distances: torch.Tensor
-    """(N, F n) metres; -1 for a miss."""
+    """Distance (m), (N, F n). Miss: -1."""
     normals_w: torch.Tensor
-    """(N, F n, 3) unit surface normals in the world frame; 0 for a miss."""
+    """Unit surface normal, world frame, (N, F n, 3). Miss: 0."""
     hit_pos_w: torch.Tensor
-    """(N, F n, 3) world positions of what is hit; for a miss, where the ray starts."""
+    """Hit point (m), world frame, (N, F n, 3). Miss: the ray's origin."""
     pos_w: torch.Tensor
-    """(N, 3) world position of the first frame."""
+    """Position of the first frame (m), world frame, (N, 3)."""
     quat_w: torch.Tensor
-    """(N, 4) orientation of the first frame, not aligned."""
+    """Orientation of the first frame, without alignment, (N, 4)."""
     frame_pos_w: torch.Tensor
-    """(N, F, 3) world positions of the frames."""
+    """Positions of the frames (m), world frame, (N, F, 3)."""
     frame_quat_w: torch.Tensor
-    """(N, F, 4) orientations of the frames, not aligned."""
+    """Orientations of the frames, without alignment, (N, F, 4)."""
 
     @classmethod
     def with_frames(cls, frame_mat: torch.Tensor, **fields: torch.Tensor) -> Self:
-        """Return data whose quaternions are computed from `frame_mat` (N, F, 3, 3) when read.
+        """Return data with quaternions computed from `frame_mat`, (N, F, 3, 3), on access.
 
-        Few terms read them, and computing them takes longer than all the other fields together.
+        Few terms read quaternions, and their computation takes longer than all other fields.
         """
         data = cls.__new__(cls)
         data.__dict__.update(fields, _frame_mat=frame_mat)
         return data
 
     def __getattr__(self, name: str) -> Any:
-        # Only asked for what is not there yet.
+        # Python calls `__getattr__` only for attributes that do not exist yet.
         if name not in ("quat_w", "frame_quat_w") or "_frame_mat" not in self.__dict__:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         self.frame_quat_w = quat_from_matrix(self.__dict__["_frame_mat"])
@@ -148,13 +148,13 @@ class RayCastData:
 
 
 class RayCastSensor(Sensor[RayCastData]):
-    """Casts a pattern of rays from one or several frames.
+    """Ray-cast sensor: casts a pattern of rays from one or several frames.
 
-    Rays are cast by `sim.sense()`: once per environment step, after resets and commands. So
-    observations see the current scene, rewards and terminations that of the previous step, and all
-    is zero before the first time. The rays meet the nearest surface of a geom of the included
+    `sim.sense()` casts the rays once per environment step, after resets and commands. So
+    observations read the current scene, rewards and terminations that of the previous step. Data is
+    zero before the first `sim.sense()`. Rays hit the nearest surface of a geom of the included
     groups: planes from above, meshes and height fields from outside, and other geoms from either
-    side. A geom that is fully transparent is not there.
+    side. Rays ignore fully transparent geoms.
     """
 
     _transient = {"_frames", "_offsets", "_local_directions", "_moving_directions"}
@@ -163,8 +163,7 @@ class RayCastSensor(Sensor[RayCastData]):
         """Check the config.
 
         Raises:
-            ValueError: an unknown alignment, a geom group outside 0..5, a reach that is not
-                positive.
+            ValueError: unknown alignment, geom group outside 0..5, or max_distance <= 0.
         """
         super().__init__()
         self.cfg = cfg
@@ -178,8 +177,8 @@ class RayCastSensor(Sensor[RayCastData]):
             check_one_of(f"{owner} include_geom_groups", group, range(NUM_GEOM_GROUPS))
         if cfg.include_geom_groups is not None and not cfg.include_geom_groups:
             raise ValueError(
-                f"{owner} include_geom_groups is empty, so that no ray could hit anything; None "
-                "includes all groups."
+                f"{owner} include_geom_groups: expected at least one group, got "
+                f"{cfg.include_geom_groups!r}; use None for all groups."
             )
         frame = cfg.frame
         self._frame_refs = (frame,) if isinstance(frame, ObjRef) else tuple(frame)
@@ -191,25 +190,23 @@ class RayCastSensor(Sensor[RayCastData]):
     # Construction.
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]) -> None:
-        """Check what the frames refer to; the spec stays as it is.
+        """Check the frames. The spec is unchanged.
 
         Raises:
-            ValueError: no frame, one that is no body, site or geom, or one of an entity that does
-                not exist.
+            ValueError: `frame` is empty, is not a body, site or geom, or has an unknown entity.
         """
         if not self._frame_refs:
-            raise self._error("frame is empty; give one ObjRef or several.")
+            raise self._error("frame: expected at least one ObjRef, got ().")
         for frame in self._frame_refs:
             owner = f"Ray sensor {self.cfg.name!r} frame {frame.name!r}"
             check_one_of(f"{owner} type", frame.type, _FRAMES)
             check_entity(owner, frame, entities)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Generate the rays and find the frames in the compiled model.
+        """Generate the rays and look up the frames in the compiled model.
 
         Raises:
-            ValueError: the pattern has no rays or makes no sense, or a frame does not exist (with
-                close names).
+            ValueError: invalid pattern, pattern without rays, or unknown frame (with close names).
         """
         try:
             offsets, directions = self.cfg.pattern.generate_rays(mj_model, device)
@@ -217,7 +214,7 @@ class RayCastSensor(Sensor[RayCastData]):
         except ValueError as error:
             raise self._error(str(error)) from error
         if len(offsets) == 0:
-            raise self._error("its pattern has no rays.")
+            raise self._error("pattern: expected at least one ray, got 0.")
         self._offsets, self._local_directions = offsets, directions
         self._num_rays_per_frame = len(offsets)
         # Vertical rays keep their directions under a rotation about the vertical.
@@ -236,18 +233,18 @@ class RayCastSensor(Sensor[RayCastData]):
         )
 
     def set_buffers(self, origins: torch.Tensor, directions: torch.Tensor) -> None:
-        """Use these tensors, (N, F n, 3) each, for the rays in the world frame.
+        """Set the tensors for ray origins and directions in the world frame, (N, F n, 3) each.
 
-        The sensor context hands out parts of one buffer, so that one query casts them all.
+        The sensor context assigns slices of one buffer, so that one query casts all rays.
         """
         self._origins, self._directions = origins, directions
         if not self._moving_directions:
             directions.copy_(self._local_directions.repeat(self.num_frames, 1))
 
     def set_context(self, ctx: object) -> None:
-        """Take note of what will evaluate the sensor; the sensor needs nothing of it."""
+        """Do nothing: the sensor does not use its context."""
 
-    # What there is.
+    # Properties.
 
     @property
     def num_frames(self) -> int:
@@ -256,7 +253,7 @@ class RayCastSensor(Sensor[RayCastData]):
 
     @property
     def num_rays_per_frame(self) -> int:
-        """Number of rays n of each frame."""
+        """Number of rays per frame n."""
         return self._num_rays_per_frame
 
     @property
@@ -266,26 +263,26 @@ class RayCastSensor(Sensor[RayCastData]):
 
     @property
     def include_geom_groups(self) -> tuple[int, ...] | None:
-        """Visible geom groups; None for all."""
+        """Visible geom groups. None: all."""
         return self.cfg.include_geom_groups
 
     @property
     def excluded_bodies(self) -> list[int]:
-        """For each ray, the body whose geoms it does not see; -1 for none."""
+        """Id of the excluded body of each ray. -1: none."""
         bodies = self._frames.body_ids if self.cfg.exclude_parent_body else [-1] * self.num_frames
         return [body for body in bodies for _ in range(self.num_rays_per_frame)]
 
     # Sensing.
 
     def update(self, dt: float) -> None:
-        """Do nothing: what was measured stays until rays are cast again."""
+        """Do nothing: data stays valid until the next ray cast."""
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Do nothing, likewise."""
+        """Do nothing: data stays valid until the next ray cast."""
 
     @property
     def needs_substep(self) -> bool:
-        """Whether a subclass does something in `update` after all."""
+        """True if a subclass overrides `update`."""
         return type(self).update is not RayCastSensor.update
 
     def prepare_rays(self) -> None:
@@ -300,7 +297,7 @@ class RayCastSensor(Sensor[RayCastData]):
             _rotate_into(rays, self._local_directions, mat, alignment)
 
     def raycast_kernel(self, rc: Callable[..., tuple[torch.Tensor, ...]]) -> None:
-        """Cast the prepared rays of this sensor alone, by `rc`: `Simulation.raycast`."""
+        """Cast only the prepared rays of this sensor, with `rc`: `Simulation.raycast`."""
         device, reach = self._origins.device, [self.cfg.max_distance] * self.num_rays
         reach = torch.tensor(reach, dtype=torch.float32, device=device)
         excluded = torch.tensor(self.excluded_bodies, dtype=torch.int32, device=device)
@@ -310,18 +307,18 @@ class RayCastSensor(Sensor[RayCastData]):
         self.set_results(distances, normals)
 
     def set_results(self, distances: torch.Tensor, normals: torch.Tensor) -> None:
-        """Take what the rays met: distances (N, F n) and normals (N, F n, 3)."""
+        """Store ray results: distances (N, F n) and normals (N, F n, 3)."""
         self._distances, self._normals = distances, normals
 
     def postprocess_rays(self) -> None:
-        """Have `data` computed anew from the latest results."""
+        """Recompute `data` from the latest results on next access."""
         self.invalidate_cache()
 
     def _compute_data(self) -> RayCastData:
         return RayCastData.with_frames(self._frame_mat.clone(), **self._measured())
 
     def _measured(self) -> dict[str, torch.Tensor]:
-        """Return the fields of the data, but for the orientations of the frames."""
+        """Return the fields of the data except the frame orientations."""
         reach = self._distances.clamp(min=0.0).unsqueeze(-1)
         return {
             "distances": self._distances,
@@ -331,17 +328,17 @@ class RayCastSensor(Sensor[RayCastData]):
             "frame_pos_w": self._frame_pos,
         }
 
-    # Looking at it.
+    # Drawing.
 
     @property
     def draws(self) -> bool:
-        """Whether viewers draw the rays, as the config says."""
+        """True if `cfg.debug_vis` is set."""
         return self.cfg.debug_vis
 
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Draw the points that are hit, and rays and normals if the config says so.
+        """Draw hit points, and rays and normals as configured by `cfg.viz`.
 
-        A ray that misses is drawn `min(0.5, 0.05 max_distance)` long, in metres.
+        Rays that miss are drawn with a length of `min(0.5, 0.05 max_distance)` (m).
         """
         if not self.cfg.debug_vis:
             return
@@ -374,16 +371,16 @@ class RayCastSensor(Sensor[RayCastData]):
 
 
 class _Frames:
-    """Poses of several frames, in the order in which they were given."""
+    """Poses of the sensor's frames, in config order."""
 
     def __init__(
         self, frames: tuple[ObjRef, ...], mj_model: mujoco.MjModel, data: Any, device: str
     ) -> None:
-        """Find the frames; ValueError with close names for one that does not exist."""
+        """Look up the frames. Raises `ValueError` with close names for unknown frames."""
         self._data = data
         self._parts: list[tuple[str, str, torch.Tensor, torch.Tensor]] = []
         self.body_ids: list[int] = []
-        """The body that carries each frame."""
+        """Id of the body of each frame."""
         ids = []
         owners = {"site": mj_model.site_bodyid, "geom": mj_model.geom_bodyid}
         for frame in frames:
@@ -423,15 +420,15 @@ def _rotate_into(
 ) -> None:
     """Write `start + A vectors` into `out`, with A the aligned orientation of each frame.
 
-    Column by column, because every column is one operation over all environments and rays, and
-    without a matrix product, which a GPU may round to TF32: centimetres, far from the origin.
+    Column by column, because every column is one operation over all environments and rays. No
+    matrix product: GPUs may compute it in TF32, with errors of centimeters far from the origin.
 
     Args:
         out: (N, F, n, 3).
         vectors: (n, 3) in the aligned frame.
         mat: (N, F, 3, 3) orientations of the frames.
-        alignment: Which part of the orientation counts.
-        start: (N, F, 3) world positions; None for none.
+        alignment: Part of the orientation to apply.
+        start: (N, F, 3) world positions. None: zero.
     """
     x, y, z = vectors.unbind(-1)
     if alignment == "yaw":
@@ -448,18 +445,18 @@ def _rotate_into(
         else:
             first, second = turn[axis]
             part = (first * x).addcmul_(second, y)
-        # The start comes last: far from the origin, sums with it are rounded most.
+        # `start` is added last: far from the origin, sums with it have the largest rounding errors.
         torch.add(part, 0.0 if start is None else start[..., axis, None], out=column)
 
 
 def _heading(mat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return cosine and sine of the yaw (...,) of rotation matrices (..., 3, 3).
 
-    The direction is that of the horizontal projection of the frame's x axis. Where the x axis is
-    nearly vertical (projection shorter than 0.1), it is the projection (a, b) of the y axis turned
-    back by a quarter: (b, -a).
+    The heading is the horizontal projection of the frame's x axis. If the x axis is nearly vertical
+    (projection shorter than 0.1), the heading is the projection (a, b) of the y axis rotated by
+    -90 deg: (b, -a).
     """
-    # By components: an operation over a last dimension of two takes a CPU ten times as long.
+    # By components: operations over a last dimension of size 2 take ten times as long on a CPU.
     x, y = mat[..., 0, 0], mat[..., 1, 0]
     is_steep = x * x + y * y < _STEEP**2
     x = torch.where(is_steep, mat[..., 1, 1], x)

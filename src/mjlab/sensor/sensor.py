@@ -1,4 +1,4 @@
-"""What all sensors share: a place in the scene's spec, cached data, and a life cycle."""
+"""Base class of sensors: spec edits, cached data, life cycle."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ T = TypeVar("T")
 
 @dataclass
 class SensorCfg(ABC):
-    """Describes a sensor."""
+    """Base sensor configuration."""
 
     name: str
     """Name of the sensor, without the prefix of an entity."""
 
     @property
     def prefixed_name(self) -> str:
-        """Name under which the scene keeps the sensor."""
+        """Name of the sensor in the scene."""
         return self.name
 
     @abstractmethod
@@ -39,39 +39,38 @@ class SensorCfg(ABC):
 
 @stateful
 class Sensor(ABC, Generic[T]):
-    """Reads something from the simulation, in all environments.
+    """Base class of sensors. `data` is a measurement in all environments.
 
-    `data` is computed when it is first read, and kept until time passes (`update`), the
-    environment is reset (`reset`), or `sim.forward` recomputes the fields that it is made of
-    (the scene then calls `invalidate_cache`). So it always belongs to the same state as these
-    fields of the simulation.
+    `data` is computed on first access and cached until time advances (`update`), an environment is
+    reset (`reset`), or `sim.forward` recomputes its source fields (the scene then calls
+    `invalidate_cache`). So `data` and its source fields always belong to the same state.
 
-    A subclass computes its data in `_compute_data`. One that overrides `update`, because it keeps
-    a history, is updated at every physics substep. If all it needs of a substep is data fields, it
-    names them in `recorded_fields` and overrides `update_recorded` too, so that the engine can run
-    the substeps in one go.
+    Subclasses compute their data in `_compute_data`. A subclass that overrides `update`, to keep a
+    history, is updated every physics substep. If it needs only data fields of a substep, it lists
+    them in `recorded_fields` and overrides `update_recorded` too, so that the engine can run the
+    substeps in one go.
     """
 
     _transient = {"_cached_data", "_cache_valid"}
 
     earliest_stage: ClassVar[Stage] = "pos"
-    """Earliest stage of a forward pass that changes the data. `"acc"`: the data is made of
-    `sensordata` of the acceleration stage only, and outlasts `sim.forward(stage="vel")`."""
+    """Earliest stage of a forward pass that changes the data. `"acc"`: the data depends only on
+    `sensordata` of the acceleration stage, and stays valid after `sim.forward(stage="vel")`."""
 
     def __init__(self) -> None:
         self._cached_data: T | None = None
         self._cache_valid = False
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]) -> None:
-        """Add to the scene's spec what the sensor needs; nothing by default."""
+        """Add the elements of the sensor to the scene's spec. Default: no elements."""
 
     @abstractmethod
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Tie the sensor to a simulation: compiled model, model fields, data fields, device."""
+        """Bind the sensor to a simulation: compiled model, model fields, data fields, device."""
 
     @property
     def data(self) -> T:
-        """The sensor's current data."""
+        """Current sensor data."""
         if not self._cache_valid:
             self._cached_data = self._compute_data()
             self._cache_valid = True
@@ -79,44 +78,47 @@ class Sensor(ABC, Generic[T]):
 
     @abstractmethod
     def _compute_data(self) -> T:
-        """Return the data of the simulation as it is now."""
+        """Return the data of the current simulation state."""
 
     def invalidate_cache(self) -> None:
-        """Compute the data anew when it is next read."""
+        """Recompute the data on next access."""
         self._cache_valid = False
 
     def _invalidate_cache(self) -> None:
         self.invalidate_cache()
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Forget what was measured in these environments."""
+        """Reset sensor state of `env_ids` (None: all)."""
         self.invalidate_cache()
 
     def update(self, dt: float) -> None:
-        """Take note that the simulation has advanced by `dt` seconds."""
+        """Update the sensor after the simulation has advanced by `dt` seconds."""
         self.invalidate_cache()
 
     @property
     def recorded_fields(self) -> tuple[str, ...]:
-        """Data fields whose values after every substep `update_recorded` takes; none by default."""
+        """Data fields to record after every substep for `update_recorded`. Default: no fields."""
         return ()
 
     def update_recorded(self, recorded: dict[str, torch.Tensor], dt: float) -> None:
-        """Do what `update` would have done after each of several substeps of `dt` seconds.
+        """Update the sensor as `update` would after each of several substeps of `dt` seconds.
 
-        `recorded` has the values of `recorded_fields` after every substep, (substeps, N, ...).
+        `recorded`: values of `recorded_fields` after every substep, (substeps, N, ...).
         """
-        raise NotImplementedError(f"{type(self).__name__} records {self.recorded_fields}.")
+        raise NotImplementedError(
+            f"{type(self).__name__}: update_recorded is required for recorded_fields "
+            f"{self.recorded_fields}."
+        )
 
     @property
     def needs_substep(self) -> bool:
-        """Whether `update` has to be called after every physics substep."""
+        """True if `update` must be called after every physics substep."""
         return type(self).update is not Sensor.update
 
     @property
     def draws(self) -> bool:
-        """Whether `debug_vis` draws anything, so that viewers offer a switch for it."""
+        """True if `debug_vis` draws anything. Viewers then offer a switch for it."""
         return type(self).debug_vis is not Sensor.debug_vis
 
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Draw what the sensor measures; nothing by default."""
+        """Draw the measurements. Default: no drawing."""

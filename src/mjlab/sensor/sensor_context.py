@@ -1,4 +1,4 @@
-"""What evaluates camera and ray sensors, with as few queries of the engine as possible."""
+"""Evaluation of camera and ray sensors with batched engine queries."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from mjlab.sim.engine import CameraView, Images
 
 RayCast = Callable[..., tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
-"""`Simulation.raycast`: origins, directions, geom groups, excluded bodies, reach of each ray."""
+"""`Simulation.raycast`: origins, directions, geom groups, excluded bodies, range of each ray."""
 
 Render = Callable[[tuple["CameraView", ...]], list["Images"]]
-"""`Simulation.render`: views to images."""
+"""`Simulation.render`: images of views."""
 
 
 class SensorContext:
-    """Evaluates the camera and ray sensors of a scene, when `Simulation.sense` calls `sense`.
+    """Evaluates the camera and ray sensors of a scene. `Simulation.sense` calls `sense`.
 
-    Ray sensors that see the same geom groups share one buffer and one query, whatever their
-    patterns, reaches and excluded bodies. All cameras are one query, and each keeps geom groups,
-    textures and shadows for itself.
+    Ray sensors with the same geom groups share one buffer and one query; patterns, ranges and
+    excluded bodies may differ. All cameras share one query; geom groups, textures and shadows may
+    differ.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class SensorContext:
         raycast_sensors: Sequence[RayCastSensor],
         device: str,
     ) -> None:
-        """Give the initialized sensors their parts of the buffers.
+        """Allocate buffers and assign slices to the initialized sensors.
 
         Args:
             mj_model: The compiled model.
@@ -52,7 +52,7 @@ class SensorContext:
             device: Torch device of all tensors.
 
         Raises:
-            ValueError: two sensors want one camera to have two projections.
+            ValueError: conflicting projections of a shared camera.
         """
         _check_shared_cameras(camera_sensors)
         self._model, self._data, self._device = model, data, device
@@ -62,7 +62,7 @@ class SensorContext:
         self.recreate(mj_model)
 
     def recreate(self, mj_model: mujoco.MjModel, expanded_fields: set[str] | None = None) -> None:
-        """Build the buffers anew, for a model that has changed."""
+        """Rebuild the buffers after a model change."""
         by_groups: dict[Any, list[RayCastSensor]] = {}
         for sensor in self._raycast_sensors:
             groups = sensor.include_geom_groups
@@ -80,12 +80,12 @@ class SensorContext:
 
     @property
     def has_cameras(self) -> bool:
-        """Whether there are camera sensors."""
+        """True if the scene has camera sensors."""
         return bool(self._camera_sensors)
 
     @property
     def has_raycasts(self) -> bool:
-        """Whether there are ray sensors."""
+        """True if the scene has ray sensors."""
         return bool(self._raycast_sensors)
 
     @property
@@ -93,21 +93,21 @@ class SensorContext:
         """MuJoCo Warp's render context of the first camera sensor.
 
         Raises:
-            AttributeError: there is no camera, or the engine is another.
-            RuntimeError: nothing has been rendered yet.
+            AttributeError: scene without cameras, or engine without render contexts.
+            RuntimeError: called before the first rendering.
         """
         if not self._views or self._find_render_context is None:
             raise UnknownAttributeError(
-                "There is no render context, because the scene has no camera."
+                "SensorContext.render_context requires a camera sensor; the scene has none."
             )
         return self._find_render_context(self._views, self._views[0])
 
     def set_render_context_source(self, find: Callable[..., Any]) -> None:
-        """Set what returns the render context of a view: `Simulation.render_context`."""
+        """Set the function that returns a view's render context: `Simulation.render_context`."""
         self._find_render_context = find
 
     def sense(self, raycast: RayCast, render: Render) -> None:
-        """Evaluate all sensors at the current poses, by the engine's queries."""
+        """Evaluate all sensors at the current poses with the engine's queries."""
         self.prepare()
         for query in self._queries:
             query.cast(raycast)
@@ -118,7 +118,7 @@ class SensorContext:
 
     @contextlib.contextmanager
     def results_kept(self) -> Generator[None]:
-        """Put the results of all sensors back after the block, in which `sense` may be called."""
+        """Restore the results of all sensors after the block. The block may call `sense`."""
         sensors = (*self._camera_sensors, *self._raycast_sensors)
         before = [capture_state(sensor) for sensor in sensors]
         try:
@@ -134,31 +134,31 @@ class SensorContext:
             sensor.prepare_rays()
 
     def finalize(self) -> None:
-        """Tell the ray sensors that they have new results; cameras take theirs from `sense`."""
+        """Invalidate the caches of ray sensors. `sense` passes images to cameras directly."""
         for sensor in self._raycast_sensors:
             sensor.postprocess_rays()
 
     # Images.
 
     def unpack_rgb(self) -> None:
-        """Do nothing: colours are unpacked as soon as they are rendered."""
+        """Do nothing: rendered colors are already unpacked."""
 
     def get_rgb(self, cam_idx: int) -> torch.Tensor:
-        """Return the latest colours (N, height, width, 3) uint8 of a camera of the model.
+        """Return the latest RGB image of a model camera, (N, height, width, 3) uint8.
 
-        Where several sensors look through it, they are those of the first that asks for colours.
+        If several sensors share the camera, the first with `rgb` in its `data_types` applies.
 
         Raises:
-            ValueError: no camera sensor measures this; the message lists those that do.
+            ValueError: no camera sensor renders this image type (with the cameras that do).
         """
         return self._image_of(cam_idx, "rgb")
 
     def get_depth(self, cam_idx: int) -> torch.Tensor:
-        """Return the latest depths (N, height, width, 1) in metres; likewise."""
+        """Return the latest depth image (m), (N, height, width, 1) float32. See `get_rgb`."""
         return self._image_of(cam_idx, "depth")
 
     def get_segmentation(self, cam_idx: int) -> torch.Tensor:
-        """Return the latest ids and types of objects (N, height, width, 2) int32; likewise."""
+        """Return the latest object ids and types, (N, height, width, 2) int32. See `get_rgb`."""
         return self._image_of(cam_idx, "segmentation")
 
     def _image_of(self, cam_idx: int, data_type: str) -> torch.Tensor:
@@ -168,13 +168,13 @@ class SensorContext:
                 return getattr(sensor.data, data_type)
         known = ", ".join(f"{s.camera_idx} ({s.cfg.name})" for s in offering) or "none"
         raise ValueError(
-            f"No camera sensor measures {data_type!r} through the camera {cam_idx} of the model. "
-            f"Those that do: {known}. Add it to data_types of the sensor's config."
+            f"Camera {cam_idx}: no camera sensor renders {data_type!r}; add {data_type!r} to "
+            f"CameraSensorCfg.data_types. Cameras with {data_type!r}: {known}."
         )
 
 
 class _RayQuery:
-    """The rays of all sensors that see the same geom groups, one after the other."""
+    """Concatenated rays of all sensors with the same geom groups."""
 
     def __init__(
         self,
@@ -205,7 +205,7 @@ class _RayQuery:
 
 
 def _check_shared_cameras(sensors: Sequence[CameraSensor]) -> None:
-    """Raise `ValueError` if two sensors want one camera to have different projections."""
+    """Raise `ValueError` if sensors that share a camera have different projections."""
     first: dict[str, CameraSensor] = {}
     for sensor in sensors:
         other = first.setdefault(sensor.camera_name, sensor)
@@ -213,8 +213,8 @@ def _check_shared_cameras(sensors: Sequence[CameraSensor]) -> None:
             values = getattr(other.cfg, field), getattr(sensor.cfg, field)
             if values[0] != values[1]:
                 raise ValueError(
-                    f"Camera sensors {other.cfg.name!r} and {sensor.cfg.name!r} look through the "
-                    f"camera {sensor.camera_name!r}, but {field} is {values[0]!r} for the one and "
-                    f"{values[1]!r} for the other. Give both the same, or one a camera of its own "
+                    f"Camera sensors {other.cfg.name!r} and {sensor.cfg.name!r} share camera "
+                    f"{sensor.camera_name!r}: expected equal {field}, got {values[0]!r} and "
+                    f"{values[1]!r}; use the same value, or a separate camera for one sensor "
                     "(camera_name=None, with parent_body, pos and quat)."
                 )

@@ -1,4 +1,4 @@
-"""Height of frames above the ground below them."""
+"""Terrain height sensors: height of frames above the ground."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ _REDUCE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
 
-# Cells of the grid that finds the ground around a point, at most, along x and along y.
-_MOST_CELLS = 512
+# Maximum number of cells of the surface lookup grid, along each of x and y.
+_MAX_CELLS = 512
 
-# Single precision may put a point beyond the edge that it is on (m).
-_EDGE = 1e-3
+# Edge tolerance (m): float32 may place a point on an edge beyond the edge.
+_EDGE_TOLERANCE = 1e-3
 
-# Planes that are tested one after the other.
-_FEW = 4
+# Maximum number of planes to test sequentially.
+_MAX_LEVEL_PLANES = 4
 
 
 @dataclass
 class TerrainHeightSensorCfg(RayCastSensorCfg):
-    """Describes a sensor of heights above the ground."""
+    """Terrain height sensor configuration."""
 
     reduction: str = "min"
-    """What becomes of the rays of a frame: their `min`, `max` or `mean`, or `none` to keep all."""
+    """Reduction over the rays of a frame: `min`, `max`, `mean`, or `none` (keep all rays)."""
 
     def build(self) -> TerrainHeightSensor:
         """Build the sensor."""
@@ -49,18 +49,18 @@ class TerrainHeightSensorCfg(RayCastSensorCfg):
 
 @dataclass
 class TerrainHeightData(RayCastData):
-    """What a terrain height sensor with F frames of n rays has measured."""
+    """Data of a terrain height sensor with F frames of n rays."""
 
     heights: torch.Tensor
-    """Metres from 0: (N, F), or (N, F, n) without a reduction."""
+    """Height above the ground (m), (N, F); (N, F, n) without reduction."""
 
 
 class TerrainHeightSensor(RayCastSensor):
-    """A ray sensor that reports heights above the ground.
+    """Ray-cast sensor that reports heights above the ground.
 
-    The height of a ray is the frame's z less that of what the ray hits; 0 if the ray starts inside
-    a solid (it hits a face that points down), or below a plane or height field, which rays do not
-    see from there; and `max_distance` if there is nothing within reach.
+    The height of a ray is the frame's z minus the z of the hit point. The height is 0 if the ray
+    starts inside a solid (hits a downward face), or below a plane or height field (invisible to
+    rays from below), and `max_distance` for a miss.
     """
 
     cfg: TerrainHeightSensorCfg
@@ -70,19 +70,19 @@ class TerrainHeightSensor(RayCastSensor):
         """Check the config.
 
         Raises:
-            ValueError: an unknown reduction, and what `RayCastSensor` refuses.
+            ValueError: unknown reduction, or any error of `RayCastSensor`.
         """
         super().__init__(cfg)
         check_one_of(f"Ray sensor {cfg.name!r} reduction", cfg.reduction, _REDUCE)
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
-        """Generate the rays, and find frames and ground in the compiled model."""
+        """Generate the rays, and look up frames and ground in the compiled model."""
         super().initialize(mj_model, model, data, device)
         self._ground = OneSidedGround(mj_model, data, self.include_geom_groups, device)
 
     @property
     def data(self) -> TerrainHeightData:
-        """The sensor's current data."""
+        """Current sensor data."""
         data = super().data
         assert isinstance(data, TerrainHeightData)
         return data
@@ -101,12 +101,12 @@ class TerrainHeightSensor(RayCastSensor):
         return TerrainHeightData.with_frames(self._frame_mat.clone(), **measured, heights=heights)
 
     def _zero_below_ground(self, heights: torch.Tensor, missed: torch.Tensor) -> torch.Tensor:
-        """Return heights that are 0 where a ray missed because it starts below the ground."""
+        """Return heights with 0 for rays that missed because they start below the ground."""
         if self._ground.is_level:
             below = self._ground.is_above_level(self._origins.flatten(0, 1)).view_as(missed)
             return torch.where(missed & below, 0.0, heights)
         if heights.device.type == "cpu":
-            # Few rays miss, and asking whether any did costs nothing here. On a GPU it would wait.
+            # Few rays miss. Testing for misses is cheap on a CPU, but would synchronize a GPU.
             rows, columns = missed.nonzero(as_tuple=True)
             if len(rows):
                 below = self._ground.is_above(self._origins[rows, columns], rows)
@@ -118,10 +118,9 @@ class TerrainHeightSensor(RayCastSensor):
 
 
 class OneSidedGround:
-    """Planes and height fields of some geom groups; tells whether a point lies below one.
+    """Point-below-surface test for the planes and height fields of some geom groups.
 
-    Rays that start below such a surface do not meet it, so their misses do not mean that there is
-    no ground.
+    Rays that start below such a surface do not hit it, so a miss does not imply missing ground.
     """
 
     def __init__(
@@ -138,21 +137,21 @@ class OneSidedGround:
         geoms = np.flatnonzero(visible)
         self._data = data
         self._geoms = torch.from_numpy(geoms).to(device)
-        # MuJoCo takes planes and height fields on static bodies only; but a static body may be
-        # carried by a mocap body, which every environment places for itself.
+        # MuJoCo allows planes and height fields on static bodies only, but a static body may be
+        # a child of a mocap body, whose pose differs between environments.
         carried = m.body_mocapid[m.body_rootid[m.geom_bodyid[geoms]]] >= 0
         self._is_placed_by_env = bool(carried.any())
         host = mujoco.MjData(m)
         mujoco.mj_kinematics(m, host)
         self._pos = _tensor(host.geom_xpos[geoms], device)
         self._mat = _tensor(host.geom_xmat[geoms].reshape(-1, 3, 3), device)
-        self._is_turned = bool((np.abs(host.geom_xmat[geoms] - np.eye(3).ravel()) > 1e-12).any())
+        self._is_rotated = bool((np.abs(host.geom_xmat[geoms] - np.eye(3).ravel()) > 1e-12).any())
         fields = m.geom_dataid[geoms]
         is_field = m.geom_type[geoms] == _HFIELD
         size = np.zeros((len(geoms), 3))
         size[~is_field] = m.geom_size[geoms[~is_field]]
         size[is_field] = m.hfield_size[fields[is_field]][:, :3]
-        # A plane of size 0 has no end.
+        # A plane of size 0 is infinite.
         extent = np.where(size[:, :2] > 0.0, size[:, :2], np.inf)
         self._extent = _tensor(extent, device)
         self._elevation = _tensor(np.where(is_field, size[:, 2], 0.0), device)
@@ -162,12 +161,12 @@ class OneSidedGround:
         start[is_field] = m.hfield_adr[fields[is_field]]
         self._shape = torch.from_numpy(shape).to(device)
         self._start = torch.from_numpy(start).to(device)
-        # Planes among height fields read elevations too, which then count for nothing.
+        # Planes among height fields read elevations too; their factor `_elevation` is 0.
         self._has_fields = bool(is_field.any())
         self._heights = _tensor(m.hfield_data, device)
-        is_still = not (self._has_fields or self._is_placed_by_env or self._is_turned)
-        self.is_level = is_still and len(geoms) <= _FEW
-        """True for a few level planes that stand still; see `is_above_level`."""
+        is_still = not (self._has_fields or self._is_placed_by_env or self._is_rotated)
+        self.is_level = is_still and len(geoms) <= _MAX_LEVEL_PLANES
+        """True for a few static planes without rotation; see `is_above_level`."""
         self._level_planes = list(zip(self._pos.tolist(), self._extent.tolist(), strict=True))
         self._make_grid(host.geom_xpos[geoms], host.geom_xmat[geoms], extent, carried, device)
 
@@ -176,23 +175,23 @@ class OneSidedGround:
     ) -> None:
         """List the surfaces above and below each cell of a grid over x and y.
 
-        Surfaces that move, have no end or lean are listed everywhere.
+        Moving, infinite and tilted surfaces are listed in every cell.
         """
         mat = mat.reshape(-1, 3, 3)
         is_local = ~carried & np.isfinite(extent).all(axis=1) & (mat[:, 2, 2] > 1.0 - 1e-9)
         local = np.flatnonzero(is_local)
-        half = (np.abs(mat[local, :2, :2]) * extent[local, None, :]).sum(axis=-1) + _EDGE
+        half = (np.abs(mat[local, :2, :2]) * extent[local, None, :]).sum(axis=-1) + _EDGE_TOLERANCE
         low, high = pos[local, :2] - half, pos[local, :2] + half
         start, end = (
             (low.min(axis=0), high.max(axis=0)) if len(local) else (np.zeros(2), np.ones(2))
         )
-        # With half as wide cells as the smallest surface, few surfaces meet in one.
+        # With cells half as wide as the smallest surface, few surfaces share a cell.
         narrowest = half.min(axis=0) if len(local) else np.ones(2)
-        count = np.ceil((end - start) / narrowest).clip(1, _MOST_CELLS).astype(int)
+        count = np.ceil((end - start) / narrowest).clip(1, _MAX_CELLS).astype(int)
         size = (end - start) / count
         first = np.floor((low - start) / size).astype(int).clip(0, count - 1)
         last = np.floor((high - start) / size).astype(int).clip(0, count - 1)
-        # The last cell is everything beyond the grid.
+        # The last cell covers all points outside the grid.
         cells: list[list[int]] = [[] for _ in range(count.prod() + 1)]
         for geom, (x0, y0), (x1, y1) in zip(local.tolist(), first, last, strict=True):
             for x in range(x0, x1 + 1):
@@ -206,10 +205,10 @@ class OneSidedGround:
         self._grid_count = torch.from_numpy(count).to(device)
 
     def _around(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the surfaces that may be above or below points (M, 3), (M, K); -1 for none."""
+        """Return candidate surfaces (M, K) above or below points (M, 3). Padding: -1."""
         cell = ((points[:, :2] - self._grid_start) / self._grid_size).nan_to_num(-1.0).floor()
         is_outside = ((cell < 0) | (cell >= self._grid_count)).any(dim=-1)
-        x, y = cell.clamp(min=0.0, max=float(_MOST_CELLS)).long().unbind(-1)
+        x, y = cell.clamp(min=0.0, max=float(_MAX_CELLS)).long().unbind(-1)
         rows = torch.where(is_outside, len(self._grid) - 1, x * self._grid_count[1] + y)
         return self._grid[rows]
 
@@ -217,9 +216,9 @@ class OneSidedGround:
         return len(self._geoms)
 
     def is_above(self, points: torch.Tensor, envs: torch.Tensor) -> torch.Tensor:
-        """Return whether each of the world points (M, 3) has such ground above it, (M,) bool.
+        """Return world points (M, 3) that are below a surface, (M,) bool.
 
-        `envs` (M,) says which environment each point is in.
+        `envs`: environment of each point, (M,).
         """
         found = self._around(points)
         geoms = found.clamp(min=0)
@@ -228,7 +227,7 @@ class OneSidedGround:
             pos = self._data.geom_xpos[envs[:, None], self._geoms[geoms]]
         # (M, K, 3): the points in the frames of the geoms.
         local = points[:, None] - pos
-        if self._is_placed_by_env or self._is_turned:
+        if self._is_placed_by_env or self._is_rotated:
             mat = self._mat[geoms]
             if self._is_placed_by_env:
                 mat = self._data.geom_xmat[envs[:, None], self._geoms[geoms]]
@@ -237,7 +236,7 @@ class OneSidedGround:
         return (inside & (local[..., 2] < self._surface(local, geoms))).any(dim=-1)
 
     def is_above_level(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the same for ground that `is_level`, plane by plane: faster than a search."""
+        """Same as `is_above`, for `is_level` ground: testing plane by plane is faster."""
         result = torch.zeros_like(points[:, 0], dtype=torch.bool)
         for position, extent in self._level_planes:
             below = points[:, 2] < position[2]
@@ -248,15 +247,15 @@ class OneSidedGround:
         return result
 
     def _surface(self, local: torch.Tensor, geoms: torch.Tensor) -> torch.Tensor:
-        """Return the height of surfaces `geoms` (...,) at local positions (..., 3), in their frames.
+        """Return heights of surfaces `geoms` (...,) at positions (..., 3), in the geom frames.
 
-        A height field is made of triangles: each cell is cut from its first to its last corner.
+        Each height field cell consists of two triangles, split from its first to its last corner.
         """
         if not self._has_fields:
             return torch.zeros_like(local[..., 2])
         cells = self._shape[geoms].flip(-1) - 1
         scaled = (local[..., :2] / self._extent[geoms] + 1.0) * 0.5 * cells
-        # Positions beyond the edge count for nothing, but have to read something.
+        # Positions beyond the edge are discarded later, but must index valid elevations.
         scaled = torch.minimum(scaled.nan_to_num().clamp(min=0.0), cells.to(scaled.dtype))
         corner = torch.minimum(scaled.long(), cells - 1)
         x, y = (scaled - corner).unbind(-1)

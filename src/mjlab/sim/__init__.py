@@ -1,4 +1,4 @@
-"""Physics: configuration, the `Simulation` facade, and the engine seam below it."""
+"""Physics: configuration, the `Simulation` facade, and the engine interface."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ _LAZY = {
     "WarpBridge": "mjlab.sim.sim_data",
 }
 
-# Configs are imported by every task, the simulation only by a run: torch loads with the run.
+# Lazy: every task imports the configs, and only a run needs the simulation and torch.
 __getattr__ = lazy_names(__name__, _LAZY)

@@ -1,4 +1,4 @@
-"""Configuration of the physics: MuJoCo's options, the engine, and its guards."""
+"""Physics configuration: MuJoCo options, engine, NaN guard."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 @accepts_older_fields
 @dataclass
 class MujocoCfg:
-    """MuJoCo options, written onto the compiled model. Names and meanings are MuJoCo's."""
+    """MuJoCo options, with MuJoCo's names and meanings. Applied to the compiled model."""
 
     timestep: float = 0.002
-    """Physics time step, in seconds."""
+    """Physics timestep (s)."""
     integrator: Literal["euler", "implicitfast"] = "implicitfast"
     """Numerical integrator."""
     impratio: float = 1.0
@@ -40,7 +40,7 @@ class MujocoCfg:
     ccd_iterations: int = 50
     """Maximum number of convex-collision iterations."""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
-    """Gravitational acceleration in the world frame, in m/s^2."""
+    """Gravitational acceleration in the world frame (m/s^2)."""
     disableflags: tuple[str, ...] = ()
     """MuJoCo features to disable, by lower-case flag name, such as `contact`. Flags that the XML of
     an entity sets are added."""
@@ -49,10 +49,10 @@ class MujocoCfg:
     an entity sets are added."""
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Write these options onto `model`; flags are added to those already set.
+        """Write the options to `model`. Flags are added to those already set.
 
         Raises:
-            ValueError: an option or flag that MuJoCo does not know, with those it does.
+            ValueError: unknown option or flag; the message lists the valid ones.
         """
         from mjlab.utils.mujoco import OPTION_ENUMS, enum_bits, enum_value
 
@@ -70,40 +70,40 @@ class MujocoCfg:
 
 @dataclass(kw_only=True)
 class SimulationCfg:
-    """Which engine runs the physics, and how."""
+    """Physics engine and its settings."""
 
     nconmax: int | None = None
-    """Contacts per environment for which Warp allocates memory; None estimates. Native ignores it."""
+    """Maximum number of contacts per environment on Warp; None: estimated. Ignored by native."""
     njmax: int | None = None
-    """Constraint rows per environment for Warp; None estimates. Native ignores it."""
+    """Maximum number of constraint rows per environment on Warp; None: estimated. Native ignores it."""
     contact_sensor_maxmatch: int = 64
-    """Matches that Warp keeps for each contact sensor. Native has no limit."""
+    """Maximum number of matches per contact sensor on Warp. Unlimited on native."""
     broadphase: Literal["nxn", "sap_tile", "sap_segmented"] | None = None
-    """Warp's broad-phase collision method; None keeps its default."""
+    """Broad-phase collision method of Warp; None: Warp's default."""
     broadphase_filter: tuple[Literal["plane", "sphere", "aabb", "obb"], ...] | None = None
-    """Warp's broad-phase filters; None keeps its default."""
+    """Broad-phase filters of Warp; None: Warp's default."""
     ls_parallel: bool | None = None
-    """Ignored; accepted because earlier releases had it."""
+    """Ignored. Accepted for compatibility with earlier releases."""
     mujoco: MujocoCfg = field(default_factory=MujocoCfg)
     """MuJoCo options."""
     nan_guard: NanGuardCfg = field(default_factory=NanGuardCfg)
-    """Recording of the states that lead to NaN."""
+    """NaN guard: recording of the states that precede a NaN."""
     engine: Literal["auto", "native", "warp"] = "auto"
-    """`native` runs MuJoCo on CPU threads, `warp` runs MuJoCo Warp on an NVIDIA GPU (or, slowly, on
-    the CPU). `auto` takes native on `cpu` and warp on `cuda`."""
+    """Physics engine: `native` (MuJoCo on CPU threads) or `warp` (MuJoCo Warp on an NVIDIA GPU, or
+    slowly on the CPU). `auto`: native on `cpu`, warp on `cuda`."""
     num_threads: int = 0
-    """Physics threads of the native engine; 0 takes every core that this process may use (affinity
-    mask, container quota, share among ranks). Results do not depend on it."""
+    """Number of physics threads of the native engine. 0: all cores available to this process
+    (affinity mask, container quota, share among ranks). Results do not depend on it."""
 
     def apply_wp_opt(self, wp_opt: Any) -> None:
-        """Write the Warp-only options onto `mujoco_warp`'s `Option`."""
+        """Write the Warp-only options to `mujoco_warp`'s `Option`."""
         import warnings
 
         from mjlab.utils.mujoco import enum_bits, enum_value
 
         if self.ls_parallel is not None:
             warnings.warn(
-                "SimulationCfg.ls_parallel has no effect any more; remove it.",
+                "SimulationCfg.ls_parallel no longer has an effect; remove it.",
                 DeprecationWarning,
                 stacklevel=2,
             )

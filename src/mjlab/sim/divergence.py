@@ -1,4 +1,4 @@
-"""Diverged physics: the joint that blew up, and what keeps it from doing so."""
+"""Diverged physics: the joint that diverged, and advice to prevent it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import mujoco
 
-# No step resolves a faster motion: half a turn (rad), or one meter, in each physics step.
+# Largest motion per physics step that a step can resolve: half a turn (rad), or one meter.
 _HALF_TURN = math.pi
 _METER = 1.0
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -15,14 +15,14 @@ _SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def fastest_dof(model: mujoco.MjModel, speeds: Sequence[float]) -> tuple[int, float]:
-    """Return the degree of freedom that moves most in a physics step.
+    """Return the degree of freedom that moves farthest in a physics step.
 
     Args:
-        model: The model.
-        speeds: Absolute velocity of each degree of freedom (nv,), m/s or rad/s; NaN counts as infinite.
+        model: Compiled model.
+        speeds: Absolute velocity of each degree of freedom (m/s or rad/s), (nv,). NaN: infinite.
 
     Returns:
-        Its index (-1 without any), and its motion in a physics step over half a turn, or one meter.
+        Index (-1 if nv is 0), and motion per physics step divided by half a turn, or by one meter.
     """
     timestep = float(model.opt.timestep)
     motions = [
@@ -36,24 +36,24 @@ def fastest_dof(model: mujoco.MjModel, speeds: Sequence[float]) -> tuple[int, fl
 
 
 def describe_dof(model: mujoco.MjModel, dof: int, speed: float) -> str:
-    """Return the joint of a degree of freedom with its speed: `joint 'knee' reached 1e+03 rad/s`."""
+    """Return joint name and speed of a degree of freedom: `joint 'knee' reached 1e+03 rad/s`."""
     joint = model.joint(int(model.dof_jntid[dof]))
     unit = "m/s" if _is_linear(model, dof) else "rad/s"
     return f"joint {joint.name!r} reached {speed:.3g} {unit}"
 
 
 def cure_of(model: mujoco.MjModel, dof: int) -> str:
-    """Return what keeps a degree of freedom from diverging, as sentences."""
+    """Return advice to keep a degree of freedom from diverging, as sentences."""
     integrator = mujoco.mjtIntegrator(model.opt.integrator)
     fast = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    other = "" if integrator == fast else ", set sim.mujoco.integrator to 'implicitfast'"
+    other = "" if integrator == fast else ", or set sim.mujoco.integrator to 'implicitfast'"
     return (
-        "MuJoCo leaves the damping of an actuator at its effort limit out of the implicit integration, "
-        "so a stiff position actuator on a light link diverges at a coarse step. Use a smaller "
-        f"sim.mujoco.timestep (now {float(model.opt.timestep):g} s), or give the joint more armature "
+        "MuJoCo does not integrate the damping of an actuator at its effort limit implicitly, so a "
+        "stiff position actuator on a light link diverges at a large timestep. Decrease "
+        f"sim.mujoco.timestep (now {float(model.opt.timestep):g} s), increase the joint's armature "
         f"(now {float(model.dof_armature[dof]):g}) or viscous_damping (now "
-        f"{float(model.dof_damping[dof]):g}), or its actuator less stiffness and damping or no "
-        f"effort_limit{other}."
+        f"{float(model.dof_damping[dof]):g}), decrease the actuator's stiffness and damping, or "
+        f"remove its effort_limit{other}."
     )
 
 

@@ -1,4 +1,4 @@
-"""Refusal of more environments than the memory can hold, before any of it is taken."""
+"""Memory check: number of environments against available memory, before any allocation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
 
-# Bytes of an environment without physics: its origin, episode clock, actions, reward and ends.
+# Bytes of an environment without physics: origin, episode length, actions, reward, terminations.
 LEAST_BYTES = 64
 
 _MEMORY = Path("/proc/meminfo")
@@ -20,48 +20,46 @@ _GROUPS = Path("/sys/fs/cgroup")
 
 
 def check_memory(num_envs: int, bytes_each: int, device: str) -> None:
-    """Raise ValueError if `num_envs` environments of at least `bytes_each` bytes cannot fit.
+    """Raise `ValueError` if `num_envs` environments of at least `bytes_each` bytes do not fit.
 
-    The estimate is a lower bound, so that nothing that fits is refused. Where it is not known how
-    much memory there is, nothing is checked.
+    The estimate is a lower bound, so everything that fits passes. If the available memory is
+    unknown, nothing is checked.
     """
     memory = available_memory(device)
     needed = num_envs * bytes_each
     if memory is None or needed <= memory:
         return
     raise ValueError(
-        f"num_envs: expected at most {memory // bytes_each:,}, which is what {memory / 1e9:.1f} GB of "
-        f"memory on {device} can hold, got {num_envs:,}, which take at least {needed / 1e9:.1f} GB "
-        f"({bytes_each:,} bytes each); use fewer. Learning takes memory besides."
+        f"num_envs: expected at most {memory // bytes_each:,} ({memory / 1e9:.1f} GB of memory on "
+        f"{device}), got {num_envs:,} (at least {needed / 1e9:.1f} GB, {bytes_each:,} bytes each); use "
+        "fewer environments. Training needs additional memory."
     )
 
 
 def bytes_per_environment(model: mujoco.MjModel, cfg: SimulationCfg, engine: str) -> int:
-    """Return a lower bound on the memory of an environment of `model` in an engine."""
+    """Return a lower bound on the memory of one environment of `model` (bytes)."""
     if engine == "native":
-        # The state in double precision, also from before the last step; positions and velocities in
-        # single precision.
+        # State before and after the last step in float64; positions and velocities in float32.
         size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)
         return LEAST_BYTES + 2 * 8 * size + 4 * (model.nq + model.nv)
-    # Numbers in single precision that MuJoCo Warp keeps of bodies (poses 28, inertias 20, velocities
-    # and forces 18), geoms, sites, joints (axes, velocities, accelerations and forces), constraint rows and
-    # contacts.
+    # float32 values in MuJoCo Warp: bodies (poses 28, inertias 20, velocities and forces 18),
+    # geoms, sites, joints (axes, velocities, accelerations and forces), constraint rows, contacts.
     numbers = 66 * model.nbody + 12 * (model.ngeom + model.nsite) + 20 * model.nv + model.nq
     numbers += 8 * (cfg.njmax or 0) + 16 * (cfg.nconmax or 0)
     return LEAST_BYTES + 4 * numbers
 
 
 def available_memory(device: str) -> int | None:
-    """Return the memory that new environments may take (bytes); None if it is not known.
+    """Return the memory available to new environments (bytes); None if unknown.
 
-    Of a GPU it is all that it has, because what earlier environments left in pools can be used again.
-    On the CPU swap space counts, and the limits of control groups.
+    For a GPU this is its total memory, because pools left by earlier environments are reused. For
+    the CPU it includes swap space, and respects the limits of control groups.
     """
     if torch.device(device).type == "cuda":
         try:
             return torch.cuda.mem_get_info(device)[1]
         except (RuntimeError, AssertionError):
-            # A device that torch cannot use is refused where it is used.
+            # A device that torch cannot use raises later, where it is used.
             return None
     try:
         lines = [line.split() for line in _MEMORY.read_text().splitlines()]
@@ -73,7 +71,7 @@ def available_memory(device: str) -> int | None:
 
 
 def _group_limits() -> list[int]:
-    """Return the memory limits of the control groups that this process is in (bytes).
+    """Return the memory limits of the control groups of this process (bytes).
 
     A line of `/proc/self/cgroup` is `<number>:<controllers>:<path>`; version 2 has no controllers.
     """

@@ -1,4 +1,4 @@
-"""Public path of the simulation's names; their homes are the other files of this folder."""
+"""Public import path of the simulation; implemented in the other files of this folder."""
 
 from mjlab.sim.config import MujocoCfg as MujocoCfg
 from mjlab.sim.config import SimulationCfg as SimulationCfg

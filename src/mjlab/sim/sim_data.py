@@ -1,7 +1,8 @@
-"""Namespaces of fields: `sim.data` and `sim.model`, and MuJoCo Warp's own structs.
+"""Field namespaces: `sim.data`, `sim.model` and wrapped MuJoCo Warp structs.
 
 The fields of `sim.data` and `sim.model` are plain torch tensors. `TorchArray` and `WarpBridge` are
-for code that holds a Warp array or struct, such as `sim.wp_data`. Importing this loads no Warp.
+for code that holds a Warp array or struct, such as `sim.wp_data`. Importing this module does not
+load Warp.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ T = TypeVar("T")
 
 
 class TorchArray(torch.Tensor):
-    """A torch tensor that shares the memory of a Warp array. Results of operations are plain.
+    """Torch tensor that shares the memory of a Warp array. Operations return plain tensors.
 
-    An array with a single row that stands for `nworld` worlds reads as `nworld` equal rows; it is
-    refused when written by `[...] = ...`, because one row cannot hold different values.
+    An array with a single row shared by `nworld` worlds reads as `nworld` equal rows. Writing it by
+    `[...] = ...` raises `RuntimeError`, because one row cannot hold different values.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # ty: ignore[incompatible-method-override]
@@ -28,7 +29,7 @@ class TorchArray(torch.Tensor):
     _is_shared: bool
 
     def __new__(cls, wp_array: Any, nworld: int | None = None) -> TorchArray:
-        """View `wp_array`, of one row or of `nworld` rows."""
+        """View `wp_array` of one or `nworld` rows."""
         from mjlab.sim.warp.engine import as_torch
 
         tensor = as_torch(wp_array)
@@ -41,12 +42,12 @@ class TorchArray(torch.Tensor):
 
     @property
     def wp_array(self) -> Any:
-        """The Warp array itself."""
+        """Wrapped Warp array."""
         return self._wp_array
 
     @property
     def tensor(self) -> torch.Tensor:
-        """The same as a plain tensor."""
+        """View as a plain tensor."""
         return self.as_subclass(torch.Tensor)
 
     def __getitem__(self, idx: Any) -> Any:
@@ -55,8 +56,8 @@ class TorchArray(torch.Tensor):
     def __setitem__(self, idx: Any, value: Any) -> None:
         if self._is_shared:
             raise WrongStateError(
-                "This model field is one row that all environments share. Give each its own with "
-                "sim.expand_model_fields((name,)) before writing it."
+                "Model field: expected one row per environment for writing, got one shared row; call "
+                "sim.expand_model_fields((name,)) first."
             )
         super().__setitem__(idx, value)
 
@@ -64,8 +65,8 @@ class TorchArray(torch.Tensor):
 class FieldView:
     """Read-only namespace over the fields of `data`, `model` or `model.opt`.
 
-    A field is looked up once and then held as a plain attribute, so that reading it again costs
-    nothing. Write into the tensors in place (`data.qpos[ids] = ...`).
+    A field is looked up once and then stored as a plain attribute, so repeated reads are free.
+    Write to the tensors in place (`data.qpos[ids] = ...`).
     """
 
     def __init__(self, lookup: Callable[[str], Any], nworld: int | None, owner: str) -> None:
@@ -79,7 +80,7 @@ class FieldView:
         return value
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # `data.qpos += 1` writes in place and then assigns the tensor to itself.
+        # `data.qpos += 1` writes in place and then assigns the same tensor.
         if value is self.__dict__.get(name):
             return
         raise UnknownAttributeError(
@@ -88,15 +89,15 @@ class FieldView:
         )
 
     def forget(self, names: Iterable[str]) -> None:
-        """Drop held fields, so that the next access looks them up again."""
+        """Drop stored fields; the next access looks them up again."""
         for name in names:
             self.__dict__.pop(name, None)
 
 
 class WarpBridge(FieldView, Generic[T]):
-    """A Warp struct whose array attributes read as `TorchArray`s; the rest reads as it is.
+    """Warp struct with array attributes wrapped as `TorchArray`; others are returned unchanged.
 
-    Attributes cannot be replaced; write into them in place.
+    Attributes cannot be replaced; write to them in place.
     """
 
     def __init__(self, struct: T, nworld: int | None = None) -> None:
@@ -106,11 +107,11 @@ class WarpBridge(FieldView, Generic[T]):
 
     @property
     def struct(self) -> T:
-        """The wrapped struct."""
+        """Wrapped struct."""
         return self.__dict__["_struct"]
 
     def clear_cache(self) -> None:
-        """Forget wrapped arrays; needed after an array of the struct was replaced."""
+        """Drop wrapped arrays. Required after an array of the struct was replaced."""
         held = [name for name, value in self.__dict__.items() if isinstance(value, TorchArray)]
         self.forget(held)
 
@@ -118,13 +119,13 @@ class WarpBridge(FieldView, Generic[T]):
         value = getattr(self.struct, name)
         if not (hasattr(value, "ptr") and hasattr(value, "dtype")):
             return value
-        # MuJoCo Warp marks arrays whose first dimension is the worlds.
+        # MuJoCo Warp marks arrays with a leading world dimension.
         is_batched = getattr(value, "_is_batched", False)
         return TorchArray(value, self.nworld if is_batched else None)
 
     def __getattr__(self, name: str) -> Any:
         value = super().__getattr__(name)
         if not isinstance(value, TorchArray):
-            # The struct may get another value.
+            # Not stored: the struct's value may change.
             self.forget([name])
         return value

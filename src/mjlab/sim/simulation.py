@@ -1,4 +1,4 @@
-"""Facade over the physics engine: one class, whichever engine runs below it."""
+"""Facade over the physics engines: one class for both."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from mjlab.utils.spec import compile_spec
 
 logger = logging.getLogger(__name__)
 
-# Shapes of rows that MuJoCo stores flat, as MuJoCo Warp has them.
+# Row shapes of fields that MuJoCo stores flat; the same as in MuJoCo Warp.
 _ROW_SHAPES = {"cam_mat0": (3, 3), "geom_aabb": (2, 3)}
 
 
@@ -49,13 +49,13 @@ class Simulation:
     with MuJoCo's names and a leading environment dimension, live and written in place. Rotation
     matrices are (..., 3, 3), and `geom_aabb` is (N, ngeom, 2, 3): center and half sizes. Sizes
     (`model.nv`) are ints. Structure (addresses, ids, types, flags, assets: `model.geom_bodyid`) has
-    no environment dimension as long as it is not expanded. Options are `sim.model.opt.<field>`:
-    real numbers (N, ...), whole numbers ints.
+    no environment dimension unless it is expanded. Options are `sim.model.opt.<field>`:
+    floats are (N, ...) tensors, integers are ints.
 
     After `step`, `qpos`, `qvel`, `act` and `time` are current, and every derived field (`xpos`,
     `cvel`, `sensordata`, ...) belongs to the state before the last physics substep. After
     `forward` all are current up to its stage; with `stage="vel"`, forces, accelerations and their
-    sensors remain those of that substep.
+    sensors remain those of the last substep.
     """
 
     def __init__(
@@ -68,34 +68,37 @@ class Simulation:
         spec: mujoco.MjSpec | None = None,
         variant_info: list[tuple[str, VariantInfo]] | None = None,
     ) -> None:
-        """Compile (from `spec`) or take (`model`) a MuJoCo model and allocate `num_envs` copies.
+        """Compile `spec`, or use the compiled `model`, and allocate `num_envs` copies.
 
-        `variant_info` has the name and the `variant_metadata` of each entity that is another thing
-        in each environment; the model has to be compiled from the spec that they are in.
+        `variant_info` has the name and `variant_metadata` of each entity with per-environment
+        variants. The model must be compiled from the spec that contains the variants.
 
         Raises:
-            ValueError: `num_envs` below 1 or beyond the memory, neither or both of model and spec, unknown options, or
-                an XML that does not compile (MuJoCo's message is passed on), or variants that
-                differ in what the engine cannot hold per environment.
-            EngineUnavailableError: the chosen engine cannot run on `device`.
+            ValueError: `num_envs` below 1 or too large for the memory; neither or both of `model`
+                and `spec`; unknown options; XML that does not compile (with MuJoCo's message);
+                variants that differ in fields that the engine cannot expand.
+            EngineUnavailableError: engine cannot run on `device`.
         """
         check_positive("num_envs", num_envs)
         if (model is None) == (spec is None):
-            raise ValueError("Give Simulation exactly one of `model` and `spec`.")
+            raise ValueError(
+                "Simulation: expected exactly one of `model` and `spec`, got "
+                f"{'neither' if model is None else 'both'}."
+            )
         engine_name = resolve_engine_name(cfg.engine, device)
         collect_mujoco_warnings()
         self.num_envs = num_envs
         self.cfg = cfg
         self.device = device
         self.mj_model: mujoco.MjModel = compile_spec(spec) if spec is not None else model
-        """The compiled model on the host. Randomized values are not in it."""
+        """Compiled model on the host, without randomized values."""
         cfg.mujoco.apply(self.mj_model)
         check_memory(num_envs, bytes_per_environment(self.mj_model, cfg, engine_name), device)
         self.mj_data = mujoco.MjData(self.mj_model)
         """Host data of the compiled model, forwarded once at `qpos0`."""
         mujoco.mj_forward(self.mj_model, self.mj_data)
-        # Viewers write an environment's values into the host model, so the defaults that
-        # randomization starts from are a snapshot.
+        # Viewers write the values of an environment into the host model, so the defaults for
+        # randomization are read from a copy.
         self._default_model = copy.copy(self.mj_model)
         self._default_fields: dict[str, torch.Tensor] = {}
         self._variants: VariantValues | None = None
@@ -103,7 +106,7 @@ class Simulation:
         self.data = FieldView(self._engine.data_field, num_envs, "data")
         """Live `MjData` fields, (N, ...)."""
         self.model = FieldView(self._read_model_field, num_envs, "model")
-        """Live `MjModel` fields; those not expanded are shared and read-only."""
+        """Live `MjModel` fields. Fields that are not expanded are shared and read-only."""
         self._options = FieldView(self._read_option, num_envs, "model.opt")
         if variant_info:
             self._apply_variants(variant_info)
@@ -121,7 +124,7 @@ class Simulation:
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the engine is and can do."""
+        """Capabilities of the engine."""
         return self._engine.capabilities
 
     @property
@@ -129,27 +132,27 @@ class Simulation:
         """`native` or `warp`."""
         return self.capabilities.name
 
-    # Escape hatch of the Warp engine.
+    # Warp engine internals.
 
     @property
     def wp_model(self) -> Any:
-        """MuJoCo Warp's model; AttributeError on another engine."""
+        """MuJoCo Warp model. Raises `AttributeError` on other engines."""
         return self._warp_engine("wp_model", "sim.model").wp_model
 
     @property
     def wp_data(self) -> Any:
-        """MuJoCo Warp's data; AttributeError on another engine."""
+        """MuJoCo Warp data. Raises `AttributeError` on other engines."""
         return self._warp_engine("wp_data", "sim.data").wp_data
 
     @property
     def wp_device(self) -> Any:
-        """Warp's device; AttributeError on another engine."""
+        """Warp device. Raises `AttributeError` on other engines."""
         return self._warp_engine("wp_device", "sim.device").wp_device
 
     def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
-        """Return MuJoCo Warp's context of a view, one of `views` that were rendered together.
+        """Return MuJoCo Warp's render context of `view`, one of `views` rendered together.
 
-        AttributeError on another engine, RuntimeError before the first rendering.
+        Raises `AttributeError` on other engines, `RuntimeError` before the first rendering.
         """
         engine = self._warp_engine("render_context", "the images of camera sensors")
         return engine.renderer.context_of(views, view)
@@ -157,8 +160,8 @@ class Simulation:
     def _warp_engine(self, name: str, instead: str) -> Any:
         if self.engine_name != "warp":
             raise UnknownAttributeError(
-                f"Simulation.{name} exists on the warp engine only, and this is "
-                f"{self.engine_name}; use {instead}, which works on both."
+                f"Simulation.{name}: expected the warp engine, got {self.engine_name}; use {instead} "
+                "on both engines."
             )
         return self._engine
 
@@ -166,17 +169,17 @@ class Simulation:
 
     @property
     def expanded_fields(self) -> set[str]:
-        """Names of model fields that each environment has for itself."""
+        """Names of per-environment model fields."""
         return set(self._engine.model_fields)
 
     @property
     def per_world_default_fields(self) -> set[str]:
-        """Fields whose compile-time value differs between environments, because of variants."""
+        """Fields with compile-time values that differ between environments, due to variants."""
         return set() if self._variants is None else set(self._variants.fields)
 
     @property
     def world_to_variant(self) -> dict[str, torch.Tensor]:
-        """Variant index of each environment, (N,) int64, by entity; empty without variants."""
+        """Variant index of each environment by entity, (N,) int64. Empty without variants."""
         variants = {} if self._variants is None else self._variants.world_to_variant
         return {
             name: torch.as_tensor(ids, dtype=torch.int64, device=self.device)
@@ -185,9 +188,9 @@ class Simulation:
 
     @cached_property
     def absent_geoms(self) -> torch.Tensor | None:
-        """(N, ngeom) bool: geoms that an environment's variants do not have; None if there are none.
+        """Geoms absent from each environment's variants, (N, ngeom) bool; None if all are present.
 
-        Such a geom touches nothing and is not seen. Its fields must not be written.
+        Absent geoms do not collide and are invisible. Do not write their fields.
         """
         if self._variants is None or not self._variants.absent_geoms.any():
             return None
@@ -201,10 +204,11 @@ class Simulation:
     def get_default_field(self, field: str) -> torch.Tensor:
         """Return the compile-time value of a model field, without environment dimension.
 
-        With it for `per_world_default_fields`: what the variants of each environment compile to.
+        Fields in `per_world_default_fields` have it: the compile-time values of each environment's
+        variants.
 
-        The baseline for randomization by scaling or adding, so that it never drifts. float32 where
-        MuJoCo has doubles. Raises ValueError for a field that does not exist.
+        Baseline for randomization by scaling or adding, so that values do not drift. Doubles are
+        returned as float32. Raises `ValueError` for an unknown field.
         """
         field = field.removeprefix("opt.")
         if field not in self._default_fields:
@@ -221,8 +225,8 @@ class Simulation:
         value = getattr(model, field, getattr(model.opt, field, None))
         if field.startswith("_") or not isinstance(value, np.ndarray | int | float | bytes):
             raise ValueError(
-                f"MjModel has no field {field!r}. Fields carry MuJoCo's names, such as "
-                "'body_mass' or 'geom_friction'; structs are those of sim.mj_model."
+                f"Unknown MjModel field {field!r}; use MuJoCo's names, such as 'body_mass' or "
+                "'geom_friction'. Structs are in sim.mj_model."
             )
         return value
 
@@ -242,11 +246,11 @@ class Simulation:
 
     def _read_option(self, name: str) -> Any:
         if not hasattr(self._default_model.opt, name):
-            raise UnknownAttributeError(f"MjOption has no field {name!r}.")
+            raise UnknownAttributeError(f"Unknown MjOption field {name!r}.")
         return self._read_model_field(name)
 
     def _apply_variants(self, info: list[tuple[str, VariantInfo]]) -> None:
-        """Give every environment the model fields of its own variants."""
+        """Set the model fields of each environment to those of its variants."""
         derived = self._engine.constants_written_by(3)
         variants = VariantValues(self._default_model, self.num_envs, info, derived)
         self._variants = variants
@@ -256,9 +260,9 @@ class Simulation:
             except ValueError as error:
                 names = ", ".join(repr(entity) for entity, _ in info)
                 raise ValueError(
-                    f"The variants of entity {names} differ in the model field {name!r}: {error}"
+                    f"Variants of entity {names} differ in model field {name!r}: {error}"
                 ) from error
-        # The mean inertia, which is not a field, scales the solver's tolerance.
+        # Updates the mean inertia too: it is not a field, and scales the solver tolerance.
         self.recompute_constants(3)
         for name in dict.fromkeys((*variants.fields, *derived)):
             getattr(self.model, name).copy_(self.get_default_field(name))
@@ -267,14 +271,14 @@ class Simulation:
         self._engine.forward(None)
 
     def expand_model_fields(self, fields: tuple[str, ...] | list[str]) -> None:
-        """Give every environment its own copy of model fields, starting from the shared values.
+        """Expand model fields to per-environment copies of the shared values.
 
-        Options go by their own name (`gravity`) or as `opt.gravity`.
+        Options are named `gravity` or `opt.gravity`.
 
-        Do this before anything keeps a reference to `sim.model.<field>`: the tensor is a new one.
+        Expand before storing references to `sim.model.<field>`: expansion replaces the tensor.
 
         Raises:
-            ValueError: no such field, or one that the engine cannot hold per environment.
+            ValueError: unknown field, or one that the engine cannot expand.
         """
         names = (name.removeprefix("opt.") for name in fields)
         new = tuple(name for name in names if name not in self._engine.model_fields)
@@ -289,10 +293,10 @@ class Simulation:
         self.expand_model_fields(self._engine.constants_written_by(int(level)))
 
     def recompute_constants(self, level: RecomputeLevel | int, env_ids: EnvIds = None) -> None:
-        """Recompute what derives from changed model fields, as `mj_setConst` does.
+        """Recompute constants derived from changed model fields, as `mj_setConst` does.
 
-        `qpos` and `qvel` stay; derived fields are those of the reference pose until the next
-        `forward`. Every field that the recomputation writes becomes per-environment.
+        `qpos` and `qvel` are unchanged; derived fields are those of the reference pose until the
+        next `forward`. Fields that the recomputation writes are expanded.
         """
         if int(level) == 0:
             return
@@ -302,7 +306,7 @@ class Simulation:
     # Physics.
 
     def step(self, nstep: int = 1, record: tuple[str, ...] = ()) -> dict[str, torch.Tensor]:
-        """Advance all environments by `nstep` substeps, in one dispatch.
+        """Advance all environments by `nstep` substeps in one dispatch.
 
         Returns:
             Values of the data fields in `record` after every substep, (nstep, N, ...).
@@ -316,10 +320,10 @@ class Simulation:
         return {name: torch.cat([step[name] for step in recorded]) for name in record}
 
     def forward(self, env_ids: EnvIds = None, stage: Stage = "acc") -> None:
-        """Make derived fields up to a stage current with the state, without advancing time.
+        """Compute derived fields up to a stage, without advancing time.
 
-        `"pos"`: positions. `"vel"`: velocities too. `"acc"`: everything. Fields and
-        sensors of later stages keep their values.
+        `"pos"`: positions. `"vel"`: also velocities. `"acc"`: everything. Fields and sensors of
+        later stages keep their values.
         """
         self._engine.forward(self.resolve_ids(env_ids), stage)
         self._notify_forward(stage)
@@ -336,10 +340,10 @@ class Simulation:
 
     @contextlib.contextmanager
     def looking_ahead(self, env_ids: torch.Tensor) -> Generator[None]:
-        """Make positions and velocities current in some environments, for the length of the block.
+        """Compute positions and velocities of `env_ids` for the duration of the `with` block.
 
-        After it, derived fields and the results of camera and ray sensors are what they were
-        before. In the block, fields of other environments may be current or not.
+        On exit, derived fields and the results of camera and ray sensors are restored. Within the
+        block, fields of other environments may or may not be current.
 
         Args:
             env_ids: Environments, (n,) int64.
@@ -355,25 +359,25 @@ class Simulation:
             yield
 
     def bad_states(self) -> torch.Tensor:
-        """Return where the last step left a state that MuJoCo calls bad, (N,) bool.
+        """Return environments in a bad state after the last step, (N,) bool.
 
-        Positions, velocities or accelerations are not finite, or beyond `mjMAXVAL` (1e10).
+        As in MuJoCo: positions, velocities or accelerations not finite or beyond `mjMAXVAL` (1e10).
         """
         return self._engine.bad_states()
 
     def bad_dof(self, env_idx: int) -> int | None:
-        """Return the degree of freedom at which MuJoCo found the state bad; None if it is not known."""
+        """Return the degree of freedom at which MuJoCo found a bad state; None if unknown."""
         return self._engine.bad_dof(env_idx)
 
     def reset(self, env_ids: EnvIds = None) -> None:
-        """Put environments into the model's initial state: time 0, `qpos0`, the rest zero.
+        """Reset environments to the initial state: time 0, `qpos0`, everything else zero.
 
-        Derived fields and model fields keep their values until `forward`.
+        Derived fields keep their values until `forward`; model fields are unchanged.
         """
         self._engine.reset(self.resolve_ids(env_ids))
 
     def add_forward_callback(self, callback: Callable[[Stage], None]) -> None:
-        """Call `callback(stage)` after every `forward`: derived fields up to a stage have changed."""
+        """Register `callback(stage)`, called after each `forward` computes fields up to `stage`."""
         self._forward_callbacks.append(callback)
 
     def _notify_forward(self, stage: Stage) -> None:
@@ -381,21 +385,22 @@ class Simulation:
             callback(stage)
 
     def sense(self, env_ids: torch.Tensor | None = None) -> None:
-        """Evaluate camera and ray sensors at the current poses; nothing without such sensors.
+        """Evaluate camera and ray sensors, if any, at the current poses.
 
         Args:
-            env_ids: Environments (n,) int64 that need results; others may get misses. None: all.
+            env_ids: Environments whose results are used, (n,) int64; others may get misses. None:
+                all.
         """
         if self._sensor_context is not None:
             raycast = self.raycast if env_ids is None else partial(self.raycast, env_ids=env_ids)
             self._sensor_context.sense(raycast, self.render)
 
     def set_sensor_context(self, ctx: Any) -> None:
-        """Set the object whose `sense(raycast, render)` evaluates camera and ray sensors.
+        """Set the context. Its `sense(raycast, render)` evaluates camera and ray sensors.
 
         Raises:
-            EngineUnavailableError: it has ray sensors, and the engine casts no rays in this model;
-                or it has cameras, and the engine does not render this model.
+            EngineUnavailableError: the context has ray sensors or cameras, and the engine does not
+                support them for this model.
         """
         problem = ctx.has_raycasts and self.capabilities.raycast_problem
         problem = problem or (ctx.has_cameras and self.capabilities.render_problem)
@@ -405,9 +410,9 @@ class Simulation:
         ctx.set_render_context_source(self.render_context)
 
     def create_graph(self) -> None:
-        """Capture graphs of `step` and `forward` again (Warp on CUDA); no effect elsewhere.
+        """Recapture graphs of `step` and `forward` (Warp on CUDA only).
 
-        Environments call this once, at the end of their construction. State, results and overflow
+        Environments call this once, at the end of construction. State, results and overflow
         flags keep their values.
         """
         self._engine.create_graph()
@@ -423,37 +428,37 @@ class Simulation:
         max_distances: torch.Tensor | None = None,
         env_ids: torch.Tensor | None = None,
     ) -> RayHits:
-        """Cast rays: (N, R, 3) world origins and unit directions.
+        """Cast rays from world origins along unit directions, both (N, R, 3).
 
-        Returns distances (N, R) with -1 on a miss, normals (N, R, 3) with 0, geom ids (N, R) with
-        -1. Only geoms of `geom_groups` (None: all) are hit; `exclude_body_ids` (R,) names a body
-        per ray whose own geoms are not (-1: none); what is farther than `max_distances` (R,) is a
-        miss. Planes are hit from above only, meshes and height fields from outside only. Results of
-        environments that are not in `env_ids` (n,), if given, may be misses.
+        Returns distances (N, R), -1 on a miss; normals (N, R, 3), 0 on a miss; geom ids (N, R), -1
+        on a miss. Only geoms of `geom_groups` (None: all) are hit. `exclude_body_ids` (R,) is a
+        body per ray whose own geoms are ignored (-1: none). Hits beyond `max_distances` (R,)
+        are misses. Planes are hit from above only, meshes and height fields from outside only. Results of
+        environments outside `env_ids` (n,) may be misses.
         """
         query = RayQuery(origins, directions, geom_groups, exclude_body_ids, max_distances, env_ids)
         return self._engine.raycast(query)
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
-        """Render what cameras see at the poses of the last `forward`; see `CameraView`, `Images`.
+        """Render views at the poses of the last `forward`; see `CameraView`, `Images`.
 
-        Camera sensors do this in `sense`. The images are overwritten by the next call.
+        Camera sensors render in `sense`. The images are overwritten by the next call.
         """
         return self._engine.render(views)
 
     def jacobian(
         self, points: torch.Tensor, body_ids: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return translational and rotational Jacobians (N, 3, nv) of (N, 3) world points.
+        """Return translational and rotational Jacobians, (N, 3, nv), of world points, (N, 3).
 
-        `body_ids` (N,) int32 says which body each point moves with. Like `xpos` and all derived
-        fields, they belong to the state before the last substep, until `forward`.
+        `body_ids` (N,) int32 is the body each point is attached to. Like `xpos` and all derived
+        fields, Jacobians belong to the state before the last substep, until `forward`.
 
         A degree of freedom with motion axis (w, v) at the center of mass c of the body's tree moves
-        a point p with v + w x (p - c).
+        a point p with velocity v + w x (p - c).
         """
-        # Not by the engine from the present qpos, which in the middle of a step is one substep newer
-        # than the positions that the points come from.
+        # Not computed by the engine from the current qpos: within a step, qpos is one substep newer
+        # than the positions of the points.
         roots, moves = self._body_motion
         body_ids = body_ids.long()
         envs = torch.arange(self.num_envs, device=self.device)
@@ -466,13 +471,13 @@ class Simulation:
 
     @cached_property
     def _body_motion(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Root of each body, (nbody,), and whether it moves with a degree of freedom, (nbody, nv)."""
+        """Root of each body, (nbody,), and mask of degrees of freedom that move it, (nbody, nv)."""
         roots = torch.as_tensor(self.mj_model.body_rootid, dtype=torch.int64, device=self.device)
         moves = torch.as_tensor(moving_dofs(self.mj_model), dtype=torch.float32, device=self.device)
         return roots, moves
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData | None = None) -> mujoco.MjData:
-        """Copy the state of one environment into host data, for viewers; runs no forward pass."""
+        """Copy the state of one environment to host data, for viewers, without a forward pass."""
         mj_data = self.mj_data if mj_data is None else mj_data
         self._engine.copy_to_host(env_idx, mj_data)
         return mj_data
@@ -480,54 +485,54 @@ class Simulation:
     # Exact resume.
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the physics state of all environments and their own model fields."""
+        """Return the physics state and per-environment model fields of all environments."""
         return {"engine": self.engine_name, **self._engine.state_dict()}
 
     def check_state(self, state: dict[str, Any]) -> None:
-        """Raise ValueError if `state` is of another engine, another release of it or another size."""
+        """Raise `ValueError` if the engine, its release or the size of `state` does not match."""
         if state["engine"] != self.engine_name:
             raise ValueError(
-                f"The saved physics state is of the {state['engine']} engine; this one is "
-                f"{self.engine_name}. Use --engine {state['engine']}."
+                f"Saved physics state: expected engine {self.engine_name!r}, got "
+                f"{state['engine']!r}; use --engine {state['engine']}."
             )
         self._engine.check_state(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore `state_dict`; raises ValueError, and changes nothing, as `check_state` does."""
+        """Restore `state_dict`. Raises `ValueError` before any change, as `check_state` does."""
         self.check_state(state)
         self.expand_model_fields(tuple(state["model"]))
         self._engine.load_state_dict(state)
         self._notify_forward("acc")
 
     def close(self) -> None:
-        """Free what the engine holds outside Python's reach."""
+        """Release engine resources that Python does not manage."""
         self._engine.close()
 
     def resolve_ids(self, env_ids: EnvIds) -> torch.Tensor | None:
-        """Return `env_ids` as the engine takes them: None, or int64, on a CPU sorted and unique."""
+        """Return `env_ids` for the engine: None (all), or int64, sorted and unique on a CPU."""
         if env_ids is None or (isinstance(env_ids, slice) and env_ids == slice(None)):
             return None
         ids = as_ids(env_ids, self.num_envs, self.device)
-        # To sort them, the host would have to wait for a GPU.
+        # Not sorted on a GPU: the host would wait for the device.
         return ids if ids.is_cuda or len(ids) < 2 else ids.unique()
 
 
 class SharedField(torch.Tensor):
-    """Model value that all environments share: reading is free, writing raises `RuntimeError`.
+    """Model value shared by all environments. Writing raises `RuntimeError`.
 
-    Writing one row would change every environment. Results of operations are plain tensors.
+    Writing one row would change every environment. Operations return plain tensors.
     """
 
     error: str
 
     @classmethod
     def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
-        """View `value` as an (nworld, ...) field; as structure, in its own shape, if None."""
+        """View `value` as a field of shape (nworld, ...); unchanged shape (structure) if None."""
         view = value if nworld is None else value.expand(nworld, *value.shape)
         field = torch.Tensor._make_subclass(cls, view)
         field.error = f"Model field {name!r} is shared by all environments and cannot be written. "
         field.error += (
-            "Change it in the spec or the model from which the Simulation is built."
+            "Change it in the spec or model that the Simulation is built from."
             if nworld is None
             else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
             f"@requires_model_fields({name!r})."
@@ -546,8 +551,8 @@ class SharedField(torch.Tensor):
                 raise WrongStateError(tensor.error)
         with torch._C.DisableTorchFunctionSubclass():
             result = func(*args, **(kwargs or {}))
-        # Views still alias the shared value, so they stay protected. Without elements all tensors
-        # have the same address.
+        # Views alias the shared value, so they stay protected. Empty tensors all have the same
+        # address.
         if isinstance(target, SharedField):
             if isinstance(result, np.ndarray):
                 result.flags.writeable = False
@@ -562,7 +567,7 @@ class SharedField(torch.Tensor):
 
 
 def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:
-    """View a model field whose rows MuJoCo stores flat as rows of matrices."""
+    """View a model field that MuJoCo stores flat as rows of matrices."""
     shape = _ROW_SHAPES.get(field)
     is_flat = shape is not None and tensor.shape[-1] == math.prod(shape)
     return tensor.unflatten(-1, shape) if is_flat else tensor

@@ -1,7 +1,7 @@
-"""MuJoCo's warnings: counted by kind, and logged once each.
+"""MuJoCo warnings: counted by kind and logged once per kind.
 
-By itself MuJoCo prints every warning and appends it to `MUJOCO_LOG.TXT` in the working folder, which
-robots that diverge in many environments turn into gigabytes.
+By default MuJoCo prints every warning and appends it to `MUJOCO_LOG.TXT` in the working directory.
+With robots diverging in many environments, that file grows to gigabytes.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ _lock = threading.Lock()
 
 
 def collect_mujoco_warnings() -> None:
-    """Log and count the warnings of MuJoCo in this process, unless a handler is set already."""
+    """Log and count MuJoCo's warnings in this process, unless a handler is already set."""
     if mujoco.get_mju_user_warning() is None:
-        mujoco.set_mju_user_warning(_take)
+        mujoco.set_mju_user_warning(_handle_warning)
 
 
 def mujoco_warnings() -> dict[str, int]:
-    """Return how often MuJoCo has warned in this process, by kind: the text without its numbers."""
+    """Return the number of MuJoCo warnings in this process by kind (text without numbers)."""
     with _lock:
         return dict(_counts)
 
 
-def _take(text: str) -> None:
-    # Called on the threads of the physics.
+def _handle_warning(text: str) -> None:
+    # Called from physics threads.
     kind = _NUMBERS.sub("#", text)
     with _lock:
         _counts[kind] += 1

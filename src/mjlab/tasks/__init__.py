@@ -1,4 +1,4 @@
-"""The tasks that ship with mjlab, one folder a family, and the registry that lists them all."""
+"""Built-in tasks, one package per family, and the task registry."""
 
 from __future__ import annotations
 

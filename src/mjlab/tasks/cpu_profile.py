@@ -1,12 +1,11 @@
-"""Profile factory for training on a few CPU cores: any task, stock or one's own.
+"""Profile factory for training on a few CPU cores, for built-in and custom tasks.
 
     register_mjlab_task(..., profiles={"cpu": cpu_profile(simple_contacts=True)})
 
-A few cores step some ten thousand environments a second, a hundredth of a GPU. So batches and networks
-are small, a policy may change more in an iteration, and rewards far away count less. What else makes a
-task easier to learn depends on the task: contacts that are quicker to solve, longer physics steps,
-pushes that begin later, mirror images. None of it makes the task easier to pass: evaluations, `evaluate`
-and `play` undo it.
+A few cores simulate about 10,000 environment steps per second, a hundredth of a GPU. Therefore batches
+and networks are small, the KL target is larger, and the discount factor is smaller. Further
+simplifications depend on the task: cheaper contacts, longer physics timesteps, delayed pushes, mirror
+images. None of them makes the task easier to pass: evaluations, `evaluate` and `play` undo them.
 """
 
 from __future__ import annotations
@@ -40,32 +39,32 @@ def cpu_profile(
     unpushed_samples: int | None = None,
     mirror: str | None = None,
 ) -> Profile:
-    """Return a profile for learning by PPO on a few cores.
+    """Return a profile for PPO training on a few cores.
 
     Args:
-        task: Edits both configs in place for what only this task needs; called last. Returns what
-            undoes that for evaluations, or None. Curriculum terms of `mjlab.tasks.easing` need no
-            undoing.
+        task: Function that applies task-specific edits to both configs in place; called last. Returns
+            a function that undoes the edits for evaluations, or None. Curriculum terms of
+            `mjlab.tasks.easing` are removed in any case.
         num_envs: Number of environments.
-        num_steps_per_env: Environment steps of an iteration.
-        hidden_dims: Widths of the hidden layers of both networks.
-        init_std: Standard deviation of actions, before any learning. None: the task's.
-        entropy_coef: Weight of the entropy bonus.
-        desired_kl: Change of the policy (nats) to which the learning rate is adapted.
+        num_steps_per_env: Number of environment steps per iteration.
+        hidden_dims: Hidden layer widths of actor and critic.
+        init_std: Initial standard deviation of actions. None: the task's.
+        entropy_coef: Entropy bonus coefficient.
+        desired_kl: Target KL divergence (nats) of the adaptive learning rate.
         gamma: Discount factor per environment step.
-        max_iterations: Iterations of a run.
+        max_iterations: Number of training iterations.
         save_interval: Iterations between checkpoints.
-        physics_steps: Physics steps of an environment step, fewer and longer ones than the task's.
-            None: the task's.
-        simple_contacts: Contacts without rolling and torsional friction, with pyramidal cones.
-        unpushed_samples: Environment steps, over all environments, in which the pushes of the event
-            `push_robot` grow from nothing to what they are. None: they are whole from the start.
-        mirror: Function that appends mirror images, as `module:function`, such as
+        physics_steps: Decimation, less than the task's; the physics timestep grows accordingly. None:
+            the task's.
+        simple_contacts: Use pyramidal friction cones, without torsional and rolling friction.
+        unpushed_samples: Environment steps, summed over environments, until the pushes of the event
+            `push_robot` grow from zero to their configured range. None: full pushes from the start.
+        mirror: Symmetry augmentation function, as `module:function`, such as
             `mjlab.tasks.velocity.symmetry:mirror_left_right`. None: no mirror images.
     """
 
     def profile(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-        # Not before it is used: a task is registered without torch.
+        # Imported here, because registering a task must not import torch.
         from mjlab.rl.config import gaussian_distribution
         from mjlab.tasks.easing import (
             coarsen_physics,
@@ -82,7 +81,7 @@ def cpu_profile(
         if simple_contacts:
             undos.append(simplify_contacts(env_cfg))
         if unpushed_samples is not None:
-            # Curricula count steps; more environments are eased for as many of them.
+            # Curricula count steps of the vectorized environment.
             ease_pushes(env_cfg, unpushed_samples // num_envs)
         rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = hidden_dims
         if init_std is not None:

@@ -1,8 +1,8 @@
-"""What makes a task easier while its learning begins, for `cpu` profiles, and what undoes it.
+"""Curricula and config edits that ease the start of training, for `cpu` profiles, and their inverses.
 
-Weights, pushes, commands, noise and starts are eased by curriculum terms, which change what is in use
-and no config. So what a flag says of them is where they end, and without those terms the task is as it
-was.
+Curriculum terms ease weights, pushes, commands and noise. They edit the live settings of the
+managers and not the config, so flags set the final values, and removing the terms restores the
+task.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mjlab.utils.noise import (
 )
 
 Undo = Callable[[ManagerBasedRlEnvCfg], None]
-"""Gives a config, or a copy of it, back what was changed."""
+"""Function that undoes an edit in the edited config or in a copy of it."""
 
 Ranges = dict[str, tuple[float, float]]
 
@@ -44,13 +44,13 @@ _NOISE_SIZES: dict[type[NoiseCfg], tuple[str, ...]] = {
 
 
 def ease_weight(env_cfg: ManagerBasedRlEnvCfg, name: str, first: float, steps: int) -> None:
-    """Let the weight of a reward go from `first` to what it is, over so many environment steps."""
+    """Ramp a reward weight from `first` to its configured value over `steps` environment steps."""
     params = {"reward_name": name, "first": first, "steps": steps}
     env_cfg.curriculum[f"eased_{name}"] = CurriculumTermCfg(func=GrowingWeight, params=params)
 
 
 def ease_pushes(env_cfg: ManagerBasedRlEnvCfg, steps: int) -> None:
-    """Let the pushes of the event `push_robot` grow from nothing to what they are."""
+    """Ramp the pushes of the event `push_robot` from zero to their range over `steps` steps."""
     if env_cfg.events.get(_PUSH) is not None:
         params = {"event_name": _PUSH, "steps": steps}
         env_cfg.curriculum[f"eased_{_PUSH}"] = CurriculumTermCfg(func=GrowingPushes, params=params)
@@ -59,12 +59,12 @@ def ease_pushes(env_cfg: ManagerBasedRlEnvCfg, steps: int) -> None:
 def grow_difficulty(
     env_cfg: ManagerBasedRlEnvCfg, reward_name: str, tracking: float, **params: Any
 ) -> None:
-    """Let commands, pushes and observation noise grow to what they are, while a policy copes.
+    """Ramp commands, pushes and observation noise to their configured sizes as the policy improves.
 
     Args:
         env_cfg: Config to edit.
-        reward_name: Reward term that tells how well commands are followed.
-        tracking: Fraction of its largest value that it must exceed.
+        reward_name: Reward term that measures command tracking.
+        tracking: Fraction of the term's maximum that must be exceeded.
         **params: Further parameters of `GrowingDifficulty`.
     """
     params = {"reward_name": reward_name, "tracking": tracking, **params}
@@ -72,7 +72,7 @@ def grow_difficulty(
 
 
 def drop_easing(env_cfg: ManagerBasedRlEnvCfg) -> None:
-    """Take the curriculum terms of this module, and those derived from them, out of a config."""
+    """Remove all curriculum terms derived from `Easing` from a config."""
     for name, term in list(env_cfg.curriculum.items()):
         func = None if term is None else term.func
         if isinstance(func, type) and issubclass(func, Easing):
@@ -80,13 +80,13 @@ def drop_easing(env_cfg: ManagerBasedRlEnvCfg) -> None:
 
 
 def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> Undo:
-    """Take only `num_steps` physics steps, longer ones, for a step of the environment.
+    """Reduce the decimation to `num_steps` and lengthen the physics timestep to match.
 
-    Histories of contact sensors keep their number of physics steps. What a flag has changed since is
-    not undone.
+    Histories of contact sensors keep their number of substeps. The returned function does not undo
+    values that flags have changed since.
 
     Raises:
-        ValueError: these are no fewer steps.
+        ValueError: `num_steps` is not less than the decimation.
     """
     fine = (env_cfg.sim.mujoco.timestep, env_cfg.decimation)
     if not 1 <= num_steps < env_cfg.decimation:
@@ -105,9 +105,10 @@ def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> Undo:
 
 
 def simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
-    """Make friction cones pyramidal, and take rolling and torsional friction from the robot.
+    """Use pyramidal friction cones, and remove torsional and rolling friction of the robot.
 
-    On the Go1 that walks, the physics of a step takes half the time. Edits the config in place. Returns what gives such a config, or a copy, the contacts back.
+    Halves the physics time of a walking Go1. Edits the config in place; returns a function that
+    restores the contacts of the config or of a copy.
     """
     cone = env_cfg.sim.mujoco.cone
     collisions = env_cfg.scene.entities[_ROBOT].collisions
@@ -131,10 +132,10 @@ def simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
 def replace_rewards(
     env_cfg: ManagerBasedRlEnvCfg, rewards: dict[str, RewardTermCfg | None]
 ) -> Undo:
-    """Reward these terms instead of the task's.
+    """Replace the task's reward terms by `rewards`.
 
-    Undone, the task's terms are there again, with the weights that flags have changed since, and None
-    where flags have removed one.
+    The returned function restores the task's terms. Terms that flags have changed or removed since
+    keep the changed weight or None.
     """
     before = dict(env_cfg.rewards)
     weights = {name: term.weight for name, term in rewards.items() if term is not None}
@@ -151,30 +152,30 @@ def replace_rewards(
 
 
 def undo_all(undos: Sequence[Undo]) -> Undo:
-    """Return what undoes all of these, one after the other."""
+    """Return a function that calls `undos` in order."""
 
     def undo(eased: ManagerBasedRlEnvCfg) -> None:
-        for one in undos:
-            one(eased)
+        for undo_one in undos:
+            undo_one(eased)
 
     return undo
 
 
 class Easing(ManagerTermBase):
-    """Base of curriculum terms that ease something at first, such as for so many environment steps."""
+    """Base class of curriculum terms that ease the start of training."""
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(env)
 
     def fraction(self, steps: int) -> float:
-        """Return how much of `steps` is over, from 0 to 1."""
+        """Return the elapsed fraction of `steps` environment steps, in [0, 1]."""
         return min(self._env.common_step_counter / steps, 1.0)
 
 
 class GrowingWeight(Easing):
-    """Lets the weight of a reward go from `first` to what it was built with, a little at a time.
+    """Curriculum that ramps a reward weight from `first` to its configured value in 60 stages.
 
-    Returns the weight. A reward that the task does not have is left alone.
+    Returns the weight; None if the task has no such reward.
     """
 
     _transient = {"_last"}
@@ -182,8 +183,8 @@ class GrowingWeight(Easing):
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         name = cfg.params["reward_name"]
-        has_it = env.cfg.rewards.get(name) is not None
-        self._last = env.reward_manager.get_term_cfg(name).weight if has_it else None
+        has_reward = env.cfg.rewards.get(name) is not None
+        self._last = env.reward_manager.get_term_cfg(name).weight if has_reward else None
 
     def __call__(
         self,
@@ -195,7 +196,7 @@ class GrowingWeight(Easing):
     ) -> float | None:
         if self._last is None:
             return None
-        # Of stages 0, 1, ..., stage k begins with step k * steps // _NUM_STAGES.
+        # Stage k = 0, 1, ... begins at step k * steps // _NUM_STAGES.
         stage = (_NUM_STAGES * (env.common_step_counter + 1) - 1) // steps
         weight = first + (self._last - first) * min(stage, _NUM_STAGES) / _NUM_STAGES
         env.reward_manager.get_term_cfg(reward_name).weight = weight
@@ -203,9 +204,9 @@ class GrowingWeight(Easing):
 
 
 class GrowingPushes(Easing):
-    """Lets pushes grow from nothing to the `velocity_range` that they were built with.
+    """Curriculum that ramps pushes from zero to the configured `velocity_range`.
 
-    Returns the fraction that they have reached. An event that the task does not have is left alone.
+    Returns the fraction of the range in use; None if the task has no such event.
     """
 
     _transient = {"_full"}
@@ -223,49 +224,50 @@ class GrowingPushes(Easing):
         if self._full is None:
             return None
         part = self.fraction(steps)
-        grown = {axis: _times(tuple(bounds), part) for axis, bounds in self._full.items()}
+        grown = {axis: _scaled(tuple(bounds), part) for axis, bounds in self._full.items()}
         env.event_manager.get_term_cfg(event_name).params["velocity_range"] = grown
         return part
 
 
 class GrowingDifficulty(Easing):
-    """Lets one difficulty d grow from 0 to 1, by `step`, after each interval in which a policy copes.
+    """Curriculum that raises a difficulty d from 0 to 1, by `step` after each successful interval.
 
-    It copes if, among the episodes that ended in the interval, the fraction that survived exceeds
-    `survival`, and the mean of the reward term, as a fraction of its weight and over all their steps,
-    exceeds `tracking`. An episode survives that lasts `survival_s`, or as long as the task lets it, and
-    one falls that is terminated before. Episodes that a time-out cuts shorter, as training does that
-    starts at random points of episodes, are neither. Steps are those really made since the reset.
+    An interval is successful if, over the episodes that ended in it, the survival rate exceeds
+    `survival`, and the mean of the reward term per step, as a fraction of its weight, exceeds
+    `tracking`. An episode survives if it lasts `survival_s`, or the task's whole episode length if
+    that is shorter. It falls if it terminates earlier. Shorter episodes that a time-out truncates
+    count as neither; training produces them by starting at random points of episodes. Steps are
+    counted since the reset.
 
-    With d, these fractions of what was built are in use; what the task does not have is left alone:
+    Fractions of the configured sizes in use; components that the task lacks are skipped:
 
         command ranges    command_from + (1 - command_from) d
         pushes            push_from + (1 - push_from) d
         noise             noise_from + (1 - noise_from) d
 
-    Ranges that another curriculum term sets meanwhile become those to grow to.
+    If another curriculum term sets a command range, that range becomes the final one.
 
     Params:
-        reward_name: Reward term of positive weight, at most 1 without it.
-        tracking: Least fraction of that.
-        survival: Least fraction of episodes.
+        reward_name: Reward term of positive weight; at most 1 before weighting.
+        tracking: Minimum reward, as a fraction of the weight.
+        survival: Minimum survival rate.
         survival_s: Time to survive (s).
-        step: Growth of d.
-        interval: Length of an interval (environment steps).
-        command_name: Velocity command whose ranges lin_vel_x, lin_vel_y and ang_vel_z grow.
-        command_from: Their fraction at d = 0.
+        step: Increment of d.
+        interval: Interval length (environment steps).
+        command_name: Velocity command; lin_vel_x, lin_vel_y and ang_vel_z are ramped.
+        command_from: Fraction of the command ranges at d = 0.
         event_name: Event with a `velocity_range`.
-        push_from: Its fraction at d = 0.
-        noise_group: Observation group whose noise grows.
-        noise_from: Its fraction at d = 0.
+        push_from: Fraction of the pushes at d = 0.
+        noise_group: Observation group whose noise is ramped.
+        noise_from: Fraction of the noise at d = 0.
 
     Returns d.
 
-    Raises, when built: `ValueError` for a reward term that does not exist or has no positive weight, or
-    noise whose size is not known.
+    Raises, when built: `ValueError` for a reward term that does not exist or whose weight is not
+    positive, and for unsupported noise.
     """
 
-    # Settings from the config.
+    # Derived from the config; not checkpointed.
     _transient = {"_pushes", "_noises"}
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
@@ -274,22 +276,22 @@ class GrowingDifficulty(Easing):
         weight = env.reward_manager.get_term_cfg(name).weight
         if not weight > 0.0:
             raise ValueError(
-                f"reward_name: expected a term of positive weight, got {name!r} of {weight}."
+                f"reward_name: expected a term of positive weight, got {name!r} of weight {weight}."
             )
         self.difficulty = 0.0
         self.last_survival, self.last_tracking = 0.0, 0.0
         self._interval_start = 0
         self._episode_start = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
-        # Of the interval: episodes that survived, that fell, their reward, and their steps.
+        # Totals of the interval: surviving episodes, falls, reward, steps.
         self._tally = torch.zeros(4, dtype=torch.float64, device=env.device)
         self._command_part = 1.0
-        self._ranges = self._ranges_in_use(cfg.params.get("command_name", "twist"))
+        self._ranges = self._command_ranges(cfg.params.get("command_name", "twist"))
         event_name = cfg.params.get("event_name", _PUSH)
         self._pushes: Ranges | None = None
         if env.cfg.events.get(event_name) is not None:
             event = env.event_manager.get_term_cfg(event_name)
             self._pushes = dict(event.params["velocity_range"])
-        self._noises = self._noises_of(cfg.params.get("noise_group", "actor"))
+        self._noises = self._noise_cfgs(cfg.params.get("noise_group", "actor"))
 
     def __call__(
         self,
@@ -310,33 +312,33 @@ class GrowingDifficulty(Easing):
     ) -> float:
         self._count(env_ids, reward_name, survival_s)
         if env.common_step_counter - self._interval_start >= interval:
-            if self._copes(reward_name, survival, tracking):
+            if self._is_successful(reward_name, survival, tracking):
                 self.difficulty = min(self.difficulty + step, 1.0)
             self._interval_start = env.common_step_counter
         d = self.difficulty
         part = command_from + (1.0 - command_from) * d
-        for name, bounds in self._ranges_in_use(command_name).items():
-            if bounds != _times(self._ranges[name], self._command_part):
+        for name, bounds in self._command_ranges(command_name).items():
+            if bounds != _scaled(self._ranges[name], self._command_part):
                 self._ranges[name] = bounds
             cfg: Any = env.command_manager.get_term_cfg(command_name)
-            setattr(cfg.ranges, name, _times(self._ranges[name], part))
+            setattr(cfg.ranges, name, _scaled(self._ranges[name], part))
         self._command_part = part
         if self._pushes is not None:
             part = push_from + (1.0 - push_from) * d
-            grown = {axis: _times(tuple(bounds), part) for axis, bounds in self._pushes.items()}
+            grown = {axis: _scaled(tuple(bounds), part) for axis, bounds in self._pushes.items()}
             env.event_manager.get_term_cfg(event_name).params["velocity_range"] = grown
         part = noise_from + (1.0 - noise_from) * d
         for noise, sizes in self._noises:
             for name, size in sizes.items():
-                setattr(noise, name, _times(size, part))
+                setattr(noise, name, _scaled(size, part))
         return d
 
     def _count(self, env_ids: torch.Tensor | slice, reward_name: str, survival_s: float) -> None:
-        """Count the episodes that end. An evaluation in between makes no steps, and counts none."""
+        """Count the episodes that end. Resets around an evaluation have no steps and count nothing."""
         env = self._env
         steps = env.common_step_counter - self._episode_start[env_ids]
-        enough = math.ceil(min(survival_s, env.max_episode_length_s) / env.step_dt - 1e-6)
-        survived = steps >= enough
+        min_steps = math.ceil(min(survival_s, env.max_episode_length_s) / env.step_dt - 1e-6)
+        survived = steps >= min_steps
         has_moved = steps > 0
         fell = env.termination_manager.terminated[env_ids] & has_moved & ~survived
         reward = env.reward_manager.episode_sum(reward_name)[env_ids] * has_moved
@@ -345,8 +347,8 @@ class GrowingDifficulty(Easing):
         )
         self._episode_start[env_ids] = env.common_step_counter
 
-    def _copes(self, reward_name: str, survival: float, tracking: float) -> bool:
-        """Return whether the policy coped in the interval, and reset the counters."""
+    def _is_successful(self, reward_name: str, survival: float, tracking: float) -> bool:
+        """Return True for a successful interval, and clear its totals."""
         env = self._env
         survived, fell, reward, steps = self._tally.tolist()
         self._tally.zero_()
@@ -356,13 +358,13 @@ class GrowingDifficulty(Easing):
         self.last_tracking = reward / (max(steps, 1.0) * unit * weight) if weight > 0.0 else 0.0
         return self.last_survival > survival and self.last_tracking > tracking
 
-    def _ranges_in_use(self, command_name: str) -> Ranges:
+    def _command_ranges(self, command_name: str) -> Ranges:
         if self._env.cfg.commands.get(command_name) is None:
             return {}
         cfg: Any = self._env.command_manager.get_term_cfg(command_name)
         return {name: tuple(getattr(cfg.ranges, name)) for name in _COMMAND_RANGES}
 
-    def _noises_of(self, group: str) -> list[tuple[NoiseCfg, dict[str, Any]]]:
+    def _noise_cfgs(self, group: str) -> list[tuple[NoiseCfg, dict[str, Any]]]:
         """Return the live noise configs of a group, each with its sizes as built."""
         manager = self._env.observation_manager
         noises = []
@@ -376,13 +378,13 @@ class GrowingDifficulty(Easing):
                     continue
                 if type(part) not in _NOISE_SIZES or part.operation == "scale":
                     raise ValueError(
-                        f"noise of {group}/{name}: expected constant, Gaussian or uniform noise that "
-                        f"is added, got {part!r}; use another noise_group to leave it as it is."
+                        f"{group}/{name} noise: expected additive constant, Gaussian or uniform noise, "
+                        f"got {part!r}; use another noise_group to keep this noise unchanged."
                     )
                 noises.append((part, {f: getattr(part, f) for f in _NOISE_SIZES[type(part)]}))
         return noises
 
 
-def _times(size: Any, factor: float) -> Any:
-    """Return a number, or each of a tuple, times `factor`."""
+def _scaled(size: Any, factor: float) -> Any:
+    """Return a number, or each number of a tuple, times `factor`."""
     return tuple(factor * s for s in size) if isinstance(size, tuple) else factor * size

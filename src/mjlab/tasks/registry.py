@@ -1,13 +1,13 @@
-"""Tasks by name.
+"""Task registry.
 
-A task is registered with its configs, or, so that listing tasks costs nothing, with the name of
-the functions that make them. Tasks come from the folders of `mjlab.tasks` and from installed
-packages that declare an entry point in the group `mjlab.tasks`; they are discovered when the
-registry is first asked.
+A task is registered with its configs or with the names of functions that return them; names keep
+listing tasks free of heavy imports. Tasks come from the packages of `mjlab.tasks` and from installed
+packages with an entry point in the group `mjlab.tasks`. The first query of the registry
+discovers them.
 
-A task that needs something (a recorded motion, say) is registered with a dataclass, `options=`, whose
-fields become flags of `train`, `play`, `evaluate` and `profile-env` for this task. The scripts know
-nothing of what is in it: they call `prepare` before they build the environment.
+A task that needs external data, such as a recorded motion, registers a dataclass as `options`. The
+fields of the dataclass become flags of `train`, `play`, `evaluate` and `profile-env` for this task, and
+the scripts call its `prepare` before they build the environment.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 ENTRY_POINT_GROUP = "mjlab.tasks"
-# Modules that every 1.x release brought along, and that are an extra here.
+# Modules that 1.x releases depend on, and that are an extra here.
 _COMPAT_MODULES = frozenset({"torchrunx", "mediapy", "moviepy"})
 _tasks: dict[str, _Task] = {}
 _discovered = False
@@ -57,34 +57,36 @@ def register_mjlab_task(
     """Register a task under `task_id`.
 
     Args:
-        task_id: the name, unique, such as `Mjlab-Cartpole-Swingup`.
-        env_cfg: the config to train with: a config, a function that makes it, or the function's
-            name as `module:function`, which is imported when the task is first used.
-        play_env_cfg: the config to play with, likewise. None calls the function of `env_cfg`,
-            with `play=True` if it takes that, or reuses its config.
-        rl_cfg: the config of the learner, likewise.
-        runner_cls: the runner class or its name as `module:Class`; None takes the default.
-        profiles: named settings for other circumstances, such as `cpu` for learning on a few
-            cores: for each name a function `(env_cfg, rl_cfg)`, or its name as
-            `module:function`, that edits copies of the task's configs in place. It may return
-            another learner's config in place of `rl_cfg`, such as `with_learner(rl_cfg, "sac")`
-            of `mjlab.rl.learners`. Flags of the command line come after it and win. It may not
-            change `rl_cfg.experiment_name`, by which runs of the task are found.
-        options: a dataclass of further command-line flags, which also gets what the task needs
-            before it is built (see `mjlab.tasks.registry`), or its name as `module:Class`.
+        task_id: Unique name, such as `Mjlab-Cartpole-Swingup`.
+        env_cfg: Training environment config: a config, a function that returns one, or the name of the
+            function as `module:function`. Names are imported on first use.
+        play_env_cfg: Play environment config, in the forms of `env_cfg`. None: the function of
+            `env_cfg`, called with `play=True` if it has that parameter, or the config of `env_cfg`.
+        rl_cfg: Learner config, in the forms of `env_cfg`.
+        runner_cls: Runner class, or its name as `module:Class`. None: the default runner.
+        profiles: Named variants of the configs, such as `cpu` for training on a few cores. Each is a
+            function `(env_cfg, rl_cfg)`, or its name as `module:function`, that edits copies of
+            the task's configs in place. A profile may return the config of another learner to use
+            instead of `rl_cfg`, such as `with_learner(rl_cfg, "sac")` of `mjlab.rl.learners`.
+            Command-line flags override profiles. Profiles must keep `rl_cfg.experiment_name`,
+            because runs of the task are found by it.
+        options: Dataclass of further command-line flags that also prepares the environment config (see
+            `TaskOptions`), or its name as `module:Class`.
 
     Raises:
-        ValueError: the name is taken, `rl_cfg` is missing, or a profile's name is no single word.
+        ValueError: the name is taken, `rl_cfg` is missing, or a profile name is not a single word.
     """
     if task_id in _tasks:
         raise ValueError(f"A task named {task_id!r} is registered already; choose another name.")
     if rl_cfg is None:
-        raise ValueError(f"Task {task_id!r} needs an rl_cfg (an RslRlOnPolicyRunnerCfg).")
+        raise ValueError(
+            f"Task {task_id!r} rl_cfg: expected a learner config, such as RslRlOnPolicyRunnerCfg, got None."
+        )
     for profile in profiles or {}:
         if not profile.replace("-", "_").isidentifier() or profile == "None":
             raise ValueError(
-                f"Task {task_id!r} has a profile named {profile!r}; a name is one word of letters, "
-                "digits, '-' and '_', such as 'cpu', and not 'None'."
+                f"Task {task_id!r} profiles: expected names of letters, digits, '-' and '_', not 'None', "
+                f"got {profile!r}; use e.g. 'cpu'."
             )
     source = sys._getframe(1).f_globals.get("__file__")
     _tasks[task_id] = _Task(
@@ -99,153 +101,154 @@ def list_tasks() -> list[str]:
 
 
 def list_profiles(task_name: str) -> list[str]:
-    """Return the names of a task's profiles, sorted; raises UnknownTaskError for no such task."""
+    """Return the names of a task's profiles, sorted. Raises `UnknownTaskError`."""
     return sorted(_find(task_name).profiles)
 
 
 def load_env_cfg(
     task_name: str, play: bool = False, profile: str | None = None
 ) -> ManagerBasedRlEnvCfg:
-    """Return a copy of the environment config of a task, to train or to `play` with.
+    """Return a copy of the environment config of a task, for training or for `play`.
 
-    `profile` names one of the task's profiles, which is applied to it; None applies none.
+    `profile` is the name of a task profile to apply. None: no profile.
 
     Raises:
-        UnknownTaskError: no such task.
-        UnknownProfileError: the task has no such profile.
-        TaskImportError: the config's function is given by name and cannot be imported.
+        UnknownTaskError: unknown task.
+        UnknownProfileError: unknown profile.
+        TaskImportError: importing the config's function by name failed.
     """
     if profile is not None:
         return _with_profile(task_name, profile, play)[0]
     task = _find(task_name)
     if not play:
-        return _made(task_name, task.env_cfg)
+        return _make_cfg(task_name, task.env_cfg)
     if task.play_env_cfg is not None:
-        return _made(task_name, task.play_env_cfg)
-    return _made(task_name, task.env_cfg, play=True)
+        return _make_cfg(task_name, task.play_env_cfg)
+    return _make_cfg(task_name, task.env_cfg, play=True)
 
 
 def load_rl_cfg(
     task_name: str, profile: str | None = None, learner: Learner | None = None
 ) -> RslRlBaseRunnerCfg:
-    """Return a copy of the learner's config of a task.
+    """Return a copy of the learner config of a task.
 
     Args:
         task_name: Name of the task.
-        profile: One of the task's profiles, which is applied to it; None applies none.
-        learner: `ppo`, `sac` or `distillation`; None takes what the task, or the profile, chooses.
-            If the profile replaces the task's own config, and that is of `learner`, it is taken, with
-            what the profile says of the task. Otherwise it is made by `mjlab.rl.learners.with_learner`.
+        profile: Name of a task profile to apply. None: no profile.
+        learner: `ppo`, `sac` or `distillation`. None: the learner of the profile or task. If the
+            profile replaces a task config that is of `learner`, the task config is used, with the
+            task settings of the profile. Otherwise `mjlab.rl.learners.with_learner` converts the
+            config.
 
     Raises:
         UnknownTaskError, UnknownProfileError, TaskImportError: see `load_env_cfg`.
-        ValueError: the learner is unknown, or cannot have the observations that the task's has.
+        ValueError: the learner is unknown, or does not support the networks or observations of the task.
     """
     from mjlab.rl.learners import for_task_of, learner_of, with_learner
 
     if profile is None:
-        cfg = given = _made(task_name, _find(task_name).rl_cfg)
+        cfg = task_cfg = _make_cfg(task_name, _find(task_name).rl_cfg)
     else:
-        _, cfg, given = _with_profile(task_name, profile, play=False)
+        _, cfg, task_cfg = _with_profile(task_name, profile, play=False)
     if learner is None or learner_of(cfg) == learner:
         return cfg
-    if learner_of(given) == learner:
-        return for_task_of(given, cfg)
+    if learner_of(task_cfg) == learner:
+        return for_task_of(task_cfg, cfg)
     return with_learner(cfg, learner)
 
 
 def load_runner_cls(task_name: str) -> type | None:
-    """Return the runner class of a task, or None for the default one; raises likewise."""
+    """Return the runner class of a task, or None for the default. Raises as `load_env_cfg`."""
     runner_cls = _find(task_name).runner_cls
-    return _imported(task_name, runner_cls) if isinstance(runner_cls, str) else runner_cls
+    return _import_name(task_name, runner_cls) if isinstance(runner_cls, str) else runner_cls
 
 
 def load_options_cls(task_name: str) -> type[TaskOptions] | None:
-    """Return the class of a task's own options, or None if it has none; raises likewise."""
+    """Return the options class of a task, or None. Raises as `load_env_cfg`."""
     options = _find(task_name).options
-    return _imported(task_name, options) if isinstance(options, str) else options
+    return _import_name(task_name, options) if isinstance(options, str) else options
 
 
 def require_profile(task_name: str, profile: str) -> Profile | str:
-    """Return what a profile was registered with.
+    """Return the function of a profile, or its name as registered.
 
     Raises:
-        UnknownTaskError: no such task.
-        UnknownProfileError: no such profile; the message lists the task's.
+        UnknownTaskError: unknown task.
+        UnknownProfileError: unknown profile; the message lists the task's profiles.
     """
     profiles = _find(task_name).profiles
     if profile in profiles:
         return profiles[profile]
-    there = f"its profiles are: {', '.join(sorted(profiles))}" if profiles else "it has none"
     raise UnknownProfileError(
-        f"Task {task_name!r} has no profile {profile!r}; {there}. Without --profile the task's "
-        "own settings are used."
+        f"Unknown profile {profile!r} of task {task_name!r}; {suggest(profile, sorted(profiles))} Omit "
+        "--profile to use the settings of the task."
     )
 
 
 def require_task(task_name: str) -> None:
-    """Raise UnknownTaskError, listing the nearest names, unless the task is registered."""
+    """Raise `UnknownTaskError`, listing close names, unless the task is registered."""
     _find(task_name)
 
 
 def task_source(task_name: str) -> str | None:
-    """Return the file that registered a task; None if that was no file. Raises UnknownTaskError."""
+    """Return the file that registered a task, or None outside a file. Raises `UnknownTaskError`."""
     return _find(task_name).source
 
 
-# Options: what a task adds to the command line.
+# Options: task-specific command-line flags.
 
 
 @dataclass
 class TaskOptions:
-    """Base of the options of a task: a dataclass with a default for each field."""
+    """Base class of task options: a dataclass with a default for each field."""
 
     def prepare(self, env_cfg: Any, origin: PolicyOrigin) -> None:
-        """Edit the environment's config in place, fetching what it needs.
+        """Edit the environment config in place, and fetch required data.
 
-        Called once, before the environment is built; by every process where there are several.
+        Scripts call `prepare` once, before they build the environment; with several processes, once
+        in each.
 
         Args:
-            env_cfg: The config, with all flags applied.
-            origin: Whose policy is to act.
+            env_cfg: Environment config with all flags applied.
+            origin: Origin of the policy.
 
         Raises:
-            ValueError: what is needed is not there; the message says what to do.
+            ValueError: required data is missing; the message names a remedy.
         """
 
     def runner_kwargs(self) -> dict[str, Any]:
-        """Return further keyword arguments of the task's runner."""
+        """Return extra keyword arguments of the task's runner."""
         return {}
 
 
 @dataclass(frozen=True)
 class PolicyOrigin:
-    """Where the policy comes from that is to act, as far as there is one."""
+    """Origin of a policy. Fields are None without a trained policy."""
 
     task: str
     """Name of the task."""
     checkpoint: Path | None = None
-    """Its checkpoint, in the folder of its run; also the one that training goes on from."""
+    """Checkpoint in the folder of its run, also when training resumes from the checkpoint."""
     wandb_run_path: str | None = None
-    """The Weights & Biases run that the checkpoint was fetched from, as entity/project/run."""
+    """Weights & Biases run of the checkpoint, as entity/project/run."""
 
 
 # Errors.
 
 
 class UnknownTaskError(UnknownNameError):
-    """Raised for a task name that is not registered; the message lists the nearest ones."""
+    """Task name that is not registered. The message lists close names."""
 
 
 class UnknownProfileError(MjlabError, ValueError):
-    """Raised for a profile that a task does not have; the message lists those it has."""
+    """Profile that the task does not have. The message lists the task's profiles."""
 
 
 class TaskImportError(MjlabError, RuntimeError):
-    """Raised for a task whose config, runner or profile, given by name, cannot be imported."""
+    """Task whose config, runner, profile or options cannot be imported by name."""
 
 
-# Making configs, and finding what registers tasks.
+# Config creation and task discovery.
 
 
 @dataclass(frozen=True)
@@ -262,70 +265,70 @@ class _Task:
 def _with_profile(
     task_name: str, profile: str, play: bool
 ) -> tuple[ManagerBasedRlEnvCfg, RslRlBaseRunnerCfg, RslRlBaseRunnerCfg]:
-    """Return copies of both configs of a task as `profile` makes them.
+    """Return copies of both configs of a task with `profile` applied, and the edited task config.
 
-    The third is the learner's config that the profile was given, which it may have replaced.
+    The third config differs from the second if the profile replaces the task's learner config.
     """
     from mjlab.rl.config import RslRlBaseRunnerCfg
 
     edit = require_profile(task_name, profile)
     if isinstance(edit, str):
-        edit = _imported(task_name, edit)
-    env_cfg, given = load_env_cfg(task_name, play), load_rl_cfg(task_name)
-    experiment = given.experiment_name
-    returned = edit(env_cfg, given)
-    rl_cfg = given if returned is None else returned
-    named = f"The profile {profile!r} of task {task_name!r}"
+        edit = _import_name(task_name, edit)
+    env_cfg, task_cfg = load_env_cfg(task_name, play), load_rl_cfg(task_name)
+    experiment = task_cfg.experiment_name
+    returned = edit(env_cfg, task_cfg)
+    rl_cfg = task_cfg if returned is None else returned
+    owner = f"Profile {profile!r} of task {task_name!r}"
     if not isinstance(rl_cfg, RslRlBaseRunnerCfg):
         raise ValueError(
-            f"{named}: expected None or an RslRlBaseRunnerCfg to be returned, got a "
-            f"{type(rl_cfg).__name__}; edit the two configs that it is given."
+            f"{owner}: expected None or an RslRlBaseRunnerCfg as return value, got "
+            f"{type(rl_cfg).__name__}; edit the two config arguments in place."
         )
     if rl_cfg.experiment_name != experiment:
         raise ValueError(
-            f"{named} sets experiment_name to {rl_cfg.experiment_name!r}; it has to stay "
-            f"{experiment!r}, because that is where runs of the task are looked for."
+            f"{owner} experiment_name: expected {experiment!r}, got {rl_cfg.experiment_name!r}; "
+            "runs of the task are found by this name."
         )
-    # A profile may return a module's constant.
-    return env_cfg, rl_cfg if rl_cfg is given else copy.deepcopy(rl_cfg), given
+    # Copied, because a profile may return a module constant.
+    return env_cfg, rl_cfg if rl_cfg is task_cfg else copy.deepcopy(rl_cfg), task_cfg
 
 
 def _find(task_name: str) -> _Task:
     _discover()
     if task_name not in _tasks:
         raise UnknownTaskError(
-            f"Unknown task {task_name!r}; {suggest(task_name, _tasks)} `list-envs` shows all "
+            f"Unknown task {task_name!r}; {suggest(task_name, _tasks)} `list-envs` lists all "
             f"{len(_tasks)} tasks."
         )
     return _tasks[task_name]
 
 
-def _made(task_name: str, source: Any, **kwargs: Any) -> Any:
-    """Return a fresh config from a config, a function, or a function's name."""
+def _make_cfg(task_name: str, source: Any, **kwargs: Any) -> Any:
+    """Return a new config from a config, a function, or the name of a function."""
     if isinstance(source, str):
-        source = _imported(task_name, source)
+        source = _import_name(task_name, source)
     if callable(source):
-        taken = inspect.signature(source).parameters
-        kwargs = {name: value for name, value in kwargs.items() if name in taken}
-    # What a function returns is copied too, because it may be put together from module constants.
+        accepted = inspect.signature(source).parameters
+        kwargs = {name: value for name, value in kwargs.items() if name in accepted}
+    # Return values of functions are copied too, because they may contain module constants.
     return copy.deepcopy(source(**kwargs) if callable(source) else source)
 
 
-def _imported(task_name: str, name: str) -> Any:
-    """Return what `module:attribute` names; raise TaskImportError if that fails."""
+def _import_name(task_name: str, name: str) -> Any:
+    """Import `module:attribute`. Raises `TaskImportError`."""
     module, _, attribute = name.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
-    # The module is not ours, and may fail in any way there is.
+    # Modules of other packages may raise any exception.
     except (Exception, SystemExit) as error:
         raise TaskImportError(
-            f"Task {task_name!r} cannot be used, because importing {name!r}, which it was "
-            f"registered with, failed: {type(error).__name__}: {error}{_missing_extra(error)}"
+            f"Task {task_name!r} cannot be used: importing {name!r} failed: "
+            f"{type(error).__name__}: {error}{_missing_extra(error)}"
         ) from error
 
 
 def _discover() -> None:
-    """Import, once, whatever registers tasks. What fails is reported and skipped."""
+    """Import all packages that register tasks, once. Packages that fail are reported and skipped."""
     global _discovered
     if _discovered:
         return
@@ -342,17 +345,17 @@ def _discover() -> None:
 
 
 def _register_all(source: str, load: Callable[[], object]) -> None:
-    """Call `load`, which registers tasks: all those of `source`, or none if it fails."""
+    """Register the tasks of `source` by calling `load`; register none of them if it raises."""
     before = dict(_tasks)
     try:
         load()
-    # A broken package must not take the others down with it, not even one that exits.
+    # A broken package, even one that exits, must not affect the others.
     except (Exception, SystemExit) as error:
-        # What it registered before it failed may need what it would have done after.
+        # Roll back: tasks registered before the error may depend on code that did not run.
         _tasks.clear()
         _tasks.update(before)
         logger.error(
-            "Tasks of %s are skipped, because it fails to import:\n%s%s",
+            "Skipping the tasks of %s: import failed:\n%s%s",
             source,
             traceback.format_exc().rstrip(),
             _missing_extra(error),
@@ -360,7 +363,7 @@ def _register_all(source: str, load: Callable[[], object]) -> None:
 
 
 def _missing_extra(error: BaseException) -> str:
-    """Return the sentence that names the extra, if `error` comes from one of its modules missing."""
+    """Return a hint at the extra if `error` was caused by one of its modules missing, else ""."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, ModuleNotFoundError) and cause.name is not None:
@@ -368,7 +371,7 @@ def _missing_extra(error: BaseException) -> str:
             # An installed package may lack the submodule: moviepy 2 has no `moviepy.editor`.
             if module in _COMPAT_MODULES and sys.modules.get(module) is None:
                 return (
-                    f"\n{module} comes with the extra mjlab[compat]: require that in place of "
+                    f"\n{module} comes with the extra mjlab[compat]: require mjlab[compat] instead of "
                     "mjlab, or run `uv sync --extra compat` in the checkout."
                 )
         cause = cause.__cause__ or cause.__context__

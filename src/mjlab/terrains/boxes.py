@@ -21,34 +21,34 @@ GREEN = (0.25, 0.80, 0.45)
 # A thin sheet lets fast or deep contacts through to the other side.
 MIN_THICKNESS = 0.5
 
-# Boxes narrower than this are rounding errors of a layout that leaves no room for them.
+# Boxes narrower than this (m) are rounding errors of a layout without room for them.
 _NO_LENGTH = 1e-9
 
 
 class Boxes:
-    """Adds boxes to the terrain, in the frame of one sub-terrain, and keeps them in order.
+    """Builder of one sub-terrain's boxes, in its frame. Keeps the geoms in order.
 
-    A box is given by its top, and reaches down at least half a metre unless it is a slab.
+    A box is defined by its top, and is at least 0.5 m thick unless it is a slab.
     """
 
     def __init__(self, spec: mujoco.MjSpec, size: tuple[float, float]) -> None:
-        """Start a sub-terrain of the given extent along x and y, in metres."""
+        """Start a sub-terrain with this extent along x and y (m)."""
         self.body = spec.body("terrain")
         self.size = size
         self.geometries: list[TerrainGeometry] = []
-        """What was added so far."""
+        """Geoms added so far."""
 
     @property
     def center(self) -> tuple[float, float]:
-        """Middle of the sub-terrain, in metres from its corner."""
+        """Center of the sub-terrain relative to its corner (m)."""
         return self.size[0] / 2, self.size[1] / 2
 
     def output(self, height: float) -> TerrainOutput:
-        """Return all boxes, with the spawn point in the middle at a height in metres."""
+        """Return all boxes, with the spawn point at the center and `height` (m)."""
         return TerrainOutput(origin=np.array([*self.center, height]), geometries=self.geometries)
 
     def keep(self, geom: mujoco.MjsGeom, color: RGBA) -> None:
-        """Take up a geom that was added otherwise."""
+        """Register a geom added without `add`."""
         self.geometries.append(TerrainGeometry(geom=geom, color=color))
 
     def add(
@@ -64,13 +64,13 @@ class Boxes:
         """Add a box.
 
         Args:
-            center: Its middle along x and y, in metres.
-            extent: Its length along its own x and y axes.
-            top: Height of its top.
-            color: Its colour where colours show height.
-            bottom: Height of its bottom; lower where it would be thinner than half a metre.
-            yaw: Rotation about z, in radians.
-            slab: Thickness of a box with nothing below; None for a solid one.
+            center: Center along x and y (m).
+            extent: Extent along the box's x and y axes (m).
+            top: Height of the top (m).
+            color: Color under the scheme `height`.
+            bottom: Height of the bottom (m). Lowered if the box would be thinner than 0.5 m.
+            yaw: Rotation about z (rad).
+            slab: Thickness of a slab (m). None: solid box.
         """
         low = min(bottom, top - MIN_THICKNESS) if slab is None else top - slab
         geom = add_box(self.body, (*center, (low + top) / 2), (*extent, top - low))
@@ -89,17 +89,17 @@ class Boxes:
         arms: float | None = None,
         order: str = "+y -y +x -x",
     ) -> None:
-        """Add a rectangular ring about the middle, of four boxes. Those along x span its length.
+        """Add a rectangular ring of four boxes about the center. The ±y boxes span the full length.
 
         Args:
-            outer: Its outer extent along x and y, in metres.
-            width: Its width; a pair is that of the boxes across x, and of those across y.
-            top: Height of its top.
-            color: Its colour where colours show height.
+            outer: Outer extent along x and y (m).
+            width: Width (m). A pair: widths of the ±x and of the ±y boxes.
+            top: Height of the top (m).
+            color: Color under the scheme `height`.
             bottom: As in `add`.
             slab: As in `add`.
-            arms: Length of each box, in the middle of its side, instead of that of the side.
-            order: Sides in the order in which they are added.
+            arms: Length of each box, centered on its side (m). None: full side.
+            order: Order of the sides.
         """
         width_x, width_y = width if isinstance(width, tuple) else (width, width)
         width_x, width_y = min(width_x, outer[0] / 2), min(width_y, outer[1] / 2)
@@ -119,28 +119,28 @@ class Boxes:
                 place, extent = (x + dx, y + dy), (length_x, length_y)
                 self.add(place, extent, top, color, bottom=bottom, slab=slab)
 
-    def add_frame(
+    def add_border(
         self,
         width: float | tuple[float, float],
         top: float,
         color: RGBA,
         bottom: float = math.inf,
     ) -> None:
-        """Add the frame along the edge of the sub-terrain, if it has a width (as in a ring)."""
+        """Add a border along the edge of the sub-terrain if `width` (as in `add_ring`) is > 0."""
         if np.min(width) > 0.0:
             self.add_ring(self.size, width, top, color, bottom=bottom, order="+y -y -x +x")
 
     def add_platform(
         self, extent: tuple[float, float], top: float, color: RGBA, bottom: float = math.inf
     ) -> None:
-        """Add a box in the middle."""
+        """Add a box at the center."""
         self.add(self.center, extent, top, color, bottom=bottom)
 
     def add_pit(
         self, width: float | tuple[float, float], top: float, color: RGBA, depth: float
     ) -> None:
-        """Add a pit over the whole sub-terrain: its black floor, and the frame down to there."""
-        self.add_frame(width, top, color, bottom=-depth)
+        """Add a pit over the whole sub-terrain: black floor, and a border down to the floor."""
+        self.add_border(width, top, color, bottom=-depth)
         self.add_platform(self.size, -depth, (0.1, 0.1, 0.1, 1.0))
 
 
@@ -149,13 +149,13 @@ def merge_equal_cells(
 ) -> Iterator[tuple[int, int, int, int]]:
     """Yield rectangles of equal values that together hold each kept cell once.
 
-    Cells are scanned along the second axis first. From each that is not taken yet, a rectangle
-    grows along the first axis and then, by whole rows, along the second.
+    Cells are scanned along the second axis first. From each unused cell, a rectangle grows along
+    the first axis and then, by whole rows, along the second.
 
     Args:
         values: (n, m) values.
-        kept: (n, m) whether each cell counts.
-        longest: Most cells along an axis of a rectangle.
+        kept: (n, m) mask of the cells to cover.
+        longest: Maximum number of cells along an axis of a rectangle.
 
     Yields:
         First cell along both axes, and number of cells along both.
@@ -165,7 +165,7 @@ def merge_equal_cells(
         if not free[i, j]:
             continue
         same = free & (values == values[i, j])
-        # `argmin` finds the first cell that is not equal; appended, there is always one.
+        # `argmin` finds the first unequal cell; the appended False guarantees one.
         num_i = int(np.argmin(np.append(same[i : i + longest, j], False)))
         block = same[i : i + num_i, j : j + longest].all(axis=0)
         num_j = int(np.argmin(np.append(block, False)))
@@ -173,11 +173,11 @@ def merge_equal_cells(
         yield i, j, num_i, num_j
 
 
-def frame_color(base: tuple[float, float, float]) -> RGBA:
-    """Return the colour of the frame of a sub-terrain that has the base colour."""
+def border_color(base: tuple[float, float, float]) -> RGBA:
+    """Return the border color of a sub-terrain with this base color."""
     return darken_rgba(brand_ramp(base, 0.0), 0.85)
 
 
 def inset(extent: tuple[float, float], by: float) -> tuple[float, float]:
-    """Return the extent of a rectangle made smaller by a distance on each side."""
+    """Return the extent of a rectangle shrunk by a distance (m) on each side."""
     return extent[0] - 2.0 * by, extent[1] - 2.0 * by

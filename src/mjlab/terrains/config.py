@@ -1,4 +1,4 @@
-"""Sub-terrains with proven figures (presets), and sets of them."""
+"""Terrain presets: sub-terrains with tuned parameters, and sets of them."""
 
 from __future__ import annotations
 
@@ -40,25 +40,25 @@ class _Presets(dict[str, Callable[..., SubTerrainCfg]]):
 
 
 ALL_TERRAIN_PRESETS: dict[str, Callable[..., SubTerrainCfg]] = _Presets()
-"""Every preset by name: a function that takes fields to override."""
+"""Presets by name: functions that take fields to override."""
 
 
 def terrain_preset(fn: _F) -> _F:
     """Decorator: register `fn` in `ALL_TERRAIN_PRESETS` under its name.
 
     Raises:
-        ValueError: the name is taken.
+        ValueError: duplicate name.
     """
     name = getattr(fn, "__name__", repr(fn))
     if name in ALL_TERRAIN_PRESETS:
-        raise ValueError(f"The terrain preset {name!r} is there already. Use another name.")
+        raise ValueError(f"Terrain preset {name!r} already exists; use another name.")
     ALL_TERRAIN_PRESETS[name] = fn
     return fn
 
 
-def _override(overrides: dict[str, Any], **figures: Any) -> dict[str, Any]:
-    """Return a preset's figures, with those that a user gave instead of its own."""
-    return {**figures, **overrides}
+def _override(overrides: dict[str, Any], **defaults: Any) -> dict[str, Any]:
+    """Return a preset's parameters: `overrides` of the user over `defaults`."""
+    return {**defaults, **overrides}
 
 
 # Each preset's fields can be overridden: `pyramid_stairs(step_width=0.4, proportion=0.2)`.
@@ -82,13 +82,13 @@ def _stairs(overrides: dict[str, Any]) -> dict[str, Any]:
 
 @terrain_preset
 def pyramid_stairs(**overrides: Any) -> BoxPyramidStairsTerrainCfg:
-    """Stairs up to a platform."""
+    """Stairs that rise to a platform."""
     return BoxPyramidStairsTerrainCfg(**_stairs(overrides))
 
 
 @terrain_preset
 def pyramid_stairs_inv(**overrides: Any) -> BoxInvertedPyramidStairsTerrainCfg:
-    """Stairs down to a platform."""
+    """Stairs that descend to a platform."""
     return BoxInvertedPyramidStairsTerrainCfg(**_stairs(overrides))
 
 
@@ -101,19 +101,19 @@ def _slope(overrides: dict[str, Any], inverted: bool) -> HfPyramidSlopedTerrainC
 
 @terrain_preset
 def hf_pyramid_slope(**overrides: Any) -> HfPyramidSlopedTerrainCfg:
-    """A hill with a platform."""
+    """Hill with a platform."""
     return _slope(overrides, inverted=False)
 
 
 @terrain_preset
 def hf_pyramid_slope_inv(**overrides: Any) -> HfPyramidSlopedTerrainCfg:
-    """A hollow with a platform."""
+    """Hollow with a platform."""
     return _slope(overrides, inverted=True)
 
 
 @terrain_preset
 def random_rough(**overrides: Any) -> HfRandomUniformTerrainCfg:
-    """Ground of random height."""
+    """Rough ground with random heights."""
     return HfRandomUniformTerrainCfg(
         **_override(overrides, noise_range=(0.02, 0.10), noise_step=0.02, border_width=0.25)
     )
@@ -149,7 +149,7 @@ def perlin_noise(**overrides: Any) -> HfPerlinNoiseTerrainCfg:
 
 @terrain_preset
 def box_random_grid(**overrides: Any) -> BoxRandomGridTerrainCfg:
-    """A grid of columns of random height."""
+    """Grid of columns with random heights."""
     return BoxRandomGridTerrainCfg(
         **_override(overrides, grid_width=0.4, grid_height_range=(0.0, 0.3), platform_width=1.0)
     )
@@ -157,7 +157,7 @@ def box_random_grid(**overrides: Any) -> BoxRandomGridTerrainCfg:
 
 @terrain_preset
 def random_spread_boxes(**overrides: Any) -> BoxRandomSpreadTerrainCfg:
-    """Boxes that lie about."""
+    """Boxes at random places on flat ground."""
     return BoxRandomSpreadTerrainCfg(**_override(
         overrides,
         num_boxes=80, box_width_range=(0.1, 1.0), box_length_range=(0.1, 2.0),
@@ -167,7 +167,7 @@ def random_spread_boxes(**overrides: Any) -> BoxRandomSpreadTerrainCfg:
 
 @terrain_preset
 def open_stairs(**overrides: Any) -> BoxOpenStairsTerrainCfg:
-    """Stairs of slabs, up to a platform."""
+    """Stairs of slabs that rise to a platform."""
     return BoxOpenStairsTerrainCfg(**_override(
         overrides,
         step_height_range=(0.1, 0.2), step_width_range=(0.4, 0.8), platform_width=1.0,
@@ -177,7 +177,7 @@ def open_stairs(**overrides: Any) -> BoxOpenStairsTerrainCfg:
 
 @terrain_preset
 def random_stairs(**overrides: Any) -> BoxRandomStairsTerrainCfg:
-    """Stairs of random height, up to a platform."""
+    """Stairs with random step heights that rise to a platform."""
     return BoxRandomStairsTerrainCfg(**_override(
         overrides,
         step_width=0.8, step_height_range=(0.1, 0.3), platform_width=1.0, border_width=0.25,
@@ -186,7 +186,7 @@ def random_stairs(**overrides: Any) -> BoxRandomStairsTerrainCfg:
 
 @terrain_preset
 def stepping_stones(**overrides: Any) -> BoxSteppingStonesTerrainCfg:
-    """Stones over a pit."""
+    """Stepping stones over a pit."""
     return BoxSteppingStonesTerrainCfg(**_override(
         overrides,
         stone_size_range=(0.4, 0.8), stone_distance_range=(0.2, 0.5), stone_height=0.2,
@@ -241,7 +241,7 @@ ROUGH_TERRAINS_CFG = TerrainGeneratorCfg(
     },
     add_lights=True,
 )
-"""Rough ground for legged robots, the set of the rough velocity tasks."""
+"""Rough terrain for legged robots, used by the rough velocity tasks."""
 
 STAIRS_TERRAINS_CFG = TerrainGeneratorCfg(
     curriculum=True,
@@ -271,7 +271,7 @@ STAIRS_TERRAINS_CFG = TerrainGeneratorCfg(
     },
     add_lights=True,
 )
-"""A curriculum of stairs of four kinds."""
+"""Curriculum of four stair types."""
 
 ALL_TERRAINS_CFG = TerrainGeneratorCfg(
     size=(8.0, 8.0),
@@ -281,4 +281,4 @@ ALL_TERRAINS_CFG = TerrainGeneratorCfg(
     sub_terrains={name: preset() for name, preset in ALL_TERRAIN_PRESETS.items()},
     add_lights=True,
 )
-"""Every preset, each as likely as any other."""
+"""All presets, with equal proportions."""

@@ -1,8 +1,8 @@
-"""Sub-terrains made of one height field.
+"""Height field sub-terrains: one height field each.
 
-Heights are whole multiples of `vertical_scale` (Perlin noise excepted) on pixels of
-`horizontal_scale`; the border stays at height 0. Rows of a field run along y and columns along x.
-Each is authored with its low corner at the origin, and z is that of the world.
+Heights are integer multiples of `vertical_scale` (except Perlin noise) on pixels of
+`horizontal_scale`; the border has height 0. Rows of a field run along y and columns along x.
+The low corner of each sub-terrain is at its origin, and z is world z.
 """
 
 from __future__ import annotations
@@ -32,62 +32,62 @@ from mjlab.utils.errors import check_field, check_field_range, check_fields_posi
 # A thin sheet lets fast or deep contacts through to the other side.
 MIN_BASE_THICKNESS = 0.5
 
-# Radius around the centre in which robots are placed and reach (m).
+# Radius around the center of the area robots start in and touch (m).
 SPAWN_RADIUS = 1.0
 
-# A mistyped pixel size should raise, rather than fill the memory.
+# A mistyped pixel size should raise an error instead of filling the memory.
 _MAX_PIXELS = 10_000_000
 
-# Obstacles stand, and their footprints grow, in steps of this many pixels.
+# Step of obstacle positions and side lengths (pixels).
 _OBSTACLE_STEP = 4
 
-# A field of Perlin noise is at least this high, in metres.
+# Minimum height of a Perlin noise field (m).
 _MIN_PERLIN_HEIGHT = 0.001
 
 # Gradients by the last two bits of a hash: x + y, x - y, -x + y, -x - y.
 _SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 
-# The height above or below z = 0, in metres, at which colours stop changing.
+# Colors saturate at this height above or below z = 0 (m).
 _FULL_COLOR_HEIGHT = 0.75
 
-# The hue at z = 0, a green; it goes to red above and to blue below.
+# Hue at z = 0: green. Hues turn to red above and to blue below.
 _GROUND_HUE = 0.33
 
 
 @dataclass(kw_only=True)
 class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
-    """Blocks and pits of random sizes at random places."""
+    """Blocks and pits of random size at random places."""
 
     obstacle_height_mode: Literal["choice", "fixed"] = "choice"
-    """`fixed` gives every obstacle the full height; `choice` draws from the full and half height,
-    up and down."""
+    """Height of obstacles: `fixed` (full height), or `choice` (random: full or half height, up or
+    down)."""
     obstacle_width_range: tuple[float, float]
-    """Smallest and largest side of an obstacle, in metres."""
+    """Minimum and maximum side length of obstacles (m)."""
     obstacle_height_range: tuple[float, float]
-    """Full height of obstacles at difficulty 0 and 1, in metres."""
+    """Full obstacle height at difficulty 0 and 1 (m)."""
     num_obstacles: int
-    """Number of obstacles; later ones overwrite earlier ones."""
+    """Number of obstacles. Later obstacles overwrite earlier ones."""
     platform_width: float = 1.0
-    """Side of the square at the centre that is cleared, in metres."""
+    """Side length of the flat square at the center (m)."""
     horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
+    """Pixel size (m)."""
     vertical_scale: float = 0.005
-    """Step of heights, in metres."""
+    """Height resolution (m)."""
     base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    """Base thickness below the lowest point / height difference. Minimum thickness: 0.5 m."""
     border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
+    """Width of the flat border (m). 0, or at least one pixel."""
     square_obstacles: bool = False
-    """Whether obstacles are as long as they are wide."""
+    """Use obstacles with equal length and width."""
     origin_z_offset: float = 0.0
-    """How far above the platform robots start, in metres."""
+    """Height of the spawn point above the platform (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """Add the terrain; robots start on the platform.
+        """Add the terrain, with the spawn point on the platform.
 
-        Obstacles begin at every fourth pixel inside the border, and are cut off where it ends.
+        Obstacles start at every fourth pixel inside the border, and are clipped at the border.
         """
         check_heightfield(self, "vertical_scale")
         mode, modes = self.obstacle_height_mode, ("choice", "fixed")
@@ -113,7 +113,7 @@ class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
         row, col = pixels.rows // 2, pixels.cols // 2
         noise[row - half : row + half, col - half : col + half] = 0
         field = add_noise(self, spec, noise)
-        # Without a platform robots stand on whatever there is at the centre.
+        # Without a platform robots stand on the obstacles at the center.
         around = max(half, 1)
         ground = field.surface[row - around : row + around, col - around : col + around].max()
         return finish(self, field, float(ground) + self.origin_z_offset, rng)
@@ -121,30 +121,30 @@ class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
 
 @dataclass(kw_only=True)
 class HfPyramidSlopedTerrainCfg(SubTerrainCfg):
-    """A hill with a flat top, or, inverted, a hollow with a flat bottom."""
+    """Pyramidal hill with a flat top, or, inverted, a hollow with a flat bottom."""
 
     slope_range: tuple[float, float]
-    """Rise over run along the centre lines, at difficulty 0 and 1."""
+    """Slope (rise / run) along the center lines at difficulty 0 and 1."""
     platform_width: float = 1.0
-    """Side of the flat square at the centre, in metres."""
+    """Side length of the flat square at the center (m)."""
     inverted: bool = False
-    """Whether it goes down instead of up."""
+    """Slope down to the platform instead of up."""
     border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
+    """Width of the flat border (m). 0, or at least one pixel."""
     horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
+    """Pixel size (m)."""
     vertical_scale: float = 0.005
-    """Step of heights, in metres."""
+    """Height resolution (m)."""
     base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    """Base thickness below the lowest point / height difference. Minimum thickness: 0.5 m."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """Add the terrain; robots start on the platform.
+        """Add the terrain, with the spawn point on the platform.
 
         Heights are `peak a(x) a(y)` with `a(x) = (c - |c - x|) / c`, c half the number of pixels,
-        cut off where the platform begins.
+        clipped at the height of the platform's edge.
         """
         check_heightfield(self, "vertical_scale")
         pixels = divide_into_pixels(self)
@@ -152,7 +152,7 @@ class HfPyramidSlopedTerrainCfg(SubTerrainCfg):
         check_platform_fits(self)
         slope = lerp(self.slope_range, difficulty) * (-1.0 if self.inverted else 1.0)
         peak = int(slope * pixels.inner_size[0] / 2 / self.vertical_scale)
-        # Tents: 0 at the start and 1 in the middle.
+        # Triangles: 0 at the start and 1 at the center.
         middles = [(count // 2, np.arange(count)) for count in pixels.inner]
         ramp_y, ramp_x = ((middle - np.abs(middle - k)) / middle for middle, k in middles)
         raw = peak * ramp_y[:, None] * ramp_x[None, :]
@@ -162,53 +162,53 @@ class HfPyramidSlopedTerrainCfg(SubTerrainCfg):
         raw = np.clip(raw, min(cut, 0.0), max(cut, 0.0))
         noise = pixels.with_border(np.rint(raw).astype(int))
         field = add_noise(self, spec, noise)
-        centre = field.surface[pixels.rows // 2, pixels.cols // 2]
-        return finish(self, field, float(centre), rng)
+        center = field.surface[pixels.rows // 2, pixels.cols // 2]
+        return finish(self, field, float(center), rng)
 
 
 @dataclass(kw_only=True)
 class HfRandomUniformTerrainCfg(SubTerrainCfg):
-    """Rough ground: random heights, interpolated if they are drawn more coarsely than pixels."""
+    """Rough ground: random heights, interpolated if sampled more coarsely than pixels."""
 
     noise_range: tuple[float, float]
-    """Lowest and highest height, in metres."""
+    """Lowest and highest height (m)."""
     noise_step: float = 0.005
-    """Step between possible heights, in metres; at least `vertical_scale`."""
+    """Step between possible heights (m). At least `vertical_scale`."""
     downsampled_scale: float | None = None
-    """Distance between drawn heights, in metres, at least a pixel; None for one at each pixel."""
+    """Distance between sampled heights (m), at least one pixel. None: every pixel."""
     horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
+    """Pixel size (m)."""
     vertical_scale: float = 0.005
-    """Step of heights, in metres."""
+    """Height resolution (m)."""
     base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    """Base thickness below the lowest point / height difference. Minimum thickness: 0.5 m."""
     border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
+    """Width of the flat border (m). 0, or at least one pixel."""
     scale_with_difficulty: bool = False
-    """Whether the range is multiplied by the difficulty, which otherwise changes nothing."""
+    """Scale `noise_range` by the difficulty. Otherwise the difficulty has no effect."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """Add the terrain; robots start at the height of the highest ground within 1 m."""
+        """Add the terrain, with the spawn point at the maximum height within 1 m."""
         check_heightfield(self, "vertical_scale", "noise_step")
         pixels = divide_into_pixels(self)
         check_field_range(self, "noise_range")
         step = int(self.noise_step / self.vertical_scale)
-        least = f"a multiple of vertical_scale = {self.vertical_scale:g} m, the step of heights"
-        check_field(self, "noise_step", step >= 1, least)
+        expected = f"a length >= vertical_scale = {self.vertical_scale:g} m"
+        check_field(self, "noise_step", step >= 1, expected)
         spacing = self._spacing(pixels.inner_size)
         factor = difficulty if self.scale_with_difficulty else 1.0
         low, high = (int(factor * end / self.vertical_scale) for end in self.noise_range)
-        # The first axis is the row, that is y.
+        # The first axis is the row (y).
         counts = [int(extent / spacing) for extent in pixels.inner_size[::-1]]
         drawn = rng.choice(np.arange(low, high + step, step), size=counts)
         noise = pixels.with_border(interpolate_cubic(drawn, pixels.inner))
         field = add_noise(self, spec, noise)
-        return finish(self, field, field.highest_near_centre(), rng)
+        return finish(self, field, field.max_height_near_center(), rng)
 
     def _spacing(self, inner_size: tuple[float, float]) -> float:
-        """Return the distance between drawn heights, which must give two along each side."""
+        """Return the distance between sampled heights (m): at least two heights along each side."""
         if self.downsampled_scale is None:
             return self.horizontal_scale
         low, high = self.horizontal_scale, min(inner_size) / 2
@@ -220,26 +220,26 @@ class HfRandomUniformTerrainCfg(SubTerrainCfg):
 
 @dataclass(kw_only=True)
 class HfWaveTerrainCfg(SubTerrainCfg):
-    """Waves along both axes, added up."""
+    """Sum of waves along x and y."""
 
     amplitude_range: tuple[float, float]
-    """Twice the amplitude of each of the two waves at difficulty 0 and 1, in metres: half of the
-    difference between the highest and the lowest point."""
+    """Twice the amplitude of each wave at difficulty 0 and 1 (m): half of the difference between
+    the highest and the lowest point."""
     num_waves: int = 1
-    """Number of waves along y inside the border; along x the wavelength is the same."""
+    """Number of waves along y inside the border. Waves along x have the same wavelength."""
     horizontal_scale: float = 0.1
-    """Size of a pixel, in metres."""
+    """Pixel size (m)."""
     vertical_scale: float = 0.005
-    """Step of heights, in metres."""
+    """Height resolution (m)."""
     base_thickness_ratio: float = 0.25
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    """Base thickness below the lowest point / height difference. Minimum thickness: 0.5 m."""
     border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
+    """Width of the flat border (m). 0, or at least one pixel."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """Add the terrain; robots start at the height of the highest ground within 1 m.
+        """Add the terrain, with the spawn point at the maximum height within 1 m.
 
         Heights are `A (cos(2 pi n col / L) + sin(2 pi n row / L))` with L the number of rows inside
         the border and A half the amplitude.
@@ -248,7 +248,7 @@ class HfWaveTerrainCfg(SubTerrainCfg):
         pixels = divide_into_pixels(self)
         check_field_range(self, "amplitude_range", lowest=0.0)
         most = pixels.inner[0] // 2
-        expected = f"1 to {most} waves, which is what {pixels.inner[0]} pixels along y can show"
+        expected = f"1 to {most} waves (>= 2 of the {pixels.inner[0]} pixels along y per wave)"
         check_field(self, "num_waves", 0 < self.num_waves <= most, expected)
         amplitude = int(0.5 * lerp(self.amplitude_range, difficulty) / self.vertical_scale)
         rows, cols = pixels.inner
@@ -256,36 +256,36 @@ class HfWaveTerrainCfg(SubTerrainCfg):
         raw = np.sin(turn * np.arange(rows))[:, None] + np.cos(turn * np.arange(cols))[None, :]
         noise = pixels.with_border(np.rint(amplitude * raw).astype(int))
         field = add_noise(self, spec, noise)
-        return finish(self, field, field.highest_near_centre(), rng)
+        return finish(self, field, field.max_height_near_center(), rng)
 
 
 @dataclass(kw_only=True)
 class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
-    """Smooth hills of several sizes: fractal Perlin noise."""
+    """Smooth hills of several sizes (fractal Perlin noise)."""
 
     height_range: tuple[float, float]
-    """Height of the highest point over the lowest at difficulty 0 and 1, in metres."""
+    """Height difference between highest and lowest point at difficulty 0 and 1 (m)."""
     octaves: int = 4
-    """Number of layers of noise, each finer and weaker than the one before."""
+    """Number of octaves, each with higher frequency and lower amplitude."""
     persistence: float = 0.5
-    """How much weaker each layer is, as a factor."""
+    """Amplitude factor between successive octaves."""
     lacunarity: float = 2.0
-    """How much finer each layer is, as a factor."""
+    """Frequency factor between successive octaves."""
     scale: float = 10.0
-    """Number of hills of the first layer along each side, times horizontal_scale / resolution."""
+    """Number of hills of the first octave along each side, times horizontal_scale / resolution."""
     horizontal_scale: float = 0.1
-    """Size that `scale` refers to, in metres."""
+    """Reference length of `scale` (m)."""
     resolution: float = 0.05
-    """Size of a pixel, in metres."""
+    """Pixel size (m)."""
     base_thickness_ratio: float = 1.0
-    """Thickness under the lowest point over the difference of heights; at least 0.5 m."""
+    """Base thickness below the lowest point / height difference. Minimum thickness: 0.5 m."""
     border_width: float = 0.0
-    """Width of the flat border, in metres: 0, or at least one pixel."""
+    """Width of the flat border (m). 0, or at least one pixel."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """Add the terrain; robots start at the height of the highest ground within 1 m."""
+        """Add the terrain, with the spawn point at the maximum height within 1 m."""
         check_heightfield(self, "scale", "lacunarity", "resolution")
         check_field(self, "octaves", self.octaves >= 1, "a number >= 1")
         check_field(self, "persistence", self.persistence >= 0.0, "a number >= 0")
@@ -294,8 +294,8 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
         frequency = self.scale * self.resolution / self.horizontal_scale
         check_field(
             self, "scale", 2 * frequency <= min(pixels.inner),
-            f"a number that makes at most {min(pixels.inner) // 2} hills along each side, which is "
-            f"what {min(pixels.inner)} pixels can show (this makes {frequency:g})",
+            f"a number with at most {min(pixels.inner) // 2} hills along each side (>= 2 of the "
+            f"{min(pixels.inner)} pixels per hill; hills with this value: {frequency:g})",
         )  # fmt: skip
         noise = fractal_noise(
             pixels.inner, frequency, self.octaves, self.persistence, self.lacunarity, rng
@@ -303,7 +303,7 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
         height = max(lerp(self.height_range, difficulty), _MIN_PERLIN_HEIGHT)
         surface = pixels.with_border(noise) * height
         field = add_heightfield(spec, self.size, surface, self.base_thickness_ratio, height)
-        return finish(self, field, field.highest_near_centre(), rng, pixel=self.resolution)
+        return finish(self, field, field.max_height_near_center(), rng, pixel=self.resolution)
 
 
 # Pixels and checks.
@@ -311,16 +311,16 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
 
 @dataclass(frozen=True)
 class Pixels:
-    """How a sub-terrain is divided into pixels. Arrays are indexed [row, col]: rows run along y."""
+    """Pixel grid of a sub-terrain. Arrays are indexed [row, col]; rows run along y."""
 
     rows: int
-    """Number of pixels along y, border included."""
+    """Number of pixels along y, including the border."""
     cols: int
-    """Number of pixels along x, border included."""
+    """Number of pixels along x, including the border."""
     border: int
-    """Width of the border, which stays at height 0, in pixels."""
+    """Width of the border (pixels). The border has height 0."""
     inner_size: tuple[float, float]
-    """Extent of the ground inside the border along x and y, in metres."""
+    """Extent inside the border along x and y (m)."""
 
     @property
     def inner(self) -> tuple[int, int]:
@@ -328,14 +328,14 @@ class Pixels:
         return self.rows - 2 * self.border, self.cols - 2 * self.border
 
     def with_border(self, inner: np.ndarray) -> np.ndarray:
-        """Return heights of the whole field, from (rows, cols) ones inside the border."""
+        """Pad heights inside the border, (rows, cols), to the whole field."""
         return np.pad(inner, self.border)
 
 
 def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale") -> Pixels:
-    """Divide `cfg.size` into pixels of the size in the given field of the config.
+    """Divide `cfg.size` into pixels of the size in field `pixel_field` of the config.
 
-    The number of columns comes from the x size and that of rows from the y size, both truncated.
+    Columns divide the x size and rows the y size, both rounded down.
 
     Raises:
         ValueError: pixels or border do not fit the size.
@@ -344,21 +344,21 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
     pixel, border_width = getattr(cfg, pixel_field), getattr(cfg, "border_width")  # noqa: B009
     check_field(
         cfg, "border_width", border_width == 0.0 or border_width >= pixel,
-        f"0, or at least one pixel ({pixel_field} = {pixel:g} m)",
+        f"0 or a length of at least one pixel ({pixel_field} = {pixel:g} m)",
     )  # fmt: skip
-    # In floats, because a tiny pixel makes more columns than an integer holds.
+    # In floats, because the number of tiny pixels overflows an integer.
     num_pixels = float(np.floor(cfg.size[0] / pixel) * np.floor(cfg.size[1] / pixel))
     check_field(
         cfg, pixel_field, num_pixels <= _MAX_PIXELS,
-        f"a length that makes at most {_MAX_PIXELS:,} pixels of {tuple(cfg.size)} m (this makes "
-        f"{num_pixels:,.0f})",
+        f"a length with at most {_MAX_PIXELS:,} pixels in {tuple(cfg.size)} m (pixels with this "
+        f"value: {num_pixels:,.0f})",
     )  # fmt: skip
     border = int(border_width / pixel)
     cols, rows = (int(extent / pixel) for extent in cfg.size)
     check_field(
         cfg, "size", min(rows, cols) - 2 * border >= 2,
-        f"at least 2 x 2 pixels of ground with {pixel_field} = {pixel:g} and border_width = "
-        f"{border_width:g}",
+        f"at least 2 x 2 pixels inside the border with {pixel_field} = {pixel:g} and border_width "
+        f"= {border_width:g}",
     )  # fmt: skip
     if border == 0:
         return Pixels(rows, cols, 0, (cfg.size[0], cfg.size[1]))
@@ -367,7 +367,7 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
 
 
 def check_heightfield(cfg: SubTerrainCfg, *scales: str) -> None:
-    """Check what all height fields have. `scales` are fields that must be positive."""
+    """Check the fields common to all height fields. `scales`: fields that must be positive."""
     check_fields_positive(cfg, "horizontal_scale", "base_thickness_ratio", *scales)
     for name, patch in (cfg.flat_patch_sampling or {}).items():
         check_flat_patch(name, patch, cfg.size)
@@ -378,33 +378,32 @@ def check_platform_fits(cfg: Any) -> None:
     room = min(cfg.size) - 2.0 * cfg.border_width
     check_field(
         cfg, "platform_width", 0.0 <= cfg.platform_width <= room,
-        f"a length from 0 to {room:g} m, which is what the border leaves of the size "
-        f"{tuple(cfg.size)}",
+        f"a length in [0, {room:g}] m (size {tuple(cfg.size)} without the border)",
     )  # fmt: skip
 
 
-# Fields and their colours.
+# Fields and their colors.
 
 
 @dataclass(frozen=True)
 class Heightfield:
-    """A height field in a spec, and the surface that it shows."""
+    """Height field in a spec, and its surface."""
 
     hfield: mujoco.MjsHField
     geom: mujoco.MjsGeom
     surface: np.ndarray
-    """(rows, cols) heights of the vertices, in metres; z of the world."""
+    """World z of the vertices (m), (rows, cols)."""
     size: tuple[float, float]
-    """Extent along x and y, in metres. Vertices are at multiples of size / (n - 1)."""
+    """Extent along x and y (m). Vertices are at multiples of size / (n - 1)."""
 
-    def highest_near_centre(self, radius: float = SPAWN_RADIUS) -> float:
-        """Return the highest vertex within `radius` of the centre, in metres."""
+    def max_height_near_center(self, radius: float = SPAWN_RADIUS) -> float:
+        """Return the maximum height within `radius` of the center (m)."""
         y, x = (
             np.linspace(-extent / 2, extent / 2, count)
             for extent, count in zip(self.size[::-1], self.surface.shape, strict=True)
         )
         squared = y[:, None] ** 2 + x[None, :] ** 2
-        # On a field with fewer vertices than that, the ones around the centre count.
+        # Coarse fields may have no vertex within the radius: use the nearest vertices.
         return float(self.surface[squared <= max(radius**2, squared.min() + 1e-9)].max())
 
 
@@ -415,18 +414,18 @@ def add_heightfield(
     thickness_ratio: float,
     flat_elevation: float,
 ) -> Heightfield:
-    """Add a height field whose surface is exactly `surface` to the body `terrain` of the spec.
+    """Add a height field with this exact surface to the body `terrain` of the spec.
 
-    MuJoCo stores elevations from 0 to 1, with rows along +y and columns along +x; vertices are
-    `size / (n - 1)` apart. The geom is centred at half the size, at the height of the lowest
-    vertex. Below that is a base of `thickness_ratio` times the elevation, at least 0.5 m.
+    MuJoCo stores elevations in [0, 1], with rows along +y and columns along +x; vertices are
+    `size / (n - 1)` apart. The geom is centered at half the size, at the height of the lowest
+    vertex. The base below has a thickness of `thickness_ratio` times the elevation, at least 0.5 m.
 
     Args:
-        spec: Where to add it.
-        size: Extent along x and y, in metres.
-        surface: (rows, cols) heights in metres, [row, col].
-        thickness_ratio: Thickness of the base over the elevation.
-        flat_elevation: The elevation that a flat field states, in metres; MuJoCo refuses 0.
+        spec: Spec to modify.
+        size: Extent along x and y (m).
+        surface: (rows, cols) heights (m), [row, col].
+        thickness_ratio: Thickness of the base / elevation.
+        flat_elevation: Elevation of a flat field (m). MuJoCo rejects 0.
     """
     low = float(surface.min())
     span = float(surface.max()) - low
@@ -454,7 +453,7 @@ def add_heightfield(
 
 
 def add_noise(cfg: Any, spec: mujoco.MjSpec, noise: np.ndarray) -> Heightfield:
-    """Add a field of whole multiples of `vertical_scale`."""
+    """Add a height field given in integer multiples of `vertical_scale`."""
     return add_heightfield(
         spec, cfg.size, noise * cfg.vertical_scale, cfg.base_thickness_ratio, cfg.vertical_scale
     )
@@ -467,7 +466,7 @@ def finish(
     rng: np.random.Generator,
     pixel: float | None = None,
 ) -> TerrainOutput:
-    """Return a field and its spawn point, and draw its flat patches."""
+    """Return the terrain output: geom, spawn point and sampled flat patches."""
     low = float(field.surface.min())
     patches = {
         name: find_flat_patches_from_heightfield(
@@ -477,7 +476,7 @@ def finish(
     }
     return TerrainOutput(
         origin=np.array([field.size[0] / 2, field.size[1] / 2, spawn_height]),
-        # It keeps the colours of its texture.
+        # Without a color, the geom keeps the colors of its texture.
         geometries=[TerrainGeometry(geom=field.geom, hfield=field.hfield)],
         flat_patches=patches or None,
     )
@@ -490,24 +489,25 @@ def color_by_height(
     physical_heights: np.ndarray,
     texture_size: int = 128,
 ) -> str:
-    """Add a texture that shows heights, and a material with it, and return the material's name.
+    """Add a material with a texture colored by height, and return the material's name.
 
-    The scale is absolute and the same for all terrains: with `s = clip(h / 0.75, -1, 1)`, the hue
-    is `0.33 (1 - s)` and saturation and value are `0.45 + 0.25 |s|`, so that ground at z = 0 is
-    green, hills turn red and hollows blue.
+    The color scale is absolute and the same for all terrains: with `s = clip(h / 0.75, -1, 1)`, the
+    hue is `0.33 (1 - s)`, saturation and value are `0.45 + 0.25 |s|`. So ground at z = 0 is green,
+    hills turn red and hollows blue.
 
     Args:
-        spec: Where to add them.
-        noise: Heights in pixels' units. They are not read: colours follow `physical_heights`.
+        spec: Spec to modify.
+        noise: Heights in multiples of the vertical scale. Unused: colors follow
+            `physical_heights`.
         unique_id: Name of the texture and of the material.
-        physical_heights: (rows, cols) heights above z = 0, in metres, [row, col].
-        texture_size: Width and height of the texture, in pixels.
+        physical_heights: (rows, cols) heights above z = 0 (m), [row, col].
+        texture_size: Width and height of the texture (pixels).
     """
     heights = resample_linear(np.asarray(physical_heights, float), (texture_size, texture_size))
     level = np.clip(heights / _FULL_COLOR_HEIGHT, -1.0, 1.0)
     vividness = 0.45 + 0.25 * np.abs(level)
     rgb = hsv_to_rgb(_GROUND_HUE * (1.0 - level), vividness, vividness)
-    # Rows of a field go up along y, and rows of a texture go down.
+    # Rows of a field run along +y, rows of a texture along -y.
     pixels = (rgb * 255.0).astype(np.uint8)[::-1]
     texture = spec.add_texture(
         name=unique_id,
@@ -523,7 +523,7 @@ def color_by_height(
 
 
 def hsv_to_rgb(hue: np.ndarray, saturation: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Convert arrays of any shape S to RGB of shape (*S, 3); everything is from 0 to 1.
+    """Convert HSV arrays of any shape S to RGB of shape (*S, 3), all in [0, 1].
 
     Channel n is `v - v s max(0, min(k, 4 - k, 1))` with `k = (n + 6 h) mod 6` and n = 5, 3, 1.
     """
@@ -543,18 +543,18 @@ def fractal_noise(
     lacunarity: float,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Return (rows, cols) noise, stretched to run from 0 to 1; zeros if there is none.
+    """Return noise rescaled to [0, 1], (rows, cols). Constant noise: zeros.
 
     Octave k adds gradient noise (K. Perlin, "Improving noise", SIGGRAPH 2002) with
-    `frequency * lacunarity^k` cells along each side and the weight `persistence^k`.
+    `frequency * lacunarity^k` cells along each side and weight `persistence^k`.
 
     Args:
         shape: Number of rows and columns.
-        frequency: Cells of the first octave along each side.
+        frequency: Number of cells of the first octave along each side.
         octaves: Number of octaves.
-        persistence: How much weaker each octave is than the one before.
-        lacunarity: How much finer each octave is than the one before.
-        rng: Draws the permutation of the lattice's gradients.
+        persistence: Amplitude factor between successive octaves.
+        lacunarity: Frequency factor between successive octaves.
+        rng: Source of the permutation of lattice gradients.
     """
     permutation = np.tile(rng.permutation(256), 2)
     total, weights = np.zeros(shape), 0.0

@@ -1,4 +1,4 @@
-"""Sub-terrains made of boxes (and of convex columns): stairs, grids, obstacles, and over a pit."""
+"""Box sub-terrains: stairs, grids (also of convex columns), obstacles, and terrains over a pit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mjlab.terrains.boxes import (
     RED,
     RGBA,
     Boxes,
-    frame_color,
+    border_color,
     inset,
     merge_equal_cells,
 )
@@ -30,16 +30,16 @@ from mjlab.utils.errors import (
     check_fields_positive,
 )
 
-# What rounding errors may add to the edges of cells, in metres.
+# Tolerance for rounding errors of cell edges (m).
 _TOLERANCE = 1e-9
 
-# Height of frame and platform of a tilted grid, in metres.
+# Height of border and platform of a tilted grid (m).
 _TILTED_HEIGHT = 0.2
 
-# Stones that the frame leaves less than this are dropped, in metres.
+# Minimum extent of stones clipped at the border (m). Smaller stones are dropped.
 _MIN_STONE = 0.05
 
-# Beams shorter than this are dropped, in metres: the platform reaches the frame there.
+# Minimum length of beams (m). Shorter beams are dropped: there the platform meets the border.
 _MIN_BEAM = 0.01
 
 
@@ -50,37 +50,37 @@ class BoxFlatTerrainCfg(SubTerrainCfg):
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         boxes = Boxes(spec, self.size)
         boxes.add_platform(self.size, 0.0, (0.5, 0.5, 0.5, 1.0), bottom=-1.0)
         return boxes.output(0.0)
 
 
-# Stairs in square rings, which rise or fall towards a platform in the middle.
+# Stairs in square rings that rise or descend towards a central platform.
 
 
 @dataclass(kw_only=True)
 class BoxPyramidStairsTerrainCfg(SubTerrainCfg):
     """Stairs that rise from all sides to a platform.
 
-    A harder terrain has higher steps. The platform is one step above the last.
+    Difficulty increases the step height. The platform is one step above the last step.
     """
 
     border_width: float = 0.0
-    """Width of the flat frame around the stairs, in metres."""
+    """Width of the flat border around the stairs (m)."""
     step_height_range: tuple[float, float]
-    """Height of a step at difficulty 0 and 1, in metres."""
+    """Step height at difficulty 0 and 1 (m)."""
     step_width: float
-    """Depth of a step, in metres."""
+    """Step depth (m)."""
     platform_width: float = 1.0
-    """Least extent of the platform, in metres."""
+    """Minimum extent of the platform (m)."""
     holes: bool = False
-    """Whether steps are only as long as the platform is wide, with nothing at the corners."""
+    """Use steps as long as the platform is wide, with holes at the corners."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         return self._make(difficulty, spec, BLUE, direction=1)
 
     def _make(
@@ -90,16 +90,16 @@ class BoxPyramidStairsTerrainCfg(SubTerrainCfg):
         base: tuple[float, float, float],
         direction: int,
     ) -> TerrainOutput:
-        """Make stairs that rise (direction 1) or fall (-1) towards the middle."""
+        """Add stairs that rise (direction 1) or descend (-1) towards the center."""
         check_fields_positive(self, "step_width")
         boxes = Boxes(spec, self.size)
         height = lerp(self.step_height_range, difficulty)
         inner = inset(self.size, self.border_width)
         count = _count_steps(inner, self.platform_width, self.step_width)
         if not self.holes:
-            boxes.add_frame(self.border_width, 0.0, frame_color(base), bottom=-height)
+            boxes.add_border(self.border_width, 0.0, border_color(base), bottom=-height)
         last = direction * (count + 1) * height
-        # Steps that rise reach below the ground around them, those that fall to the platform.
+        # Rising steps extend below the surrounding ground, descending steps to the platform.
         bottom = -height if direction > 0 else last
         for step in range(count):
             boxes.add_ring(
@@ -117,40 +117,40 @@ class BoxPyramidStairsTerrainCfg(SubTerrainCfg):
 
 @dataclass(kw_only=True)
 class BoxInvertedPyramidStairsTerrainCfg(BoxPyramidStairsTerrainCfg):
-    """Stairs that fall from all sides to a platform."""
+    """Stairs that descend from all sides to a platform."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         return self._make(difficulty, spec, RED, direction=-1)
 
 
 @dataclass(kw_only=True)
 class BoxOpenStairsTerrainCfg(SubTerrainCfg):
-    """Stairs of slabs with nothing below them.
+    """Stairs of slabs with open space below.
 
-    A harder terrain has steps that are higher and not as deep.
+    Difficulty increases the step height and decreases the step depth.
     """
 
     step_height_range: tuple[float, float] = (0.1, 0.2)
-    """Height of a step at difficulty 0 and 1, in metres."""
+    """Step height at difficulty 0 and 1 (m)."""
     step_width_range: tuple[float, float] = (0.4, 0.8)
-    """Depth of a step at difficulty 1 and 0, in metres."""
+    """Step depth at difficulty 1 and 0 (m)."""
     platform_width: float = 1.0
-    """Least extent of the platform in the middle, in metres."""
+    """Minimum extent of the central platform (m)."""
     border_width: float = 0.25
-    """Width of the flat frame around the stairs, in metres."""
+    """Width of the flat border around the stairs (m)."""
     step_thickness: float = 0.05
-    """Thickness of the slabs, in metres."""
+    """Thickness of the slabs (m)."""
     inverted: bool = True
-    """Whether the stairs fall towards the platform. The first step is then level with the frame,
-    and the platform one step below the last."""
+    """Descend towards the platform. The first step is then level with the border, and the platform
+    one step below the last step."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "step_thickness")
         check_field(self, "step_width_range", min(self.step_width_range) > 0.0, "widths > 0")
         boxes = Boxes(spec, self.size)
@@ -158,7 +158,7 @@ class BoxOpenStairsTerrainCfg(SubTerrainCfg):
         width = lerp(self.step_width_range[::-1], difficulty)
         inner = inset(self.size, self.border_width)
         count = _count_steps(inner, self.platform_width, width)
-        boxes.add_frame(self.border_width, 0.0, frame_color(BLUE), bottom=-height)
+        boxes.add_border(self.border_width, 0.0, border_color(BLUE), bottom=-height)
         tops = [-k * height if self.inverted else (k + 1) * height for k in range(count + 1)]
         for step in range(count):
             boxes.add_ring(
@@ -175,29 +175,29 @@ class BoxOpenStairsTerrainCfg(SubTerrainCfg):
 
 @dataclass(kw_only=True)
 class BoxRandomStairsTerrainCfg(SubTerrainCfg):
-    """Stairs that rise to a platform, each step by another height.
+    """Stairs with random step heights that rise to a platform.
 
-    A harder terrain has higher steps: half of the drawn height at difficulty 0, all of it at 1.
+    Difficulty scales the sampled heights: by 0.5 at difficulty 0, by 1 at difficulty 1.
     """
 
     step_width: float = 0.8
-    """Depth of a step, in metres."""
+    """Step depth (m)."""
     step_height_range: tuple[float, float] = (0.1, 0.3)
-    """Range from which the height of each step is drawn, in metres."""
+    """Range of random step heights (m)."""
     platform_width: float = 1.0
-    """Least extent of the platform in the middle, in metres. It is level with the last step."""
+    """Minimum extent of the central platform, level with the last step (m)."""
     border_width: float = 0.25
-    """Width of the flat frame around the stairs, in metres."""
+    """Width of the flat border around the stairs (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "step_width")
         boxes = Boxes(spec, self.size)
         inner = inset(self.size, self.border_width)
         count = _count_steps(inner, self.platform_width, self.step_width)
-        boxes.add_frame(self.border_width, 0.0, frame_color(BLUE))
+        boxes.add_border(self.border_width, 0.0, border_color(BLUE))
         top = 0.0
         for step in range(count):
             top += float(rng.uniform(*self.step_height_range)) * (0.5 + 0.5 * difficulty)
@@ -210,7 +210,7 @@ class BoxRandomStairsTerrainCfg(SubTerrainCfg):
 
 
 def _count_steps(inner: tuple[float, float], platform: float, step_width: float) -> int:
-    """Return how many rings of steps fit between the frame and the platform."""
+    """Return the number of step rings that fit between border and platform."""
     return max(0, min(int((side - platform) / (2.0 * step_width)) for side in inner))
 
 
@@ -218,61 +218,60 @@ def _shade(base: tuple[float, float, float], step: int, count: int) -> RGBA:
     return brand_ramp(base, step / max(count - 1, 1))
 
 
-# Grids of cells: level ones of random height, or tilted ones.
+# Grids of columns: with random heights, or with tilted tops.
 
 
 @dataclass(kw_only=True)
 class BoxRandomGridTerrainCfg(SubTerrainCfg):
-    """A grid of square columns of random height, around a platform as high as they get.
+    """Grid of square columns with random heights, around a platform of maximum height.
 
-    A harder terrain has larger differences in height. The size must be square.
+    Difficulty increases the height range. The size must be square.
     """
 
     grid_width: float
-    """Extent of a column along x and y, in metres."""
+    """Column extent along x and y (m)."""
     grid_height_range: tuple[float, float]
-    """Largest height of a column at difficulty 0 and 1, in metres; heights are drawn between that
-    below zero and that above."""
+    """Maximum column height h at difficulty 0 and 1 (m). Heights are sampled from [-h, h]."""
     platform_width: float = 1.0
-    """Extent of the platform in the middle, in metres."""
+    """Extent of the central platform (m)."""
     holes: bool = False
-    """Whether only the columns of a cross are kept, which is as wide as the platform."""
+    """Keep only the columns of a cross as wide as the platform."""
     merge_similar_heights: bool = False
-    """Whether neighbours of about the same height become one box, for fewer geoms."""
+    """Merge neighboring columns of similar height into one box, to reduce the number of geoms."""
     height_merge_threshold: float = 0.05
-    """Multiple to which heights are rounded before merging, in metres."""
+    """Step to round heights to before merging (m)."""
     max_merge_distance: int = 3
-    """Most columns along x and y that become one box."""
+    """Maximum number of columns per merged box, along each of x and y."""
     border_width: float = 0.25
-    """Least width of the flat frame around the grid, in metres."""
+    """Minimum width of the flat border around the grid (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`.
+        """Add the terrain; see `SubTerrainCfg.function`.
 
         Raises:
-            RuntimeError: columns fill the whole terrain and leave no frame.
-            ValueError: a field makes no sense.
+            RuntimeError: columns fill the whole terrain without a border.
+            ValueError: invalid field.
         """
         check_field(self, "size", self.size[0] == self.size[1], "a square")
         check_field(self, "grid_height_range", min(self.grid_height_range) >= 0.0, "heights >= 0")
         check_fields_positive(self, "height_merge_threshold", "max_merge_distance")
         boxes = Boxes(spec, self.size)
         grid = _lay_out(self, boxes.center)
-        if min(grid.frame) <= _TOLERANCE:
+        if min(grid.border) <= _TOLERANCE:
             raise WrongStateError(
-                f"BoxRandomGridTerrainCfg: {grid.counts[0]} columns of grid_width "
-                f"{self.grid_width} m fill the size of {self.size[0]} m and leave no frame. "
-                "Give a border_width, or another grid_width."
+                f"BoxRandomGridTerrainCfg: expected a border, got {grid.counts[0]} columns of "
+                f"grid_width {self.grid_width} m that fill the size of {self.size[0]} m; set "
+                "border_width, or change grid_width."
             )
-        boxes.add_frame(grid.frame, 0.0, frame_color(GREEN), bottom=-1.0)
+        boxes.add_border(grid.border, 0.0, border_color(GREEN), bottom=-1.0)
         highest = lerp(self.grid_height_range, difficulty)
         heights = rng.uniform(-highest, highest, grid.counts)
         merge = self.merge_similar_heights and not self.holes
         if merge:
             threshold = self.height_merge_threshold
-            # Rounding must not lift a column that the platform hides in part above it.
+            # Rounding must not lift partly covered columns above the platform.
             rounded = np.round(heights / threshold) * threshold
             heights = np.clip(rounded, -highest, highest)
         kept = [
@@ -298,33 +297,33 @@ class BoxRandomGridTerrainCfg(SubTerrainCfg):
 
 @dataclass(kw_only=True)
 class BoxTiltedGridTerrainCfg(SubTerrainCfg):
-    """A grid of square columns over a pit, with tilted tops, around a level platform.
+    """Grid of square columns with tilted tops over a pit, around a level platform.
 
-    A harder terrain has larger tilts and differences in height.
+    Difficulty increases tilts and height differences.
     """
 
     grid_width: float = 1.0
-    """Extent of a column along x and y, in metres."""
+    """Column extent along x and y (m)."""
     tilt_range_deg: float = 15.0
-    """Largest tilt about x and about y at difficulty 1, in degrees."""
+    """Maximum tilt about each of x and y at difficulty 1 (deg)."""
     height_range: float = 0.1
-    """Range of heights at difficulty 1, in metres, about that of the platform."""
+    """Height range at difficulty 1, centered on the platform height (m)."""
     platform_width: float = 1.0
-    """Extent of the platform in the middle, in metres."""
+    """Extent of the central platform (m)."""
     border_width: float = 0.25
-    """Least width of the flat frame around the grid, in metres."""
+    """Minimum width of the flat border around the grid (m)."""
     floor_depth: float = 2.0
-    """Depth of the pit, in metres."""
+    """Pit depth (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "floor_depth")
         boxes = Boxes(spec, self.size)
         grid = _lay_out(self, boxes.center)
-        dark, bottom = frame_color(GREEN), -self.floor_depth
-        boxes.add_pit(grid.frame, _TILTED_HEIGHT, dark, self.floor_depth)
+        dark, bottom = border_color(GREEN), -self.floor_depth
+        boxes.add_pit(grid.border, _TILTED_HEIGHT, dark, self.floor_depth)
         platform = (self.platform_width, self.platform_width)
         boxes.add_platform(platform, _TILTED_HEIGHT, dark, bottom=bottom)
         name = asset_name(spec, "tilted_column")
@@ -350,7 +349,7 @@ class BoxTiltedGridTerrainCfg(SubTerrainCfg):
         corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * grid.width
         tops = _TILTED_HEIGHT + rise + corners @ slopes
         if grid.touches_platform(*cell):
-            # A column that reaches under the platform must not come out of it.
+            # A column that extends under the platform must not protrude through the platform.
             tops -= max(tops.max() - _TILTED_HEIGHT, 0.0)
         bottoms = np.full(4, -self.floor_depth)
         points = np.concatenate(
@@ -365,42 +364,42 @@ class BoxTiltedGridTerrainCfg(SubTerrainCfg):
 
 @dataclass(frozen=True)
 class _Grid:
-    """Square cells about the middle of a sub-terrain, with a platform over some of them."""
+    """Grid of square cells about the center of a sub-terrain, partly covered by a platform."""
 
     width: float
-    """Extent of a cell, in metres."""
+    """Cell extent (m)."""
     counts: tuple[int, int]
     """Number of cells along x and y."""
-    frame: tuple[float, float]
-    """Distance of the cells from the edge of the sub-terrain, along x and y."""
+    border: tuple[float, float]
+    """Distance of the cells from the edge of the sub-terrain along x and y (m)."""
     center: tuple[float, float]
-    """Middle of the sub-terrain."""
+    """Center of the sub-terrain (m)."""
     platform: float
-    """Extent of the platform."""
+    """Platform extent (m)."""
 
     def place(self, i: int, j: int) -> tuple[float, float]:
-        """Return the centre of cell (i, j)."""
+        """Return the center of cell (i, j)."""
         return (
-            self.frame[0] + (i + 0.5) * self.width,
-            self.frame[1] + (j + 0.5) * self.width,
+            self.border[0] + (i + 0.5) * self.width,
+            self.border[1] + (j + 0.5) * self.width,
         )
 
     def cells(self) -> Iterator[tuple[int, int]]:
-        """Yield all cells, those of one x after another."""
+        """Yield all cells (i, j), j fastest."""
         for i in range(self.counts[0]):
             for j in range(self.counts[1]):
                 yield i, j
 
     def is_under_platform(self, i: int, j: int) -> bool:
-        """Return whether the platform hides the whole cell."""
+        """Return True if the platform covers the whole cell."""
         return self._farthest(i, j) + self.width / 2 <= self.platform / 2 + _TOLERANCE
 
     def touches_platform(self, i: int, j: int) -> bool:
-        """Return whether the platform hides part of the cell, or all of it."""
+        """Return True if the platform covers part of the cell, or the whole cell."""
         return self._farthest(i, j) - self.width / 2 < self.platform / 2 - _TOLERANCE
 
     def is_in_cross(self, i: int, j: int) -> bool:
-        """Return whether the cell's centre is in one of the strips across the platform."""
+        """Return True if the cell's center is in a strip along x or y through the platform."""
         x, y = self.place(i, j)
         apart = min(abs(x - self.center[0]), abs(y - self.center[1]))
         return apart <= self.platform / 2 + _TOLERANCE
@@ -415,12 +414,12 @@ def _lay_out(
 ) -> _Grid:
     check_fields_positive(cfg, "grid_width")
     counts = tuple(int((side - 2.0 * cfg.border_width) / cfg.grid_width) for side in cfg.size)
-    check_field(cfg, "grid_width", min(counts) >= 1, "a width of which a cell fits in the borders")
-    frame = tuple(
+    check_field(cfg, "grid_width", min(counts) >= 1, "a width that fits inside the border")
+    border = tuple(
         (side - count * cfg.grid_width) / 2 for side, count in zip(cfg.size, counts, strict=True)
     )
     return _Grid(
-        cfg.grid_width, (counts[0], counts[1]), (frame[0], frame[1]), center, cfg.platform_width
+        cfg.grid_width, (counts[0], counts[1]), (border[0], border[1]), center, cfg.platform_width
     )
 
 
@@ -429,42 +428,42 @@ def _lay_out(
 
 @dataclass(kw_only=True)
 class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
-    """Boxes of random size, at random places and turned at random, around a free square.
+    """Boxes of random size, position and yaw around a free square.
 
-    A harder terrain has more and higher boxes. Boxes that would reach into the square are left out.
+    Difficulty increases number and height of boxes. Boxes that overlap the square are dropped.
     """
 
     num_boxes: int = 60
-    """Number of boxes at difficulty 1; half of it at 0."""
+    """Number of boxes at difficulty 1. Half at difficulty 0."""
     box_width_range: tuple[float, float] = (0.3, 1.0)
-    """Range of a box's length along its x axis, in metres."""
+    """Range of box lengths along the box's x axis (m)."""
     box_length_range: tuple[float, float] = (0.3, 1.0)
-    """Range of a box's length along its y axis, in metres."""
+    """Range of box lengths along the box's y axis (m)."""
     box_height_range: tuple[float, float] = (0.05, 1.0)
-    """Range of a box's height at difficulty 1, in metres; a fifth of it at 0."""
+    """Range of box heights at difficulty 1 (m). One fifth at difficulty 0."""
     box_yaw_range: tuple[float, float] = (0.0, 360.0)
-    """Range of a box's rotation about z, in degrees."""
+    """Range of box rotations about z (deg)."""
     add_floor: bool = True
-    """Whether there is ground between the boxes, instead of only a platform in the middle."""
+    """Add ground between the boxes. Otherwise only a central platform."""
     platform_width: float = 1.0
-    """Extent of the square in the middle, in metres."""
+    """Extent of the central square (m)."""
     border_width: float = 0.25
-    """Width of the flat frame around the boxes, in metres."""
+    """Width of the flat border around the boxes (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         for field in ("box_width_range", "box_length_range", "box_height_range"):
             check_field_range(self, field, lowest=0.0)
             check_field(self, field, getattr(self, field)[0] > 0.0, "lengths > 0")
         check_field_range(self, "box_yaw_range")
         check_field(self, "num_boxes", self.num_boxes >= 0, "a number >= 0")
         boxes = Boxes(spec, self.size)
-        boxes.add_frame(self.border_width, 0.0, frame_color(BLUE), bottom=-1.0)
+        boxes.add_border(self.border_width, 0.0, border_color(BLUE), bottom=-1.0)
         inner = inset(self.size, self.border_width)
         ground = inner if self.add_floor else (self.platform_width, self.platform_width)
-        boxes.add_platform(ground, 0.0, frame_color(BLUE), bottom=-1.0 * (not self.add_floor))
+        boxes.add_platform(ground, 0.0, border_color(BLUE), bottom=-1.0 * (not self.add_floor))
         for _ in range(int(self.num_boxes * (0.5 + 0.5 * difficulty))):
             self._add_obstacle(boxes, inner, difficulty, rng)
         return boxes.output(0.0)
@@ -481,8 +480,8 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         room = np.maximum(np.array(inner) - length, 0.0) / 2
         place = np.array([rng.uniform(-room[0], room[0]), rng.uniform(-room[1], room[1])])
         yaw = math.radians(rng.uniform(*self.box_yaw_range))
-        # The draws above keep the box as it is before it turns inside the frame.
-        reach = _turned_extent(length, yaw) / 2
+        # The sampling ranges above keep only the unrotated box inside the border.
+        reach = _rotated_extent(length, yaw) / 2
         limit = np.maximum(np.array(inner) / 2 - reach, 0.0)
         place = np.clip(place, -limit, limit)
         if (reach > np.array(inner) / 2).any():
@@ -497,72 +496,73 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         )  # fmt: skip
 
 
-def _turned_extent(length: np.ndarray, yaw: float) -> np.ndarray:
-    """Return the (2,) extent along x and y of a rectangle that is turned by yaw."""
+def _rotated_extent(length: np.ndarray, yaw: float) -> np.ndarray:
+    """Return the extent along x and y of a rectangle rotated by yaw, (2,)."""
     cos, sin = abs(math.cos(yaw)), abs(math.sin(yaw))
     return np.array([length[0] * cos + length[1] * sin, length[0] * sin + length[1] * cos])
 
 
 def _touches_square(center: np.ndarray, length: np.ndarray, yaw: float, side: float) -> bool:
-    """Return whether a turned rectangle touches a square about the origin.
+    """Return True if a rotated rectangle touches a square centered on the origin.
 
-    Two convex shapes are apart if they are apart along an axis of one of them.
+    Separating axis test: two rectangles are disjoint if their projections onto an axis of one of
+    them are disjoint.
     """
-    if (abs(center) > (_turned_extent(length, yaw) + side) / 2).any():
+    if (abs(center) > (_rotated_extent(length, yaw) + side) / 2).any():
         return False
     cos, sin = math.cos(yaw), math.sin(yaw)
     along = np.array([center[0] * cos + center[1] * sin, -center[0] * sin + center[1] * cos])
-    square = _turned_extent(np.array([side, side]), yaw)
+    square = _rotated_extent(np.array([side, side]), yaw)
     return bool((abs(along) <= (square + length) / 2).all())
 
 
-# Over a pit: stepping stones, beams, and nested rings.
+# Terrains over a pit: stepping stones, beams, and nested rings.
 
 
 @dataclass(kw_only=True)
 class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
-    """Stones in a grid over a pit, around a platform.
+    """Grid of stepping stones over a pit, around a platform.
 
-    A harder terrain has smaller stones, that differ more in size, place and height.
+    Difficulty decreases the stone size, and increases variations of size, position and height.
     """
 
     stone_size_range: tuple[float, float] = (0.4, 0.8)
-    """Extent of a stone at difficulty 1 and 0, in metres."""
+    """Stone extent at difficulty 1 and 0 (m)."""
     stone_distance_range: tuple[float, float] = (0.2, 0.5)
-    """The first is the least gap between stones at difficulty 0, in metres; the second has no
-    effect, because gaps grow as stones shrink."""
+    """First: minimum gap between stones at difficulty 0 (m). Second: no effect, because gaps grow
+    as stones shrink."""
     stone_height: float = 0.2
-    """Height of stones, platform and frame, in metres."""
+    """Height of stones, platform and border (m)."""
     stone_height_variation: float = 0.1
-    """Largest deviation of a stone's height at difficulty 1, in metres."""
+    """Maximum deviation of stone heights at difficulty 1 (m)."""
     stone_size_variation: float = 0.1
-    """Largest deviation of a stone's extents at difficulty 1, in metres."""
+    """Maximum deviation of stone extents at difficulty 1 (m)."""
     floor_depth: float = 2.0
-    """Depth of the pit, in metres."""
+    """Pit depth (m)."""
     displacement_range: float = 0.1
-    """Largest displacement of a stone along x and y at difficulty 1, in metres."""
+    """Maximum displacement of stones along x and y at difficulty 1 (m)."""
     platform_width: float = 1.0
-    """Least extent of the platform in the middle, in metres."""
+    """Minimum extent of the central platform (m)."""
     border_width: float = 0.25
-    """Width of the frame, in metres."""
+    """Width of the border (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "floor_depth")
         check_field_range(self, "stone_size_range", lowest=0.0)
         check_field(self, "stone_size_range", self.stone_size_range[1] > 0.0, "lengths > 0")
         boxes = Boxes(spec, self.size)
         side = lerp(self.stone_size_range[::-1], difficulty)
         inner = np.array(inset(self.size, self.border_width))
-        pitch_least = self.stone_size_range[1] + self.stone_distance_range[0]
-        least_gap = f"a first value > {-self.stone_size_range[1]:g}"
-        check_field(self, "stone_distance_range", pitch_least > 0.0, least_gap)
-        counts = np.maximum(2, np.floor(inner / pitch_least).astype(int) + 1)
+        min_pitch = self.stone_size_range[1] + self.stone_distance_range[0]
+        expected = f"a first value > {-self.stone_size_range[1]:g}"
+        check_field(self, "stone_distance_range", min_pitch > 0.0, expected)
+        counts = np.maximum(2, np.floor(inner / min_pitch).astype(int) + 1)
         pitch = inner / (counts - 1)
         reach = self._platform_reach(side, inner, counts, pitch)
-        dark, bottom = frame_color(GREEN), -self.floor_depth
+        dark, bottom = border_color(GREEN), -self.floor_depth
         boxes.add_pit(self.border_width, self.stone_height, dark, self.floor_depth)
         platform = (2.0 * float(reach[0]), 2.0 * float(reach[1]))
         boxes.add_platform(platform, self.stone_height, dark, bottom=bottom)
@@ -575,10 +575,10 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
     def _platform_reach(
         self, side: float, inner: np.ndarray, counts: np.ndarray, pitch: np.ndarray
     ) -> np.ndarray:
-        """Return the (2,) half extents of the platform, whose gap to the next stones is theirs."""
+        """Return half extents of the platform with the stone gap to the next stones, (2,)."""
         gap = np.maximum(0.0, pitch - side)
         least = self.platform_width / 2
-        # The first stone, along each axis, that is a gap or more beyond the least platform.
+        # The first stone along each axis at least one gap beyond the minimum platform.
         beyond = (inner / 2 + least + side / 2 + gap) / pitch
         index = np.minimum(counts - 1, np.ceil(beyond))
         return np.maximum(least, index * pitch - inner / 2 - side / 2 - gap)
@@ -593,7 +593,7 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
         difficulty: float,
         rng: np.random.Generator,
     ) -> None:
-        """Add one stone, unless it is on the platform or the frame leaves too little of it."""
+        """Add one stone, unless its center is on the platform or the clipped stone is too small."""
         shift, vary = self.displacement_range * difficulty, self.stone_size_variation * difficulty
         place = place + rng.uniform(-shift, shift, 2)
         half = (side + rng.uniform(-vary, vary, 2)) / 2
@@ -614,31 +614,31 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
 
 @dataclass(kw_only=True)
 class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
-    """Beams over a pit, from a platform to the frame in all directions.
+    """Radial beams over a pit, from a platform to the border.
 
-    A harder terrain has narrower beams.
+    Difficulty decreases the beam width.
     """
 
     num_beams: int = 16
     """Number of beams."""
     beam_width_range: tuple[float, float] = (0.2, 0.4)
-    """Width of a beam at difficulty 1 and 0, in metres."""
+    """Beam width at difficulty 1 and 0 (m)."""
     beam_height: float = 0.2
-    """Height of beams, platform and frame, in metres."""
+    """Height of beams, platform and border (m)."""
     spacing: float = 0.8
-    """Has no effect: beams are at equal angles."""
+    """No effect: beams are at equal angles."""
     platform_width: float = 1.0
-    """Largest extent of the platform in the middle, in metres. It is smaller where the beams would
-    leave it apart."""
+    """Maximum extent of the central platform (m). Reduced until adjacent beams meet at the
+    platform."""
     border_width: float = 0.25
-    """Width of the frame, in metres."""
+    """Width of the border (m)."""
     floor_depth: float = 2.0
-    """Depth of the pit, in metres."""
+    """Pit depth (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "floor_depth")
         check_field_range(self, "beam_width_range", lowest=0.0)
         check_field(self, "beam_width_range", self.beam_width_range[0] > 0.0, "widths > 0")
@@ -648,7 +648,7 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
         if self.num_beams > 1:
             chord = 2.0 * math.sqrt(2.0) * math.sin(math.pi / self.num_beams)
             radius = min(radius, width / chord)
-        dark, bottom, top = frame_color(BLUE), -self.floor_depth, self.beam_height
+        dark, bottom, top = border_color(BLUE), -self.floor_depth, self.beam_height
         boxes.add_pit(self.border_width, top, dark, self.floor_depth)
         boxes.add_platform((2.0 * radius, 2.0 * radius), top, dark, bottom=bottom)
         for index in range(self.num_beams):
@@ -666,47 +666,47 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
         return boxes.output(top)
 
     def _reach(self, angle: float, width: float) -> float:
-        """Return how far a beam goes from the middle: so far that its whole end is on the frame.
+        """Return the distance from the center to the beam's end: the whole end is on the border.
 
-        It ends earlier where its corners would leave the terrain.
+        The beam is shortened if its corners would leave the terrain.
         """
         reaches = []
         for side, along, across in (
             (self.size[0], abs(math.cos(angle)), abs(math.sin(angle))),
             (self.size[1], abs(math.sin(angle)), abs(math.cos(angle))),
         ):
-            onto_frame = side / 2 - self.border_width + width / 2 * across
+            onto_border = side / 2 - self.border_width + width / 2 * across
             within = side / 2 - width / 2 * across
-            reaches.append(min(onto_frame, within) / max(along, 1e-9))
+            reaches.append(min(onto_border, within) / max(along, 1e-9))
         return min(reaches)
 
 
 @dataclass(kw_only=True)
 class BoxNestedRingsTerrainCfg(SubTerrainCfg):
-    """Square rings over a pit, one in another, with gaps between them.
+    """Nested square rings over a pit, with gaps between them.
 
-    A harder terrain has narrower rings and wider gaps.
+    Difficulty decreases the ring width and increases the gaps.
     """
 
     num_rings: int = 5
-    """Most rings; there are fewer if they get as small as the platform."""
+    """Maximum number of rings. Fewer if rings reach the platform size."""
     ring_width_range: tuple[float, float] = (0.3, 0.6)
-    """Width of a ring at difficulty 1 and 0, in metres."""
+    """Ring width at difficulty 1 and 0 (m)."""
     gap_range: tuple[float, float] = (0.0, 0.2)
-    """Gap between rings at difficulty 0 and 1, in metres."""
+    """Gap between rings at difficulty 0 and 1 (m)."""
     height_range: tuple[float, float] = (0.1, 0.4)
-    """Their mean is the height of all tops, in metres, whatever the difficulty."""
+    """Range whose mean is the height of all tops, at every difficulty (m)."""
     platform_width: float = 1.0
-    """Rings end where one would be smaller than this, in metres; a pad fills what is left."""
+    """Minimum extent of rings (m). A pad fills the remaining center."""
     border_width: float = 0.25
-    """Width of the frame, in metres."""
+    """Width of the border (m)."""
     floor_depth: float = 2.0
-    """Depth of the pit, in metres."""
+    """Pit depth (m)."""
 
     def function(
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
-        """See `SubTerrainCfg.function`."""
+        """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "floor_depth")
         check_field_range(self, "ring_width_range", lowest=0.0)
         check_field(self, "ring_width_range", self.ring_width_range[0] > 0.0, "widths > 0")
@@ -714,7 +714,7 @@ class BoxNestedRingsTerrainCfg(SubTerrainCfg):
         boxes = Boxes(spec, self.size)
         width = lerp(self.ring_width_range[::-1], difficulty)
         gap = lerp(self.gap_range, difficulty)
-        dark, bottom, top = frame_color(BLUE), -self.floor_depth, sum(self.height_range) / 2
+        dark, bottom, top = border_color(BLUE), -self.floor_depth, sum(self.height_range) / 2
         boxes.add_pit(self.border_width, top, dark, self.floor_depth)
         outer, ring = inset(self.size, self.border_width), 0
         while ring < self.num_rings and min(outer) > self.platform_width:

@@ -1,4 +1,4 @@
-"""The ground, and where on it the environments are."""
+"""Terrain entity: the ground and the environment origins on it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _GREEN = (0.2, 0.6, 0.2, 0.3)
 _BLUE = (0.2, 0.2, 0.6, 0.3)
 _YELLOW = (0.6, 0.6, 0.2, 0.3)
 
-# Half the height of the box that shows a flat patch, in metres.
+# Half height of the box that marks a flat patch (m).
 _PATCH_HALF_HEIGHT = 0.02
 
 
@@ -53,40 +53,39 @@ _GROUND_MATERIAL = spec_cfg.MaterialCfg(
 
 @dataclass
 class TerrainEntityCfg(EntityCfg):
-    """Describes the ground. `SceneCfg.terrain` takes it."""
+    """Terrain configuration, for `SceneCfg.terrain`."""
 
     lights: tuple[spec_cfg.LightCfg, ...] = (_SUN,)
     """Lights to add."""
     textures: tuple[spec_cfg.TextureCfg, ...] = (_GROUND_TEXTURE,)
     """Textures to add."""
     materials: tuple[spec_cfg.MaterialCfg, ...] = (_GROUND_MATERIAL,)
-    """Materials to add and to give to geoms."""
+    """Materials to add and to assign to geoms."""
     terrain_type: Literal["generator", "plane"] = "plane"
-    """`plane` is one infinite plane; `generator` makes a grid of sub-terrains."""
+    """Terrain type: `plane` (one infinite plane) or `generator` (grid of sub-terrains)."""
     terrain_generator: TerrainGeneratorCfg | None = None
-    """What `generator` makes."""
+    """Sub-terrain grid of type `generator`."""
     env_spacing: float | None = 2.0
-    """Distance between environments on a plane, in metres. A scene puts its own here."""
+    """Distance between environment origins on a plane (m). A scene sets this field."""
     max_init_terrain_level: int | None = None
-    """Highest level (row) of a generated terrain at which environments start; None for all."""
+    """Highest initial level (row) of environments on a generated terrain. None: all levels."""
     num_envs: int = 1
-    """Number of environments. A scene puts its own here."""
+    """Number of environments. A scene sets this field."""
     debug_vis: bool = False
-    """Whether to add sites that show where environments start, the spawn points of the terrain and
-    its flat patches."""
+    """Add sites at environment origins, and at the terrain's spawn points and flat patches."""
 
     def build(self) -> NoReturn:
-        """Not offered, because a terrain also needs a device: use `TerrainEntity(cfg, device)`."""
+        """Raise `TypeError`: a terrain needs a device. Use `TerrainEntity(cfg, device)`."""
         raise WrongTypeError(
-            "TerrainEntityCfg.build() cannot know the device. Set SceneCfg.terrain, or call "
-            "TerrainEntity(cfg, device)."
+            "TerrainEntityCfg.build() is not supported, because a terrain needs a device; set "
+            "SceneCfg.terrain, or use TerrainEntity(cfg, device)."
         )
 
 
 class TerrainEntity(Entity):
-    """The ground: one static body `terrain` of the world, and the environments' origins."""
+    """Ground of the scene: one static body `terrain`, and the environment origins."""
 
-    # The ground is built from the config; a checkpoint says where on it the environments are.
+    # The config defines the ground; checkpoints hold the levels and columns of environments.
     _transient = {"_device", "_flat_patches", "_flat_patch_radii", "_holds_levels"}
 
     cfg: TerrainEntityCfg
@@ -95,26 +94,26 @@ class TerrainEntity(Entity):
         """Build the ground and place the environments on it.
 
         Raises:
-            ValueError: the config makes no sense, or asks for what is not available.
+            ValueError: invalid config.
         """
         self._device = device
         self.env_origins = torch.zeros(cfg.num_envs, 3, dtype=torch.float32, device=device)
-        """(N, 3) world positions of the environments' origins."""
+        """World positions of the environment origins (m), (N, 3)."""
         self.terrain_origins: torch.Tensor | None = None
-        """(R, C, 3) spawn points of a grid of R levels and C columns; None on a plane."""
+        """Spawn points of a grid of R levels and C columns (m), (R, C, 3). None on a plane."""
         self.terrain_levels: torch.Tensor | None = None
-        """(N,) level (row) of each environment; None on a plane."""
+        """Level (row) of each environment, (N,). None on a plane."""
         self.terrain_types: torch.Tensor | None = None
-        """(N,) column of each environment; None on a plane."""
+        """Column of each environment, (N,). None on a plane."""
         self.max_terrain_level = 0
-        """Number of levels; 0 on a plane."""
+        """Number of levels. 0 on a plane."""
         self.terrain_generator: TerrainGenerator | None = None
-        """What made the terrain; None on a plane."""
+        """Generator of the terrain. None on a plane."""
         self._holds_levels = False
         self._flat_patches: dict[str, torch.Tensor] = {}
         self._flat_patch_radii: dict[str, float] = {}
         if cfg.terrain_type == "generator":
-            # There is no plane that the default material could be given to.
+            # A generated terrain has no geom `terrain` for the default material.
             added_only = dataclasses.replace(_GROUND_MATERIAL, geom_names_expr=None)
             materials = tuple(added_only if m == _GROUND_MATERIAL else m for m in cfg.materials)
             cfg = dataclasses.replace(cfg, materials=materials)
@@ -124,8 +123,8 @@ class TerrainEntity(Entity):
         top = self.cfg.max_init_terrain_level
         if top is not None and top < 0:
             raise ValueError(
-                f"TerrainEntityCfg.max_init_terrain_level is {top}; it must be 0 or more, or None "
-                "for all levels."
+                f"TerrainEntityCfg.max_init_terrain_level: expected an integer >= 0, or None for "
+                f"all levels, got {top}."
             )
         check_one_of("TerrainEntityCfg.terrain_type", self.cfg.terrain_type, ("plane", "generator"))
         spec = mujoco.MjSpec()
@@ -140,11 +139,12 @@ class TerrainEntity(Entity):
         return spec
 
     def _generate(self, spec: mujoco.MjSpec) -> None:
-        """Add the configured grid of sub-terrains and put the environments on it."""
+        """Add the configured grid of sub-terrains and assign environments to it."""
         if self.cfg.terrain_generator is None:
             raise ValueError(
-                "TerrainEntityCfg.terrain_type is 'generator', but terrain_generator is None. Give "
-                "a TerrainGeneratorCfg, such as mjlab.terrains.config.ROUGH_TERRAINS_CFG."
+                "TerrainEntityCfg.terrain_generator: expected a TerrainGeneratorCfg for "
+                "terrain_type 'generator', got None; use e.g. "
+                "mjlab.terrains.config.ROUGH_TERRAINS_CFG."
             )
         generator = TerrainGenerator(self.cfg.terrain_generator, self._device)
         generator.compile(spec)
@@ -154,7 +154,7 @@ class TerrainEntity(Entity):
             for name, found in generator.flat_patches.items()
         }
         self._flat_patch_radii = dict(generator.flat_patch_radii)
-        # Elsewhere a column holds several kinds, even where there are as many columns as kinds.
+        # Without a curriculum a column mixes types, even if columns and types are equal in number.
         shares = generator.proportions if generator.cfg.curriculum else None
         self.configure_env_origins(generator.terrain_origins, shares)
 
@@ -174,7 +174,7 @@ class TerrainEntity(Entity):
                     group=5, rgba=_BLUE,
                 )  # fmt: skip
         for name, patches in self._flat_patches.items():
-            # MuJoCo refuses sites without extent, and a patch may be a single point.
+            # MuJoCo rejects sites of size 0, and a patch may be a single point.
             radius = max(self._flat_patch_radii[name], _PATCH_HALF_HEIGHT)
             size = (radius, radius, _PATCH_HALF_HEIGHT)
             for index in torch.cartesian_prod(
@@ -187,17 +187,17 @@ class TerrainEntity(Entity):
                 )  # fmt: skip
 
     def _placeable(self, spec: mujoco.MjSpec) -> mujoco.MjSpec:
-        # The ground stays where it is.
+        # The terrain has a fixed pose.
         return spec
 
     @property
     def flat_patches(self) -> dict[str, torch.Tensor]:
-        """Flat spots by name, (R, C, number, 3) world positions; none on a plane."""
+        """World positions of flat patches by name (m), (R, C, num_patches, 3). Empty on a plane."""
         return self._flat_patches
 
     @property
     def flat_patch_radii(self) -> dict[str, float]:
-        """Radius of the flat spots by name, in metres; none on a plane."""
+        """Radius of flat patches by name (m). Empty on a plane."""
         return self._flat_patch_radii
 
     def configure_env_origins(
@@ -205,25 +205,24 @@ class TerrainEntity(Entity):
         origins: np.ndarray | torch.Tensor | None = None,
         proportions: np.ndarray | None = None,
     ) -> None:
-        """Place all environments anew.
+        """Reassign the origins of all environments.
 
         Args:
-            origins: (R, C, 3) spawn points of a grid of R levels and C columns. Levels are drawn
-                at random, up to the configured one; columns get blocks of environments. None lays
-                the environments out on a plane.
-            proportions: Share of the environments for each column; None, or another number of
-                them than there are columns, shares equally. Pass them only where each column is
-                one kind of terrain, as in a curriculum.
+            origins: (R, C, 3) spawn points of a grid of R levels and C columns. Levels are sampled
+                up to the configured maximum; each column gets a block of environments. None: grid
+                on a plane.
+            proportions: Share of environments per column. None, or a length other than C: equal
+                shares. Use only if each column is a single terrain type, as in a curriculum.
 
         Raises:
-            ValueError: `origins` has another shape, or is None without a configured spacing.
+            ValueError: invalid shape of `origins`, or `origins` and `cfg.env_spacing` are None.
         """
         num_envs = self.cfg.num_envs
         if origins is None:
             if self.cfg.env_spacing is None:
                 raise ValueError(
-                    "TerrainEntityCfg.env_spacing is None, but the environments are laid out on a "
-                    "plane. Give the distance between them, in metres."
+                    "TerrainEntityCfg.env_spacing: expected a distance (m) for environments on a "
+                    "plane, got None."
                 )
             self.terrain_origins = self.terrain_levels = self.terrain_types = None
             self.max_terrain_level = 0
@@ -232,7 +231,7 @@ class TerrainEntity(Entity):
         grid = torch.as_tensor(origins, dtype=torch.float32, device=self._device)
         if grid.ndim != 3 or grid.shape[2] != 3 or 0 in grid.shape:
             raise ValueError(
-                f"origins has the shape {tuple(grid.shape)}; it must be (levels, columns, 3)."
+                f"origins: expected shape (levels, columns, 3), got {tuple(grid.shape)}."
             )
         num_rows, num_cols = grid.shape[:2]
         top = num_rows - 1
@@ -247,29 +246,29 @@ class TerrainEntity(Entity):
     def update_env_origins(
         self, env_ids: torch.Tensor, move_up: torch.Tensor, move_down: torch.Tensor
     ) -> None:
-        """Move environments up or down a level; nothing on a plane or while levels are held.
+        """Move environments up or down a level.
 
-        Those that pass the highest level go to a random one, and none go below the lowest. The
-        column of an environment never changes here.
+        Environments above the highest level get a random level; the lowest level is a lower bound.
+        Columns do not change. Does nothing on a plane and inside `levels_held`.
 
         Args:
             env_ids: (k,) environments.
-            move_up: (k,) whether each goes up.
-            move_down: (k,) whether each goes down.
+            move_up: (k,) mask of environments to move up.
+            move_down: (k,) mask of environments to move down.
         """
         if self._holds_levels or self.terrain_origins is None or self.terrain_levels is None:
             return
         levels = self.terrain_levels[env_ids] + move_up.long() - move_down.long()
-        # One draw for every environment, so that how many are drawn does not depend on results.
+        # One draw per environment, so that the number of draws does not depend on results.
         drawn = torch.randint_like(levels, self.max_terrain_level)
         levels = torch.where(levels >= self.max_terrain_level, drawn, levels.clamp(min=0))
         self._go_to_levels(env_ids, levels)
 
     @contextmanager
     def levels_held(self) -> Generator[None]:
-        """Within this context `update_env_origins` does nothing: no curriculum moves environments.
+        """Disable `update_env_origins` inside this context, so that no curriculum changes levels.
 
-        That is for evaluations, whose figures must not depend on those before them.
+        For evaluations: their results must not depend on previous evaluations.
         """
         held, self._holds_levels = self._holds_levels, True
         try:
@@ -278,7 +277,7 @@ class TerrainEntity(Entity):
             self._holds_levels = held
 
     def randomize_env_origins(self, env_ids: torch.Tensor) -> None:
-        """Move environments to cells drawn uniformly; nothing on a plane."""
+        """Move environments to uniformly sampled cells. Does nothing on a plane."""
         if self.terrain_origins is None or self.terrain_types is None:
             return
         num_rows, num_cols = self.terrain_origins.shape[:2]
@@ -288,7 +287,7 @@ class TerrainEntity(Entity):
         self._go_to_levels(env_ids, levels)
 
     def _go_to_levels(self, env_ids: torch.Tensor, levels: torch.Tensor) -> None:
-        """Put environments on levels of their columns."""
+        """Move environments to levels of their columns."""
         grid, kept, types = self.terrain_origins, self.terrain_levels, self.terrain_types
         if grid is not None and kept is not None and types is not None:
             kept[env_ids] = levels
@@ -296,7 +295,7 @@ class TerrainEntity(Entity):
 
 
 def grid_origins(num_envs: int, spacing: float, device: str) -> torch.Tensor:
-    """Return (num_envs, 3) origins on a square grid, centred on the world's origin.
+    """Return origins (m) on a square grid centered on the world origin, (num_envs, 3).
 
     With `rows = ceil(N / floor(sqrt N))` and `cols = ceil(N / rows)`, environment k is in row
     `i = k div cols` and column `j = k mod cols`, at
@@ -315,11 +314,11 @@ def grid_origins(num_envs: int, spacing: float, device: str) -> torch.Tensor:
 def assign_columns(
     num_envs: int, num_cols: int, proportions: np.ndarray | None, device: str
 ) -> torch.Tensor:
-    """Return (num_envs,) terrain columns: each column gets a contiguous block of environments.
+    """Return terrain columns in contiguous blocks of environments, (num_envs,).
 
-    With one proportion for each column, blocks are sized by them: every column first gets one
-    environment (if there are enough), and the rest is split by largest remainder. Otherwise blocks
-    are of equal size.
+    With one proportion per column, block sizes are proportional: every column first gets one
+    environment (if possible), and the rest is split by largest remainder. Otherwise blocks have
+    equal size.
     """
     if proportions is None or len(proportions) != num_cols:
         index = torch.arange(num_envs, device=device)
@@ -329,20 +328,20 @@ def assign_columns(
 
 
 def split_by_proportion(total: int, proportions: np.ndarray) -> list[int]:
-    """Return how many of `total` each share gets: at least one where possible; sums to `total`.
+    """Split `total` into counts per share: at least one each if possible, with sum `total`.
 
     Raises:
-        ValueError: a proportion is negative, or all are zero.
+        ValueError: negative proportion, or all proportions zero.
     """
     proportions = np.asarray(proportions, dtype=np.float64)
     if (proportions < 0.0).any() or proportions.sum() <= 0.0:
         raise ValueError(
-            f"Terrain proportions {proportions.tolist()} must not be negative, and not all zero."
+            f"Terrain proportions: expected values >= 0, not all 0, got {proportions.tolist()}."
         )
     shares = proportions / proportions.sum()
     counts = np.full(len(shares), 1 if total >= len(shares) else 0)
     exact = shares * (total - counts.sum())
-    # Products such as 0.3 * 10 must not fall below the whole number that they mean.
+    # Rounding must not push products such as 0.3 * 10 below the exact integer.
     whole = np.floor(exact + 1e-9).astype(int)
     counts += whole
     left_over = total - int(counts.sum())

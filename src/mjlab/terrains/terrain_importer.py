@@ -1,4 +1,4 @@
-"""The module where release 1.1 had the terrain importer."""
+"""Module path of the terrain importer in release 1.1."""
 
 from mjlab.compat import older_names
 

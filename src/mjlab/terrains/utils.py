@@ -1,4 +1,4 @@
-"""Geometry and numbers that sub-terrains share: boxes, borders, flat patches, resampling."""
+"""Helpers of sub-terrains: boxes, borders, flat patches, resampling."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ import numpy as np
 
 from mjlab.utils.errors import check_count, check_in_range, check_positive
 
-# MuJoCo refuses geoms without extent.
+# MuJoCo rejects geoms of size 0.
 _MIN_HALF_SIZE = 1e-6
 
 
 @dataclass
 class FlatPatchSamplingCfg:
-    """Describes which flat spots of a height field to look for."""
+    """Configuration of flat patch sampling on a height field."""
 
     num_patches: int = 10
-    """Number of spots."""
+    """Number of patches."""
     patch_radius: float = 0.5
-    """Radius of a spot, in metres."""
+    """Radius of a patch (m)."""
     max_height_diff: float = 0.05
-    """Largest difference in height within a spot, in metres."""
+    """Maximum height difference within a patch (m)."""
     x_range: tuple[float, float] = (-1e6, 1e6)
-    """Where the middle of a spot may be along x, in metres from the corner of the sub-terrain."""
+    """Range of patch centers along x, from the corner of the sub-terrain (m)."""
     y_range: tuple[float, float] = (-1e6, 1e6)
-    """Where the middle of a spot may be along y, likewise."""
+    """Range of patch centers along y, from the corner of the sub-terrain (m)."""
     z_range: tuple[float, float] = (-1e6, 1e6)
-    """How high the middle of a spot may be in the world, in metres."""
+    """Range of patch center heights in the world frame (m)."""
     grid_resolution: float | None = None
-    """Distance of the points that are tried, in metres, where finer than those of the field."""
+    """Distance between candidate points (m), if finer than the field. None: field vertices."""
 
 
 def make_plane(
@@ -44,12 +44,12 @@ def make_plane(
     """Add one box with a flat top to `body` and return it in a list.
 
     Args:
-        body: The body that gets the box.
-        size: Extent along x and y, in metres.
-        height: Height of the top, in metres.
-        center_zero: Whether the box is centred on the body's origin, or starts there and extends
-            along +x and +y.
-        plane_thickness: Extent of the box below its top, in metres.
+        body: Parent body of the box.
+        size: Extent along x and y (m).
+        height: Height of the top (m).
+        center_zero: Center the box on the body's origin. Otherwise the box starts at the origin
+            and extends along +x and +y.
+        plane_thickness: Extent of the box below its top (m).
     """
     x, y = (0.0, 0.0) if center_zero else (size[0] / 2, size[1] / 2)
     return [
@@ -64,16 +64,16 @@ def make_border(
     height: float,
     position: tuple[float, float, float],
 ) -> list[mujoco.MjsGeom]:
-    """Add a rectangular frame of four boxes to `body` and return them: +y, -y, -x, +x.
+    """Add a rectangular border of four boxes to `body` and return them: +y, -y, -x, +x.
 
-    The first two span the whole length along x, the others lie between them.
+    The ±y boxes span the full length along x; the ±x boxes lie between them.
 
     Args:
-        body: The body that gets the boxes.
-        size: Outer extent of the frame along x and y, in metres.
-        inner_size: Extent of the hole.
-        height: Extent of the boxes along z.
-        position: Centre of the frame.
+        body: Parent body of the boxes.
+        size: Outer extent of the border along x and y (m).
+        inner_size: Inner extent of the border along x and y (m).
+        height: Extent of the boxes along z (m).
+        position: Center of the border (m).
     """
     x, y, z = position
     thick_x, thick_y = (size[0] - inner_size[0]) / 2, (size[1] - inner_size[1]) / 2
@@ -93,7 +93,7 @@ def add_box(
     center: tuple[float, float, float],
     extent: tuple[float, float, float],
 ) -> mujoco.MjsGeom:
-    """Add a box to `body`, from its centre and its full extent along x, y and z, in metres."""
+    """Add a box with this center and full extent along x, y and z (m) to `body`."""
     half = [max(length / 2, _MIN_HALF_SIZE) for length in extent]
     return body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=center, size=half)
 
@@ -106,30 +106,30 @@ def find_flat_patches_from_heightfield(
     rng: np.random.Generator,
     size: tuple[float, float] | None = None,
 ) -> np.ndarray:
-    """Draw flat patches of a height field, uniformly among all vertices that qualify.
+    """Sample flat patches of a height field, uniformly among all qualifying vertices.
 
     With `r = ceil(patch_radius / spacing)`, a vertex qualifies if heights over the disc
     `i^2 + j^2 <= r^2` of vertices around it differ by at most `max_height_diff`, if the disc is on
-    the field, and if its position lies in the ranges of the config. Radius 0 means the vertex
-    alone. Vertices are drawn without replacement while there are enough. If none qualifies, all
-    patches are the field's centre.
+    the field, and if its position lies in the ranges of the config. With radius 0 the disc is the
+    vertex. Vertices are sampled without replacement if possible. If no vertex qualifies, all
+    patches are the field's center.
 
     Args:
-        heights: (rows, cols) heights in metres, [row, col]: rows run along y.
-        horizontal_scale: Size of a pixel in metres.
-        z_offset: What to add to heights to get z of the world.
-        cfg: How many to find, and what counts as flat.
-        rng: Draws them.
-        size: Extent of the field along x and y, in metres; None for pixels times their number. The
-            vertices are `size / (n - 1)` apart, which is more than a pixel.
+        heights: (rows, cols) heights (m), [row, col]; rows run along y.
+        horizontal_scale: Pixel size (m).
+        z_offset: Offset from heights to world z (m).
+        cfg: Number of patches, and criteria for a flat patch.
+        rng: Source of all random numbers.
+        size: Extent of the field along x and y (m). None: number of pixels times pixel size. The
+            distance of vertices is `size / (n - 1)`, more than a pixel.
 
     Returns:
-        (num_patches, 3) positions: x and y from the field's low corner, z of the world.
+        (num_patches, 3) positions (m): x and y from the field's low corner, world z.
     """
     rows, cols = heights.shape
     if size is None:
         size = (cols * horizontal_scale, rows * horizontal_scale)
-    centre = (size[0] / 2, size[1] / 2, heights[rows // 2, cols // 2] + z_offset)
+    center = (size[0] / 2, size[1] / 2, heights[rows // 2, cols // 2] + z_offset)
     if cfg.grid_resolution is not None and cfg.grid_resolution < horizontal_scale:
         finer = horizontal_scale / cfg.grid_resolution
         heights = resample_linear(heights, (round(rows * finer), round(cols * finer)))
@@ -148,50 +148,48 @@ def find_flat_patches_from_heightfield(
     )
     row, col = np.nonzero(valid)
     if len(row) == 0:
-        return np.tile(centre, (cfg.num_patches, 1))
+        return np.tile(center, (cfg.num_patches, 1))
     drawn = rng.choice(len(row), size=cfg.num_patches, replace=len(row) < cfg.num_patches)
     row, col = row[drawn], col[drawn]
     return np.stack((x[col], y[row], z[row, col]), axis=-1)
 
 
 def check_flat_patch(name: str, cfg: FlatPatchSamplingCfg, size: tuple[float, float]) -> None:
-    """Raise `ValueError` if no field of the size could ever have the patch.
+    """Raise `ValueError` if a height field of this size cannot contain the patch.
 
     Args:
-        name: What the patch is called, for the message.
-        cfg: The patch.
-        size: Extent of the field along x and y, in metres.
+        name: Name of the patch, for the message.
+        cfg: Configuration of the patch.
+        size: Extent of the field along x and y (m).
     """
-    where = f"flat_patch_sampling[{name!r}]"
-    check_count(f"{where} num_patches", cfg.num_patches)
-    check_in_range(f"{where} patch_radius", cfg.patch_radius, 0.0, min(size) / 2)
-    check_in_range(f"{where} max_height_diff", cfg.max_height_diff, 0.0, math.inf)
+    owner = f"flat_patch_sampling[{name!r}]"
+    check_count(f"{owner} num_patches", cfg.num_patches)
+    check_in_range(f"{owner} patch_radius", cfg.patch_radius, 0.0, min(size) / 2)
+    check_in_range(f"{owner} max_height_diff", cfg.max_height_diff, 0.0, math.inf)
     if cfg.grid_resolution is not None:
-        check_positive(f"{where} grid_resolution", cfg.grid_resolution)
+        check_positive(f"{owner} grid_resolution", cfg.grid_resolution)
     for field, extent in (("x_range", size[0]), ("y_range", size[1]), ("z_range", math.inf)):
         low, high = getattr(cfg, field)
         if not low <= high:
             raise ValueError(
-                f"{where} {field}: expected (low, high) with low <= high, got {low, high}."
+                f"{owner} {field}: expected (low, high) with low <= high, got {low, high}."
             )
         first, last = cfg.patch_radius, extent - cfg.patch_radius
         if field != "z_range" and (high < first or low > last):
             raise ValueError(
-                f"{where} {field}: expected a range that meets [{first:g}, {last:g}], the centres of "
-                f"patches that fit, got {low, high}. It is measured from the low corner of the "
-                "sub-terrain."
+                f"{owner} {field}: expected a range that overlaps [{first:g}, {last:g}] (centers "
+                f"of patches that fit, from the low corner of the sub-terrain), got {low, high}."
             )
 
 
 def interpolate_cubic(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return whole (rows, cols) numbers of another shape, by a bicubic spline through those given.
+    """Resample (rows, cols) values to another shape by bicubic splines, rounded to integers.
 
-    Corners stay where they are. With fewer than four numbers along an axis, the spline is of a
-    lower degree there.
+    Corners are preserved. Axes with fewer than four values use a spline of lower degree.
     """
     if values.shape == shape:
         return values
-    # Loading it takes a second, and few terrains need it.
+    # Importing SciPy takes a second, and few terrains need it.
     from scipy.interpolate import RectBivariateSpline
 
     old_y, old_x = (np.linspace(0.0, 1.0, count) for count in values.shape)
@@ -202,7 +200,7 @@ def interpolate_cubic(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def resample_linear(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Resample (rows, cols) values linearly to another shape; corners stay where they are."""
+    """Resample (rows, cols) values to another shape by linear interpolation, with equal corners."""
     for axis, count in enumerate(shape):
         old = values.shape[axis]
         position = np.linspace(0.0, old - 1.0, count)
@@ -215,27 +213,27 @@ def resample_linear(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def lerp(ends: tuple[float, float], difficulty: float) -> float:
-    """Return the value of a range at a difficulty: its low end at 0, its high end at 1."""
+    """Interpolate linearly between the ends of a range: first at difficulty 0, second at 1."""
     return ends[0] + difficulty * (ends[1] - ends[0])
 
 
 def _flat_vertices(heights: np.ndarray, radii: tuple[int, int], limit: float) -> np.ndarray:
-    """Return (rows, cols) whether heights over the disc around each vertex differ by `limit`."""
+    """Return vertices with height differences <= `limit` over their disc, (rows, cols) bool."""
     flat = np.zeros(heights.shape, dtype=bool)
     r, c = radii
     rows, cols = heights.shape
     if rows > 2 * r and cols > 2 * c:
         spread = _disc_max(heights, radii) + _disc_max(-heights, radii)
-        # Differences of multiples of a vertical step carry rounding of the last bits.
+        # Differences of multiples of a vertical step have rounding errors in the last bits.
         flat[r : rows - r, c : cols - c] = spread <= limit + 1e-9
     return flat
 
 
 def _disc_max(values: np.ndarray, radii: tuple[int, int]) -> np.ndarray:
-    """Return the largest value over the disc around each vertex whose disc is on the field.
+    """Return the maximum over the disc around each vertex with a disc inside the field.
 
-    A disc is a stack of rows, and the largest value of any run of columns is that of two runs of a
-    power-of-two length that cover it. So the work grows with the radius rather than its square.
+    A disc is a stack of rows, and the maximum of any run of columns is the maximum of two covering
+    runs of power-of-two length. So the cost is linear, not quadratic, in the radius.
 
     Args:
         values: (rows, cols).

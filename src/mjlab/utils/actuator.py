@@ -1,4 +1,4 @@
-"""Arithmetic of electric motors and their gears, in SI units."""
+"""Electric motor and gear formulas, in SI units."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from mjlab.utils.errors import check_positive
 
 @dataclass
 class ElectricActuator:
-    """A motor as seen at the joint, after its gear."""
+    """Motor properties at the joint, after the gear."""
 
     reflected_inertia: float
-    """Inertia of the rotor at the joint, kg m^2."""
+    """Reflected rotor inertia at the joint (kg m^2)."""
     velocity_limit: float
-    """Largest speed, rad/s."""
+    """Maximum speed (rad/s)."""
     effort_limit: float
-    """Largest torque, N m."""
+    """Maximum torque (N m)."""
 
 
 class LinearJointProperties(NamedTuple):
-    """A rotary motor as seen at a sliding joint."""
+    """Rotary motor properties at a slide joint."""
 
     armature: float
-    """Mass, kg."""
+    """Reflected mass (kg)."""
     velocity_limit: float
-    """Largest speed, m/s."""
+    """Maximum speed (m/s)."""
     effort_limit: float
-    """Largest force, N."""
+    """Maximum force (N)."""
 
 
 def reflected_inertia(rotor_inertia: float, gear_ratio: float) -> float:
-    """Return the rotor's inertia behind a gear: J G^2."""
+    """Return the reflected rotor inertia after a gear: J G^2."""
     return rotor_inertia * gear_ratio**2
 
 
 def reflected_inertia_from_two_stage_planetary(
     rotor_inertia: tuple[float, float, float], gear_ratio: tuple[float, float, float]
 ) -> float:
-    """Return the inertia of a motor with two planetary stages: J0 (G1 G2)^2 + J1 G2^2 + J2.
+    """Return the reflected inertia after two planetary stages: J0 (G1 G2)^2 + J1 G2^2 + J2.
 
     Args:
         rotor_inertia: (J0, J1, J2), of rotor, first and second stage, kg m^2.
@@ -49,9 +49,7 @@ def reflected_inertia_from_two_stage_planetary(
     Raises `ValueError` unless the first ratio is 1.
     """
     if gear_ratio[0] != 1:
-        raise ValueError(
-            f"The first gear ratio is {gear_ratio[0]}; it must be 1, that of the rotor itself."
-        )
+        raise ValueError(f"gear_ratio[0]: expected 1 (the rotor itself), got {gear_ratio[0]}.")
     _, first, second = gear_ratio
     rotor, stage_1, stage_2 = rotor_inertia
     return reflected_inertia(rotor, first * second) + reflected_inertia(stage_1, second) + stage_2
@@ -68,13 +66,13 @@ def reflect_rotary_to_linear(
     effort_limit_rotary: float,
     transmission_ratio: float,
 ) -> LinearJointProperties:
-    """Return what a rotary motor is at a sliding joint.
+    """Return the properties of a rotary motor at a slide joint.
 
     Args:
-        armature_rotary: I, kg m^2.
-        velocity_limit_rotary: omega, rad/s.
-        effort_limit_rotary: tau, N m.
-        transmission_ratio: r, metres of travel per radian.
+        armature_rotary: I (kg m^2).
+        velocity_limit_rotary: omega (rad/s).
+        effort_limit_rotary: tau (N m).
+        transmission_ratio: r (m/rad), travel per angle.
 
     Returns mass I / r^2, speed r omega and force tau / r. Raises `ValueError` unless r > 0.
     """

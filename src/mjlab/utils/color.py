@@ -1,4 +1,4 @@
-"""Colours as tuples of numbers from 0 to 1."""
+"""Colors, as tuples of numbers in [0, 1]."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class RGB(NamedTuple):
 
     @staticmethod
     def random(rng: np.random.Generator) -> RGB:
-        """Return a colour with uniform components."""
+        """Return a color with uniform random components."""
         return RGB(*(float(value) for value in rng.random(3)))
 
     def to_tuple(self) -> tuple[float, float, float]:
-        """Return a plain tuple."""
+        """Return the color as a plain tuple."""
         return (self.r, self.g, self.b)
 
 
@@ -45,12 +45,12 @@ class RGBA(NamedTuple):
 
     @classmethod
     def from_rgb(cls, rgb: RGB, alpha: float = 1.0) -> RGBA:
-        """Return the colour with an opacity."""
+        """Return `rgb` with opacity `alpha`."""
         return cls(*rgb, alpha)
 
     @staticmethod
     def random(rng: np.random.Generator, alpha: float = 1.0) -> RGBA:
-        """Return a colour with uniform components and the given opacity."""
+        """Return a color with uniform random components and opacity `alpha`."""
         return RGBA.from_rgb(RGB.random(rng), alpha)
 
 
@@ -60,17 +60,17 @@ def clamp(value: float, min_val: float = 0.0, max_val: float = 1.0) -> float:
 
 
 def rgb_to_hsv(rgb: tuple[float, float, float]) -> HSV:
-    """Convert RGB to HSV; the hue is from 0 to 1."""
+    """Convert RGB to HSV; the hue is in [0, 1]."""
     return HSV(*colorsys.rgb_to_hsv(*rgb))
 
 
 def hsv_to_rgb(hsv: HSV) -> tuple[float, float, float]:
-    """Convert HSV to RGB; the hue is from 0 to 1."""
+    """Convert HSV to RGB; the hue is in [0, 1]."""
     return colorsys.hsv_to_rgb(*hsv)
 
 
 def adjust_saturation(rgb: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    """Multiply the saturation, which is then limited to [0, 1]."""
+    """Multiply the saturation by `factor` and clamp it to [0, 1]."""
     hue, saturation, value = rgb_to_hsv(rgb)
     return hsv_to_rgb(HSV(hue, clamp(saturation * factor), value))
 
@@ -86,7 +86,7 @@ def darken_rgba(
 def lighten_rgba(
     rgba: tuple[float, float, float, float], factor: float = 0.15
 ) -> tuple[float, float, float, float]:
-    """Move red, green and blue towards white by the fraction `factor` of the way."""
+    """Interpolate red, green and blue toward white by the fraction `factor`."""
     r, g, b, a = rgba
     return (
         clamp(r + (1.0 - r) * factor),
@@ -99,9 +99,9 @@ def lighten_rgba(
 def brand_ramp(
     base_rgb: tuple[float, float, float], t: float, alpha: float = 1.0
 ) -> tuple[float, float, float, float]:
-    """Return a shade of the base colour, from dull and dark (t = 0) to vivid and bright (t = 1).
+    """Return a shade of the base color, from dull and dark (t = 0) to vivid and bright (t = 1).
 
-    The hue stays; value = 0.75 + 0.25 t, saturation = s (0.85 + 0.25 t), at most 1. Raises
+    The hue is unchanged; value = 0.75 + 0.25 t, saturation = s (0.85 + 0.25 t), at most 1. Raises
     `ValueError` for t outside [0, 1].
     """
     check_in_range("t", t, 0.0, 1.0)

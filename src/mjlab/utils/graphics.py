@@ -1,7 +1,8 @@
-"""MuJoCo's graphics library, chosen before MuJoCo is imported.
+"""Selection of MuJoCo's graphics library, before MuJoCo is imported.
 
-`MUJOCO_GL` names it. With one that MuJoCo does not know, or that is not installed, `import mujoco` fails,
-also in programs that draw nothing: it is switched off then, and rendering says why.
+The variable `MUJOCO_GL` names the library. If the library is unknown or not installed, `import mujoco`
+fails, even in programs without rendering. So an unusable value is replaced by `disable`, and rendering
+reports the reason.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ _SWITCHED_OFF = (_OFF, "disabled", "off", "false", "0")
 _OF_PLATFORM = {"linux": ("glx", "egl", "osmesa"), "win32": ("wgl",), "darwin": ("cgl",)}
 
 problem: str | None = None
-"""Value of `MUJOCO_GL` that cannot be used, and why; None if there is nothing to say."""
+"""Unusable value of `MUJOCO_GL` with the reason; None if the value is usable."""
 
 
 def choose_graphics_library() -> None:
-    """Set `MUJOCO_GL` to `egl` on Linux if it is not set and EGL is installed; to `disable` if unusable."""
+    """Set `MUJOCO_GL` to `egl` on Linux if unset and EGL is installed; to `disable` if unusable."""
     global problem
     if "mujoco" in sys.modules:
         return
@@ -30,17 +31,17 @@ def choose_graphics_library() -> None:
         if sys.platform == "linux" and _has_egl():
             os.environ[_VARIABLE] = "egl"
         return
-    given = os.environ[_VARIABLE]
-    value = given.lower().strip()
+    setting = os.environ[_VARIABLE]
+    value = setting.lower().strip()
     known = (*_ANYWHERE, *_SWITCHED_OFF, *_OF_PLATFORM.get(sys.platform, ()))
     if value not in known:
         options = ", ".join(("glfw", *_OF_PLATFORM.get(sys.platform, ()), _OFF))
-        problem = f"{_VARIABLE}={given} is unknown to MuJoCo; unset it, or choose from {options}"
+        problem = f"{_VARIABLE}={setting} is unknown to MuJoCo; unset it, or choose from {options}"
     elif (value == "egl" and not _has_egl()) or (
-        # As PyOpenGL looks for it.
+        # Same lookup as in PyOpenGL.
         value == "osmesa" and ctypes.util.find_library("OSMesa") is None
     ):
-        problem = f"{_VARIABLE}={given}, and that library is not installed"
+        problem = f"{_VARIABLE}={setting}, but this library is not installed"
     else:
         return
     os.environ[_VARIABLE] = _OFF

@@ -1,4 +1,4 @@
-"""Environment ids as rows, and element ids as columns, of tensors (num_envs, ...)."""
+"""Row and column indices of batched tensors: environment ids and element ids."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ EnvIds = torch.Tensor | slice | None
 """Environments: None (all), a slice, a bool mask or 1-D integer ids."""
 
 Columns = slice | torch.Tensor
-"""Second index of a tensor: a slice, or int64 ids."""
+"""Column index of a tensor: a slice, or int64 ids."""
 
 
 def as_ids(
@@ -33,17 +33,17 @@ def as_index(env_ids: EnvIds) -> torch.Tensor | slice:
 
 
 def is_empty(env_ids: EnvIds) -> bool:
-    """Return True for an empty tensor. A bool mask is not read: a GPU would have to be waited for."""
+    """Return True for an empty tensor. Bool masks are not read, to avoid a GPU synchronization."""
     return isinstance(env_ids, torch.Tensor) and env_ids.numel() == 0
 
 
 def as_columns(
     ids: Sequence[int] | torch.Tensor | slice | int, device: torch.device | str
 ) -> Columns:
-    """Return consecutive `ids` as a slice, others as an int64 tensor; a slice or tensor unchanged.
+    """Return contiguous `ids` as a slice, other ids as an int64 tensor.
 
-    A slice costs no gather: it reads a view and writes one plain copy. Tensors are cached by
-    their ids, so never write into them.
+    Slices and tensors are returned unchanged. Slices avoid a gather: reads are views, writes are
+    plain copies. Tensors are cached by their ids, so never write to them.
     """
     if isinstance(ids, (slice, torch.Tensor)):
         return ids
@@ -55,27 +55,27 @@ def _cached_columns(ids: tuple[int, ...], device: torch.device | str) -> Columns
     first = ids[0] if ids else 0
     if first >= 0 and ids == tuple(range(first, first + len(ids))):
         return slice(first, first + len(ids))
-    # Autograd cannot save tensors made in inference mode, which may be what fills the cache.
+    # Autograd cannot save inference tensors, and the first call may be in inference mode.
     with torch.inference_mode(mode=False):
         return torch.tensor(ids, dtype=torch.int64, device=device)
 
 
 def num_selected(ids: Sequence[int] | torch.Tensor | slice | int, count: int) -> int:
-    """Return how many of `count` elements `ids` selects."""
+    """Return the number of elements, out of `count`, that `ids` selects."""
     if isinstance(ids, slice):
         return len(range(count)[ids])
     return 1 if isinstance(ids, int) else len(ids)
 
 
 def read_columns(source: torch.Tensor, columns: Columns) -> torch.Tensor:
-    """Return columns of `source` (N, m): a view if `columns` is a slice, else a copy."""
+    """Return columns of `source`, (N, m): a view if `columns` is a slice, else a copy."""
     return source[:, columns] if isinstance(columns, slice) else source.index_select(1, columns)
 
 
 def write_columns(
     target: torch.Tensor, columns: Columns, values: torch.Tensor, env_ids: EnvIds = None
 ) -> None:
-    """Write `values` (N, n) into columns of `target` (N, m), in all rows or in `env_ids`."""
+    """Write `values`, (N, n), to columns of `target`, (N, m), in all rows or in rows `env_ids`."""
     if isinstance(columns, slice):
         if env_ids is None:
             target[:, columns] = values

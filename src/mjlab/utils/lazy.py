@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used."""
+"""Lazy import of package attributes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def lazy_names(module_name: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a module `__getattr__` for names whose modules (`homes`) are costly to import."""
+    """Return a module `__getattr__` that imports names from their modules (`homes`) on first use."""
 
     def __getattr__(name: str) -> Any:
         if name not in homes:
@@ -16,8 +16,8 @@ def lazy_names(module_name: str, homes: Mapping[str, str]) -> Callable[[str], An
         try:
             module = importlib.import_module(homes[name])
         except AttributeError as error:
-            # `from package import name` would hide it behind "cannot import name".
-            raise ImportError(f"{homes[name]} failed to be imported: {error}") from error
+            # `from package import name` would hide the cause behind "cannot import name".
+            raise ImportError(f"Import of {homes[name]} failed: {error}") from error
         return getattr(module, name)
 
     return __getattr__

@@ -1,4 +1,4 @@
-"""Messages to the person at the terminal."""
+"""Terminal output."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _LONGEST = 8000
 
 
 def print_info(message: str, color: str = "green") -> None:
-    """Print a message, coloured where the output is a terminal. For command lines, not libraries.
+    """Print a message, colored if the output is a terminal. For commands, not libraries.
 
-    Raises `ValueError` for an unknown colour.
+    Raises `ValueError` for an unknown color.
     """
     if color not in _CODES:
-        raise ValueError(f"Unknown colour {color!r}; use one of {list(_CODES)}.")
+        raise ValueError(f"Unknown color {color!r}. Available: {list(_CODES)}.")
     if sys.stdout.isatty():
         message = f"\033[{_CODES[color]}m{message}\033[0m"
     print(message)
 
 
 def print_notice(message: str) -> None:
-    """Print a notice to standard error; standard output is for a command's results."""
+    """Print a notice to stderr. Stdout is reserved for a command's results."""
     print(shorten(message), file=sys.stderr, flush=True)
 
 
 def shorten(text: str) -> str:
-    """Return `text`; of more than 8,000 characters, of a damaged file say, only both ends."""
+    """Return `text`, shortened to both ends if longer than 8,000 characters (e.g. a damaged file)."""
     half = _LONGEST // 2
     return text if len(text) <= _LONGEST else f"{text[:half]} [...] {text[-half:]}"

@@ -1,4 +1,4 @@
-"""Facts about MuJoCo's elements and options: widths of joints, kinds of actuators, enum names."""
+"""MuJoCo helpers: joint widths, actuator kinds, enum names, column addresses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CommandField = Literal["position", "velocity", "effort"]
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 _SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
 
-# Number of entries in qpos and in qvel.
+# Numbers of entries in qpos and qvel.
 _WIDTHS = {
     int(_FREE): (7, 6),
     int(_BALL): (4, 3),
@@ -25,14 +25,14 @@ _WIDTHS = {
     int(_HINGE): (1, 1),
 }
 
-# In the order of controls. A feedforward is a force; a voltage is commanded as an effort.
+# In control order. A feedforward input is a force; a voltage is an effort command.
 _INPUTS: tuple[tuple[mujoco.mjtCtrlInput, CommandField], ...] = (
     (mujoco.mjtCtrlInput.mjINPUT_POS, "position"),
     (mujoco.mjtCtrlInput.mjINPUT_VEL, "velocity"),
     (mujoco.mjtCtrlInput.mjINPUT_FF, "effort"),
     (mujoco.mjtCtrlInput.mjINPUT_VOLTAGE, "effort"),
 )
-# Inputs where the spec states none.
+# Default inputs.
 _DEFAULT_INPUTS = {
     int(mujoco.mjtGain.mjGAIN_PID): (
         mujoco.mjtCtrlInput.mjINPUT_POS.value | mujoco.mjtCtrlInput.mjINPUT_VEL.value
@@ -48,14 +48,14 @@ OPTION_ENUMS = {
     "disableflags": (mujoco.mjtDisableBit, "mjDSBL_"),
     "enableflags": (mujoco.mjtEnableBit, "mjENBL_"),
 }
-"""Options whose values are members of an enum (flags: bits), with the prefix of the members."""
+"""Enum (for flags: bits) and member prefix of options with enum values."""
 
 
 def enum_value(option: str, name: Any, enum: Any, prefix: str = "") -> int:
-    """Return an enum's member for a lower-case name.
+    """Return the enum member with a lower-case name.
 
     Raises:
-        ValueError: an unknown name, with the valid ones. `option` says where it was given.
+        ValueError: unknown name. The message lists the valid names and starts with `option`.
     """
     members = _members(enum, prefix)
     check_one_of(option, name, members)
@@ -70,27 +70,27 @@ def enum_bits(option: str, names: Iterable[str], enum: Any, prefix: str = "") ->
 
 
 def flag_names(option: str, bits: int) -> list[str]:
-    """Return the lower-case names of the bits that are set in `disableflags` or `enableflags`."""
+    """Return the lower-case names of the bits set in `disableflags` or `enableflags`."""
     return [name for name, bit in _members(*OPTION_ENUMS[option]).items() if bits & bit]
 
 
 def qpos_width(joint_type: int | mujoco.mjtJoint) -> int:
-    """Return how many entries of `qpos` a joint of this type has. `ValueError` if unknown."""
+    """Return the number of `qpos` entries of a joint type. Raises `ValueError` if unknown."""
     return _width(joint_type)[0]
 
 
 def dof_width(joint_type: int | mujoco.mjtJoint) -> int:
-    """Return how many entries of `qvel` a joint of this type has. `ValueError` if unknown."""
+    """Return the number of `qvel` entries of a joint type. Raises `ValueError` if unknown."""
     return _width(joint_type)[1]
 
 
 def is_muscle_actuator(actuator: mujoco.MjsActuator) -> bool:
-    """Return whether the actuator has muscle activation dynamics."""
+    """Return True if the actuator has muscle activation dynamics."""
     return actuator.dyntype == mujoco.mjtDyn.mjDYN_MUSCLE
 
 
 def is_position_actuator(actuator: mujoco.MjsActuator) -> bool:
-    """Return whether the actuator is a position servo: force = kp (u - l) - kd l'."""
+    """Return True for a position servo: force = kp (u - l) - kd l'."""
     unfiltered = actuator.dyntype in (
         mujoco.mjtDyn.mjDYN_NONE,
         mujoco.mjtDyn.mjDYN_FILTEREXACT,
@@ -99,7 +99,7 @@ def is_position_actuator(actuator: mujoco.MjsActuator) -> bool:
 
 
 def is_velocity_actuator(actuator: mujoco.MjsActuator) -> bool:
-    """Return whether the actuator is a velocity servo: force = kd (u - l')."""
+    """Return True for a velocity servo: force = kd (u - l')."""
     return (
         actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE
         and _has_affine_bias(actuator)
@@ -109,7 +109,7 @@ def is_velocity_actuator(actuator: mujoco.MjsActuator) -> bool:
 
 
 def is_motor_actuator(actuator: mujoco.MjsActuator) -> bool:
-    """Return whether the actuator applies its control as a force: fixed gain and no bias."""
+    """Return True for a motor: force = gain * u, with fixed gain and no bias."""
     return (
         actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED
         and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
@@ -118,10 +118,10 @@ def is_motor_actuator(actuator: mujoco.MjsActuator) -> bool:
 
 
 def control_inputs(actuator: mujoco.MjsActuator) -> tuple[CommandField | None, ...]:
-    """Return the command that each control of `actuator` is, in the order of its columns of `ctrl`.
+    """Return the command field of each control of `actuator`, in `ctrl` order.
 
-    None stands for a control of an unknown kind, or a component of an orientation. `<pid>` and
-    `<dcmotor>` have one control for each of their inputs, `<orientation>` three or four.
+    None: control of an unknown kind, or a component of an orientation. `<pid>` and `<dcmotor>` have
+    one control per input, `<orientation>` three or four.
     """
     if actuator.gaintype == mujoco.mjtGain.mjGAIN_SO3:
         is_quaternion = actuator.ctrlspec == mujoco.mjtCtrlChart.mjCHART_QUAT
@@ -140,9 +140,9 @@ def control_inputs(actuator: mujoco.MjsActuator) -> tuple[CommandField | None, .
 
 
 def detect_command_field(actuator: mujoco.MjsActuator) -> CommandField:
-    """Return the command that the one control of `actuator` is: position, velocity or effort.
+    """Return the command field of a single-control actuator: position, velocity or effort.
 
-    Raises `ValueError` for an actuator of an unknown kind, and one without or with several controls.
+    Raises `ValueError` for actuators of an unknown kind, without controls or with several controls.
     """
     inputs = control_inputs(actuator)
     if len(inputs) != 1:
@@ -152,17 +152,17 @@ def detect_command_field(actuator: mujoco.MjsActuator) -> CommandField:
         )
     if inputs[0] is None:
         raise ValueError(
-            f"The kind of actuator {actuator.name!r} cannot be detected (dyntype "
-            f"{actuator.dyntype.name}, gaintype {actuator.gaintype.name}, biastype "
-            f"{actuator.biastype.name}, gainprm {list(actuator.gainprm[:3])}, biasprm "
-            f"{list(actuator.biasprm[:3])}). Known are <motor>, <position>, <velocity>, <muscle>, "
-            "<pid> and <dcmotor>; for another kind state the command field in the actuator config."
+            f"Actuator {actuator.name!r}: expected <motor>, <position>, <velocity>, <muscle>, <pid> or "
+            f"<dcmotor>, got an unknown kind (dyntype {actuator.dyntype.name}, gaintype "
+            f"{actuator.gaintype.name}, biastype {actuator.biastype.name}, gainprm "
+            f"{list(actuator.gainprm[:3])}, biasprm {list(actuator.biasprm[:3])}); set command_field in "
+            "the actuator config."
         )
     return inputs[0]
 
 
 def moving_dofs(model: mujoco.MjModel) -> np.ndarray:
-    """Return which degrees of freedom move which bodies, (nbody, nv) bool."""
+    """Return True for degrees of freedom that move a body, (nbody, nv) bool."""
     moves = np.zeros((model.nbody, model.nv), dtype=bool)
     for body in range(1, model.nbody):
         moves[body] = moves[model.body_parentid[body]]
@@ -172,13 +172,13 @@ def moving_dofs(model: mujoco.MjModel) -> np.ndarray:
 
 
 def control_columns(model: mujoco.MjModel, actuator_ids: Iterable[int]) -> list[int]:
-    """Return the columns of `ctrl` of each actuator in turn: none, one or several."""
+    """Return the columns of `ctrl` of the actuators, in order: none, one or several each."""
     starts, widths = model.actuator_ctrladr, model.actuator_ctrlnum
     return [int(starts[i]) + k for i in actuator_ids for k in range(widths[i])]
 
 
 def force_columns(model: mujoco.MjModel, actuator_ids: Iterable[int]) -> list[int]:
-    """Return the columns of `actuator_force` of each actuator in turn, one or several."""
+    """Return the columns of `actuator_force` of the actuators, in order: one or several each."""
     starts, widths = model.actuator_outadr, model.actuator_outnum
     return [int(starts[i]) + k for i in actuator_ids for k in range(widths[i])]
 
@@ -196,7 +196,7 @@ def _width(joint_type: int | mujoco.mjtJoint) -> tuple[int, int]:
         return _WIDTHS[int(joint_type)]
     except KeyError:
         raise ValueError(
-            f"{joint_type!r} is no joint type; use a member of mujoco.mjtJoint "
+            f"Unknown joint type {joint_type!r}; use a member of mujoco.mjtJoint "
             "(mjJNT_FREE, mjJNT_BALL, mjJNT_SLIDE or mjJNT_HINGE)."
         ) from None
 

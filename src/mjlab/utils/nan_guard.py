@@ -1,4 +1,4 @@
-"""Find states that turned NaN or infinite, and keep what led to them for replay."""
+"""NaN detection: record physics states and dump those before a NaN or infinite value."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CHECKED_FIELDS = ("qpos", "qvel", "qacc", "qacc_warmstart", "sensordata")
-"""Fields of which one NaN or infinite value makes an environment invalid."""
+"""Fields checked for NaN and infinite values."""
 
 _PHYSICS_STATE = ("qpos", "qvel", "act", "history")
 _MOCAP_STATE = ("mocap_pos", "mocap_quat")
 _INPUTS = ("ctrl", "xfrc_applied")
 _FORMAT = 2
 _ARCHIVE = b"PK\x03\x04"
-# Entries of the metadata that replaying needs, and their types.
+# Metadata entries required for replay, and their types.
 _METADATA = {
     "model_file": str,
     "num_envs_total": int,
@@ -48,27 +48,27 @@ _METADATA = {
 
 @dataclass
 class NanGuardCfg:
-    """Recording of the physics states that lead to NaN."""
+    """NaN guard configuration."""
 
     enabled: bool = False
-    """Whether to record. Recording copies the state before every substep and waits for the GPU
-    after it, so leave it off unless you are hunting a NaN."""
+    """Record physics states. Recording copies the state before every substep and synchronizes
+    the GPU after it; enable it only for debugging."""
     buffer_size: int = 100
-    """Number of substeps kept."""
+    """Number of substeps to keep."""
     output_dir: str = field(
         default_factory=lambda: str(Path(tempfile.gettempdir()) / "mjlab" / "nan_dumps")
     )
-    """Folder into which the dump is written. If it is in a shared folder, such as `/tmp`, and another
-    user made it, the dump goes to `~/.cache/mjlab/` instead."""
+    """Output folder of dumps. If the folder is in a shared folder such as `/tmp` and belongs to
+    another user, dumps go to `~/.cache/mjlab/` instead."""
     max_envs_to_dump: int = 5
-    """Number of environments in a dump; the first that went NaN are taken."""
+    """Maximum number of environments in a dump; the first environments with NaN are taken."""
 
 
 class NanGuard:
-    """Keeps the last states of all environments and writes them out when one turns NaN.
+    """Keeps the last states of all environments and dumps them on the first NaN.
 
-    Only the first detection is written. The guard neither stops the simulation nor repairs
-    anything; resetting environments that went NaN is the environment's task, see `detect_nans`.
+    Only the first detection is dumped. The guard neither stops nor repairs the simulation;
+    environments reset themselves on NaN, see `detect_nans`.
     """
 
     def __init__(
@@ -79,13 +79,13 @@ class NanGuard:
         *,
         model_fields: Callable[[], Mapping[str, torch.Tensor]] | None = None,
     ) -> None:
-        """Prepare to record `num_envs` environments of `mj_model`.
+        """Allocate buffers for `num_envs` environments of `mj_model`.
 
-        `model_fields` returns the model fields that differ between environments, each (N, ...), at
-        the time of a dump; without them a dump holds the model as it was compiled.
+        `model_fields` returns the per-environment model fields, each (N, ...), at the time of a
+        dump. None: dumps hold only the compiled model.
 
         Raises:
-            ValueError: a buffer size or a number of environments to dump below 1.
+            ValueError: `buffer_size` or `max_envs_to_dump` is below 1.
         """
         for name in ("buffer_size", "max_envs_to_dump"):
             check_count(f"NanGuardCfg.{name}", getattr(cfg, name))
@@ -104,14 +104,14 @@ class NanGuard:
         self._input_fields = [n for n in _INPUTS if n != "ctrl" or mj_model.nu]
 
     def capture(self, wp_data: Any) -> None:
-        """Remember the present state of all environments; call before a substep."""
+        """Record the current state of all environments. Call before each substep."""
         if self.enabled and not self._dumped:
             names = (*self._state_fields, *self._input_fields)
             self.buffer.append({name: getattr(wp_data, name).clone() for name in names})
             self._steps += 1
 
     def check_and_dump(self, data: Any) -> bool:
-        """Return whether any environment is invalid; write the dump on the first detection."""
+        """Return True if any environment has NaN; write a dump on the first detection."""
         if not self.enabled or self._dumped:
             return False
         invalid = self.detect_nans(data)
@@ -122,17 +122,16 @@ class NanGuard:
         try:
             self.dump_path = self._dump(ids)
         except OSError as error:
-            # A full disk must not end the run that is being watched.
+            # A full disk must not end the run.
             logger.error(
-                "Environments %s turned NaN, but the dump could not be written to %s: %s.",
+                "NaN in environments %s, but the dump could not be written to %s: %s.",
                 ids[:10],
                 self.cfg.output_dir,
                 error,
             )
         else:
             logger.warning(
-                "Environments %s turned NaN at substep %d; the states before are in %s (viz-nan "
-                "shows them).",
+                "NaN in environments %s at substep %d; previous states are in %s (view with viz-nan).",
                 ids[:10],
                 self._steps,
                 self.dump_path,
@@ -142,27 +141,27 @@ class NanGuard:
 
     @contextmanager
     def watch(self, wp_data: Any) -> Generator[None]:
-        """Capture before the enclosed substep and check after it."""
+        """Call `capture` before the enclosed substep and `check_and_dump` after it."""
         self.capture(wp_data)
         yield
         self.check_and_dump(wp_data)
 
     @staticmethod
     def detect_nans(data: Any, fields: tuple[str, ...] = CHECKED_FIELDS) -> torch.Tensor:
-        """Return a bool tensor (N,): which environments have NaN or infinite values.
+        """Return True for environments with NaN or infinite values, (N,) bool.
 
-        `data` is anything with the checked fields as (N, ...) tensors, such as `sim.data`. Does
-        not wait for the GPU.
+        `data` is any object with the checked fields as (N, ...) tensors, such as `sim.data`. Does
+        not synchronize the GPU.
         """
         invalid = None
         for name in fields:
             values = getattr(data, name)
-            # The sum over a row is finite only if all its values are, unless it overflows; the
-            # product with zero keeps NaN and turns infinities into it, and never overflows.
+            # Multiplication by zero maps NaN and infinite values to NaN, and other values to zero,
+            # so the sum over a row cannot overflow.
             bad = (values.flatten(1) * 0).sum(dim=1) != 0
             invalid = bad if invalid is None else invalid | bad
         if invalid is None:
-            raise ValueError("detect_nans needs at least one field to check.")
+            raise ValueError("detect_nans fields: expected at least one field, got none.")
         return invalid
 
     def _dump(self, nan_ids: list[int]) -> Path:
@@ -194,7 +193,7 @@ class NanGuard:
         return path
 
     def _recorded(self, ids: list[int]) -> dict[str, Any]:
-        """Return the arrays of the kept substeps, the state in the order of `mj_setState`."""
+        """Return the arrays of the recorded substeps; states are in `mj_setState` order."""
         import numpy as np
 
         arrays: dict[str, Any] = {}
@@ -227,15 +226,15 @@ class NanGuard:
             "timestamp": stamp,
             "model_file": model_path.name,
             "note": (
-                "States are those before each substep; the last one led to the NaN. Arrays "
-                "model_<field> hold the dumped environments' own values, which the model file, as "
-                "compiled, does not."
+                "States are those before each substep; the last state led to the NaN. Arrays "
+                "model_<field> hold per-environment values of the dumped environments; the model "
+                "file holds the compiled values."
             ),
         }
 
 
 def state_spec(mj_model: mujoco.MjModel) -> int:
-    """Return the `mjtState` bits that a dump of `mj_model` holds: physics, and mocap if any."""
+    """Return the `mjtState` bits in a dump of `mj_model`: physics, and mocap if present."""
     import mujoco
 
     spec = int(mujoco.mjtState.mjSTATE_PHYSICS)
@@ -247,72 +246,71 @@ def state_spec(mj_model: mujoco.MjModel) -> int:
 
 @dataclass
 class NanDump:
-    """A dump read back: what `NanGuard` wrote, ready for replay."""
+    """Dump written by `NanGuard`, loaded for replay."""
 
     metadata: dict[str, Any]
-    """See `NanGuard`; `dumped_env_ids` names the environments of the arrays' rows."""
+    """See `NanGuard`; `dumped_env_ids` are the environments of the array rows."""
     model_file: Path
-    """The compiled model, next to the dump."""
+    """Compiled model, next to the dump."""
     steps: list[int]
-    """Indices of the kept substeps, rising."""
+    """Indices of the recorded substeps, ascending."""
     arrays: dict[str, np.ndarray[Any, Any]]
     """`states_step_*`, `ctrl_step_*`, `xfrc_applied_step_*` and `model_*`."""
 
     @classmethod
     def load(cls, path: str | Path) -> NanDump:
-        """Read a dump; nothing in the file is executed.
+        """Load a dump. No code in the file is executed.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: a file that is not such a dump.
+            FileNotFoundError: `path` does not exist.
+            ValueError: the file is not a valid dump.
         """
         path = Path(path).resolve()
         with path.open("rb") as file:
             is_archive = file.read(len(_ARCHIVE)) == _ARCHIVE
         try:
             if not is_archive:
-                raise ValueError("it is not an .npz file")
+                raise ValueError("not an .npz file")
             arrays = _read_arrays(path)
             metadata = json.loads(str(arrays.pop("_metadata")))
             missing = [name for name in _METADATA if name not in metadata]
             if missing:
-                raise ValueError(f"it has no {missing}")
+                raise ValueError(f"metadata {missing} not found")
             for name, kind in _METADATA.items():
                 if not isinstance(metadata[name], kind):
-                    raise ValueError(f"its {name} is {metadata[name]!r}")
+                    raise ValueError(f"metadata {name}: expected {kind}, got {metadata[name]!r}")
             rows = metadata["num_envs_dumped"]
             if rows != len(metadata["dumped_env_ids"]) or rows < 1:
-                raise ValueError(f"it says {rows} environments, and names others")
+                raise ValueError(f"num_envs_dumped={rows} does not match dumped_env_ids")
             short = [name for name, array in arrays.items() if array.shape[:1] != (rows,)]
             if short:
-                raise ValueError(f"{short} are not of {rows} environments")
+                raise ValueError(f"{short}: expected {rows} rows")
             steps = sorted(
                 int(name.rpartition("_")[2]) for name in arrays if name.startswith("states_step_")
             )
         except Exception as error:
-            # Damaged bytes make the readers fail in any way there is.
+            # Damaged bytes can make the readers raise any exception.
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(
-                f"{path} is not a NaN dump of this version of mjlab, or is damaged: {reason}."
+                f"{path} is not a NaN dump of this mjlab version, or is damaged: {reason}."
             ) from error
         model_file = path.parent / Path(metadata["model_file"]).name
         return cls(metadata=metadata, model_file=model_file, steps=steps, arrays=arrays)
 
     def apply(self, step: int, row: int, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-        """Write one environment's recorded values into a host model and data; no forward pass.
+        """Write the recorded values of one environment to a host model and data, without forward.
 
         `step` is one of `steps`, `row` an index into `metadata["dumped_env_ids"]`.
 
         Raises:
-            ValueError: a substep or row that the dump does not hold.
+            ValueError: the dump does not contain the substep or row.
         """
         import mujoco
 
         if step not in self.steps or not 0 <= row < self.metadata["num_envs_dumped"]:
             raise ValueError(
-                f"The dump holds substeps {self.steps[0]} to {self.steps[-1]} of "
-                f"{self.metadata['num_envs_dumped']} environments; asked for substep {step} of row "
-                f"{row}."
+                f"NanDump.apply: expected substep {self.steps[0]} to {self.steps[-1]} and row < "
+                f"{self.metadata['num_envs_dumped']}, got substep {step} and row {row}."
             )
         state = self.arrays[f"states_step_{step:06d}"][row]
         mujoco.mj_setState(mj_model, mj_data, state, self.metadata["state_spec"])
@@ -343,17 +341,17 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
             except ValueError as error:
                 if "allow_pickle" in str(error):
                     raise ValueError(
-                        f"{name} holds Python objects, which a dump has none of; nothing was run"
+                        f"{name}: Python objects are not allowed in dumps; nothing was executed"
                     ) from error
                 raise
-            # Numpy returns the bytes of what is not an array.
+            # NumPy returns the raw bytes of entries that are not arrays.
             if not isinstance(arrays[name], np.ndarray):
                 raise ValueError(f"{name} is not an array")
     return arrays
 
 
 def _link(link: Path, target: Path) -> None:
-    """Let `link` name `target`, by a copy where the file system has no links."""
+    """Link `link` to `target`, or copy it on file systems without links."""
     link.unlink(missing_ok=True)
     try:
         os.symlink(target.name, link)

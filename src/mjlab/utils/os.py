@@ -1,4 +1,4 @@
-"""Files of a run: readable YAML of its configs, and the search for a checkpoint."""
+"""Run files: YAML configs, checkpoint lookup, atomic and locked files."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ except ImportError:
 logger = logging.getLogger(__name__)
 
 _WANDB_CACHE = "wandb_checkpoints"
-# See `temporary_path`. Those of other programs, and of earlier versions, carry no lock.
+# Names of `temporary_path`. Files of other programs and of earlier versions are not locked.
 _TEMPORARY = re.compile(r"\.(.+)\.\d+-[0-9a-f]{8}\.tmp")
-# Age from which those of other machines, whose locks may not be seen here, are removed.
+# Age for removal of files of other machines, because their locks may not be visible here.
 _SECONDS_TO_KEEP = 86400.0
 _WANDB_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
 
 
 def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> None:
-    """Write `data` as plain YAML that `yaml.safe_load` reads.
+    """Write `data` as plain YAML, readable by `yaml.safe_load`.
 
-    Dataclasses become mappings, tuples, arrays and tensors lists, enum members their names, and
-    functions and classes "module:name". Missing folders are made, and the suffix ".yaml" is added
-    unless the name has it (or ".yml"). The file appears whole or not at all.
+    Converts dataclasses to mappings, tuples, arrays and tensors to lists, enum members to names, and
+    functions and classes to "module:name". Creates missing folders, and adds the suffix ".yaml"
+    unless the name ends in ".yaml" or ".yml". The write is atomic.
     """
     import yaml
 
@@ -52,7 +52,7 @@ def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> 
     filename.parent.mkdir(parents=True, exist_ok=True)
 
     class PlainDumper(yaml.SafeDumper):
-        # An object reached twice is written twice: anchors are hard to read.
+        # Repeat objects, because YAML anchors are hard to read.
         def ignore_aliases(self, data: Any) -> bool:
             return True
 
@@ -73,14 +73,14 @@ def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
     if value is None:
         return None
     for kind in (bool, int, float, str):
-        # Subclasses (numpy's float64 among them) are unknown to the safe dumper.
+        # The safe dumper rejects subclasses such as NumPy's float64.
         if isinstance(value, kind):
             return kind(value)
     if id(value) in _parents:
         return "<contains itself>"
     inner = (*_parents, id(value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        # Fields are read one by one: `asdict` copies, which not every value allows.
+        # Not `asdict`, because it copies values and not all values can be copied.
         return {f.name: to_plain(getattr(value, f.name), inner) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         items = {}
@@ -103,14 +103,14 @@ def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
 
 
 def _plain_object(value: Any) -> Any:
-    # Arrays, tensors and numpy scalars; a class has the method too, but no values.
+    # Arrays, tensors and NumPy scalars; their classes also have `tolist`, but no values.
     if hasattr(value, "tolist") and not isinstance(value, type):
         return value.tolist()
     if callable(value):
         return qualified_name(value)
     if isinstance(value, (os.PathLike, slice)) or type(value).__module__ == "torch":
         return str(value)
-    # The default `repr` shows a memory address, which differs from run to run.
+    # The default `repr` contains a memory address that differs between runs.
     if type(value).__repr__ is object.__repr__ or type(value).__module__.startswith("mujoco"):
         return f"<{qualified_name(type(value))}>"
     return repr(value)
@@ -119,21 +119,21 @@ def _plain_object(value: Any) -> Any:
 def get_checkpoint_path(
     log_path: Path, run_dir: str = ".*", checkpoint: str = ".*", sort_alpha: bool = True
 ) -> Path:
-    """Return the newest checkpoint of the newest run that has one.
+    """Return the newest checkpoint of the newest run with a checkpoint.
 
     Args:
         log_path: Folder of the experiment; its sub-folders are runs.
-        run_dir: Regular expression for the name of the run. Runs matched in full are preferred to
-            those of which it matches only the start.
+        run_dir: Regular expression for the name of the run. Full matches are preferred to matches
+            at the start.
         checkpoint: Regular expression for the whole name of the checkpoint file.
-        sort_alpha: The newest run is the last by name; False: the one changed last.
+        sort_alpha: Sort runs by name. False: by modification time.
 
-    The newest checkpoint of a run is the one with the highest number in its name. Raises
-    `ValueError`, saying what there is, if the folder, a matching run or a checkpoint is missing.
+    The newest checkpoint of a run has the highest number in its name. Raises `ValueError`, listing
+    the available runs, if the folder, a matching run or a checkpoint is not found.
     """
     log_path = Path(log_path)
     if not log_path.is_dir():
-        raise ValueError(f"There is no log folder {str(log_path)!r}. Has the task been trained?")
+        raise ValueError(f"Log folder {str(log_path)!r} not found; train the task first.")
     folders = [p for p in log_path.iterdir() if p.is_dir() and p.name != _WANDB_CACHE]
     folders.sort(key=lambda p: p.name if sort_alpha else (p.stat().st_mtime_ns, p.name))
     runs = [p for p in folders if re.fullmatch(run_dir, p.name)]
@@ -141,36 +141,36 @@ def get_checkpoint_path(
     if not runs:
         raise ValueError(
             f"No run in {str(log_path)!r} matches {run_dir!r}. "
-            f"Runs there: {[p.name for p in folders]}."
+            f"Available: {[p.name for p in folders]}."
         )
     for run in reversed(runs):
         files = [p for p in run.iterdir() if p.is_file() and re.fullmatch(checkpoint, p.name)]
         if files:
             return max(files, key=_checkpoint_age)
     raise ValueError(
-        f"No file matching {checkpoint!r} in any of the runs {[p.name for p in runs]} of "
+        f"No checkpoint matching {checkpoint!r} in the runs {[p.name for p in runs]} of "
         f"{str(log_path)!r}."
     )
 
 
 def _checkpoint_age(path: Path) -> tuple[bool, int, str]:
     numbers = re.findall(r"\d+", path.stem)
-    # Event files have long numbers in their names too: a ".pt" file goes before all others.
+    # ".pt" files first, because event files also have long numbers in their names.
     return path.suffix == ".pt", int(numbers[-1]) if numbers else -1, path.name
 
 
 def get_wandb_checkpoint_path(
     log_path: Path, run_path: Path, checkpoint_name: str | None = None
 ) -> tuple[Path, bool]:
-    """Return a checkpoint of a Weights & Biases run, and whether it was in the cache already.
+    """Return a checkpoint of a Weights & Biases run, and True if it was cached.
 
     Args:
-        log_path: Folder of the experiment; the cache is `wandb_checkpoints/<run id>/` in it.
+        log_path: Folder of the experiment; the cache is its sub-folder `wandb_checkpoints/<run id>/`.
         run_path: "entity/project/run_id".
-        checkpoint_name: File name as "model_100.pt"; None takes the highest number.
+        checkpoint_name: File name such as "model_100.pt". None: highest number.
 
-    A cached file is used as it is. Raises `ValueError`, listing the checkpoints there are, if the
-    run does not have the one asked for, and `ConnectionError` if Weights & Biases does not give it.
+    Cached files are not downloaded again. Raises `ValueError`, listing the available checkpoints, if
+    the checkpoint is not found, and `ConnectionError` if the download fails.
     """
     cache = Path(log_path) / _WANDB_CACHE / Path(run_path).name
     if checkpoint_name is not None and _WANDB_CHECKPOINT.fullmatch(checkpoint_name):
@@ -185,15 +185,15 @@ def get_wandb_checkpoint_path(
     names.sort(key=lambda name: int(name[len("model_") : -len(".pt")]))
     if not names or (checkpoint_name is not None and checkpoint_name not in names):
         raise ValueError(
-            f"The run {str(run_path)!r} has no checkpoint {checkpoint_name or 'model_<n>.pt'!r}. "
-            f"Checkpoints there: {names}."
+            f"Checkpoint {checkpoint_name or 'model_<n>.pt'!r} not found in run {str(run_path)!r}. "
+            f"Available: {names}."
         )
     name = checkpoint_name or names[-1]
     target = cache / name
     if target.is_file():
         return target, True
     cache.mkdir(parents=True, exist_ok=True)
-    # Downloaded next to its place and renamed, so that a broken transfer leaves nothing behind.
+    # Download to a temporary file and rename it, so that a failed download leaves no partial file.
     with tempfile.TemporaryDirectory(dir=cache) as folder, _asking_wandb(run_path):
         run.file(name).download(folder, replace=True)
         os.replace(Path(folder) / name, target)
@@ -202,28 +202,27 @@ def get_wandb_checkpoint_path(
 
 @contextlib.contextmanager
 def _asking_wandb(run_path: Path) -> Generator[None]:
-    """Turn what wandb raises within the block into one `ConnectionError` that says what to do."""
+    """Convert wandb errors within the block to a `ConnectionError` with instructions."""
     try:
         yield
     except OSError:
-        # The disk's, and those of the network, which say what they are.
+        # Disk and network errors already have clear messages.
         raise
     except Exception as error:
-        # wandb raises errors of many kinds, of its own and of what it is built on.
+        # wandb raises many error types, including those of its dependencies.
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise ConnectionError(
-            f"The Weights & Biases run {str(run_path)!r} cannot be read: {reason} Use `wandb login`, and "
-            "a path as entity/project/run."
+            f"Cannot read the Weights & Biases run {str(run_path)!r}: {reason} Use `wandb login`, and "
+            "a path entity/project/run."
         ) from error
 
 
 @contextlib.contextmanager
 def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
-    """Yield a binary file that takes the place of `path` if the block succeeds.
+    """Yield a binary file that replaces `path` atomically if the block succeeds.
 
-    It is written beside `path` and renamed, so `path` appears whole or not at all. The umask decides
-    who may read it, and a link at `path` is replaced instead of followed. `flush`: the content is on
-    the disk before the file gets its name.
+    The file is written next to `path` and then renamed. Permissions follow the umask, and a link at
+    `path` is replaced, not followed. `flush`: sync the content to disk before renaming.
     """
     with create_locked(temporary_path(path)) as file:
         try:
@@ -238,40 +237,40 @@ def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return a new name beside `path`, for a file of this process that will take its place."""
+    """Return a unique temporary path next to `path`, for a file of this process to replace `path`."""
     owner = f"{socket.gethostname()}.{os.getpid()}"
     return path.with_name(f".{path.name}.{owner}-{secrets.token_hex(4)}.tmp")
 
 
 def create_locked(path: Path) -> IO[bytes]:
-    """Make a file and open it; until it is closed, `remove_abandoned` leaves it alone.
+    """Create and open a locked file. `remove_abandoned` skips it until it is closed.
 
     Raises:
-        OSError: it cannot be made, or there is a file or a link of that name.
+        OSError: the file cannot be created, or a file or link of that name exists.
     """
     while True:
         file = open(path, "xb")  # noqa: SIM115
         if fcntl is not None:
-            # Not every file system has locks.
+            # Some file systems do not support locks.
             with contextlib.suppress(OSError):
                 fcntl.flock(file, fcntl.LOCK_EX)
-        # It may have been removed before it was locked.
+        # Another process may have removed the file before it was locked.
         if os.fstat(file.fileno()).st_nlink > 0:
             return file
         file.close()
 
 
 def rename_locked(file: IO[bytes], path: Path) -> None:
-    """Give a file of `create_locked` its name, and close it."""
+    """Rename a file of `create_locked` to `path`, and close it."""
     if fcntl is None:
-        # Windows does not rename an open file.
+        # Windows cannot rename open files.
         file.close()
     os.replace(file.name, path)
     file.close()
 
 
 def remove_abandoned(path: Path) -> bool:
-    """Remove a file of `create_locked` if its process is gone; return whether it was removed."""
+    """Remove a file of `create_locked` if its process has ended; return True if removed."""
     if fcntl is None:
         return False
     try:
@@ -284,9 +283,9 @@ def remove_abandoned(path: Path) -> bool:
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Remove the files in `folder` that a process was writing (`replacing`) when it was killed.
+    """Remove partial files in `folder`, left by killed processes (`replacing`).
 
-    Those of other machines only after a day.
+    Files of other machines are removed only after a day.
     """
     for path in folder.glob(".*.tmp"):
         match = _TEMPORARY.fullmatch(path.name)
@@ -299,13 +298,13 @@ def remove_temporary_files(folder: Path) -> None:
 
 
 def own_folder(folder: Path) -> Path:
-    """Make `folder` and return it, or a folder of that name in the user's cache if it is foreign.
+    """Create and return `folder`, or a folder of that name in the user's cache if it is foreign.
 
-    Foreign is a folder that another user could have planted, or a link to one: in a folder that
-    everyone may write to, such as `/tmp`, a part of the path belongs to neither this user nor root.
+    A folder is foreign if another user could have planted it or a link to it: in a world-writable
+    folder such as `/tmp`, a part of the path belongs to neither this user nor root.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
     path = Path(os.path.abspath(folder))
     for part in (*reversed(path.parents), path):
@@ -316,7 +315,7 @@ def own_folder(folder: Path) -> Path:
             cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
             own = cache / "mjlab" / path.name
             own.mkdir(parents=True, exist_ok=True)
-            logger.warning("%s belongs to another user; %s is used instead.", part, own)
+            logger.warning("%s belongs to another user; using %s.", part, own)
             return own
     return folder
 

@@ -1,7 +1,7 @@
-"""The processes that share a training run, as torchrun and our own launcher number them.
+"""Process ranks of a training run, and CPU cores per process.
 
-Both set the environment variables RANK, LOCAL_RANK, WORLD_SIZE and LOCAL_WORLD_SIZE. Without them
-there is one process.
+torchrun and mjlab's launcher set the environment variables RANK, LOCAL_RANK, WORLD_SIZE and
+LOCAL_WORLD_SIZE. Without these variables, the run has one process.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from mjlab.utils.errors import MjlabError
 
-# Set for a child that is to end with the process that started it: the number of that process.
+# Process id of the launcher, set for children that must end with their launcher.
 PARENT_VARIABLE = "MJLAB_PARENT_PID"
 
 _SECONDS_BETWEEN_LOOKS = 0.5
@@ -28,25 +28,25 @@ _CGROUP_ROOT = Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True)
 class ProcessRank:
-    """Which of the processes of a run this one is."""
+    """Rank of this process in a run."""
 
     rank: int = 0
-    """Number of this process among all, from 0."""
+    """Index of this process among all processes, from 0."""
     world_size: int = 1
-    """Number of processes of the run, over all machines."""
+    """Number of processes on all machines."""
     local_rank: int = 0
-    """Number of this process among those of this machine, from 0."""
+    """Index of this process among the processes on this machine, from 0."""
     local_world_size: int = 1
-    """Number of processes of the run on this machine."""
+    """Number of processes on this machine."""
 
     @property
     def is_first(self) -> bool:
-        """Whether this is the process that writes files and talks to people."""
+        """True for the main process (rank 0), which writes files and prints output."""
         return self.rank == 0
 
     @property
     def is_alone(self) -> bool:
-        """Whether the run has no other process."""
+        """True if the run has only one process."""
         return self.world_size == 1
 
     def __str__(self) -> str:
@@ -54,10 +54,10 @@ class ProcessRank:
 
 
 def process_rank() -> ProcessRank:
-    """Return which of the processes of a run this one is.
+    """Return the rank of this process in its run.
 
     Raises:
-        ValueError: the environment variables contradict each other, or are no numbers.
+        ValueError: the environment variables are inconsistent or not integers.
     """
     world_size = _number("WORLD_SIZE", 1)
     rank = _number("RANK", 0)
@@ -65,9 +65,10 @@ def process_rank() -> ProcessRank:
     local_world_size = _number("LOCAL_WORLD_SIZE", world_size)
     if not (rank < world_size and local_rank < local_world_size <= world_size):
         raise ValueError(
-            f"RANK={rank} has to be below WORLD_SIZE={world_size}, and LOCAL_RANK={local_rank} "
-            f"below LOCAL_WORLD_SIZE={local_world_size}, which is at most WORLD_SIZE. torchrun "
-            "sets these variables; unset them to train in one process."
+            "Expected RANK < WORLD_SIZE and LOCAL_RANK < LOCAL_WORLD_SIZE <= WORLD_SIZE, got "
+            f"RANK={rank}, WORLD_SIZE={world_size}, LOCAL_RANK={local_rank} and "
+            f"LOCAL_WORLD_SIZE={local_world_size}. torchrun sets these variables; unset them to "
+            "train in one process."
         )
     return ProcessRank(rank, world_size, local_rank, local_world_size)
 
@@ -79,32 +80,33 @@ def _number(variable: str, default: int) -> int:
     least = 1 if variable.endswith("WORLD_SIZE") else 0
     if not text.isdigit() or int(text) < least:
         raise ValueError(
-            f"The environment variable {variable} is {text!r}; it has to be a whole number of at "
-            f"least {least}. torchrun sets it; unset it to train in one process."
+            f"Environment variable {variable}: expected an integer >= {least}, got {text!r}. "
+            "torchrun sets this variable; unset it to train in one process."
         )
     return int(text)
 
 
 class OtherProcessError(MjlabError, RuntimeError):
-    """Another process of the run failed, and said why; this one cannot go on without it."""
+    """Failure of another process of the run, which reports the cause itself."""
 
     exit_status = 3
 
 
 @functools.cache
 def end_with_launcher() -> None:
-    """Let this process get SIGTERM when its launcher is gone, even by SIGKILL; training then saves.
+    """Send SIGTERM to this process when its launcher ends, even by SIGKILL, so that training saves.
 
-    Does nothing unless our commands or torchrun started it: a shell may leave before its children.
+    No effect unless mjlab's commands or torchrun started this process, because a shell may end before
+    its children.
     """
-    # Not for processes that this one starts.
-    given = os.environ.pop(PARENT_VARIABLE, None)
-    # Elsewhere the number of a parent does not change when it ends.
-    if os.name != "posix" or (given is None and "TORCHELASTIC_RUN_ID" not in os.environ):
+    # Popped, because child processes must not inherit the variable.
+    launcher_id = os.environ.pop(PARENT_VARIABLE, None)
+    # Only POSIX changes the parent id when the parent ends.
+    if os.name != "posix" or (launcher_id is None and "TORCHELASTIC_RUN_ID" not in os.environ):
         return
     parent = os.getppid()
-    # A wrapper may stand between.
-    launcher = parent if given is None else int(given)
+    # The launcher may differ from the parent: a wrapper may be in between.
+    launcher = parent if launcher_id is None else int(launcher_id)
 
     def watch() -> None:
         while os.getppid() == parent and _is_running(launcher):
@@ -120,27 +122,27 @@ def _is_running(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        # It is another user's.
+        # The process exists and belongs to another user.
         pass
     return True
 
 
 def cores_per_process() -> int:
-    """Return the number of CPU cores for each process of the run on this machine, at least 1."""
+    """Return the number of CPU cores per process of the run on this machine, at least 1."""
     return max(1, available_cores() // process_rank().local_world_size)
 
 
 def available_cores() -> int:
-    """Return the number of CPU cores this process may use: its affinity mask or quota, rounded up.
+    """Return the number of CPU cores for this process: affinity mask or cgroup quota, rounded up.
 
-    A container limited to two cores still sees all cores of its host; threads beyond the quota
-    are put to sleep in the middle of a step.
+    A container limited to two cores still sees all cores of its host; the scheduler throttles
+    threads beyond the quota in the middle of a step.
     """
     if hasattr(os, "sched_getaffinity"):
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    # Quotas of this process's control group and of all groups above it apply together.
+    # Quotas of this process's control group and of all its ancestors apply.
     quotas = [
         quota
         for folder, read in _control_groups()
@@ -151,9 +153,9 @@ def available_cores() -> int:
 
 
 def _control_groups() -> Iterator[tuple[Path, Callable[[Path], float | None]]]:
-    """Yield the folder of each control group that may limit this process, and its reader.
+    """Yield folder and quota reader of each control group that may limit this process.
 
-    A line of `/proc/self/cgroup` is `<number>:<controllers>:<path>`; version 2 has no controllers.
+    Lines of `/proc/self/cgroup` are `<number>:<controllers>:<path>`; version 2 has no controllers.
     """
     try:
         lines = _OWN_CGROUPS.read_text().splitlines()
@@ -171,12 +173,12 @@ def _control_groups() -> Iterator[tuple[Path, Callable[[Path], float | None]]]:
 
 
 def _quota_v2(group: Path) -> float | None:
-    # "<quota> <period>" in microseconds; the quota is "max" if there is no limit.
+    # "<quota> <period>" in microseconds; quota "max": no limit.
     return _ratio(*_words(group / "cpu.max"))
 
 
 def _quota_v1(group: Path) -> float | None:
-    # The quota is -1 if there is no limit.
+    # Quota -1: no limit.
     names = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
     return _ratio(*(word for name in names for word in _words(group / name)))
 

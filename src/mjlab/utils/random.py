@@ -1,9 +1,9 @@
-"""Seeds: of every random number generator, and of the parts of a run that must not draw alike.
+"""Seeds of random number generators, and separate seeds for the parts of a run.
 
-Generators are seeded with 32 bits. The lower half of them is for the processes of a run, the third
-quarter for evaluations, the last for sessions of several processes after a resume. So no part of a
-run draws the numbers of another, and neither does any of a run whose `--agent.seed` differs, as long
-as that is below 2**20 and there are at most 1,000 processes.
+Seeds have 32 bits. The lower half of the range is for the processes of a run, the third quarter for
+evaluations, the last quarter for multi-process sessions after a resume. So the parts of a run have
+different random numbers, also for different `--agent.seed`, if seeds are below 2**20 and the number
+of processes is at most 1,000.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from mjlab.utils.errors import check_in_range
 _MAX_SEED = 2**32 - 1
 _PROCESS_STRIDE = 2**20
 _EVALUATIONS, _SESSIONS = 2**31, 2**31 + 2**30
-# Odd, and near 2**32 over the golden ratio: multiples by small numbers lie far apart.
+# Odd, and close to 2**32 / golden ratio: small multiples are far apart.
 _SPREAD = 0x9E3779B1
 
 
 def draw_seed() -> int:
-    """Return a seed from 0 to 9999 drawn from the system's entropy, whatever was seeded before."""
+    """Return a seed in [0, 9999] from the system's entropy, independent of earlier seeding."""
     return int(np.random.default_rng().integers(0, 10_000))
 
 
 def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
     """Seed the generators of Python, NumPy and torch (CPU and GPUs).
 
-    `PYTHONHASHSEED` is set too: it does not change this process, but the ones it starts.
+    Also sets `PYTHONHASHSEED`, which affects child processes but not this process.
 
     Args:
         seed: An integer from 0 to 2**32 - 1.
-        torch_deterministic: Also make torch choose deterministic algorithms, with a warning where
-            an operation has none.
+        torch_deterministic: Also use deterministic torch algorithms, with a warning for
+            operations without one.
 
     Raises `ValueError` if the seed is out of range.
     """
@@ -49,10 +49,10 @@ def seed_rng(seed: int, torch_deterministic: bool = False) -> None:
     np.random.seed(seed)
     torch.manual_seed(seed)
     if torch_deterministic:
-        # cuBLAS is only reproducible with a fixed workspace, read when it starts.
+        # cuBLAS is only reproducible with a fixed workspace, configured before it starts.
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-        # The same as `use_deterministic_algorithms(True, warn_only=True)`, which would load
-        # torch's compiler first (seconds).
+        # Same as `use_deterministic_algorithms(True, warn_only=True)`, but without loading torch's
+        # compiler (seconds).
         torch.set_deterministic_debug_mode("warn")
 
 
@@ -60,7 +60,7 @@ def rng_state() -> dict[str, Any]:
     """Return the states of torch (CPU and GPUs), NumPy and Python as tensors and numbers."""
     kind, keys, position, has_gauss, cached_gaussian = np.random.get_state(legacy=True)
     if kind != "MT19937":
-        raise ValueError(f"NumPy's global generator is {kind}; only MT19937 can be saved.")
+        raise ValueError(f"NumPy's global generator: expected MT19937, got {kind}.")
     version, words, next_gauss = random.getstate()
     state: dict[str, Any] = {
         "torch": torch.get_rng_state(),
@@ -82,7 +82,7 @@ def rng_state() -> dict[str, Any]:
 
 
 def set_rng_state(state: dict[str, Any]) -> None:
-    """Restore what `rng_state` returned. States of GPUs that are not there are left out."""
+    """Restore the result of `rng_state`. States of missing GPUs are skipped."""
     torch.set_rng_state(state["torch"].cpu())
     saved = state["numpy"]
     keys = saved["keys"].cpu().numpy().astype(np.uint32)
@@ -99,7 +99,7 @@ def set_rng_state(state: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def preserved_rng() -> Generator[None]:
-    """Put all generators back, after the block, to where they were before it."""
+    """Restore the states of all generators at the end of the block."""
     state = rng_state()
     try:
         yield
@@ -108,14 +108,14 @@ def preserved_rng() -> Generator[None]:
 
 
 def process_seed(seed: int, rank: int) -> int:
-    """Return the seed of process `rank` of a run with `seed`; that of the first is `seed` itself."""
+    """Return the seed of process `rank` of a run with `seed`; rank 0 gets `seed`."""
     return seed if rank == 0 else (seed + rank * _PROCESS_STRIDE) % 2**32
 
 
 def session_seed(seed: int, iteration: int) -> int:
-    """Return the seed of a process with `seed` whose run is resumed after `iteration` iterations.
+    """Return the seed of a process with `seed` whose run resumes after `iteration` iterations.
 
-    For runs of which a checkpoint does not hold the generators.
+    For runs whose checkpoint does not contain the generator states.
     """
     return _SESSIONS + _spread(seed, iteration)
 
@@ -125,7 +125,8 @@ def evaluation_seed(seed: int, iteration: int = 0) -> int:
 
     Args:
         seed: Seed of the run.
-        iteration: Each gives other episodes; 0 is for those that are the same in all evaluations.
+        iteration: Each iteration gives different episodes; 0 is for episodes that are the same
+            in all evaluations.
     """
     return _EVALUATIONS + _spread(seed, iteration)
 

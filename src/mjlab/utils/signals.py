@@ -1,4 +1,4 @@
-"""Signal handlers and restoring them: stop requests, the first Ctrl+C, signals for child processes."""
+"""Scoped signal handlers: stop requests, the first Ctrl+C, signals for child processes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterable
 from types import FrameType
 from typing import Any
 
-# Not on every system: SIGHUP, which a closed terminal sends.
+# SIGHUP (closed terminal) does not exist on all systems.
 _HANGUP = getattr(signal, "SIGHUP", None)
 
 FORWARDED: dict[int, signal.Signals] = {
@@ -17,16 +17,16 @@ FORWARDED: dict[int, signal.Signals] = {
     signal.SIGTERM: signal.SIGTERM,
     **({} if _HANGUP is None else {_HANGUP: signal.SIGTERM}),
 }
-"""Signals that end a process, and what a training process that it started gets for each: training
-saves at the first two."""
+"""Signals that end a launcher, and the signal forwarded to its training process. Training saves on
+SIGINT and SIGTERM."""
 
 
 def replace_handlers(
     handler: Callable[[int, FrameType | None], None], numbers: Iterable[int]
 ) -> dict[int, Any]:
-    """Let `handler` handle these signals; return the handlers before, for `restore_handlers`.
+    """Install `handler` for the signals `numbers`; return the previous handlers.
 
-    Outside the main thread, which alone can handle signals, nothing is changed.
+    No effect outside the main thread, because only the main thread can handle signals.
     """
     if threading.current_thread() is not threading.main_thread():
         return {}
@@ -34,36 +34,36 @@ def replace_handlers(
 
 
 def restore_handlers(previous: dict[int, Any]) -> None:
-    """Put handlers back, and take them out of `previous`."""
+    """Restore the handlers in `previous` and clear it."""
     while previous:
         number, handler = previous.popitem()
-        # A handler that was not set from Python reads as None and cannot be set again.
+        # Handlers not set from Python read as None and cannot be restored.
         signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 def not_ignored(numbers: Iterable[int]) -> list[int]:
-    """Return the signals that this process does not ignore, as one under `nohup` ignores SIGHUP."""
+    """Return the signals in `numbers` that are not ignored (`nohup` ignores SIGHUP)."""
     return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 class StopRequest:
-    """A context in which SIGINT, SIGTERM and SIGHUP set `signal_name` instead of ending the process.
+    """Context manager: SIGINT, SIGTERM and SIGHUP set `signal_name` instead of ending the process.
 
-    The handlers that were there before come back with the first signal, so that a second one does
-    what it always did, and at the end of the context. A second SIGHUP is ignored until then, because
-    a terminal and its shell both send one. A process that ignores SIGHUP, such as one under `nohup`,
-    goes on doing so. Outside the main thread, which alone can handle signals, nothing is changed.
+    The first signal and the end of the context restore the previous handlers, so a second signal has
+    its usual effect. A second SIGHUP is ignored until the end of the context, because a terminal and
+    its shell both send SIGHUP. A process that ignores SIGHUP, such as under `nohup`, keeps ignoring
+    it. No effect outside the main thread, because only the main thread can handle signals.
     """
 
     def __init__(self, on_request: Callable[[str], None] | None = None) -> None:
-        """`on_request` is called with the name of the signal when it arrives."""
+        """Store `on_request`, a callback that receives the signal name."""
         self.signal_name: str | None = None
         self._on_request = on_request
         self._previous: dict[int, Any] = {}
 
     @property
     def requested(self) -> bool:
-        """Whether a signal has arrived."""
+        """True if a signal has arrived."""
         return self.signal_name is not None
 
     def __enter__(self) -> StopRequest:
@@ -103,7 +103,7 @@ def handled_signals(
 
 @contextlib.contextmanager
 def first_interrupt_calls(callback: Callable[[], None], enabled: bool) -> Generator[None]:
-    """Let the first Ctrl+C call `callback`, and a second one interrupt as usual."""
+    """Call `callback` on the first Ctrl+C; a second Ctrl+C interrupts as usual."""
 
     def handler(signum: int, frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""Descriptions of observation and action spaces, without a dependency on a gym library."""
+"""Observation and action spaces, without a dependency on a gym library."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from mjlab.utils.errors import check_count
 
 @dataclass
 class Space:
-    """Shape and type of a value."""
+    """Shape and data type of a value."""
 
     shape: tuple[int, ...] = ()
-    """Sizes of the axes."""
+    """Shape."""
     dtype: Literal["float32", "int32", "int64", "uint8"] = "float32"
-    """Type of the entries."""
+    """Data type."""
 
 
 @dataclass
 class Box(Space):
-    """An array with bounds."""
+    """Bounded array."""
 
     low: float | tuple[float, ...] = -math.inf
-    """Lower bound, one for all entries or one for each entry of the last axis."""
+    """Lower bound: a scalar, or one value per entry of the last axis."""
     high: float | tuple[float, ...] = math.inf
-    """Upper bound, likewise."""
+    """Upper bound: a scalar, or one value per entry of the last axis."""
 
 
 @dataclass
 class Dict(Space):
-    """Named spaces."""
+    """Dictionary of spaces."""
 
     spaces: dict[str, Space] = field(default_factory=dict)
-    """Name to space."""
+    """Spaces by name."""
 
 
 def batch_space(space: Space, batch_size: int) -> Space:
-    """Return the space of `batch_size` values at once.
+    """Return the space of a batch of `batch_size` values.
 
-    Arrays get one more leading axis. A `Dict` batches each of its spaces and has the shape
-    (batch_size,). Raises `ValueError` for a batch size less than 1.
+    Arrays get a leading batch axis. A `Dict` batches each of its spaces and has shape
+    (batch_size,). Raises `ValueError` if `batch_size` < 1.
     """
     check_count("batch_size", batch_size)
     if isinstance(space, Dict):

@@ -1,4 +1,4 @@
-"""Functions on MuJoCo specs: joints, options, copies, the mocap wrap, export, new actuators."""
+"""MjSpec functions: attaching, compilation, mocap base, joints, options, copies, actuators."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mjlab.utils.xml import (  # noqa: F401
 logger = logging.getLogger(__name__)
 MOCAP_BASE_NAME = "mocap_base"
 _EMPTY_PREFIX = "Attaching a spec with an empty prefix"
-# What belongs to an element's place in its spec rather than to what it is.
+# Attributes of an element's place in its spec; not copied.
 _NOT_DATA = {"name", "id", "signature", "classname", "compiler"}
 _TRANSMISSIONS = {
     mujoco.MjsJoint: mujoco.mjtTrn.mjTRN_JOINT,
@@ -35,7 +35,7 @@ _OFF = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
 class TransmissionType(str, Enum):  # noqa: UP042 (part of the interface)
-    """What an actuator acts on."""
+    """Type of actuator target."""
 
     JOINT = "joint"
     TENDON = "tendon"
@@ -45,10 +45,10 @@ class TransmissionType(str, Enum):  # noqa: UP042 (part of the interface)
 def attach(
     parent: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str, frame: mujoco.MjsFrame
 ) -> None:
-    """Attach `child` to a frame of `parent`; its elements move there.
+    """Attach `child` to a frame of `parent`. Its elements move to `parent`.
 
-    Without a prefix MuJoCo prints, and logs to a file, that such a spec may not be saved correctly:
-    default classes lose their names. What this package saves, it repairs (`fix_spec_xml`).
+    Suppresses MuJoCo's warning about empty prefixes (printed and logged to a file): saved specs lose
+    the names of default classes. `fix_spec_xml` fixes the XML saved by this package.
     """
     handler = mujoco.get_mju_user_warning()
     messages: list[str] = []
@@ -63,21 +63,21 @@ def attach(
 
 
 def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a spec without MuJoCo's warning about empty prefixes; see `attach`."""
+    """Compile a spec, suppressing MuJoCo's warning about empty prefixes; see `attach`."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=_EMPTY_PREFIX)
         return spec.compile()
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile `spec` so that inertial frames may differ between environments afterwards.
+    """Compile `spec` such that inertial frames may be randomized per environment.
 
     Raises:
-        ValueError: the spec does not compile, with MuJoCo's message.
+        ValueError: the spec does not compile; contains MuJoCo's message.
     """
     for body in spec.bodies:
-        # The compiler's shortcut for free bodies fixes the sparsity of the mass matrix, which a
-        # randomized centre of mass would need in full.
+        # The compiler's shortcut for free bodies fixes a sparsity of the mass matrix that is invalid
+        # for a randomized center of mass.
         body.simple = 0
     try:
         return compile_composed(spec)
@@ -88,14 +88,14 @@ def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
 def auto_wrap_fixed_base_mocap(
     spec_fn: Callable[[], mujoco.MjSpec],
 ) -> Callable[[], mujoco.MjSpec]:
-    """Return a function like `spec_fn` whose specs have a base that can be placed freely.
+    """Wrap `spec_fn` such that fixed bases are attached to a mocap body.
 
-    A spec without a free joint, whose first body is no mocap body, is put under a new mocap body
-    `mocap_base`: each environment can then place it by writing the mocap pose. Options, model
-    name and keyframes of the spec are kept. Other specs are returned as they are.
+    A spec without a free joint whose first body is not a mocap body is attached to a new mocap body
+    `mocap_base`, so that each environment can place it by its mocap pose. Options, model name and
+    keyframes of the spec are kept. Other specs are returned unchanged.
 
-    The new function raises `ValueError` for a spec to be wrapped that has a mocap body further
-    down, since mocap bodies must be children of the world.
+    The returned function raises `ValueError` if a spec to be wrapped contains a mocap body, because
+    mocap bodies must be children of the world.
     """
 
     @functools.wraps(spec_fn)
@@ -107,9 +107,9 @@ def auto_wrap_fixed_base_mocap(
         nested = [body.name for body in bodies if body.mocap]
         if nested:
             raise ValueError(
-                f"The spec {spec.modelname!r} has a fixed base, which is put under a mocap body, "
-                f"but has mocap bodies itself: {nested}. Mocap bodies must be children of the "
-                "world: make it the first body, or an entity of its own."
+                f"Spec {spec.modelname!r}: fixed bases are attached to a mocap body, but mocap bodies "
+                f"{nested} must be children of the world; make the mocap body the first body, or a "
+                "separate entity."
             )
         return _under_mocap_base(spec)
 
@@ -117,12 +117,12 @@ def auto_wrap_fixed_base_mocap(
 
 
 def _under_mocap_base(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    # Attaching moves the elements away, so a function that returns one spec twice needs a copy.
+    # Attaching moves the elements, and the function may return the same spec twice.
     child = spec.copy()
     make_asset_paths_absolute(child, spec.modelfiledir)
     parent = mujoco.MjSpec()
     parent.modelname = spec.modelname
-    # Attaching drops the options; kept here, the scene still sees what the entity asked for.
+    # Attaching drops the options; copied, because the scene reads the options of entities.
     for name in option_field_names():
         setattr(parent.option, name, getattr(spec.option, name))
     base = parent.worldbody.add_body(name=MOCAP_BASE_NAME, mocap=True)
@@ -136,29 +136,29 @@ def _under_mocap_base(spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def get_free_joint(spec: mujoco.MjSpec) -> mujoco.MjsJoint | None:
-    """Return the first free joint of the spec, or None."""
+    """Return the first free joint of `spec`, or None."""
     return next((joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE), None)
 
 
 def get_non_free_joints(spec: mujoco.MjSpec) -> tuple[mujoco.MjsJoint, ...]:
-    """Return the joints that are not free, in spec order."""
+    """Return the joints in spec order, without free joints."""
     return tuple(joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE)
 
 
 def is_joint_limited(jnt: mujoco.MjsJoint) -> bool:
-    """Return whether the joint has limits: it says so, or leaves it open and has a range."""
+    """Return True if `jnt` is limited: explicitly, or automatically by its range."""
     if jnt.limited == mujoco.mjtLimited.mjLIMITED_AUTO:
         return bool(jnt.range[0] < jnt.range[1])
     return jnt.limited == mujoco.mjtLimited.mjLIMITED_TRUE
 
 
 def option_field_names() -> tuple[str, ...]:
-    """Return the names of all fields of a spec's `<option>`."""
+    """Return all field names of `<option>`."""
     return tuple(name for name in dir(mujoco.MjSpec().option) if not name.startswith("_"))
 
 
 def non_default_option_fields(opt: Any) -> list[str]:
-    """Return the names of the fields of `spec.option` that differ from MuJoCo's defaults."""
+    """Return the field names of `spec.option` with values other than MuJoCo's defaults."""
     default = mujoco.MjSpec().option
     return [
         name
@@ -168,30 +168,30 @@ def non_default_option_fields(opt: Any) -> list[str]:
 
 
 def copy_mesh_data(src: mujoco.MjsMesh, dst: mujoco.MjsMesh) -> None:
-    """Copy everything but the name. `ValueError` if `dst` has no name yet."""
+    """Copy all attributes except the name. Raises `ValueError` if `dst` is unnamed."""
     _copy_data(src, dst)
 
 
 def copy_texture_data(src: mujoco.MjsTexture, dst: mujoco.MjsTexture) -> None:
-    """Copy everything but the name. `ValueError` if `dst` has no name yet."""
-    # Compiling keeps the pixels of a file in `data`, but not their number.
+    """Copy all attributes except the name. Raises `ValueError` if `dst` is unnamed."""
+    # Compilation keeps the pixels of a file in `data`, but not their number.
     is_read = src.file or any(src.cubefiles)
-    _copy_data(src, dst, leave_out=("data",) if is_read else ())
+    _copy_data(src, dst, exclude=("data",) if is_read else ())
 
 
 def copy_material_data(src: mujoco.MjsMaterial, dst: mujoco.MjsMaterial) -> None:
-    """Copy everything but the name, textures by name. `ValueError` if `dst` has no name yet."""
+    """Copy all attributes except the name; textures by name. Raises `ValueError` if `dst` is unnamed."""
     _copy_data(src, dst)
 
 
-def _copy_data(src: Any, dst: Any, leave_out: Collection[str] = ()) -> None:
+def _copy_data(src: Any, dst: Any, exclude: Collection[str] = ()) -> None:
     if not dst.name:
         raise ValueError(
-            f"The {type(dst).__name__} to copy {src.name!r} into has no name. "
-            "Name it first: names must be unique in a spec, so they are not copied."
+            f"Copy of {type(dst).__name__} {src.name!r}: expected a named destination; set its "
+            "name first, because names must be unique in a spec and are not copied."
         )
     for field in dir(src):
-        if field.startswith("_") or field in _NOT_DATA or field in leave_out:
+        if field.startswith("_") or field in _NOT_DATA or field in exclude:
             continue
         value = getattr(src, field)
         if callable(value) or (field == "plugin" and not value.active):
@@ -215,19 +215,19 @@ def create_position_actuator(
     """Add a position servo: force = clamp(stiffness (u - l) - damping l', -E, E).
 
     Args:
-        spec: The spec to change.
+        spec: Spec to change.
         joint_name: Name of the joint or tendon with position l.
-        stiffness: N m/rad or N/m.
-        damping: N m s/rad or N s/m.
-        effort_limit: E, in N m or N; None for no limit.
-        armature: Overrides the target's; None keeps it. So do the next two.
-        frictionloss: N m or N.
-        viscous_damping: N m s/rad or N s/m.
+        stiffness: Position gain (N m/rad or N/m).
+        damping: Velocity gain (N m s/rad or N s/m).
+        effort_limit: E (N m or N). None: no limit.
+        armature: Armature of the target (kg m^2 or kg). None: unchanged.
+        frictionloss: Dry friction of the target (N m or N). None: unchanged.
+        viscous_damping: Passive damping of the target (N m s/rad or N s/m). None: unchanged.
         transmission_type: Joint or tendon.
-        actuator_name: None takes the target's name.
+        actuator_name: Actuator name. None: name of the target.
 
-    With an effort limit the control range tells which targets can make a difference; it is
-    written but not enforced. Raises `ValueError` for a site, or a target that does not exist.
+    With an effort limit, the control range is the range of controls that changes the force; it is
+    not enforced. Raises `ValueError` for a site or an unknown target.
     """
     target = _target(spec, joint_name, transmission_type, allow_site=False)
     _override(target, armature, frictionloss, viscous_damping)
@@ -236,7 +236,7 @@ def create_position_actuator(
     _set_effort_limit(actuator, effort_limit)
     if effort_limit is not None:
         lower, upper = _authored_range(target)
-        # Without stiffness the control has no effect, and no distance is needed for full effort.
+        # Without stiffness, the control has no effect.
         reach = effort_limit / stiffness if stiffness > 0 else 0.0
         actuator.ctrlrange[:] = (lower - reach, upper + reach)
     return actuator
@@ -256,7 +256,7 @@ def create_velocity_actuator(
 ) -> mujoco.MjsActuator:
     """Add a velocity servo: force = clamp(damping (u - l'), -E, E).
 
-    Arguments and errors are those of `create_position_actuator`.
+    Arguments and errors as in `create_position_actuator`.
     """
     target = _target(spec, joint_name, transmission_type, allow_site=False)
     _override(target, armature, frictionloss, viscous_damping)
@@ -279,8 +279,7 @@ def create_motor_actuator(
 ) -> mujoco.MjsActuator:
     """Add a motor: force on the target = gear clamp(u, -E, E), with E = `effort_limit` (or inf).
 
-    Raises `ValueError` for a target that does not exist, and for a site with an armature, friction
-    loss or damping, which a site does not have.
+    Raises `ValueError` for an unknown target, and for a site with armature, frictionloss or damping.
     """
     target = _target(spec, joint_name, transmission_type, allow_site=True)
     _override(target, armature, frictionloss, viscous_damping)
@@ -314,9 +313,9 @@ def create_muscle_actuator(
     fvmax: float = 1.2,
     transmission_type: TransmissionType | str = "tendon",
 ) -> mujoco.MjsActuator:
-    """Add a muscle with MuJoCo's parameters, driven by an excitation from 0 to 1.
+    """Add a muscle with MuJoCo's parameters, driven by an excitation in [0, 1].
 
-    Raises `ValueError` for a site, or a target that does not exist.
+    Raises `ValueError` for a site or an unknown target.
     """
     target = _target(spec, target_name, transmission_type, allow_site=False)
     actuator = _add(spec, target_name, target)
@@ -343,22 +342,22 @@ def apply_target_overrides(
     frictionloss: float | None,
     viscous_damping: float | None,
 ) -> None:
-    """Write the passive properties that are not None to the joint or tendon.
+    """Write passive properties that are not None to the joint or tendon.
 
-    Raises `ValueError` for a target that does not exist, and for a site if one of them is positive.
+    Raises `ValueError` for an unknown target, and for a site if a property is positive.
     """
     target = _target(spec, target_name, transmission_type, allow_site=True)
     _override(target, armature, frictionloss, viscous_damping)
 
 
 def _target(spec: mujoco.MjSpec, name: str, transmission_type: Any, allow_site: bool) -> Any:
-    """Return the joint, tendon or site to act on."""
+    """Return the target joint, tendon or site."""
     kind = getattr(transmission_type, "value", transmission_type)
     check_one_of("transmission_type", kind, [member.value for member in TransmissionType])
     if kind == "site" and not allow_site:
         raise ValueError(
-            f"Only motors can act on a site, not this kind of actuator (site {name!r}). "
-            "Use a joint or a tendon."
+            f"Site {name!r}: expected a motor, because other actuators cannot act on sites; use a "
+            "joint or a tendon."
         )
     check_exists(kind, name, [element.name for element in getattr(spec, f"{kind}s")])
     return getattr(spec, kind)(name)
@@ -370,7 +369,7 @@ def _override(
     frictionloss: float | None,
     viscous_damping: float | None,
 ) -> None:
-    """Write the passive properties that are not None; a site has none."""
+    """Write passive properties that are not None. Sites have no passive properties."""
     if isinstance(target, mujoco.MjsSite):
         if armature or frictionloss or viscous_damping:
             raise ValueError(
@@ -383,13 +382,13 @@ def _override(
     if frictionloss is not None:
         target.frictionloss = frictionloss
     if viscous_damping is not None:
-        # The other entries are coefficients of damping that grows with speed.
+        # The other entries are coefficients of higher-order damping.
         target.damping[0] = viscous_damping
 
 
 def _add(spec: mujoco.MjSpec, name: str, target: Any) -> mujoco.MjsActuator:
     trntype = _TRANSMISSIONS[type(target)]
-    # Inputs of the spec's default, such as those of a <pid>, are not those of this kind.
+    # Clear inputs from the spec's default class, such as those of <pid>.
     return spec.add_actuator(name=name, target=target.name, trntype=trntype, ctrlspec=0)
 
 
@@ -414,7 +413,7 @@ def _set_effort_limit(actuator: mujoco.MjsActuator, effort_limit: float | None) 
 
 
 def _authored_range(target: Any) -> tuple[float, float]:
-    """Return the range in SI units; a spec read from XML may still hold degrees."""
+    """Return the range in SI units. Specs loaded from XML may hold degrees."""
     lower, upper = float(target.range[0]), float(target.range[1])
     angular = isinstance(target, mujoco.MjsJoint) and target.type in (
         mujoco.mjtJoint.mjJNT_HINGE,

@@ -1,7 +1,7 @@
-"""Editors of an MjSpec: textures, materials, meshes, geoms, collisions, lights and cameras.
+"""MjSpec editors: textures, materials, meshes, geoms, collisions, lights and cameras.
 
-Names are matched by regular expressions at their START (see `mjlab.utils.string`). Geoms that
-share a name, unnamed ones among them, are matched together.
+Regular expressions match at the START of names (see `mjlab.utils.string`). Geoms with the same
+name, and unnamed geoms, are matched together.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _LIGHT_FIELDS = (
     *("name", "castshadow", "pos", "dir", "cutoff", "exponent", "diffuse"),
     *("specular", "ambient", "active", "attenuation"),
 )
-# MuJoCo's enum and the prefix of its members.
+# MuJoCo enum and prefix of its members.
 _TEXTURE = (mujoco.mjtTexture, "mjTEXTURE_")
 _BUILTIN = (mujoco.mjtBuiltin, "mjBUILTIN_")
 _MARK = (mujoco.mjtMark, "mjMARK_")
@@ -49,55 +49,55 @@ _CAM_LIGHT = (mujoco.mjtCamLight, "mjCAMLIGHT_")
 
 @dataclass(kw_only=True)
 class SpecCfg(ABC):
-    """A change to an MjSpec, described by data."""
+    """Declarative edit of an MjSpec."""
 
     @abstractmethod
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Make the change. Raises `ValueError` if the description is not valid."""
+        """Apply the edit. Raises `ValueError` for invalid values."""
 
     def validate(self) -> None:
-        """Raise `ValueError`, saying which value is not valid and what is allowed."""
+        """Raise `ValueError` for invalid values, with the value and the allowed values."""
         return
 
 
 @accepts_older_fields
 @dataclass
 class CollisionCfg(SpecCfg):
-    """The collision setup of an entity. Values are given as in `GeomCfg`.
+    """Collision setup of an entity. Values have the form of `GeomCfg`.
 
-    The four required attributes are always written, so dicts should cover every geom chosen; what
-    no pattern names gets contype 1, conaffinity 1, condim 3 or priority 0, with a warning. The
-    others are patches.
+    The four required attributes are always written, so dicts should cover every selected geom;
+    unmatched geoms get contype 1, conaffinity 1, condim 3 or priority 0, with a warning. The other
+    attributes are patches.
     """
 
     geom_names_expr: tuple[str, ...]
-    """Patterns that choose the geoms, matched at the start of the name."""
+    """Patterns of geom names, matched at the start of the name."""
     contype: int | dict[str, int]
     """Collision type bits."""
     conaffinity: int | dict[str, int]
-    """Bits of the collision types these geoms collide with."""
+    """Bit mask of contypes that these geoms collide with."""
     condim: int | dict[str, int]
     """Contact dimension: 1, 3, 4 or 6."""
     priority: int | dict[str, int]
-    """The geom with the higher priority decides friction and solver parameters of a contact."""
+    """Priority. The geom with the higher priority sets friction and solver parameters of a contact."""
     friction: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Sliding, torsional and rolling friction; fewer values set the first ones."""
+    """Friction: sliding, torsional, rolling; fewer values set the first ones."""
     solref: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
     """Contact solver reference; fewer values set the first ones."""
     solimp: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
     """Contact solver impedance; fewer values set the first ones."""
     margin: float | dict[str, float] | None = None
-    """Distance (m) below which a contact is found."""
+    """Distance threshold (m) of contact detection."""
     gap: float | dict[str, float] | None = None
-    """Distance (m) by which a contact found is inactive."""
+    """Part of the margin (m) within which detected contacts are inactive."""
     solmix: float | dict[str, float] | None = None
-    """Weight, 0 to 1, for averaging the contact parameters of two geoms."""
+    """Weight in [0, 1] for averaging the contact parameters of two geoms."""
     disable_other_geoms: bool = True
-    """Switch off collisions of every geom that no pattern matches."""
+    """Disable collisions of all unmatched geoms."""
     set_array_field = staticmethod(set_array_field)
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Write the setup. Raises `ValueError` if a value is not valid."""
+        """Apply the setup. Raises `ValueError` for invalid values."""
         self.validate()
         geoms, others = _split_geoms(spec, self.geom_names_expr)
         names = tuple(geom.name for geom in geoms)
@@ -117,80 +117,80 @@ class CollisionCfg(SpecCfg):
                 geom.contype = geom.conaffinity = 0
 
     def validate(self) -> None:
-        """Raise `ValueError`, naming the field, the pattern and what is allowed."""
+        """Raise `ValueError` for invalid values, with field, pattern and allowed values."""
         for field in _REQUIRED:
             if getattr(self, field) is None:
-                raise ValueError(f"CollisionCfg.{field} is None; it must have a value.")
+                raise ValueError(f"CollisionCfg.{field}: expected a value, got None.")
         _validate_collision(self)
 
 
 @dataclass
 class GeomCfg(SpecCfg):
-    """A patch of geoms: what is None, or has no pattern that matches, stays as it is.
+    """Patch of geoms. Attributes that are None or unmatched are unchanged.
 
-    Every attribute is one value for all, or a dict of name pattern (matched at the start of the
-    name, the first in dict order counts) to value.
+    Attributes are one value for all geoms, or a dict of values by name pattern (matched at the start
+    of the name; the first match in dict order wins).
     """
 
     geom_names_expr: tuple[str, ...]
-    """Patterns that choose the geoms, matched at the start of the name."""
+    """Patterns of geom names, matched at the start of the name."""
     group: int | dict[str, int] | None = None
-    """Visualization group, 0 to 5."""
+    """Visualization group, in [0, 5]."""
     contype: int | dict[str, int] | None = None
     """Collision type bits."""
     conaffinity: int | dict[str, int] | None = None
-    """Bits of the collision types this geom collides with."""
+    """Bit mask of contypes that these geoms collide with."""
     condim: int | dict[str, int] | None = None
     """Contact dimension: 1, 3, 4 or 6."""
     priority: int | dict[str, int] | None = None
-    """The geom with the higher priority decides friction and solver parameters of a contact."""
+    """Priority. The geom with the higher priority sets friction and solver parameters of a contact."""
     friction: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
-    """Sliding, torsional and rolling friction; fewer values set the first ones."""
+    """Friction: sliding, torsional, rolling; fewer values set the first ones."""
     solref: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
     """Contact solver reference; fewer values set the first ones."""
     solimp: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
     """Contact solver impedance; fewer values set the first ones."""
     margin: float | dict[str, float] | None = None
-    """Distance (m) below which a contact is found."""
+    """Distance threshold (m) of contact detection."""
     gap: float | dict[str, float] | None = None
-    """Distance (m) by which a contact found is inactive."""
+    """Part of the margin (m) within which detected contacts are inactive."""
     solmix: float | dict[str, float] | None = None
-    """Weight, 0 to 1, for averaging the contact parameters of two geoms."""
+    """Weight in [0, 1] for averaging the contact parameters of two geoms."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Patch the geoms. Raises `ValueError` if a value is not valid."""
+        """Patch the geoms. Raises `ValueError` for invalid values."""
         self.validate()
         geoms, _ = _split_geoms(spec, self.geom_names_expr)
         for field in ("group", *_REQUIRED, *_PATCHES):
             _patch(geoms, field, getattr(self, field))
 
     def validate(self) -> None:
-        """Raise `ValueError`, naming the field, the pattern and what is allowed."""
-        check_values(self, "group", lambda value: value in range(6), "from 0 to 5")
+        """Raise `ValueError` for invalid values, with field, pattern and allowed values."""
+        check_values(self, "group", lambda value: value in range(6), "an integer in [0, 5]")
         _validate_collision(self)
 
 
 @dataclass
 class MaterialCfg(SpecCfg):
-    """Adds a material and, if patterns are given, puts it on geoms."""
+    """Material to add and, with `geom_names_expr`, to assign to geoms."""
 
     name: str
-    """Name of the material."""
+    """Material name."""
     rgba: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    """Colour and opacity."""
+    """Color and opacity."""
     texuniform: bool = False
-    """Repeat the texture per metre instead of per geom."""
+    """Texture repetitions are per meter instead of per geom."""
     texrepeat: tuple[float, float] = (1.0, 1.0)
-    """How often the texture is repeated."""
+    """Number of texture repetitions along x and y."""
     reflectance: float = 0.0
-    """Reflectance, 0 to 1."""
+    """Reflectance, in [0, 1]."""
     texture: str | None = None
-    """Name of the texture that gives the colour."""
+    """Name of the color texture."""
     geom_names_expr: tuple[str, ...] | None = None
-    """Patterns that choose the geoms, matched at the start of the name."""
+    """Patterns of geom names, matched at the start of the name."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Add the material. Raises `ValueError` if a value is not valid."""
+        """Add the material. Raises `ValueError` for invalid values."""
         self.validate()
         material = spec.add_material(
             name=self.name,
@@ -208,34 +208,34 @@ class MaterialCfg(SpecCfg):
                     geom.material = self.name
 
     def validate(self) -> None:
-        """Raise `ValueError` unless both repeats are positive."""
+        """Raise `ValueError` unless both values of `texrepeat` are positive."""
         check_values(self, "texrepeat", lambda value: min(value) > 0, "two positive numbers")
 
 
 @dataclass
 class TextureCfg(SpecCfg):
-    """Adds a texture, drawn by MuJoCo (`builtin`) or read from files."""
+    """Texture to add, generated by MuJoCo (`builtin`) or loaded from files."""
 
     name: str
-    """Name of the texture."""
+    """Texture name."""
     type: Literal["2d", "cube", "skybox"]
-    """How it is mapped."""
+    """Texture mapping."""
     builtin: Literal["checker", "gradient", "flat", "none"] = "none"
-    """The picture MuJoCo draws."""
+    """Builtin image."""
     rgb1: tuple[float, float, float] | None = None
-    """First colour of the drawn picture; None keeps MuJoCo's."""
+    """First color of the builtin image. None: MuJoCo's default."""
     rgb2: tuple[float, float, float] | None = None
-    """Second colour of the drawn picture; None keeps MuJoCo's."""
+    """Second color of the builtin image. None: MuJoCo's default."""
     width: int | None = None
-    """Width of the drawn picture in pixels."""
+    """Width of the builtin image (pixels)."""
     height: int | None = None
-    """Height of the drawn picture in pixels."""
+    """Height of the builtin image (pixels)."""
     mark: Literal["edge", "cross", "random", "none"] = "none"
-    """Marks drawn on top."""
+    """Marks on top of the builtin image."""
     markrgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour of the marks."""
+    """Color of the marks."""
     random: float = 0.01
-    """Probability of a dot in each pixel, for random marks."""
+    """Probability of a dot per pixel, for random marks."""
     file: str | None = None
     """Image file."""
     cubefiles: tuple[str, ...] | None = None
@@ -243,16 +243,16 @@ class TextureCfg(SpecCfg):
     gridsize: tuple[int, int] | None = None
     """Rows and columns of the grid of faces in one file."""
     gridlayout: str | None = None
-    """Which face each cell of the grid holds, one letter of ".RLUDFB" a cell."""
+    """Face of each grid cell, one letter of ".RLUDFB" per cell."""
     nchannel: int = 3
-    """Number of colour channels."""
+    """Number of color channels."""
     hflip: bool = False
     """Flip the image horizontally."""
     vflip: bool = False
     """Flip the image vertically."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Add the texture. Raises `ValueError` if a value is not valid."""
+        """Add the texture. Raises `ValueError` for invalid values."""
         self.validate()
         texture = spec.add_texture(
             name=self.name,
@@ -275,45 +275,46 @@ class TextureCfg(SpecCfg):
             texture.gridlayout[cell] = letter
 
     def validate(self) -> None:
-        """Raise `ValueError` for a texture without a source, a size or a face it needs."""
+        """Raise `ValueError` if the source, the size or a required face is missing."""
         for field, enum in (("type", _TEXTURE), ("builtin", _BUILTIN), ("mark", _MARK)):
             mujoco_enum(self, field, enum)
         for field in ("width", "height"):
-            check_values(self, field, lambda value: value > 0, "positive")
+            check_values(self, field, lambda value: value > 0, "an integer > 0")
         drawn = self.builtin != "none"
         if drawn and (self.width is None or self.height is None):
             raise ValueError(
-                f"TextureCfg {self.name!r} draws {self.builtin!r} but has width {self.width} and "
-                f"height {self.height}; both must be given in pixels."
+                f"TextureCfg {self.name!r}: builtin {self.builtin!r} requires width and height "
+                f"(pixels), got width {self.width} and height {self.height}."
             )
         if not drawn and self.file is None and not self.cubefiles:
             raise ValueError(
-                f"TextureCfg {self.name!r} has no source; set `builtin`, `file` or `cubefiles`."
+                f"TextureCfg {self.name!r}: expected a source, got none; set `builtin`, `file` or "
+                "`cubefiles`."
             )
         if self.cubefiles and len(self.cubefiles) != _CUBE_FACES:
             raise ValueError(
-                f"TextureCfg {self.name!r} has {len(self.cubefiles)} cubefiles; it needs "
-                f"{_CUBE_FACES} (an empty string leaves a face out)."
+                f"TextureCfg {self.name!r} cubefiles: expected {_CUBE_FACES} files, got "
+                f"{len(self.cubefiles)}; use an empty string to omit a face."
             )
         one_image = self.file is not None and self.gridsize in (None, (1, 1), [1, 1])
         if self.type == "skybox" and one_image and not drawn:
             raise ValueError(
-                f"TextureCfg {self.name!r} is a skybox made from one image, but six faces are "
-                "needed: give `gridsize` and `gridlayout`, or six `cubefiles`."
+                f"TextureCfg {self.name!r}: a skybox requires six faces, got one image; set `gridsize` "
+                "and `gridlayout`, or six `cubefiles`."
             )
 
 
 @dataclass
 class MeshCfg(SpecCfg):
-    """Changes mesh assets."""
+    """Edit of mesh assets."""
 
     mesh_names_expr: tuple[str, ...]
-    """Patterns that choose the meshes, matched at the start of the name."""
+    """Patterns of mesh names, matched at the start of the name."""
     maxhullvert: int | dict[str, int] | None = None
-    """Largest number of vertices of the convex hull: -1 for no limit, else more than 3."""
+    """Maximum number of vertices of the convex hull, at least 4. -1: no limit."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Change the meshes. Raises `ValueError` if a value is not valid."""
+        """Edit the meshes. Raises `ValueError` for invalid values."""
         self.validate()
         chosen = set(filter_exp(self.mesh_names_expr, tuple(mesh.name for mesh in spec.meshes)))
         meshes = [mesh for mesh in spec.meshes if mesh.name in chosen]
@@ -323,52 +324,52 @@ class MeshCfg(SpecCfg):
                 mesh.maxhullvert = value
 
     def validate(self) -> None:
-        """Raise `ValueError`, naming the pattern, for a limit that is not allowed."""
+        """Raise `ValueError` for an invalid `maxhullvert`, with the pattern."""
         check_values(
             self,
             "maxhullvert",
             lambda value: value == -1 or value > 3,
-            "-1 or more than 3",
+            "-1 or an integer > 3",
         )
 
 
 @dataclass
 class LightCfg(SpecCfg):
-    """Adds a light to a body."""
+    """Light to add to a body."""
 
     name: str | None = None
-    """Name of the light, if it has one."""
+    """Light name. None: unnamed."""
     body: str = "world"
-    """Name of the body it belongs to."""
+    """Name of the parent body."""
     mode: str = "fixed"
-    """fixed, track, trackcom, targetbody or targetbodycom."""
+    """Mode: `fixed`, `track`, `trackcom`, `targetbody` or `targetbodycom`."""
     target: str | None = None
-    """Name of the body the last two modes point at."""
+    """Name of the target body, for modes `targetbody` and `targetbodycom`."""
     type: Literal["spot", "directional"] = "spot"
-    """Kind of light."""
+    """Light type."""
     castshadow: bool = True
-    """Whether things it falls on cast shadows."""
+    """Cast shadows."""
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position in the body frame, m."""
+    """Position in the body frame (m)."""
     dir: tuple[float, float, float] = (0.0, 0.0, -1.0)
     """Direction in the body frame."""
     cutoff: float = 45.0
-    """Half the opening angle of a spot, degrees."""
+    """Cutoff angle of a spotlight: half the opening angle (degrees)."""
     exponent: float = 10.0
-    """How fast a spot fades towards its edge."""
+    """Exponent of the falloff of a spotlight toward its edge."""
     diffuse: tuple[float, float, float] | None = None
-    """Diffuse colour; None keeps MuJoCo's."""
+    """Diffuse color. None: MuJoCo's default."""
     specular: tuple[float, float, float] | None = None
-    """Specular colour; None keeps MuJoCo's."""
+    """Specular color. None: MuJoCo's default."""
     ambient: tuple[float, float, float] | None = None
-    """Ambient colour; None keeps MuJoCo's."""
+    """Ambient color. None: MuJoCo's default."""
     active: bool = True
-    """Whether it is on."""
+    """Switch the light on."""
     attenuation: tuple[float, float, float] = (1.0, 0.0, 0.0)
     """Constant, linear and quadratic attenuation with distance."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Add the light. Raises `ValueError`, with the choices, for an unknown body or mode."""
+        """Add the light. Raises `ValueError` for an unknown body or mode, with the available ones."""
         self.validate()
         light = find_body(self, spec, self.body).add_light(
             mode=mujoco_enum(self, "mode", _CAM_LIGHT),
@@ -382,32 +383,32 @@ class LightCfg(SpecCfg):
                 setattr(light, field, value)
 
     def validate(self) -> None:
-        """Raise `ValueError` for an unknown mode or type, or a mode without its target."""
+        """Raise `ValueError` for an unknown mode or type, or a target mode without `target`."""
         check_one_of("LightCfg.type", self.type, ("spot", "directional"))
         _validate_mode(self)
 
 
 @dataclass
 class CameraCfg(SpecCfg):
-    """Adds a camera to a body."""
+    """Camera to add to a body."""
 
     name: str
-    """Name of the camera."""
+    """Camera name."""
     body: str = "world"
-    """Name of the body it belongs to."""
+    """Name of the parent body."""
     mode: str = "fixed"
-    """fixed, track, trackcom, targetbody or targetbodycom."""
+    """Mode: `fixed`, `track`, `trackcom`, `targetbody` or `targetbodycom`."""
     target: str | None = None
-    """Name of the body the last two modes point at."""
+    """Name of the target body, for modes `targetbody` and `targetbodycom`."""
     fovy: float = 45.0
-    """Vertical field of view, degrees."""
+    """Vertical field of view (degrees)."""
     pos: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position in the body frame, m."""
+    """Position in the body frame (m)."""
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation (w, x, y, z) in the body frame."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Add the camera. Raises `ValueError`, with the choices, for an unknown body or mode."""
+        """Add the camera. Raises `ValueError` for an unknown body or mode, with the available ones."""
         self.validate()
         camera = find_body(self, spec, self.body).add_camera(
             name=self.name,
@@ -420,7 +421,7 @@ class CameraCfg(SpecCfg):
             camera.targetbody = find_body(self, spec, self.target).name
 
     def validate(self) -> None:
-        """Raise `ValueError` for an unknown mode, or one without its target."""
+        """Raise `ValueError` for an unknown mode, or a target mode without `target`."""
         _validate_mode(self)
 
 
@@ -429,9 +430,9 @@ def warn_overlapping_geom_edits(
     collision_cfgs: Sequence[CollisionCfg],
     spec: mujoco.MjSpec,
 ) -> None:
-    """Warn (`UserWarning`) where a `CollisionCfg` overwrites what a `GeomCfg` sets.
+    """Warn (`UserWarning`) if a `CollisionCfg` overwrites values set by a `GeomCfg`.
 
-    Up to eight of them are listed as "geom.attribute".
+    Lists up to eight of them as "geom.attribute".
     """
     patched = _edited_attributes(geom_cfgs, spec)
     overwritten = _edited_attributes(collision_cfgs, spec)
@@ -445,7 +446,7 @@ def warn_overlapping_geom_edits(
         listed = ", ".join(f"{geom}.{field}" for geom, field in overlap[:_MAX_LISTED])
         more = len(overlap) - _MAX_LISTED
         warnings.warn(
-            f"A CollisionCfg overwrites what a GeomCfg sets: {listed}"
+            f"A CollisionCfg overwrites values set by a GeomCfg: {listed}"
             + (f" and {more} more." if more > 0 else "."),
             UserWarning,
             stacklevel=2,
@@ -473,7 +474,7 @@ def _edited_attributes(
 def _split_geoms(
     spec: mujoco.MjSpec, patterns: Sequence[str]
 ) -> tuple[list[mujoco.MjsGeom], list[mujoco.MjsGeom]]:
-    """Return the geoms that a pattern matches, and the others."""
+    """Return matched geoms and other geoms."""
     chosen = set(filter_exp(tuple(patterns), tuple(geom.name for geom in spec.geoms)))
     matched = [geom for geom in spec.geoms if geom.name in chosen]
     return matched, [geom for geom in spec.geoms if geom.name not in chosen]
@@ -494,9 +495,9 @@ def _patch(geoms: Sequence[mujoco.MjsGeom], field: str, value: Any) -> None:
 
 def _validate_collision(cfg: GeomCfg | CollisionCfg) -> None:
     for field in ("contype", "conaffinity", "priority", "margin", "gap"):
-        check_values(cfg, field, lambda value: value >= 0, "at least 0")
+        check_values(cfg, field, lambda value: value >= 0, "a number >= 0")
     check_values(cfg, "condim", lambda value: value in (1, 3, 4, 6), "1, 3, 4 or 6")
-    check_values(cfg, "solmix", lambda value: 0 <= value <= 1, "from 0 to 1")
+    check_values(cfg, "solmix", lambda value: 0 <= value <= 1, "a number in [0, 1]")
     for field, size in _ARRAYS.items():
         check_values(
             cfg,
@@ -510,29 +511,29 @@ def _validate_mode(cfg: LightCfg | CameraCfg) -> None:
     mujoco_enum(cfg, "mode", _CAM_LIGHT)
     if cfg.mode.startswith("target") and cfg.target is None:
         raise ValueError(
-            f"{type(cfg).__name__} {cfg.name!r} has mode {cfg.mode!r}, which needs `target`, the "
-            "name of the body to point at."
+            f"{type(cfg).__name__} {cfg.name!r}: mode {cfg.mode!r} requires `target`, the name of "
+            "the target body."
         )
 
 
 def check_values(owner: SpecCfg, field: str, is_valid: Callable[[Any], bool], allowed: str) -> None:
-    """Raise `ValueError` unless each value of a field (scalar, or dict by pattern) is valid."""
-    given = getattr(owner, field)
-    by_pattern = given if isinstance(given, dict) else {None: given}
+    """Raise `ValueError` unless all values of a field (scalar, or dict by pattern) are valid."""
+    values = getattr(owner, field)
+    by_pattern = values if isinstance(values, dict) else {None: values}
     for pattern, value in by_pattern.items():
         if value is not None and not is_valid(value):
             where = "" if pattern is None else f" for pattern {pattern!r}"
             raise ValueError(
-                f"{type(owner).__name__}.{field} is {value!r}{where}; it must be {allowed}."
+                f"{type(owner).__name__}.{field}{where}: expected {allowed}, got {value!r}."
             )
 
 
 def mujoco_enum(owner: SpecCfg, field: str, enum: tuple[Any, str]) -> int:
-    """Return MuJoCo's constant for a field that names it. `ValueError` lists the choices."""
+    """Return the MuJoCo constant named by a field. Raises `ValueError` listing the valid names."""
     return enum_value(f"{type(owner).__name__}.{field}", getattr(owner, field), *enum)
 
 
 def find_body(owner: SpecCfg, spec: mujoco.MjSpec, name: str) -> mujoco.MjsBody:
-    """Return the body of that name ("world" is the world). `ValueError` lists the bodies."""
+    """Return the body called `name` ("world": world body). Raises `ValueError` listing the bodies."""
     check_exists(f"{type(owner).__name__} body", name, [body.name for body in spec.bodies])
     return spec.body(name)

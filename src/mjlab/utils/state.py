@@ -1,9 +1,9 @@
-"""Capture and restore the run-time state of an object tree, for runs that resume bit for bit.
+"""Capture and restore the run-time state of an object tree, for bitwise exact resume.
 
 Managers, terms, buffers and actuators keep their run-time state in plain attributes. Instead of
-asking every one of them (and every term a user writes) for a `state_dict`, this module walks the
-attributes of objects whose class is marked `stateful` and saves what is data: tensors, arrays,
-numbers, strings, random generators, and lists, tuples, deques and dicts of those.
+requiring a `state_dict` of each class (and of users' terms), this module walks the attributes of
+objects whose class is marked `stateful` and saves all data: tensors, arrays, numbers, strings,
+random generators, and lists, tuples, deques and dicts of these.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ import torch
 logger = logging.getLogger(__name__)
 C = TypeVar("C", bound=type)
 _MARK = "_is_stateful"
-# Marks what was captured from an object, to tell it from a plain dict.
+# Marks the state of an object, to tell it from a plain dict.
 _CLASS_KEY = "__class__"
-# Attributes that say where and how large an object is; that is for the new run to decide.
+# Attributes for device and size of an object, set by the new run.
 _SETTINGS = frozenset({"device", "_device", "num_envs", "_num_envs"})
 _TRANSIENT = "_transient"
-# Exactly these: a torch.Size or a named tuple says what something is, not what has happened.
+# Exact types only: a torch.Size or named tuple describes an object, not its run-time state.
 _SEQUENCES = (list, tuple, deque)
 
 
 class _Skip:
-    """Stands for a value that is not state."""
+    """Sentinel for values that are not state."""
 
 
 SKIP = _Skip()
 
 
 def stateful(cls: C) -> C:
-    """Class decorator: attributes of instances (subclasses included) are run-time state.
+    """Class decorator: mark instance attributes (also of subclasses) as run-time state.
 
-    Attributes named in the class attribute `_transient` (a set of names; those of base classes
-    count too) are left out: caches, settings from the config, and views of simulation tensors.
+    Attributes named in the class attribute `_transient` (a set, merged with those of base classes)
+    are excluded: caches, config settings, and views of simulation tensors.
     """
     setattr(cls, _MARK, True)
     return cls
@@ -51,7 +51,7 @@ def is_stateful(obj: Any) -> bool:
 
 
 def capture_state(obj: Any, *, generators: bool = True) -> dict[str, Any]:
-    """Return a copy of the run-time state of `obj`, whose class is marked `stateful`.
+    """Return a copy of the run-time state of `obj`, an instance of a `stateful` class.
 
     The result holds only tensors, numbers, strings, None, lists and dicts, so it can be saved by
     `torch.save` and loaded with `weights_only=True`.
@@ -64,10 +64,10 @@ def capture_state(obj: Any, *, generators: bool = True) -> dict[str, Any]:
 
 
 def restore_state(obj: Any, state: dict[str, Any]) -> None:
-    """Write `state`, made by `capture_state`, back into `obj`.
+    """Restore the `state` of `obj` captured by `capture_state`.
 
-    Tensors are written in place where shape and type agree, so that references stay valid. An
-    attribute that `obj` does not have yet, because it is made at the first call, is made.
+    Tensors are written in place if shape and type agree, so that references stay valid. Missing
+    attributes, such as those created at the first call, are created.
     """
     transient = _transient_names(type(obj))
     for name, value in state.items():
@@ -77,7 +77,7 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
         is_object = isinstance(value, dict) and _CLASS_KEY in value
         if is_object and not is_stateful(current):
             logger.warning(
-                "%s.%s is not restored: it was a %s and is %r now.",
+                "%s.%s not restored: expected a %s, got %r.",
                 type(obj).__name__, name, value[_CLASS_KEY], current,
             )  # fmt: skip
             continue
@@ -85,14 +85,15 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
 
 
 def shape_differences(saved: Any, current: Any, path: str = "") -> list[str]:
-    """Return where two captured states cannot be of the same objects: tensors of other shapes.
+    """Return descriptions of tensors whose shapes differ between two captured states.
 
-    What only one of them has is no difference: some state is made at the first call.
+    Values in only one of the states are not differences, because some state is created at the first
+    call.
     """
     if isinstance(saved, torch.Tensor) and isinstance(current, torch.Tensor):
         if saved.shape == current.shape:
             return []
-        return [f"{path} has shape {tuple(saved.shape)} there and {tuple(current.shape)} here"]
+        return [f"{path}: expected shape {tuple(current.shape)}, got {tuple(saved.shape)}"]
     if isinstance(saved, dict) and isinstance(current, dict):
         keys = [key for key in saved if key in current]
         parts = [shape_differences(saved[k], current[k], f"{path}.{k}".lstrip(".")) for k in keys]
@@ -105,10 +106,10 @@ def shape_differences(saved: Any, current: Any, path: str = "") -> list[str]:
 
 
 def plain_scalar(value: Any) -> Any:
-    """Return `value` as exactly None, bool, int, float or str, or `SKIP` if it is none of these.
+    """Return `value` as exactly None, bool, int, float or str; `SKIP` for other types.
 
-    Subclasses (numpy's numbers above all) are converted, because a checkpoint that holds them
-    cannot be loaded as plain data.
+    Subclasses (mainly NumPy scalars) are converted, because checkpoints with them cannot be loaded
+    with `weights_only=True`.
     """
     if value is None:
         return None
@@ -143,11 +144,11 @@ def _capture_value(value: Any, seen: set[int], generators: bool) -> Any:
     if isinstance(value, torch.Generator):
         return value.get_state() if generators else SKIP
     if is_stateful(value):
-        # An object reached twice is saved once: state is a tree.
+        # Objects reached twice are saved once: state is a tree.
         if id(value) in seen:
             return SKIP
         return {_CLASS_KEY: type(value).__name__, **_capture_object(value, seen, generators)}
-    # Sequences keep their length, so that items that are not state hold their place.
+    # Sequences keep their length: items that are not state are saved as None.
     if type(value) in _SEQUENCES:
         items = [_capture_value(item, seen, generators) for item in value]
         if items and all(item is SKIP for item in items):
@@ -163,7 +164,7 @@ def _capture_value(value: Any, seen: set[int], generators: bool) -> Any:
 
 
 def _owns_its_values(tensor: torch.Tensor) -> bool:
-    """Return whether each element is its own: not one value seen many times, nor a guarded view."""
+    """Return True unless elements share memory (expanded tensor) or the tensor is a guarded view."""
     if type(tensor) not in (torch.Tensor, torch.nn.Parameter):
         return False
     return not any(
@@ -172,7 +173,7 @@ def _owns_its_values(tensor: torch.Tensor) -> bool:
 
 
 def _restored(current: Any, saved: Any) -> Any:
-    """Return what the attribute now holding `current` should hold to match `saved`."""
+    """Return the value that restores `saved` in an attribute that holds `current`."""
     if isinstance(saved, torch.Tensor):
         return _restored_tensor(current, saved)
     if is_stateful(current):
@@ -188,7 +189,7 @@ def _restored(current: Any, saved: Any) -> Any:
         for key, value in saved.items():
             current[key] = _restored(current.get(key), value)
         return current
-    # A place that holds something which is not state was saved as None: leave it alone.
+    # Values that are not state were saved as None: keep them.
     if saved is None and not isinstance(current, torch.Tensor) and plain_scalar(current) is SKIP:
         return current
     return saved
@@ -203,7 +204,7 @@ def _restored_tensor(current: Any, saved: torch.Tensor) -> Any:
     if not isinstance(current, torch.Tensor):
         return saved.clone()
     same = current.shape == saved.shape and current.dtype == saved.dtype
-    # An inference tensor cannot be written outside `inference_mode`.
+    # Inference tensors cannot be written outside `inference_mode`.
     is_locked = current.is_inference() and not torch.is_inference_mode_enabled()
     if not same or is_locked or current.requires_grad or not _owns_its_values(current):
         return saved.to(current.device)

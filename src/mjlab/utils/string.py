@@ -1,7 +1,7 @@
-"""Lenient matching of names by regular expression, used by spec editors and config dictionaries.
+"""Lenient name matching by regular expression, for spec editors and config dictionaries.
 
-Patterns here match at the START of a name (`re.match`), so "hip" matches "hip_b". Entity lookups
-are strict instead: see `mjlab.utils.lab_api.string.resolve_matching_names`.
+Patterns match at the START of a name (`re.match`), so "hip" matches "hip_b". Entity lookups match
+whole names: see `mjlab.utils.lab_api.string.resolve_matching_names`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 logger = logging.getLogger(__name__)
 
-# So many names are listed in full; of more, so many for each name that was looked for.
+# Maximum number of names listed in full; of longer lists, number of close names per query.
 _FEW = 12
 _SHOWN = 3
 
@@ -22,15 +22,15 @@ _SHOWN = 3
 def resolve_expr(
     pattern_map: dict[str, Any], names: tuple[str, ...], default_val: Any = None
 ) -> tuple[Any, ...]:
-    """Return, for each name, the value of the first pattern (in dict order) that matches its start.
+    """Return the value of the first pattern (in dict order) that matches each name's start.
 
     Args:
         pattern_map: Regular expression to value.
-        names: The names to resolve.
-        default_val: The value of a name that no pattern matches.
+        names: Names to resolve.
+        default_val: Value of unmatched names.
 
-    A pattern that matches none of the names is reported by a logged warning, because it is most
-    often a misspelling. Raises `ValueError` for a pattern that is not a regular expression.
+    Logs a warning for patterns that match no name, because these are usually misspelled. Raises
+    `ValueError` for a pattern that is not a valid regular expression.
     """
     compiled = [(compile_pattern(pattern), value) for pattern, value in pattern_map.items()]
     _report_unmatched((pattern for pattern, _ in compiled), names)
@@ -41,10 +41,10 @@ def resolve_expr(
 
 
 def filter_exp(exprs: list[str] | tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names whose start any pattern matches, in name order, duplicates kept.
+    """Return the names whose start matches any pattern, in name order, with duplicates.
 
-    Patterns that match nothing are reported by a logged warning. Raises `ValueError` for a pattern
-    that is not a regular expression.
+    Logs a warning for patterns that match no name. Raises `ValueError` for a pattern that is not a
+    valid regular expression.
     """
     compiled = [compile_pattern(expr) for expr in exprs]
     _report_unmatched(compiled, names)
@@ -52,14 +52,14 @@ def filter_exp(exprs: list[str] | tuple[str, ...], names: tuple[str, ...]) -> tu
 
 
 def resolve_field(field: Any, names: tuple[str, ...], default_val: Any = None) -> tuple[Any, ...]:
-    """Return one value for each name: `resolve_expr` of a dict, else `field` for every name."""
+    """Return one value per name: `resolve_expr` of a dict, else `field` for every name."""
     if isinstance(field, dict):
         return resolve_expr(field, names, default_val)
     return tuple(field for _ in names)
 
 
 def compile_pattern(pattern: str) -> re.Pattern[str]:
-    """Compile a regular expression; raise `ValueError` that quotes it if it is not one."""
+    """Compile a regular expression. Raises `ValueError` with the pattern if it is not valid."""
     try:
         return re.compile(pattern)
     except re.error as error:
@@ -67,19 +67,18 @@ def compile_pattern(pattern: str) -> re.Pattern[str]:
 
 
 def qualified_name(value: Any) -> str:
-    """Return "module:qualified.name" of a class or function, or of the class of another value."""
+    """Return "module:qualified.name" of a class or function, or of the class of other values."""
     named = value if hasattr(value, "__qualname__") else type(value)
-    # Methods of built-in classes know their class instead of their module.
+    # Methods of built-in classes have `__objclass__` instead of `__module__`.
     owner = getattr(named, "__objclass__", None) or getattr(named, "__self__", None)
     module = getattr(named, "__module__", None) or getattr(owner, "__module__", "builtins")
     return f"{module}:{named.__qualname__}"
 
 
 def name_list(names: Sequence[str], near: Iterable[str]) -> str:
-    """Return `names` for a message: all if they are few, else those near any of `near`.
+    """Return `names` for a message: all of a short list, else the names close to any of `near`.
 
-    "['a', 'b']", or "['leg_1', 'leg_2'] and 198 others". Where nothing is near, the first names are
-    given.
+    "['a', 'b']", or "['leg_1', 'leg_2'] and 198 others". If no name is close, lists the first names.
     """
     if len(names) <= _FEW:
         return str(list(names))
@@ -91,14 +90,15 @@ def name_list(names: Sequence[str], near: Iterable[str]) -> str:
 def suggest(name: str, available: Iterable[str]) -> str:
     """Return a hint for an unknown `name`: "did you mean 'y'? Available: ['x', 'y']."."""
     names = list(available)
+    listed = name_list(names, near=[name])
     close = difflib.get_close_matches(name, names, n=_SHOWN, cutoff=0.5)
-    question = f"did you mean {' or '.join(map(repr, close))}? " if close else ""
-    return f"{question}Available: {name_list(names, near=[name])}."
+    if not close:
+        return f"available: {listed}."
+    return f"did you mean {' or '.join(map(repr, close))}? Available: {listed}."
 
 
 def _report_unmatched(patterns: Iterable[re.Pattern[str]], names: Sequence[str]) -> None:
-    # Nothing can match where there are no names: the default pattern ".*" of an entity without
-    # joints is no mistake.
+    # Without names, patterns cannot match: the default ".*" for an entity without joints is valid.
     if not names:
         return
     unmatched = [p.pattern for p in patterns if not any(p.match(name) for name in names)]

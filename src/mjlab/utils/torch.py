@@ -1,4 +1,4 @@
-"""Settings of torch that hold for the whole process, and tensors that do."""
+"""Process-wide torch settings, constant tensors, and number of threads."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ import torch
 from mjlab.utils.processes import cores_per_process
 
 # Multiply-adds of one mini-batch (forward) above which several threads pay off. Measured: two
-# threads update 64x64 networks on 4096 rows (0.04e9) in 0.75 of the time of one thread on a quiet
-# machine, but in 5 to 40 times of it when anything else runs, because the threads of OpenMP wait
-# for each other by spinning.
+# threads update 64x64 networks on 4096 rows (0.04e9) in 0.75 times the time of one thread on an idle
+# machine, but in 5 to 40 times that time under load, because OpenMP threads wait for each other by
+# spinning.
 _WORTH_SEVERAL_THREADS = 0.4e9
 _MOST_THREADS = 8
 _TORCHRUN_VARIABLE = "TORCHELASTIC_RUN_ID"
 
 
 def prepare_torch(device: str) -> None:
-    """Configure torch for a process that trains or plays on `device`: its current GPU, and TF32."""
+    """Set the current GPU and enable TF32 for a process that trains or plays on `device`."""
     configure_torch_backends()
     if torch.device(device).type == "cuda":
-        # Events, and streams that are asked for without a device, are otherwise those of cuda:0.
+        # Otherwise events, and streams created without a device, are those of cuda:0.
         torch.cuda.set_device(torch.device(device))
 
 
@@ -33,12 +33,12 @@ def configure_torch_backends(allow_tf32: bool = True, deterministic: bool = Fals
     """Set precision and determinism of GPU kernels.
 
     Args:
-        allow_tf32: Let matrix products and convolutions of float32 round to TF32, which is faster.
-        deterministic: Let cuDNN choose deterministic algorithms, and not by timing them.
+        allow_tf32: Round float32 matrix products and convolutions to TF32, for speed.
+        deterministic: Use deterministic cuDNN algorithms, without benchmarking.
     """
     precision = "tf32" if allow_tf32 else "ieee"
     if hasattr(torch.backends.cuda.matmul, "fp32_precision"):
-        # The switches of torch 2.9 on. Torch refuses to mix them with the earlier ones.
+        # Flags since torch 2.9. Torch raises if they are mixed with the earlier flags.
         torch.backends.cuda.matmul.fp32_precision = precision
         cudnn: Any = torch.backends.cudnn
         cudnn.conv.fp32_precision = precision
@@ -56,26 +56,26 @@ def constant_tensor(
     device: torch.device | str,
     dtype: torch.dtype = torch.float32,
 ) -> torch.Tensor:
-    """Return a tensor of (nested tuples of) numbers; every call returns the same one, to be read only.
+    """Return a cached, read-only tensor of (nested tuples of) numbers.
 
-    For numbers of configs: a step copies nothing to the device, and edited configs are seen.
+    For config values: steps copy nothing to the device, and edited configs take effect.
     """
-    # An inference tensor could not take part in later computations with gradients.
+    # Inference tensors cannot be used in later computations with gradients.
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=dtype, device=device)
 
 
 @contextlib.contextmanager
 def threads_for_policy(policy: Any, batch_size: int, device: Any) -> Generator[None]:
-    """Let torch use as many threads within the block as playing `policy` is worth.
+    """Set the number of torch threads within the block to suit inference of `policy`.
 
     Args:
-        policy: A module, a method of one, or any function; one that is no module counts as small.
-        batch_size: Rows of an observation: the number of environments.
-        device: Where the policy runs. On a GPU nothing is changed.
+        policy: A module, a method of a module, or a function; functions count as small.
+        batch_size: Number of environments.
+        device: Device of the policy. No effect for a GPU.
 
     Raises:
-        ValueError: `MJLAB_TORCH_THREADS` or `OMP_NUM_THREADS` is no positive whole number.
+        ValueError: `MJLAB_TORCH_THREADS` or `OMP_NUM_THREADS` is not an integer >= 1.
     """
     if torch.device(device).type != "cpu":
         yield
@@ -89,7 +89,7 @@ def threads_for_policy(policy: Any, batch_size: int, device: Any) -> Generator[N
 
 @contextlib.contextmanager
 def using_torch_threads(count: int) -> Generator[None]:
-    """Let torch use `count` threads within the block."""
+    """Set the number of torch threads to `count` within the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -99,12 +99,12 @@ def using_torch_threads(count: int) -> Generator[None]:
 
 
 def torch_threads(num_parameters: int, batch_size: int) -> int:
-    """Return the number of threads for networks of this many parameters and rows per mini-batch.
+    """Return the number of threads for networks with `num_parameters` and `batch_size` rows.
 
-    It depends on the machine, the networks and the batch only, never on the threads of the
-    physics: sums are split among threads, so their number decides the last bits of the weights.
-    Several processes of a run on one machine share its cores. `MJLAB_TORCH_THREADS` overrides it;
-    `OMP_NUM_THREADS` limits it.
+    The number depends only on machine, networks and batch, not on the physics threads: sums are
+    split among threads, so their number affects the last bits of the weights. Processes of a run
+    on one machine share its cores. `MJLAB_TORCH_THREADS` overrides the number; `OMP_NUM_THREADS`
+    limits it.
     """
     if override := os.environ.get("MJLAB_TORCH_THREADS"):
         return _positive("MJLAB_TORCH_THREADS", override)
@@ -112,7 +112,7 @@ def torch_threads(num_parameters: int, batch_size: int) -> int:
         return 1
     limit = os.environ.get("OMP_NUM_THREADS")
     if limit == "1" and _TORCHRUN_VARIABLE in os.environ:
-        # torchrun sets this for all that it starts, unasked; the cores are shared out here.
+        # torchrun always sets OMP_NUM_THREADS for its workers; cores are divided here instead.
         limit = None
     most = _positive("OMP_NUM_THREADS", limit) if limit else _MOST_THREADS
     return max(1, min(cores_per_process(), most))
@@ -120,5 +120,5 @@ def torch_threads(num_parameters: int, batch_size: int) -> int:
 
 def _positive(name: str, value: str) -> int:
     if not value.isdigit() or int(value) < 1:
-        raise ValueError(f"{name} is {value!r}; it must be a positive whole number.")
+        raise ValueError(f"{name}: expected an integer >= 1, got {value!r}.")
     return int(value)

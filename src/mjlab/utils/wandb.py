@@ -1,4 +1,4 @@
-"""Tags of Weights & Biases runs."""
+"""Weights & Biases run tags."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ _VARIABLE = "WANDB_TAGS"
 
 
 def add_wandb_tags(tags: Sequence[str]) -> None:
-    """Add tags to the live run, or, where there is none, to those the next run starts with.
+    """Add tags to the active run, or else to the tags of the next run.
 
-    Empty tags, which wandb refuses, are left out.
+    Empty tags are omitted, because wandb rejects them.
     """
-    # Whoever has a live run has imported wandb; importing it here would only cost time.
+    # An active run implies that wandb is already imported; importing it here would only cost time.
     run = getattr(sys.modules.get("wandb"), "run", None)
     if run is not None:
         run.tags = _merged(run.tags or (), tags)
@@ -23,7 +23,7 @@ def add_wandb_tags(tags: Sequence[str]) -> None:
     if merged:
         os.environ[_VARIABLE] = ",".join(merged)
     else:
-        # To wandb a variable that is set to nothing is one empty tag.
+        # wandb reads an empty variable as one empty tag.
         os.environ.pop(_VARIABLE, None)
 
 

@@ -1,4 +1,4 @@
-"""A spec as XML and files: export, files in memory, corrections to the XML that MuJoCo writes."""
+"""Spec export: XML, asset files, in-memory files, and fixes of MuJoCo's XML output."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _STAND_IN = "mjlab_without_texture"
 
 
 def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> None:
-    """Write `scene.xml` and, under `assets/`, the files it refers to. `spec` is not changed.
+    """Write `scene.xml` and its asset files under `assets/`. `spec` is unchanged.
 
-    Textures made from raw pixels are left out, with the materials that use them, because XML
-    cannot hold them. With `zip` the result is the archive `<output_dir>.zip` instead of a folder.
+    Textures built from raw pixels, and materials that use them, are omitted, because XML cannot
+    represent them. With `zip`, writes the archive `<output_dir>.zip` instead of a folder.
 
-    Raises `ValueError` if a file cannot be found, or if the spec has been attached to another one.
+    Raises `ValueError` if a file is not found, or if the spec has been attached to another one.
     """
     if spec.parent is not None:
-        # MuJoCo would end the process.
+        # MuJoCo would abort the process.
         raise ValueError(
-            f"The spec {spec.modelname!r} has been attached to another one, and MuJoCo cannot "
-            "write it any more. Write the whole (`spec.parent`), or a copy made before attaching."
+            f"Spec {spec.modelname!r} is attached to another spec, so MuJoCo cannot write it; write "
+            "the parent (`spec.parent`), or a copy made before attaching."
         )
     output_dir = Path(output_dir)
     if not zip:
@@ -46,7 +46,7 @@ def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> 
 
 
 def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
-    # Everything that can fail comes before the first file is written.
+    # All checks precede the first write.
     copy = spec.copy()
     strip_buffer_textures(copy)
     contents: dict[str, bytes] = {}
@@ -69,14 +69,14 @@ def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
 
 
 def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None) -> None:
-    """Turn relative paths of files on disk into absolute ones. Changes `spec`.
+    """Convert relative paths of files on disk to absolute paths. Changes `spec`.
 
-    Attaching forgets the folder a spec was read from, so do this before. Paths that are keys of
-    `spec.assets`, or lead to no file, are left alone.
+    Call this before attaching, because attaching discards the folder of a spec. Keys of
+    `spec.assets` and paths without a file are unchanged.
 
     Args:
-        spec: The spec.
-        model_dir: The folder of its XML file; None takes `spec.modelfiledir`.
+        spec: Spec to change.
+        model_dir: Folder of its XML file. None: `spec.modelfiledir`.
     """
     model_dir = spec.modelfiledir if model_dir is None else model_dir
     for place in _file_places(spec):
@@ -87,13 +87,12 @@ def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None)
 
 
 def put_files_in_memory(spec: mujoco.MjSpec, prefix: str) -> None:
-    """Bring all files that a spec refers to into `spec.assets`, as `<prefix><file>`. Changes `spec`.
+    """Load all files of a spec into `spec.assets`, as `<prefix><file>`. Changes `spec`.
 
-    Specs that are merged need that if one of them has files in memory: attaching a spec with such
-    files renames those on disk too, and a path on disk may be taken for a file in memory that ends
-    alike.
+    Required for merging specs if one of them has in-memory files: attaching such a spec also renames
+    files on disk, and a path on disk may match an in-memory file with the same ending.
 
-    Raises `ValueError` if a file cannot be found.
+    Raises `ValueError` if a file is not found.
     """
     contents: dict[str, bytes] = {}
     for place in list(_file_places(spec)):
@@ -105,11 +104,10 @@ def put_files_in_memory(spec: mujoco.MjSpec, prefix: str) -> None:
 
 
 def fix_spec_xml(xml: str, meshdir: str | None = None) -> str:
-    """Return the XML that `MjSpec.to_xml` wrote, corrected so that MuJoCo reads it again.
+    """Return XML written by `MjSpec.to_xml`, fixed so that MuJoCo can load it.
 
-    Empty `<default>` elements are removed, and a default nested in a default of the same class is
-    merged into it: both are left behind by attaching specs. `meshdir`, if given, is set as the
-    folder of meshes and textures.
+    Removes empty `<default>` elements and merges defaults nested in a default of the same class; both
+    result from attaching specs. `meshdir`, if not None, is set as folder of meshes and textures.
     """
     root = ElementTree.fromstring(xml)
     used = {
@@ -135,7 +133,7 @@ def fix_spec_xml(xml: str, meshdir: str | None = None) -> str:
 
 
 def _clean_default(default: ElementTree.Element, used: set[str | None]) -> None:
-    # The outermost default is the class "main" where no name is written.
+    # An unnamed outermost default is class "main".
     name = default.get("class", "main")
     for child in default.findall("default"):
         _clean_default(child, used)
@@ -147,21 +145,20 @@ def _clean_default(default: ElementTree.Element, used: set[str | None]) -> None:
                 if same is None:
                     default.append(element)
                 else:
-                    # Where both set an attribute, the inner value counts.
+                    # The inner value takes precedence.
                     same.attrib.update(element.attrib)
         elif len(child) == 0 and inner not in used:
-            # An empty class that something refers to has to stay: it inherits.
+            # An empty class that is referenced must stay, because it inherits.
             default.remove(child)
 
 
 def strip_buffer_textures(spec: mujoco.MjSpec) -> None:
-    """Delete what uses textures made from raw pixels, which XML cannot express.
+    """Delete textures built from raw pixels, and their users, because XML cannot represent them.
 
-    Removes those textures, the materials whose RGB texture they are, and the references of geoms
-    to these materials. Changes `spec`.
+    Removes these textures, materials that use them as RGB texture, and references of geoms to these
+    materials. Changes `spec`.
 
-    Where MuJoCo will not let go of a reference, those geoms get a material without a texture that
-    looks like none.
+    If MuJoCo does not drop a reference, the geoms get a neutral material without a texture.
     """
     no_builtin = mujoco.mjtBuiltin.mjBUILTIN_NONE
     textures = {
@@ -176,8 +173,8 @@ def strip_buffer_textures(spec: mujoco.MjSpec) -> None:
     for element in (*materials.values(), *textures.values()):
         spec.delete(element)
     if geoms and not _can_be_written(spec):
-        # Once compiled, a geom keeps the id of its material, and no material's name at all does not
-        # reset it, so that the id may now be out of bounds. Another name does.
+        # A compiled geom keeps the id of its material, and the id may now be out of bounds. An
+        # empty material name does not reset the id; another name does.
         if spec.material(_STAND_IN) is None:
             spec.add_material(name=_STAND_IN, rgba=(0.5, 0.5, 0.5, 1.0))
         for geom in geoms:
@@ -188,13 +185,13 @@ def _can_be_written(spec: mujoco.MjSpec) -> bool:
     try:
         spec.to_xml()
     except ValueError:
-        # What is wrong beyond the materials is told when the spec is written.
+        # Other errors are raised when the spec is written.
         return False
     return True
 
 
 class _FilePlace:
-    """One attribute of one element that names a file."""
+    """Attribute of an element that holds a file path."""
 
     def __init__(self, element: Any, path: str, folder: str, write: Callable[[str], None]) -> None:
         self.element = element
@@ -203,7 +200,7 @@ class _FilePlace:
         self._write = write
 
     def rename(self, path: str) -> None:
-        # An element without a name is called after its file.
+        # Unnamed elements are named after their file.
         if not self.element.name:
             self.element.name = PurePosixPath(self.path).stem
         self._write(path)
@@ -235,28 +232,27 @@ def _read(spec: mujoco.MjSpec, place: _FilePlace, model_dir: str) -> bytes:
     path = Path(model_dir, place.folder, place.path)
     if not path.is_file():
         raise ValueError(
-            f"{type(place.element).__name__} {place.element.name!r} refers to the file "
-            f"{place.path!r}, which is neither at {str(path)!r} nor among the assets of the spec "
-            f"({sorted(spec.assets)}). Add it to `spec.assets`, or call "
-            "`make_asset_paths_absolute` on a spec before attaching it."
+            f"{type(place.element).__name__} {place.element.name!r}: file {place.path!r} not found, "
+            f"neither at {str(path)!r} nor in spec.assets ({sorted(spec.assets)}); add it to "
+            "`spec.assets`, or call `make_asset_paths_absolute` on a spec before attaching it."
         )
     return path.read_bytes()
 
 
 def _asset_key(spec: mujoco.MjSpec, place: _FilePlace) -> str | None:
-    """Return the key of `spec.assets` for a path: itself, in its folder, or one that ends so."""
+    """Return the key of `spec.assets` for a path: exact, in its folder, or with the same ending."""
     keys = spec.assets.keys()
     for key in (place.path, str(PurePosixPath(place.folder, place.path))):
         if key in keys:
             return key
     endings = [key for key in keys if key.endswith("/" + place.path)]
-    # A name in the file's own folder is the better match where several end alike.
+    # Of several keys with the same ending, prefer one in the file's folder.
     endings.sort(key=lambda key: (place.folder not in key, key))
     return endings[0] if endings else None
 
 
 def _unique_name(place: _FilePlace, content: bytes, taken: dict[str, bytes]) -> str:
-    """Return the path of a file below the assets folder: its own where that is free."""
+    """Return a free path for a file below the assets folder, by default its current path."""
     path = PurePosixPath(place.path)
     if path.is_absolute() or ".." in path.parts:
         path = PurePosixPath(path.name)

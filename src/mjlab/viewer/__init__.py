@@ -1,6 +1,6 @@
-"""What a person looks at: browser viewer, native window, offscreen images and videos.
+"""Viewers: Viser, native MuJoCo window, offscreen rendering, video.
 
-The names are loaded on first use, so that a config can import `ViewerConfig` without paying for
+Names are imported on first use, so that a config can import `ViewerConfig` without loading
 MuJoCo, torch or viser.
 """
 

@@ -1,8 +1,8 @@
-"""The loop all interactive viewers share: pacing, pausing, actions and errors.
+"""Base class of interactive viewers: pacing, pausing, actions and errors.
 
-`BaseViewer` is the loop; `run_headless` is the one without a display. What they expect of environments
-and policies is above them; the clock (`RealtimePacer`, `RateMeter`) and the recent values of terms
-(`TermHistory`) are below.
+`BaseViewer` runs the loop with a display, `run_headless` without one. The protocols of environments
+and policies precede them; timing (`RealtimePacer`, `RateMeter`) and the recent values of terms
+(`TermHistory`) follow.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SPEEDS = tuple(2.0**exponent for exponent in range(-5, 4))
-"""Speeds a viewer offers, as multiples of real time: 1/32, 1/16, ... 8."""
+"""Default selectable speeds, as multiples of real time: 1/32, 1/16, ... 8."""
 
-# Longest sleep between two looks at what is due, so that buttons answer at once.
+# Bounds of the sleep between ticks. The upper bound keeps buttons responsive.
 _MAX_SLEEP_S = 0.005
 _MIN_SLEEP_S = 0.0005
 
@@ -44,7 +44,7 @@ _STATS_WINDOW_S = 0.5
 
 
 class VerbosityLevel(enum.IntEnum):
-    """How much a viewer logs."""
+    """Verbosity of a viewer's log."""
 
     SILENT = 0
     INFO = 1
@@ -52,7 +52,7 @@ class VerbosityLevel(enum.IntEnum):
 
 
 class EnvProtocol(Protocol):
-    """What a viewer needs of an environment, or of the wrapper a policy expects around it."""
+    """Environment, or wrapper that the policy expects around it, as a viewer uses it."""
 
     @property
     def cfg(self) -> ManagerBasedRlEnvCfg: ...
@@ -62,7 +62,7 @@ class EnvProtocol(Protocol):
 
     @property
     def unwrapped(self) -> Any:
-        """The `ManagerBasedRlEnv` itself."""
+        """Unwrapped `ManagerBasedRlEnv`."""
         ...
 
     def get_observations(self) -> Any: ...
@@ -75,18 +75,18 @@ class EnvProtocol(Protocol):
 
 
 class PolicyProtocol(Protocol):
-    """Anything that turns observations into actions (num_envs, num_actions).
+    """Callable that maps observations to actions (num_envs, num_actions).
 
-    A policy with memory also has a method `reset()`, called when the environments are reset. Where it
-    is `reset(dones=None)`, it is also called after every step, with `dones` (num_envs,) not 0 where an
-    episode ended.
+    A recurrent policy also has a method `reset()`, called when the environments are reset. With the
+    signature `reset(dones=None)`, it is also called after every step, with `dones` (num_envs,)
+    nonzero for episodes that ended.
     """
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor: ...
 
 
 class ViewerAction(enum.Enum):
-    """What a person can ask a viewer for."""
+    """Viewer commands."""
 
     RESET = "reset"
     TOGGLE_PAUSE = "toggle_pause"
@@ -105,7 +105,7 @@ class ViewerAction(enum.Enum):
 
 @dataclass
 class ViewerStatus:
-    """What a status display shows."""
+    """Values of a status display."""
 
     paused: bool
     step_count: int
@@ -113,25 +113,25 @@ class ViewerStatus:
     speed_multiplier: float
     speed_label: str
     target_realtime: float
-    """Simulated seconds per wall second that were asked for."""
+    """Target of simulated seconds per wall second."""
     actual_realtime: float
-    """Simulated seconds per wall second that were reached."""
+    """Measured simulated seconds per wall second."""
     smoothed_fps: float
     capped: bool
-    """Whether the machine is too slow for the target."""
+    """True if the machine is too slow for the target."""
     last_error: str | None
     """Last line of the error that paused the viewer."""
 
 
 class BaseViewer(ABC):
-    """Steps an environment with a policy in real time, and lets a subclass show it.
+    """Viewer that steps an environment with a policy in real time; subclasses display it.
 
-    Everything that touches the environment happens in the thread that calls `run`. Buttons and
-    keys, whose callbacks arrive in other threads, put actions into a queue (`request_action`).
+    Only the thread that calls `run` accesses the environment. Callbacks of buttons and keys run
+    in other threads and queue actions (`request_action`).
     """
 
     SPEED_MULTIPLIERS: ClassVar[list[float]] = list(SPEEDS)
-    """Selectable speeds, as multiples of real time, in rising order."""
+    """Selectable speeds, as multiples of real time, in ascending order."""
 
     def __init__(
         self,
@@ -140,13 +140,13 @@ class BaseViewer(ABC):
         frame_rate: float = 30.0,
         verbosity: int = VerbosityLevel.SILENT,
     ) -> None:
-        """Prepare a paused-off viewer at real-time speed.
+        """Create an unpaused viewer at real-time speed.
 
         Args:
             env: Environment or wrapper whose observations `policy` takes.
             policy: Maps observations to actions.
             frame_rate: Displayed frames per second of wall time.
-            verbosity: How much to log, a `VerbosityLevel`.
+            verbosity: Log verbosity, a `VerbosityLevel`.
 
         Raises:
             ValueError: The frame rate is not positive.
@@ -173,7 +173,7 @@ class BaseViewer(ABC):
         self._last_tick = now
         self._next_frame = now
 
-    # What a subclass provides.
+    # Hooks of subclasses.
 
     @abstractmethod
     def setup(self) -> None:
@@ -181,41 +181,41 @@ class BaseViewer(ABC):
 
     @abstractmethod
     def is_running(self) -> bool:
-        """Whether the window or page is still there."""
+        """Return True until the window or page is closed."""
 
     @abstractmethod
     def sync_env_to_viewer(self) -> None:
-        """Show the environment's present state; called once a displayed frame."""
+        """Show the current state of the environment; called once per displayed frame."""
 
     @abstractmethod
     def sync_viewer_to_env(self) -> None:
-        """Bring what the person did in the viewer (a push, say) into the environment."""
+        """Apply user input, e.g. a push with the mouse, to the environment."""
 
     @abstractmethod
     def close(self) -> None:
-        """Close the window or page; may be called twice."""
+        """Close the window or page. Repeated calls have no effect."""
 
     def after_env_step(self) -> None:  # noqa: B027, optional
-        """Called after every environment step, before anything else happens."""
+        """Called right after every environment step."""
 
     def after_reset(self) -> None:  # noqa: B027, optional
-        """Called after the environments have been reset."""
+        """Called after the environments are reset."""
 
     def on_paused(self, paused: bool) -> None:  # noqa: B027, optional
         """Called when the viewer is paused or resumed."""
 
     def handle_action(self, action: ViewerAction, payload: Any) -> bool:
-        """Handle an action that the base does not know; False means it is not known here."""
+        """Handle an action that `BaseViewer` does not; return False if it is unknown."""
         return False
 
-    # The loop.
+    # Loop.
 
     def run(self, num_steps: int | None = None, catch_sigint: bool = True) -> None:
-        """Show the environment until the viewer is closed, then close it.
+        """Run the viewer until the user closes it or a limit is reached, then close it.
 
         Args:
-            num_steps: Stop after so many environment steps; None runs until closed.
-            catch_sigint: Let the first Ctrl+C end the loop, and only a second one the program.
+            num_steps: Number of environment steps to take. None: unlimited.
+            catch_sigint: Let the first Ctrl+C end the loop and the second one the program.
         """
         self._interrupted = False
         self._step_limit = None if num_steps is None else self._total_steps + num_steps
@@ -238,7 +238,7 @@ class BaseViewer(ABC):
                 self.close()
 
     def tick(self) -> bool:
-        """Do what is due now: actions, environment steps, a frame. True if a frame was shown."""
+        """Process due actions, environment steps and frame; return True if a frame was shown."""
         now = time.perf_counter()
         elapsed, self._last_tick = now - self._last_tick, now
         self._process_actions()
@@ -249,7 +249,7 @@ class BaseViewer(ABC):
         now = time.perf_counter()
         if now < self._next_frame:
             return False
-        # A frame that came late does not make the next ones come early.
+        # A late frame must not bring the next ones forward.
         self._next_frame = max(self._next_frame + self.frame_time, now)
         with self._pause_on_error("updating the viewer"):
             self.sync_env_to_viewer()
@@ -257,11 +257,11 @@ class BaseViewer(ABC):
         return True
 
     def step_simulation(self) -> bool:
-        """Observe, ask the policy, step once. False if that failed, which pauses the viewer."""
+        """Observe, run the policy and step once. On an error, pause the viewer and return False."""
         with self._pause_on_error("stepping the environment"), torch.no_grad():
             self.sync_viewer_to_env()
             actions = self.policy(self.env.get_observations())
-            forget(self.policy, ended(self.env.step(actions)))
+            reset_policy(self.policy, done_mask(self.env.step(actions)))
             self._step_count += 1
             self._total_steps += 1
             self._rates.count(steps=1)
@@ -270,7 +270,7 @@ class BaseViewer(ABC):
         return False
 
     def _update_stats(self) -> None:
-        """Average the rates of steps and frames; called every tick, subclasses may add theirs."""
+        """Update step and frame rates; called every tick. Subclasses may add statistics."""
         if self._rates.update(time.perf_counter()):
             self.log_performance()
 
@@ -295,7 +295,7 @@ class BaseViewer(ABC):
     def request_action(self, name: str, payload: Any | None = None) -> None:
         """Queue an action by name, from any thread.
 
-        A name that is not a `ViewerAction` becomes `CUSTOM`, with its payload.
+        Names that are not a `ViewerAction` become `CUSTOM`.
         """
         try:
             action = ViewerAction(name.lower())
@@ -322,7 +322,7 @@ class BaseViewer(ABC):
         self.request_action("reset_speed")
 
     def _process_actions(self) -> None:
-        performs: dict[ViewerAction, Callable[[], Any]] = {
+        handlers: dict[ViewerAction, Callable[[], Any]] = {
             ViewerAction.RESET: self.reset_environment,
             ViewerAction.TOGGLE_PAUSE: self.toggle_pause,
             ViewerAction.SINGLE_STEP: self._single_step,
@@ -335,13 +335,11 @@ class BaseViewer(ABC):
                 action, payload = self._actions.get_nowait()
             except queue.Empty:
                 return
-            with self._pause_on_error(f"performing the action {action.value!r}"):
-                if action in performs:
-                    performs[action]()
+            with self._pause_on_error(f"performing action {action.value!r}"):
+                if action in handlers:
+                    handlers[action]()
                 elif not self.handle_action(action, payload):
-                    self.log(
-                        f"This viewer does not know the action {action.value!r} ({payload!r})."
-                    )
+                    self.log(f"Unknown viewer action {action.value!r} (payload {payload!r}).")
 
     def _single_step(self) -> None:
         if self._paused and not self._limit_reached():
@@ -349,26 +347,26 @@ class BaseViewer(ABC):
             self.step_simulation()
 
     def reset_environment(self) -> None:
-        """Reset all environments, and the policy where it has a memory."""
+        """Reset all environments and, if it is recurrent, the policy."""
         with torch.no_grad():
             self.env.reset()
-        reset_policy = getattr(self.policy, "reset", None)
-        if callable(reset_policy):
-            reset_policy()
+        reset = getattr(self.policy, "reset", None)
+        if callable(reset):
+            reset()
         self._step_count = 0
         self._pacer.clear()
         self._last_error = None
         self.after_reset()
 
     def pause(self) -> None:
-        """Stop stepping; the display goes on."""
+        """Stop stepping; the display keeps updating."""
         if not self._paused:
             self._paused = True
             self._pacer.clear()
             self.on_paused(True)
 
     def resume(self) -> None:
-        """Go on stepping. What was wrong is taken as seen."""
+        """Resume stepping and clear the last error."""
         if self._paused:
             self._paused = False
             self._last_error = None
@@ -395,7 +393,7 @@ class BaseViewer(ABC):
 
     @property
     def target_realtime(self) -> float:
-        """Simulated seconds per wall second that were asked for."""
+        """Target of simulated seconds per wall second."""
         return self._pacer.speed
 
     @property
@@ -417,7 +415,7 @@ class BaseViewer(ABC):
         )
 
     def log(self, message: str, level: VerbosityLevel = VerbosityLevel.INFO) -> None:
-        """Log `message` if the viewer is as talkative as `level`."""
+        """Log `message` if the viewer's verbosity is at least `level`."""
         if self.verbosity >= level:
             log.info("%s", message)
 
@@ -431,29 +429,29 @@ class BaseViewer(ABC):
         )
 
     @contextlib.contextmanager
-    def _pause_on_error(self, doing: str) -> Generator[None]:
-        """Keep the viewer alive: log the traceback, pause, and show the error's last line."""
+    def _pause_on_error(self, activity: str) -> Generator[None]:
+        """On an error, log the traceback, pause, and show the last line of the error."""
         try:
             yield
         except Exception as error:
             last_line = traceback.format_exception_only(error)[-1].strip()
-            # A display that fails does so at every frame; say it once.
+            # A failing display fails at every frame; log the error once.
             if last_line != self._last_error:
-                log.exception("The viewer is paused after an error while %s.", doing)
+                log.exception("The viewer is paused after an error while %s.", activity)
             self.pause()
             self._last_error = last_line
 
 
 @dataclass(frozen=True)
 class HeadlessResult:
-    """What happened in `run_headless`."""
+    """Result of `run_headless`."""
 
     num_steps: int
-    """Environment steps taken."""
+    """Number of environment steps taken."""
     mean_step_reward: float
-    """Reward a step, averaged over steps and environments."""
+    """Reward per step, averaged over steps and environments."""
     num_episodes: int
-    """Episodes that ended, over all environments."""
+    """Number of episodes that ended, over all environments."""
 
 
 def run_headless(
@@ -462,14 +460,14 @@ def run_headless(
     num_steps: int,
     on_step: Callable[[int], None] | None = None,
 ) -> HeadlessResult:
-    """Step `env` with `policy` as fast as it goes.
+    """Step `env` with `policy` as fast as possible.
 
     Args:
-        env: An environment, or the vector wrapper rsl_rl uses; its `step` returns four or five
-            things, of which the second is the reward (num_envs,).
+        env: Environment, or the vector wrapper of rsl_rl; `step` returns four or five values, the
+            second being the reward (num_envs,).
         policy: Maps observations to actions (num_envs, num_actions).
-        num_steps: Environment steps to take.
-        on_step: Called with the number of steps done, after each.
+        num_steps: Number of environment steps to take.
+        on_step: Called after each step with the number of steps taken.
 
     Raises:
         ValueError: The number of steps is negative.
@@ -481,43 +479,43 @@ def run_headless(
         for step in range(num_steps):
             result = env.step(policy(env.get_observations()))
             reward_sum += result[1].double().mean()
-            done = ended(result)
-            forget(policy, done)
-            episodes += (done != 0).sum()
+            dones = done_mask(result)
+            reset_policy(policy, dones)
+            episodes += (dones != 0).sum()
             if on_step is not None:
                 on_step(step + 1)
     return HeadlessResult(num_steps, float(reward_sum) / max(num_steps, 1), int(episodes))
 
 
-def ended(results: tuple[Any, ...]) -> torch.Tensor:
-    """Return where an episode ended (num_envs,), from the four or five results of a step."""
+def done_mask(results: tuple[Any, ...]) -> torch.Tensor:
+    """Return the mask of ended episodes (num_envs,), from the four or five results of a step."""
     return results[2] if len(results) == 4 else results[2] | results[3]
 
 
-def forget(policy: Any, dones: torch.Tensor) -> None:
-    """Let a policy with memory forget the environments in which `dones` (num_envs,) is not 0."""
+def reset_policy(policy: Any, dones: torch.Tensor) -> None:
+    """Reset a recurrent policy in the environments with nonzero `dones` (num_envs,)."""
     reset = getattr(policy, "reset", None)
     try:
-        knows_ends = callable(reset) and "dones" in inspect.signature(reset).parameters
+        accepts_dones = callable(reset) and "dones" in inspect.signature(reset).parameters
     except (TypeError, ValueError):
-        # Compiled functions do not say what they take.
+        # Compiled functions have no signature.
         return
-    if knows_ends:
+    if accepts_dones:
         reset(dones)
 
 
 def speed_label(multiplier: float) -> str:
-    """A speed as people write it: `1/4x`, `1x`, `8x`."""
+    """Return the label of a speed: `1/4x`, `1x`, `8x`."""
     if multiplier < 1.0:
         return f"1/{round(1.0 / multiplier)}x"
     return f"{multiplier:g}x"
 
 
 class RealtimePacer:
-    """Turns elapsed wall time into a budget of simulated time to step through.
+    """Conversion of elapsed wall time into a budget of simulated time.
 
-    Time that could not be used within one frame is dropped except for a single step: a simulation
-    that is slower than asked for runs late, and the screen still answers.
+    Time not used within one frame is dropped except for a single step: a simulation slower than
+    the target lags behind, and the display stays responsive.
     """
 
     def __init__(self, step_dt: float, frame_period: float, speeds: Sequence[float] = SPEEDS):
@@ -534,7 +532,7 @@ class RealtimePacer:
         return self._speeds[self._speed_index]
 
     def change_speed(self, steps: int) -> None:
-        """Go `steps` up (or down, where negative) in the list of speeds, within its ends."""
+        """Move `steps` up (negative: down) in the list of speeds, clamped to its ends."""
         self._speed_index = min(max(self._speed_index + steps, 0), len(self._speeds) - 1)
 
     def reset_speed(self) -> None:
@@ -547,8 +545,8 @@ class RealtimePacer:
         self._budget += elapsed * self.speed
 
     def take_step(self) -> bool:
-        """Whether there is time for one more step; it is taken off the budget."""
-        # Adding many small times leaves rounding errors, which must not cost a whole step.
+        """Subtract one step from the budget; return False if the budget is too small."""
+        # Rounding errors of many small increments must not cost a whole step.
         if self._budget < self.step_dt * (1.0 - 1e-9):
             return False
         self._budget = max(self._budget - self.step_dt, 0.0)
@@ -556,22 +554,22 @@ class RealtimePacer:
 
     @property
     def time_to_next_step(self) -> float:
-        """Wall time in seconds until the budget is enough for a step."""
+        """Wall time until the budget suffices for a step (s)."""
         return max(self.step_dt - self._budget, 0.0) / self.speed
 
     def out_of_time(self) -> None:
-        """Say that this frame's wall time is used up; what is left is cut to one step."""
+        """End the frame's wall time: cut the remaining budget to one step."""
         self.capped = self._budget >= self.step_dt
         self._budget = min(self._budget, self.step_dt)
 
     def clear(self) -> None:
-        """Forget the budget: time that passed while paused is not caught up with."""
+        """Clear the budget: time spent paused is not made up."""
         self._budget = 0.0
         self.capped = False
 
 
 class RateMeter:
-    """Steps and frames a second, averaged over half a second of wall time."""
+    """Steps and frames per second, averaged over half a second of wall time."""
 
     def __init__(self, now: float):
         self.steps_per_second = 0.0
@@ -585,7 +583,7 @@ class RateMeter:
         self._frames += frames
 
     def update(self, now: float) -> bool:
-        """Close the averaging window if it is full; return whether there are new rates."""
+        """Close the averaging window if it is full; return True if the rates changed."""
         elapsed = now - self._start
         if elapsed < _STATS_WINDOW_S:
             return False
@@ -596,14 +594,14 @@ class RateMeter:
         return True
 
     def restart(self, now: float) -> None:
-        """Forget what was counted, as after a pause."""
+        """Clear counts and rates, e.g. after a pause."""
         self._start = now
         self._steps = self._frames = 0
         self.steps_per_second = self.frames_per_second = 0.0
 
 
 class TermHistory:
-    """Keeps the last `length` values of each term of a manager, for one environment."""
+    """Last `length` values of each term of a manager, for one environment."""
 
     def __init__(self, length: int):
         self.length = length
@@ -614,9 +612,9 @@ class TermHistory:
         return list(self._values)
 
     def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
-        """Append one point a term, as `get_active_iterable_terms(env_idx)` gives them.
+        """Append one point per term, as returned by `get_active_iterable_terms(env_idx)`.
 
-        A value that is not finite is recorded as NaN, which plots leave out.
+        Non-finite values are recorded as NaN; plots skip them.
         """
         for name, values in terms:
             value = float(np.ravel(values)[0])
@@ -624,17 +622,17 @@ class TermHistory:
             series.append(value if np.isfinite(value) else float("nan"))
 
     def values(self, name: str) -> np.ndarray:
-        """Points of one term, (count,), the latest last."""
+        """Return the points of one term, oldest first, (count,)."""
         return np.array(self._values.get(name, ()), dtype=float)
 
     def mean(self, name: str) -> float:
-        """Mean of the finite points; 0 without any."""
+        """Return the mean of the finite points, or 0 without any."""
         values = self.values(name)
         finite = values[np.isfinite(values)]
         return float(finite.mean()) if len(finite) else 0.0
 
     def clear(self) -> None:
-        """Forget the points, keep the names."""
+        """Clear the points and keep the names."""
         for series in self._values.values():
             series.clear()
 

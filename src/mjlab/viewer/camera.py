@@ -1,4 +1,4 @@
-"""One camera resolver for the native, the browser and the offscreen viewer."""
+"""Camera resolution shared by the native, browser and offscreen viewers."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from mjlab.viewer.viewer_config import OriginType, ViewerConfig
 
 @dataclass(frozen=True)
 class CameraView:
-    """A resolved camera; angles in degrees with MuJoCo's signs (negative elevation looks down)."""
+    """Resolved camera; angles in degrees with MuJoCo's signs (negative elevation looks down)."""
 
     body_id: int | None
-    """Body to follow, or None for the fixed point `lookat`."""
+    """Body to follow. None: the fixed point `lookat`."""
     lookat: tuple[float, float, float]
     distance: float
     azimuth: float
@@ -27,15 +27,15 @@ class CameraView:
     fovy: float | None
 
     def target(self, body_xpos: np.ndarray) -> np.ndarray:
-        """World point the camera looks at, (3,), given body positions (nbody, 3)."""
+        """Return the world point the camera looks at, (3,), from body positions (nbody, 3)."""
         if self.body_id is None:
             return np.asarray(self.lookat, dtype=float)
         return np.asarray(body_xpos[self.body_id], dtype=float)
 
     def offset(self) -> np.ndarray:
-        """Vector from the target to the camera, (3,), world axes, metres.
+        """Return the vector from the target to the camera (m), world axes, (3,).
 
-        MuJoCo's camera looks along (cos e cos a, cos e sin a, sin e), so it stands at the opposite.
+        MuJoCo's camera looks along (cos e cos a, cos e sin a, sin e); the offset is its opposite.
         """
         azimuth, elevation = np.deg2rad([self.azimuth, self.elevation])
         forward = np.array(
@@ -51,15 +51,15 @@ class CameraView:
 def resolve_camera(
     cfg: ViewerConfig, model: mujoco.MjModel, entities: Mapping[str, Any]
 ) -> CameraView:
-    """Find where the camera of `cfg` is and what it follows in `model`.
+    """Resolve the pose of the camera of `cfg` and the body it follows in `model`.
 
     Args:
-        cfg: The viewer's configuration.
-        model: The compiled scene; bodies of an entity are named `<entity>/<body>`.
-        entities: The scene's entities by name; "terrain" is never followed.
+        cfg: Viewer configuration.
+        model: Compiled scene; bodies of an entity are named `<entity>/<body>`.
+        entities: Entities of the scene by name; the camera never follows "terrain".
 
     Raises:
-        ValueError: The camera, entity or body does not exist, or is needed and was not named.
+        ValueError: Unknown camera, entity or body, or a required name is missing.
     """
     if cfg.camera is not None:
         return _view_of_model_camera(model, cfg.camera, cfg.distance)
@@ -87,7 +87,7 @@ def whole_model_view(model: mujoco.MjModel) -> CameraView:
 
 
 def first_moving_body(model: mujoco.MjModel) -> int | None:
-    """Id of the first body that can move; below a mocap root, bodies count as moving."""
+    """Return the ID of the first body that can move; bodies below a mocap root count as moving."""
     for body_id in range(1, model.nbody):
         welded = model.body_weldid[body_id] == 0
         if not welded or model.body_mocapid[model.body_rootid[body_id]] >= 0:
@@ -96,7 +96,7 @@ def first_moving_body(model: mujoco.MjModel) -> int | None:
 
 
 def nearest_envs(origins: np.ndarray, env_idx: int, count: int) -> list[int]:
-    """The `count` environments whose origins (num_envs, 3) are nearest to that of `env_idx`."""
+    """Return the `count` environments with origins (num_envs, 3) nearest to that of `env_idx`."""
     distances = np.linalg.norm(origins - origins[env_idx], axis=-1)
     distances[env_idx] = np.inf
     order = np.argsort(distances, kind="stable")
@@ -104,13 +104,13 @@ def nearest_envs(origins: np.ndarray, env_idx: int, count: int) -> list[int]:
 
 
 def _view_of_model_camera(model: mujoco.MjModel, name: str, distance: float) -> CameraView:
-    """Return the view of the camera `name`, as it stands in the model's initial pose."""
+    """Return the view of the camera `name` in the model's initial pose."""
     names = [model.camera(i).name for i in range(model.ncam)]
     check_exists("viewer.camera", name, names)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     camera_id = names.index(name)
-    # A MuJoCo camera looks along its own -z axis.
+    # A MuJoCo camera looks along its -z axis.
     forward = -data.cam_xmat[camera_id].reshape(3, 3)[:, 2]
     return CameraView(
         body_id=None,
@@ -132,8 +132,8 @@ def _followed_body(
     names = [name for name in entities if name != "terrain"]
     if cfg.entity_name is None and len(names) != 1:
         raise ValueError(
-            f"viewer.entity_name: origin_type {cfg.origin_type.name} needs the name of an entity, "
-            f"because the scene has {len(names)}; use one of {names}."
+            f"viewer.entity_name: expected the name of an entity for origin_type "
+            f"{cfg.origin_type.name} in a scene with {len(names)}, got None; use one of {names}."
         )
     name = names[0] if cfg.entity_name is None else cfg.entity_name
     check_exists("viewer.entity_name", name, entities)
@@ -142,8 +142,8 @@ def _followed_body(
     bodies = list(entities[name].body_names)
     if cfg.body_name is None:
         raise ValueError(
-            f"viewer.body_name: origin_type {cfg.origin_type.name} needs the name of a body of "
-            f"{name!r}; use one of {bodies}."
+            f"viewer.body_name: expected the name of a body of {name!r} for origin_type "
+            f"{cfg.origin_type.name}, got None; use one of {bodies}."
         )
     body_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{name}/{cfg.body_name}")
     if body_id < 0:

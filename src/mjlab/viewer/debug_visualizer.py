@@ -1,4 +1,4 @@
-"""The drawing board that terms and sensors get in `debug_vis`."""
+"""Debug visualizer: drawing interface passed to `debug_vis` of terms and sensors."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ Color = tuple[float, float, float, float]
 """Red, green, blue and opacity, each in [0, 1]."""
 
 DEFAULT_AXIS_COLORS = ((0.9, 0.0, 0.0), (0.0, 0.9, 0.0), (0.0, 0.0, 0.9))
-"""Colours of the x, y and z arrows of a frame."""
+"""Colors of the x, y and z arrows of a frame."""
 
 MIN_LENGTH = 1e-6
-"""Arrows and cylinders shorter than this (metres) have no direction and are not drawn."""
+"""Arrows and cylinders shorter than this (m) have no direction and are not drawn."""
 
 
 class DebugVisualizer(ABC):
-    """Draws primitives over the scene. All poses are in the world frame, lengths in metres.
+    """Draws primitives over the scene. Poses are in the world frame, lengths in m.
 
-    What is drawn lasts for one displayed frame: the viewer clears the board and asks again.
-    `label` names an item for the reader of the code; no viewer shows it.
+    Drawings last for one displayed frame: the viewer clears them and calls `debug_vis` again.
+    `label` documents an item in the code; viewers do not show it.
     """
 
     env_idx: int = 0
-    """The environment in view."""
+    """Environment in view."""
     show_all_envs: bool = False
-    """Whether terms should draw for every environment, not only for the one in view."""
+    """Draw for all environments, not only for the one in view."""
 
     def get_env_indices(self, num_envs: int) -> Iterable[int]:
-        """Environments to draw for: all, or the one in view, or none where it does not exist."""
+        """Return the environments to draw: all, the one in view, or none if it does not exist."""
         if self.show_all_envs:
             return range(num_envs)
         return (self.env_idx,) if 0 <= self.env_idx < num_envs else ()
@@ -42,7 +42,7 @@ class DebugVisualizer(ABC):
     @property
     @abstractmethod
     def meansize(self) -> float:
-        """Typical size of a body in the model (m), to scale drawings by."""
+        """Typical size of a body in the model (m), to scale drawings."""
 
     @abstractmethod
     def add_arrow(
@@ -53,7 +53,7 @@ class DebugVisualizer(ABC):
         width: float = 0.015,
         label: str | None = None,
     ) -> None:
-        """Draw an arrow between two points (3,); `width` is the radius of its shaft."""
+        """Draw an arrow between two points (3,); `width` is the radius of the shaft."""
 
     @abstractmethod
     def add_sphere(
@@ -70,7 +70,7 @@ class DebugVisualizer(ABC):
         color: Color,
         label: str | None = None,
     ) -> None:
-        """Draw a cylinder whose flat ends are centred on two points (3,)."""
+        """Draw a cylinder with flat ends centered on two points (3,)."""
 
     @abstractmethod
     def add_ellipsoid(
@@ -104,10 +104,10 @@ class DebugVisualizer(ABC):
         alpha: float = 0.5,
         label: str | None = None,
     ) -> None:
-        """Draw the moving bodies of `model` at configuration `qpos` (nq,), see-through.
+        """Draw the moving bodies of `model` at configuration `qpos` (nq,), transparent.
 
-        A mocap pose of shape (3,) or (4,) goes to mocap body 0, one of shape (nmocap, 3) or
-        (nmocap, 4) to all of them.
+        A mocap position (3,) or quaternion (4,) sets mocap body 0; shapes (nmocap, 3) and
+        (nmocap, 4) set all mocap bodies.
         """
 
     @abstractmethod
@@ -133,7 +133,7 @@ class DebugVisualizer(ABC):
 
 
 class NullDebugVisualizer:
-    """Accepts every drawing call and draws nothing."""
+    """Visualizer that ignores all drawing calls."""
 
     def __init__(self, env_idx: int = 0, meansize: float = 0.1):
         self.env_idx = env_idx
@@ -189,7 +189,7 @@ def pose_ghost(
     mocap_pos: np.ndarray | None,
     mocap_quat: np.ndarray | None,
 ) -> None:
-    """Write a ghost's configuration into `data`: one mocap pose for body 0, or one for each."""
+    """Write a ghost's configuration into `data`; mocap poses are for body 0 or for all bodies."""
     data.qpos[:] = qpos
     if mocap_pos is not None:
         positions = np.atleast_2d(mocap_pos)

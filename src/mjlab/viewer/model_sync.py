@@ -1,4 +1,4 @@
-"""Copying one environment of a batched simulation into the host model and data viewers draw."""
+"""Copy one environment of a batched simulation into the host model and data of a viewer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 VIEWER_MODEL_FIELDS = frozenset(
     {
         "qpos0",
-        # Looks and shape of geoms, materials and sites.
+        # Appearance and shape of geoms, materials and sites.
         "geom_dataid",
         "geom_matid",
         "geom_rgba",
@@ -31,10 +31,10 @@ VIEWER_MODEL_FIELDS = frozenset(
         "site_quat",
         "site_size",
         "site_rgba",
-        # What touches in an environment that lacks some geoms; a mesh that is not there must not.
+        # Collision filters: geoms that an environment lacks must not show contacts.
         "geom_contype",
         "geom_conaffinity",
-        # Frames and inertia of bodies, which the inertia boxes and the centre of mass show.
+        # Frames and inertia of bodies, for inertia boxes and the center of mass.
         "body_pos",
         "body_quat",
         "body_ipos",
@@ -65,7 +65,7 @@ VIEWER_MODEL_FIELDS = frozenset(
         "light_exponent",
     }
 )
-"""Per-environment model fields that change what is drawn; viewers copy these and no others."""
+"""Per-environment model fields that affect rendering; viewers copy only these."""
 
 VIEWER_INERTIAL_FIELDS = frozenset({"body_mass", "body_ipos"})
 """Fields that move the center of mass, which MuJoCo's tracking camera follows."""
@@ -74,19 +74,19 @@ _STATE_FIELDS = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "time
 
 
 def host_model(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A private copy of `model` whose visual settings and randomised fields may be overwritten."""
+    """Return a copy of `model` whose visual settings and randomized fields may be overwritten."""
     private = copy.copy(model)
     disable_model_sameframe_shortcuts(private)
-    # The tree of boxes by which MuJoCo looks for contacts is that of the compiled shapes.
+    # The bounding volume hierarchy of the midphase is that of the compiled shapes.
     private.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     return private
 
 
 def disable_model_sameframe_shortcuts(model: mujoco.MjModel) -> None:
-    """Make MuJoCo compute every geom, site and inertial frame of `model` from its own pose.
+    """Make MuJoCo compute each geom, site and inertial frame of `model` from its local pose.
 
-    The compiler marks frames that coincide with their body's, and kinematics then ignores their
-    position and rotation. Once those are randomised the marks are wrong.
+    The compiler marks frames that coincide with the body frame, and kinematics then ignores their
+    position and rotation. Randomizing either invalidates the marks.
     """
     model.body_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     model.geom_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
@@ -99,13 +99,13 @@ def sync_model_fields(
     fields: set[str] | frozenset[str],
     env_idx: int,
 ) -> None:
-    """Copy the drawn fields among `fields` of one environment into `dst_model`.
+    """Copy those of `fields` that affect rendering from one environment into `dst_model`.
 
     Args:
-        dst_model: Host model to write, which should be a private copy (`host_model`).
+        dst_model: Host model to write, a private copy made by `host_model`.
         sim_model: Batched model; each field has a leading environment dimension.
-        fields: Names of the per-environment fields. Those that no viewer draws are skipped.
-        env_idx: The environment to copy.
+        fields: Names of the per-environment fields; those without effect on rendering are skipped.
+        env_idx: Environment to copy.
     """
     for field in sorted(fields & VIEWER_MODEL_FIELDS):
         target = getattr(dst_model, field)
@@ -113,11 +113,11 @@ def sync_model_fields(
 
 
 def copy_state(source: Any, env_idx: int, mj_data: mujoco.MjData) -> None:
-    """Copy the state of one environment into `mj_data`, computing nothing from it.
+    """Copy the state of one environment into `mj_data`, without computing derived quantities.
 
     Args:
-        source: A `Simulation` (which knows how), its `data`, or a plain `MjData`.
-        env_idx: The environment to copy; a plain `MjData` has only the one.
+        source: A `Simulation`, its `data`, or a plain `MjData`.
+        env_idx: Environment to copy; ignored for a plain `MjData`.
         mj_data: Host data to write.
     """
     if hasattr(source, "copy_to_host"):
@@ -135,9 +135,9 @@ def copy_state(source: Any, env_idx: int, mj_data: mujoco.MjData) -> None:
 
 
 def compute_poses(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Compute from qpos all that drawing shapes needs: frames, cameras, lights and tendons.
+    """Compute from qpos all quantities needed to render: frames, cameras, lights and tendons.
 
-    A full `mj_forward` would also collide and solve, which costs more than drawing does.
+    A full `mj_forward` would also run collision and the solver, at a higher cost than rendering.
     """
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -147,7 +147,7 @@ def compute_poses(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def to_numpy(value: Any) -> np.ndarray:
-    """A host array from a torch tensor or a Warp array on any device, an array or a number."""
+    """Return a host array of a torch tensor or Warp array on any device, an array or a number."""
     if hasattr(value, "detach"):
         value = value.detach().cpu()
     if hasattr(value, "numpy"):

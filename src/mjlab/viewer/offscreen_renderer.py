@@ -1,8 +1,8 @@
-"""Images of one environment and its neighbours, drawn without a window.
+"""Offscreen rendering of one environment and its neighbors.
 
-`OffscreenRenderer` draws environments, `open_renderer` opens MuJoCo's renderer for any model. A machine
-that cannot draw raises `RenderingUnavailableError`. Models without a sky get one painted, and their
-directional lights become one sun that follows the camera.
+`OffscreenRenderer` renders environments; `open_renderer` opens MuJoCo's renderer for any model.
+Both raise `RenderingUnavailableError` on a machine that cannot render. Models without a skybox get
+a painted sky, and directional lights merge into one sun that follows the camera target.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 _MAX_GEOMS = 10_000
 _MIN_EXTENT = 4.0
 
-# Graphics libraries that need no display.
-_WITHOUT_DISPLAY = ("egl", "osmesa")
+# Graphics libraries that work without a display.
+_HEADLESS_LIBRARIES = ("egl", "osmesa")
 
 _INSTALL_HINT = (
     "To render without a display, install an EGL library and a driver "
@@ -46,25 +46,25 @@ _INSTALL_HINT = (
     "(`apt-get install libosmesa6`) and set MUJOCO_GL=osmesa."
 )
 
-# How PyOpenGL fails where there is no EGL: it looks for the function in a library that is None.
+# PyOpenGL's error without EGL: it looks up the function in a library that is None.
 _NO_EGL = "object has no attribute 'eglQueryString'"
 
-# How MuJoCo's renderer fails without a graphics library.
+# Error of MuJoCo's renderer without a graphics library.
 _NO_CONTEXT = "has no attribute 'GLContext'"
 
-# The sky above, as a colour in [0, 1]; towards the horizon it becomes the haze of the model.
+# Color of the sky at the zenith, in [0, 1]; it fades to the haze of the model at the horizon.
 _ZENITH = (0.35, 0.52, 0.70)
 
-# Least half width, in metres, of the square around the target in which sunlight casts shadows.
+# Minimum half width of the square with sunlight shadows, around the target (m).
 _MIN_SHADOW_RANGE = 2.0
 _SUN_HEIGHT = 3.0
 
 
 class OffscreenRenderer:
-    """Draws `cfg.env_idx` and its `cfg.max_extra_envs` nearest neighbours into an image.
+    """Renders `cfg.env_idx` and its `cfg.max_extra_envs` nearest neighbors into an image.
 
-    The renderer draws from a private copy of the model, whose extent is `max(4, 1.5 distance)`:
-    clipping planes and shadows then do not depend on how far apart the environments lie.
+    The renderer uses a private copy of the model with extent `max(4, 1.5 distance)`, so that
+    clipping planes and shadows do not depend on the environment spacing.
     """
 
     def __init__(
@@ -75,19 +75,19 @@ class OffscreenRenderer:
         sim_model: Any | None = None,
         expanded_fields: set[str] | None = None,
     ) -> None:
-        """Prepare; nothing is drawn and no graphics library is touched until `initialize`.
+        """Prepare the model and camera. `initialize` opens the graphics context.
 
         Args:
-            model: The compiled scene.
+            model: Compiled scene.
             cfg: Camera, image size and visibility.
-            scene: The scene, for its entities and environment origins (num_envs, 3).
-            sim_model: Batched model, to draw the randomised fields of each environment. Not
-                needed where `update` gets the `Simulation`, which knows its own.
+            scene: Scene, for its entities and environment origins (num_envs, 3).
+            sim_model: Batched model, to render the randomized fields of each environment. Unused
+                if `update` gets a `Simulation`, because that provides its model.
             expanded_fields: Names of the per-environment fields of `sim_model`.
 
         Raises:
-            ValueError: The number of extra environments is negative, the image has no pixels, or
-                the camera's entity or body does not exist.
+            ValueError: `max_extra_envs` < 0, width or height < 1, or the camera's entity or body
+                does not exist.
         """
         check_count("viewer.max_extra_envs", cfg.max_extra_envs, minimum=0)
         check_count("viewer.width", cfg.width)
@@ -106,9 +106,9 @@ class OffscreenRenderer:
             visual.global_.fovy = self._view.fovy
         visual.global_.offwidth = max(visual.global_.offwidth, cfg.width)
         visual.global_.offheight = max(visual.global_.offheight, cfg.height)
-        # A shadow map much finer than the image costs most of the drawing time where a CPU draws.
-        finest = 1 << int(np.ceil(np.log2(2 * max(cfg.width, cfg.height))))
-        visual.quality.shadowsize = min(visual.quality.shadowsize, finest)
+        # On a CPU, a shadow map much finer than the image dominates the rendering time.
+        max_shadow_size = 1 << int(np.ceil(np.log2(2 * max(cfg.width, cfg.height))))
+        visual.quality.shadowsize = min(visual.quality.shadowsize, max_shadow_size)
         self._data = mujoco.MjData(self._model)
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = cfg.geom_group
@@ -133,11 +133,12 @@ class OffscreenRenderer:
         """Open the graphics context.
 
         Raises:
-            RuntimeError: It is open already.
-            RenderingUnavailableError: This machine cannot render; the text says what to install.
+            RuntimeError: The context is already open.
+            RenderingUnavailableError: This machine cannot render; the message names the packages
+                to install.
         """
         if self._renderer is not None:
-            raise WrongStateError("The offscreen renderer is open already; call close() first.")
+            raise WrongStateError("The offscreen renderer is already open; call close() first.")
         self._renderer = open_renderer(self._model, self._cfg.height, self._cfg.width)
         flags = self._renderer.scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._cfg.enable_shadows
@@ -150,17 +151,16 @@ class OffscreenRenderer:
         debug_vis_callback: Callable[[MujocoNativeDebugVisualizer], None] | None = None,
         camera: str | int | None = None,
     ) -> None:
-        """Take up the present state.
+        """Update the scene to the current state.
 
         Args:
             data: A `Simulation`, its `data`, or a plain `MjData`.
             debug_vis_callback: Called with a visualizer for the primary environment.
-            camera: Name or number of a model camera to look through, instead of the configured
-                view.
+            camera: Name or ID of a model camera to use instead of the configured view.
 
         Raises:
             RuntimeError: `initialize` has not been called.
-            ValueError: There is no camera of that name.
+            ValueError: Unknown camera.
         """
         scene = self.renderer.scene
         origins = self._scene.env_origins
@@ -174,14 +174,14 @@ class OffscreenRenderer:
             self._visualizer.begin(env_idx, show_all_envs=False)
             debug_vis_callback(self._visualizer)
         if self._extra_envs is None:
-            # Chosen once: terrain curricula move origins, and neighbours should not flicker.
+            # Choose neighbors once: terrain curricula move origins, and neighbors would flicker.
             self._extra_envs = nearest_envs(to_numpy(origins), env_idx, self._cfg.max_extra_envs)
         for extra in self._extra_envs:
             self._load(data, extra)
             add_moving_geoms(scene, self._model, self._data, self._option)
 
     def render(self) -> np.ndarray:
-        """The image of the last `update`: (height, width, 3), uint8, rows from the top.
+        """Return the image of the last `update`, rows from the top, uint8, (height, width, 3).
 
         Raises:
             RuntimeError: `initialize` has not been called.
@@ -192,14 +192,14 @@ class OffscreenRenderer:
         return pixels
 
     def close(self) -> None:
-        """Close the graphics context; may be called twice, and `initialize` again after it."""
+        """Close the graphics context. Repeated calls have no effect; `initialize` may follow."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
             self._visualizer = None
 
     def _load(self, data: Any, env_idx: int) -> None:
-        # A simulation is asked anew each time: fields may have been expanded since the last frame.
+        # Read from the simulation at every frame: fields may have been expanded since the last.
         model = getattr(data, "model", self._sim_model)
         fields = getattr(data, "expanded_fields", self._expanded_fields)
         if model is not None and fields:
@@ -225,23 +225,23 @@ class OffscreenRenderer:
 
 
 def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
-    """A renderer for images of (height, width) pixels.
+    """Return a renderer for images of (height, width) pixels.
 
-    MuJoCo chooses its graphics library when it is imported. A program that imports it before
-    mjlab gets one that needs a display; the library named by MUJOCO_GL (on Linux, egl where that
-    is not set) is used here all the same.
+    MuJoCo selects its graphics library on import. A program that imports it before mjlab gets one
+    that needs a display; this function still uses the library named by MUJOCO_GL (on Linux, egl if
+    unset).
 
     Raises:
-        RenderingUnavailableError: No image can be drawn, or none of that size; the text says what to
-            install or change.
+        RenderingUnavailableError: This machine cannot render, or not at that size; the message says
+            what to install or change.
     """
-    # Where a library is missing, PyOpenGL and MuJoCo fail in a dozen ways (ImportError,
-    # AttributeError, FatalError, ...), some of them while being imported. All mean the same.
+    # If a library is missing, PyOpenGL and MuJoCo raise a dozen error types (ImportError,
+    # AttributeError, FatalError, ...), some of them on import. All have the same cause.
     try:
         return _open(model, height, width)
     except Exception as error:
         failure = error
-    # Is it the machine, or the size?
+    # A tiny image tells a machine that cannot render from an image that is too large.
     try:
         small = _open(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
     except Exception:
@@ -250,42 +250,42 @@ def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Rend
         from OpenGL import GL
 
         limit = int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE))
-        most = f" It draws at most {limit} x {limit}, if the memory is enough."
+        limit_hint = f" Its limit is {limit} x {limit}, if memory allows."
     except Exception:
-        most = ""
+        limit_hint = ""
     finally:
         small.close()
     reason = " ".join(str(failure).split())
     raise RenderingUnavailableError(
-        f"The graphics library of this machine cannot draw an image of {width} x {height} pixels "
-        f"({reason}).{most} Choose a smaller width or height; those of clips are "
-        "--video-width and --video-height."
+        f"The graphics library of this machine cannot render an image of {width} x {height} pixels "
+        f"({reason}).{limit_hint} Use a smaller width or height; for clips, --video-width and "
+        "--video-height."
     ) from failure
 
 
 def _open(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
     library = os.environ.get("MUJOCO_GL", "").lower() or "egl"
-    if sys.platform == "linux" and library in _WITHOUT_DISPLAY:
+    if sys.platform == "linux" and library in _HEADLESS_LIBRARIES:
         from mujoco.rendering.classic import gl_context
 
         context = importlib.import_module(f"mujoco.{library}").GLContext
         if getattr(gl_context, "GLContext", None) is not context:
-            # MuJoCo chooses by the variable when this module of it is loaded.
+            # MuJoCo reads the variable when it imports gl_context.
             os.environ["MUJOCO_GL"] = library
             importlib.reload(gl_context)
     return mujoco.Renderer(model, height, width, max_geom=_MAX_GEOMS)
 
 
 class RenderingUnavailableError(MjlabError, RuntimeError):
-    """Raised where an image or a window was asked for and this machine cannot draw one.
+    """Image or window requested on a machine that cannot render.
 
-    Its text is one line that says what failed and what to install, so that a caller can go on
-    without pictures: `except RenderingUnavailableError as error: log.warning("%s", error)`.
+    The message is one line with the failure and the packages to install, so that a caller can
+    continue without images: `except RenderingUnavailableError as error: log.warning("%s", error)`.
     """
 
     @classmethod
     def offscreen(cls, cause: BaseException | str) -> RenderingUnavailableError:
-        """The error for an OpenGL context that could not be made, whatever the library said."""
+        """Return the error for a failure to create an OpenGL context."""
         if graphics.problem is not None:
             return cls(f"Cannot render offscreen: {graphics.problem}. {_INSTALL_HINT}")
         backend = os.environ.get("MUJOCO_GL") or "unset"
@@ -293,31 +293,31 @@ class RenderingUnavailableError(MjlabError, RuntimeError):
         if _NO_EGL in reason:
             reason = "no EGL library or driver was found"
         elif _NO_CONTEXT in reason:
-            reason = "the variable switches rendering off"
+            reason = "the variable disables rendering"
         return cls(
             f"Cannot render offscreen (MUJOCO_GL={backend}): {reason.rstrip('.')}. {_INSTALL_HINT}"
         )
 
 
 def has_sky(model: mujoco.MjModel) -> bool:
-    """Whether the model brings a sky of its own."""
+    """Return True if the model has a skybox."""
     return bool((model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any())
 
 
 def paint_sky(pixels: np.ndarray, renderer: mujoco.Renderer) -> None:
-    """Paint a sky where the image that `renderer` has just drawn shows nothing.
+    """Paint a sky into the empty pixels of the image last drawn by `renderer`.
 
     Args:
-        pixels: The image, (height, width, 3), uint8, rows from the top; written in place.
-        renderer: The renderer, whose buffers still hold the image.
+        pixels: Image, written in place, rows from the top, uint8, (height, width, 3).
+        renderer: Renderer with the image in its buffers.
     """
     depth = np.empty(pixels.shape[:2], dtype=np.float32)
     context = renderer._mjr_context
     mujoco.mjr_readPixels(None, depth, renderer._rect, context)
-    # The buffer is read from the bottom.
+    # Rows of the depth buffer start at the bottom.
     zero_far = context.readDepthMap == mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-    nothing = depth[::-1] == (0.0 if zero_far else 1.0)
-    rows = np.flatnonzero(nothing.any(axis=1))
+    empty = depth[::-1] == (0.0 if zero_far else 1.0)
+    rows = np.flatnonzero(empty.any(axis=1))
     if len(rows) == 0:
         return
     horizon = np.asarray(renderer.model.vis.rgba.haze[:3], dtype=float)
@@ -325,22 +325,22 @@ def paint_sky(pixels: np.ndarray, renderer: mujoco.Renderer) -> None:
     colors = (1.0 - share) * np.array(_ZENITH) + share * horizon
     sky = np.zeros((len(pixels), 1, 3), dtype=np.uint8)
     sky[: rows[-1] + 1, 0] = np.round(255.0 * colors)
-    # See-through shapes, such as ghosts, are drawn over black, and are not in the depths. How much of
-    # what is behind they let through is not known any more; half is what ghosts do.
-    through = nothing & pixels.any(axis=2)
+    # Transparent geoms, such as ghosts, are blended over black and are not in the depth buffer.
+    # Their opacity is lost; assume that of ghosts, 0.5.
+    through = empty & pixels.any(axis=2)
     tinted = np.minimum(pixels.astype(np.uint16) + sky // 2, 255)
-    np.copyto(pixels, sky, where=(nothing & ~through)[:, :, None])
+    np.copyto(pixels, sky, where=(empty & ~through)[:, :, None])
     np.copyto(pixels, tinted.astype(np.uint8), where=through[:, :, None])
 
 
 def prepare_sun(model: mujoco.MjModel, distance: float) -> None:
-    """Make directional lights one sun, whose shadows are near the camera's target, and fine.
+    """Merge directional lights into one sun with sharp shadows near the camera's target.
 
-    A ground and a grid of terrain bring a light each, and under two everything would be white.
+    A ground plane and a terrain grid add a light each, and two lights overexpose the image.
 
     Args:
-        model: A private copy of the model, with its extent set.
-        distance: Distance from the camera to its target, in metres.
+        model: Private copy of the model, with its extent set.
+        distance: Distance from the camera to its target (m).
     """
     suns = np.flatnonzero(_is_directional(model))
     model.light_diffuse[suns] /= max(len(suns), 1)
@@ -349,9 +349,9 @@ def prepare_sun(model: mujoco.MjModel, distance: float) -> None:
 
 
 def move_sun(model: mujoco.MjModel, data: mujoco.MjData, target: np.ndarray) -> None:
-    """Bring directional lights over `target` (3,), so that its shadow follows it.
+    """Place directional lights over `target` (3,), so that its shadow follows it.
 
-    Where such a light stands only decides where it casts shadows.
+    The position of a directional light only determines the area with shadows.
     """
     suns = _is_directional(model)
     data.light_xpos[suns] = target - _SUN_HEIGHT * data.light_xdir[suns]

@@ -1,4 +1,4 @@
-"""Servers of pages: where they listen, and what to open in a browser."""
+"""Viser page servers: address checks, start-up and URL."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_EVERYWHERE = ("0.0.0.0", "::")
+_ALL_INTERFACES = ("0.0.0.0", "::")
 
 
 def check_address(host: str, port: int, prefix: str = "") -> None:
-    """Raise ValueError unless this machine can listen on `host` and `port` is a port.
+    """Raise `ValueError` unless this machine can listen on `host` and `port` is a valid port.
 
-    Viser would wait for ever. A port that is taken is fine: the next free one is used. `prefix` is
-    what the names of the two flags begin with in the message, such as `--`.
+    On an invalid address viser would wait forever. A port in use passes: viser takes the next free
+    one. `prefix` precedes the names of the two flags in the message, e.g. `--`.
     """
     if not 1 <= port <= 65535:
-        raise ValueError(f"{prefix}port is {port}; ports go from 1 to 65535.")
-    # Numbers are not looked up as a name, which can take long.
+        raise ValueError(f"{prefix}port: expected a port in [1, 65535], got {port}.")
+    # Skip the DNS lookup of numeric addresses: it can take long.
     numeric = socket.AI_NUMERICHOST if host.replace(".", "").isdigit() else 0
     try:
         addresses = socket.getaddrinfo(
@@ -39,12 +39,12 @@ def check_address(host: str, port: int, prefix: str = "") -> None:
         reason = getattr(error, "strerror", None) or error
         raise ValueError(
             f"{prefix}host: expected an address of this machine, got {host!r} ({reason}); use "
-            "127.0.0.1, which this machine alone can open, or 0.0.0.0 for the whole network."
+            "127.0.0.1 for this machine only, or 0.0.0.0 for the whole network."
         ) from error
 
 
 def serve_page(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> viser.ViserServer:
-    """Return the server of an empty page; where `port` is taken, it is at the next free one.
+    """Return the server of an empty page, at `port` or the next free one.
 
     Raises:
         ValueError: see `check_address`.
@@ -54,14 +54,14 @@ def serve_page(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> viser.Vise
     check_address(host, port)
     if host not in _LOOPBACK:
         log.warning(
-            "The page is served on %s: everyone who can reach this machine can control it.", host
+            "The page is served on %s: anyone who can reach this machine can control it.", host
         )
     return viser.ViserServer(host=host, port=port, verbose=False)
 
 
 def page_url(server: viser.ViserServer) -> str:
-    """Return where to point a browser on this machine."""
+    """Return the URL of the page for a browser on this machine."""
     host = server.get_host()
-    if host in (*_LOOPBACK, *_EVERYWHERE):
+    if host in (*_LOOPBACK, *_ALL_INTERFACES):
         host = "localhost"
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"

@@ -1,4 +1,4 @@
-"""Where a viewer's camera stands, and what it draws."""
+"""Viewer configuration: camera, image size and visibility."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 
 class OriginType(enum.Enum):
-    """What the camera looks at."""
+    """Camera target."""
 
     AUTO = 1
-    """The first body that can move; the fixed point `lookat` where nothing moves."""
+    """First body that can move; the fixed point `lookat` if all bodies are fixed."""
     WORLD = 2
-    """The fixed point `lookat`."""
+    """Fixed point `lookat`."""
     ASSET_ROOT = 3
-    """The root body of `entity_name`, followed as it moves."""
+    """Root body of `entity_name`; the camera follows it."""
     ASSET_BODY = 4
-    """The body `body_name` of `entity_name`, followed as it moves."""
+    """Body `body_name` of `entity_name`; the camera follows it."""
 
 
 @dataclass(kw_only=True)
@@ -26,39 +26,39 @@ class ViewerConfig:
     OriginType = OriginType
 
     origin_type: OriginType = OriginType.AUTO
-    """What the camera looks at."""
+    """Camera target."""
     height: int = 240
-    """Height of offscreen images, in pixels."""
+    """Height of offscreen images (pixels)."""
     width: int = 320
-    """Width of offscreen images, in pixels."""
+    """Width of offscreen images (pixels)."""
     enable_reflections: bool = True
-    """Whether shiny surfaces mirror the scene."""
+    """Render reflections."""
     enable_shadows: bool = True
-    """Whether lights cast shadows."""
+    """Render shadows."""
     geom_group: tuple[int, int, int, int, int, int] = (1, 1, 1, 0, 0, 0)
-    """Which of the six geom groups are drawn."""
+    """Visibility of the six geom groups."""
     site_group: tuple[int, int, int, int, int, int] = (1, 1, 1, 0, 0, 0)
-    """Which of the six site groups are drawn."""
+    """Visibility of the six site groups."""
     env_idx: int = 0
-    """The environment in view; clamped to those that exist."""
+    """Environment in view, clamped to [0, num_envs - 1]."""
     max_extra_envs: int = 2
-    """How many neighbouring environments are drawn around it."""
+    """Number of neighboring environments to draw."""
     reward_bar_max_terms: int = 20
-    """How many reward terms the browser viewer shows as bars."""
+    """Number of reward terms shown as bars in the browser viewer."""
     distance: float = 5.0
-    """Distance from the camera to what it looks at, in metres."""
+    """Distance from the camera to its target (m)."""
     elevation: float = -45.0
-    """Pitch of the view in degrees; negative looks down from above."""
+    """Elevation of the view (degrees). Negative: looking down."""
     azimuth: float = 90.0
-    """Heading of the view in degrees; 0 looks along +x, 90 along +y."""
+    """Azimuth of the view (degrees). 0 looks along +x, 90 along +y."""
     fovy: float | None = None
-    """Vertical field of view in degrees; None keeps the viewer's own."""
+    """Vertical field of view (degrees). None: the viewer's default."""
     lookat: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """World point to look at, where no body is followed."""
+    """World point to look at if the camera follows no body."""
     entity_name: str | None = None
-    """Entity to follow; may be left out where the scene has exactly one."""
+    """Entity to follow. Optional if the scene has exactly one."""
     body_name: str | None = None
     """Body to follow, without the entity's prefix."""
     camera: str | None = None
-    """Camera of the model whose view to take instead, by its name in the scene
-    (`<entity>/<camera>`); None takes the view that the fields above describe."""
+    """Model camera to use instead of the fields above, by its name in the scene
+    (`<entity>/<camera>`). None: use the fields above."""

@@ -63,8 +63,8 @@ def test_terminations_have_stages_too() -> None:
 @pytest.mark.parametrize(
     ("stages", "error", "message"),
     [
-        ([{"step": 5}, {"step": 4}], ValueError, "4 comes after 5"),
-        ([{"weight": 1.0}], ValueError, "no 'step'"),
+        ([{"step": 5}, {"step": 4}], ValueError, "'term'.*4 after 5"),
+        ([{"weight": 1.0}], ValueError, "'term'.*'step'"),
         ([{"step": 0, "wieght": 1.0}], AttributeError, r"'wieght'.*'weight'"),
         ([{"step": 0, "params": {"sdt": 1.0}}], KeyError, r"'sdt'.*'std'"),
     ],

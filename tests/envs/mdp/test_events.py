@@ -134,7 +134,7 @@ def test_uniform_root_state_turns_about_the_bodys_axes(world: Any) -> None:
 
 
 def test_unknown_range_keys_are_refused(world: Any) -> None:
-    with pytest.raises(ValueError, match=r"unknown keys \['rol'\].*roll"):
+    with pytest.raises(ValueError, match=r"\['rol'\].*'roll'"):
         events.reset_root_state_uniform(world, None, {"rol": (0.0, 1.0)})
 
 
@@ -160,9 +160,9 @@ def test_a_mocap_base_takes_the_pose(make_cart: Any) -> None:
 def test_a_fixed_base_without_mocap_is_refused(world: Any, monkeypatch: Any) -> None:
     entity = type(world.robot)
     monkeypatch.setattr(entity, "is_fixed_base", property(lambda self: True))
-    with pytest.raises(ValueError, match="'robot' is fixed and no mocap body"):
+    with pytest.raises(ValueError, match="mocap base, got 'robot' with a fixed base"):
         events.reset_root_state_uniform(world, None, {})
-    with pytest.raises(ValueError, match="'robot' has a fixed base"):
+    with pytest.raises(ValueError, match="'robot' with a fixed base"):
         events.push_by_setting_velocity(world, None, {})
     before = world.sim.data.qpos[:, :7].clone()
     events.reset_scene_to_default(world, None)

@@ -73,7 +73,7 @@ def test_drawing_defaults_are_those_of_the_interface(make_world: Any) -> None:
     )  # fmt: skip
     assert apply_body_impulse.VizCfg((0.0, 0.0, 1.0, 1.0), 0.1).scale == 0.1
     world = make_world()
-    # Forces of 2 N on each axis, and of 0.5 N, which is below what is drawn.
+    # Forces of 2 N on each axis, and of 0.5 N, below the minimum force to draw.
     for force, count in ((2.0, 4), (0.5, 0)):
         manager = make_term(world, force_range=(force, force))
         run(world, manager, 5)

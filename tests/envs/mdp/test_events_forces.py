@@ -53,7 +53,7 @@ def at_rest(world: Any, link: torch.Tensor) -> None:
 
 
 def accelerations(world: Any, link: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return those of the centre of mass and of the rotation, at rest, in world axes."""
+    """Return those of the center of mass and of the rotation, at rest, in world axes."""
     world.sim.forward()
     qacc = world.sim.data.qacc
     rotation = quat_apply(link, qacc[:, 3:])

@@ -83,7 +83,7 @@ def test_builtin_sensors_only() -> None:
     env: Any = SimpleNamespace(scene={"up": Up(), "rays": SimpleNamespace()})
     assert obs.builtin_sensor(env, "up").tolist() == Up().data.tolist()
     assert torch.equal(obs.projected_gravity_from_sensor(env, "up"), -Up().data)
-    with pytest.raises(TypeError, match="'rays' is a SimpleNamespace, not a BuiltinSensor"):
+    with pytest.raises(TypeError, match="'rays': expected BuiltinSensor, got SimpleNamespace"):
         obs.builtin_sensor(env, "rays")
 
 

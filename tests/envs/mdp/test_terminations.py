@@ -26,7 +26,7 @@ def test_tilt_and_height_of_the_root(make_world: Any) -> None:
 
 
 def test_a_tilt_beyond_what_acos_takes_is_no_nan() -> None:
-    """Rounding makes the cosine of an upright or overturned root slightly more than one."""
+    """Due to rounding, the cosine of an upright or overturned root slightly exceeds 1."""
     down = torch.tensor([[0.0, 0.0, -1.0000002], [0.0, 0.0, 1.0000002], [0.0, 0.6, -0.8]])
     assert torch.acos(-down[:2, 2]).isnan().all()
     data = SimpleNamespace(projected_gravity_b=down.clone())

@@ -1,4 +1,4 @@
-"""Real environments of the manipulation tasks, made small."""
+"""Small environments of the manipulation tasks."""
 
 from __future__ import annotations
 

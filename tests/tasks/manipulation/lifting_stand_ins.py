@@ -1,4 +1,4 @@
-"""Stand-ins for an environment, with just what terms read, so that values are known by hand."""
+"""Stand-ins for an environment, with only the attributes that terms read and known values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ORIGIN_STEP = 3.0
 
 
 class Object:
-    """A thing that is where it was last put, or where a test puts it."""
+    """Object at the pose last written, by the command or by a test."""
 
     def __init__(self, num_envs: int, geom_ids: list[int], is_fixed_base: bool = False) -> None:
         self.is_fixed_base = is_fixed_base
@@ -38,7 +38,7 @@ class Object:
 
 
 class Simulation:
-    """Derives where objects are, as a forward pass does, and notes for which environments."""
+    """Stand-in for `forward`: updates object positions and records the environments."""
 
     def __init__(self, objects: dict[str, Object], num_envs: int, geoms: int) -> None:
         self.objects = objects
@@ -58,7 +58,7 @@ class Simulation:
 
 
 class StandInEnv:
-    """N environments with objects, three metres from one to the next."""
+    """N environments with objects, 3 m apart."""
 
     def __init__(self, num_envs: int = 4, **objects: Object) -> None:
         self.num_envs, self.device, self.step_dt = num_envs, "cpu", 0.02

@@ -1,4 +1,4 @@
-"""The tasks under test, made small."""
+"""Small versions of the tasks under test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm that does as it is told: inverse kinematics on the host, for one environment."""
+"""Scripted arm: inverse kinematics on the host, for one environment."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ScriptedArm:
         self.joints = self.home.copy()
 
     def go(self, position: tuple[float, float, float], grip: float, steps: int, down: bool) -> None:
-        """Go there, with the hand pointing down if asked for, and keep the fingers at `grip`."""
+        """Move to a position, optionally with the hand pointing down, with the fingers at `grip`."""
         start, end = self.joints, self._solve(np.array(position), down)
         for step in range(steps):
             share = min(1.0, (step + 1) / (0.7 * steps))
@@ -48,7 +48,7 @@ class ScriptedArm:
         return joints
 
     def _action(self, joints: np.ndarray, grip: float) -> torch.Tensor:
-        # The springs of the joints are soft, so that weight is commanded away.
+        # Position gains are low, so the command compensates for gravity.
         self._pose(joints)
         stiffness = self.model.actuator_gainprm[:_ARM, 0]
         target = np.append(joints[:_ARM] + self.data.qfrc_bias[:_ARM] / stiffness, grip)

@@ -1,4 +1,4 @@
-"""Lifting commands: what is drawn, when objects move, and what counts as success."""
+"""Lifting commands: sampling, placement of objects, and success."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PoseRange = LiftingCommandCfg.ObjectPoseRangeCfg
 
 
 def started(**fields: Any) -> tuple[StandInEnv, Any]:
-    """Return a stand-in and a command of which all environments have just begun."""
+    """Return a stand-in and a command, both just reset."""
     env, term = lifting_command(**fields)
     term.reset(None)
     env.sim.forward()
@@ -27,13 +27,13 @@ def started(**fields: Any) -> tuple[StandInEnv, Any]:
 
 
 def put(env: StandInEnv, term: Any, *distances: float) -> None:
-    """Put the cubes of the environments so far from their goals."""
+    """Put the cubes at given distances from their goals."""
     where = env.objects["cube"].data.root_link_pos_w
     where.copy_(term.target_pos)
     where[:, 1] += torch.tensor(distances)
 
 
-# Drawing.
+# Sampling.
 
 
 @pytest.mark.parametrize("difficulty", ["dynamic", "fixed"])
@@ -72,7 +72,7 @@ def test_goals_and_objects_are_within_their_ranges_from_the_origin_of_their_envi
         (goal, (0.1, -0.4, 0.5), (0.2, -0.3, 0.5)),
         (position, (-0.2, 0.1, 0.05), (0.0, 0.3, 0.06)),
     ):
-        # Origins of a kilometre cost some digits.
+        # Origins at 1 km cost some digits.
         low, high = torch.tensor(low), torch.tensor(high)
         assert ((values >= low - 2e-4) & (values <= high + 2e-4)).all()
         spread = values.max(dim=0).values - values.min(dim=0).values
@@ -117,7 +117,7 @@ def test_a_new_goal_moves_the_object_and_derives_where_it_is_in_these_environmen
 def test_a_step_without_a_new_goal_and_a_reset_derive_nothing():
     env, term = started()
     term.compute(0.02)
-    # A reset has a forward pass of its own.
+    # A reset calls forward itself.
     term.reset(torch.tensor([0]))
     term.compute(torch.tensor([0.0, 0.02, 0.02, 0.02]))
     assert env.sim.forwarded == []
@@ -220,7 +220,7 @@ def test_an_empty_reset_draws_and_logs_nothing():
     assert torch.equal(torch.get_rng_state(), state)
 
 
-# Drawing for viewers.
+# Visualization.
 
 
 class Board(NullDebugVisualizer):
@@ -244,7 +244,7 @@ def test_a_sphere_marks_the_goal_of_the_environment_in_view():
     assert LiftingCommandCfg.VizCfg().target_color == (1.0, 0.5, 0.0, 0.3)
 
 
-# What is refused.
+# Config errors.
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_a_mistake_in_the_config_is_one_clear_message(fields, message):
 
 def test_an_object_that_cannot_move_is_refused_unless_it_stays():
     env = StandInEnv(cube=Object(4, [0], is_fixed_base=True))
-    with pytest.raises(ValueError, match="'cube' has a fixed base.*free joint"):
+    with pytest.raises(ValueError, match="'cube'.*fixed base.*free joint"):
         lifting_command(env)
     lifting_command(env, object_pose_range=None)
 

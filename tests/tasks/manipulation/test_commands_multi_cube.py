@@ -1,4 +1,4 @@
-"""Commands for one cube out of several: which one, where it is, and that none is in another."""
+"""Multi-cube commands: target selection, placement without overlap, visualization."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DIAGONAL = 0.04 * math.sqrt(3)
 
 
 def started(env: StandInEnv | None = None, **fields: Any) -> tuple[StandInEnv, Any]:
-    """Return a stand-in and a command of which all environments have just begun."""
+    """Return a stand-in and a command, both just reset."""
     env, term = multi_cube_command(env, **fields)
     term.reset(None)
     env.sim.forward()
@@ -35,7 +35,7 @@ def started(env: StandInEnv | None = None, **fields: Any) -> tuple[StandInEnv, A
 
 
 def placed(env: StandInEnv) -> torch.Tensor:
-    """Return where cubes were put, from the origins, (N, K, 3)."""
+    """Return the placed cube positions relative to the origins, (N, K, 3)."""
     poses = torch.stack([one.pose[:, :3] for one in env.objects.values()], dim=1)
     return poses - env.scene.env_origins.unsqueeze(1)
 
@@ -74,7 +74,7 @@ def test_no_cube_is_put_into_another():
     term.reset(None)
     where = placed(env)[..., :2]
     distances = torch.cdist(where, where) + torch.eye(4)
-    # Origins of a kilometre cost some digits.
+    # Origins at 1 km cost some digits.
     assert distances.min() > DIAGONAL - 2e-4
     assert (where >= torch.tensor([0.25, -0.15]) - 2e-4).all()
     assert (where <= torch.tensor([0.40, 0.15]) + 2e-4).all()
@@ -119,7 +119,7 @@ def test_cubes_for_which_there_is_room_are_not_warned_about(caplog):
 
 
 def knobbed_cube():
-    """Return a cube with another geom, which stands off its origin."""
+    """Return a cube with a second geom away from its origin."""
     spec = get_cube_spec()
     box = mujoco.mjtGeom.mjGEOM_BOX
     spec.body("cube").add_geom(type=box, size=(0.01,) * 3, pos=(0.08, 0.0, 0.0))
@@ -152,11 +152,11 @@ def test_variants_of_cubes_are_as_far_apart_as_their_own_sizes_ask(make_env, lar
     gaps = (where[0] - where[1]).norm(dim=1)
     small, large = gaps[0::2], gaps[1::2]
     assert large.min() > 2.0 * radius - 1e-3
-    # Small ones are not kept further apart than they have to be.
+    # Small cubes are kept no further apart than necessary.
     assert DIAGONAL - 1e-3 < small.min() < 0.1
 
 
-# Which cube is wanted.
+# Target selection.
 
 
 def test_every_cube_is_wanted_as_often():
@@ -236,7 +236,7 @@ def test_viewers_show_the_goal_and_mark_the_wanted_cube():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"entity_names": ()}, "entity_names is empty"),
+        ({"entity_names": ()}, r"entity_names: .*got \(\)"),
         ({"entity_names": ("cube_0", "cube")}, "entity_names 'cube'.*'cube_0', 'cube_1'"),
         ({"object_pose_range": PoseRange(x=(1.0, 0.0))}, "object_pose_range.x"),
         ({"difficulty": "hard"}, "difficulty"),

@@ -1,4 +1,4 @@
-"""The handle by which a person drags the goal in the browser."""
+"""Goal panel: drag the goal in the browser."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from page import Page, Widget
 
 
 class Play:
-    """A command with its panel, and the environment in view."""
+    """Command with its panel, and the displayed environment."""
 
     def __init__(self):
         self.env, self.term = lifting_command(difficulty="dynamic")
@@ -61,7 +61,7 @@ def test_dragging_the_handle_moves_the_goal_of_this_environment_only(play):
     assert torch.equal(play.term.command[others], before[others])
     assert play.page.widgets["Hold goal"].value
     assert play.changes == 1
-    # It is not pulled back to where it was while it is dragged.
+    # The handle is not moved back during a drag.
     assert play.handle.position == (ORIGIN_STEP + 0.45, -0.1, 0.35)
 
 
@@ -73,7 +73,7 @@ def test_a_goal_that_is_held_is_neither_redrawn_nor_is_the_object_moved(play):
         play.term.compute(0.5)
     assert play.goal(1) == pytest.approx([0.4, 0.0, 0.3], abs=1e-5)
     assert torch.equal(play.env.objects["cube"].pose[1], pose[1])
-    # The others go on.
+    # Other environments are unaffected.
     assert not torch.equal(play.env.objects["cube"].pose[0], pose[0])
     play.page.widgets["Hold goal"].by_person(value=False)
     for _ in range(30):
@@ -101,7 +101,7 @@ def test_sliders_move_goal_and_handle(play):
 def test_a_handle_that_is_dragged_too_far_comes_back_to_the_end_of_the_sliders(play):
     play.handle.by_person(position=(ORIGIN_STEP + 5.0, 0.0, 0.3))
     play.step()
-    # A decimetre beyond the range that goals are drawn from.
+    # 0.1 m beyond the range of goals.
     assert play.goal(1) == pytest.approx([0.6, 0.0, 0.3], abs=1e-5)
     assert play.handle.position[0] == pytest.approx(ORIGIN_STEP + 0.6)
 

@@ -1,4 +1,4 @@
-"""What the configs of the tasks say beyond their tables."""
+"""Task configs: content beyond their tables."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_play_config_never_ends_draws_goals_every_four_seconds_and_is_not_nois
 # The cubes.
 
 
-def test_a_cube_is_what_the_behaviour_page_says():
+def test_a_cube_is_what_the_behavior_page_says():
     model = get_cube_spec().compile()
     assert [model.body(1).name, model.joint(0).name, model.geom(0).name] == [
         "cube", "cube_joint", "cube_geom",
@@ -120,7 +120,7 @@ def test_a_cube_is_what_the_behaviour_page_says():
     assert geom.friction == pytest.approx([1, 0.005, 0.0001])
 
 
-def test_cubes_have_the_size_the_mass_and_the_colour_that_is_asked_for():
+def test_cubes_have_the_size_the_mass_and_the_color_that_is_asked_for():
     model = get_cube_spec(cube_size=0.03, mass=0.2, rgba=(0.1, 0.2, 0.3, 0.4)).compile()
     assert model.geom(0).size.tolist() == [0.03] * 3
     assert model.body_mass[1] == pytest.approx(0.2)
@@ -128,7 +128,7 @@ def test_cubes_have_the_size_the_mass_and_the_colour_that_is_asked_for():
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_several_cubes_have_colours_around_the_circle(count):
+def test_several_cubes_have_colors_around_the_circle(count):
     cfg = yam_multi_cube_seg_env_cfg(num_cubes=count)
     names = [f"cube_{index}" for index in range(count)]
     assert [name for name in cfg.scene.entities if name != "robot"] == names
@@ -147,7 +147,7 @@ def test_a_kind_of_image_or_a_number_of_cubes_that_there_is_not_is_refused():
         yam_multi_cube_seg_env_cfg(num_cubes=0)
 
 
-def test_every_reset_gives_the_cube_another_colour_where_colour_is_seen(make_env):
+def test_every_reset_gives_the_cube_a_new_color_where_color_is_seen(make_env):
     env = make_env(RGB, num_envs=3)
     env.reset()
     cube = env.scene["cube"].indexing.geom_ids

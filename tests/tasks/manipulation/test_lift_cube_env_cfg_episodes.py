@@ -43,7 +43,7 @@ def test_a_scripted_arm_lifts_the_cube_to_its_goal_and_holds_it_there(make_env):
     assert rate["lift"] > 1.5
 
 
-def test_a_cube_that_nobody_touches_comes_to_rest_on_the_ground(make_env):
+def test_a_cube_that_is_not_touched_comes_to_rest_on_the_ground(make_env):
     env = make_env(num_envs=8)
     env.reset()
     for _ in range(60):
@@ -94,5 +94,5 @@ def test_both_engines_see_the_same_depth():
         images.append(env.step(torch.zeros(3, 7))[0]["camera"].clone())
         env.close()
     difference = (images[0] - images[1]).abs()
-    # Away from edges, of which a pixel may see one side or the other.
+    # Away from edges, since edge pixels may show either side.
     assert (difference < 2e-3).float().mean() > 0.97

@@ -1,4 +1,4 @@
-"""Training and scoring: policies that come with their checkpoints, and what success is."""
+"""Manipulation runner: exported policies and success."""
 
 from __future__ import annotations
 
@@ -107,8 +107,8 @@ def test_evaluations_report_success_errors_and_the_time_at_the_goal(make_env, me
 
 
 def test_a_goal_that_comes_just_before_the_end_costs_no_success(make_env):
-    # Every goal lies where the cube is put; nobody touches it. So each is met until the very last,
-    # which is drawn two steps before the end and lies where the cube will not come to.
+    # Goals are at the start of the untouched cube. All goals are met except the last one,
+    # sampled two steps before the end and out of reach.
     def edit(cfg):
         cfg.episode_length_s = 1.0
         command = cfg.commands["lift_height"]

@@ -1,4 +1,4 @@
-"""Environments of motion tracking, made small and closed in the end."""
+"""Small environments of motion tracking, closed after each test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reference in viewers: the ghost, the slider, the button, and the errors of the bodies."""
+"""Reference in viewers: ghost, slider, start button and body errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mjlab.viewer.viser.viewer import ViserPlayViewer
 
 
 class Board:
-    """A drawing board that writes down what is drawn."""
+    """Debug visualizer that records its calls."""
 
     def __init__(self, *indices: int):
         self.ghosts, self.frames, self._indices = [], [], indices
@@ -47,7 +47,7 @@ def command_of(env):
     return env.command_manager.get_term("motion")
 
 
-def test_the_ghost_is_the_robot_alone_in_one_colour(env):
+def test_the_ghost_is_the_robot_alone_in_one_color(env):
     command, board = command_of(env), Board(1)
     command.drawing.draw(board)
     ((qpos, model, alpha),) = board.ghosts
@@ -77,7 +77,7 @@ def test_ghosts_are_drawn_for_the_environments_in_view_and_may_stand_beside(env)
     nothing = Board()
     command.drawing.draw(nothing)
     assert not nothing.ghosts
-    # The config is no place for what is changed meanwhile.
+    # Interactive changes must not modify the config.
     assert command.cfg.viz.ghost_offset == (0.0, 0.0, 0.0)
 
 
@@ -110,7 +110,7 @@ def test_frames_of_reference_and_robot_can_be_drawn_instead(env):
 
 @pytest.fixture
 def panel(env):
-    """A page with the panel, the environment in view, and what was asked of the viewer."""
+    """Page with the panel, the displayed environment, and the viewer actions requested."""
     page, asked, view = Page(), [], [0]
     command_of(env).create_gui(
         "motion", page, lambda: view[0], lambda: asked.append("redraw"),
@@ -134,7 +134,7 @@ def test_the_slider_follows_the_reference_while_playing(env, panel):
     drawn(env)
     assert panel.page["Motion"].value == "wave"
     assert panel.page["Frame"].max == 260
-    # Nobody moves the reference while it plays.
+    # The slider is inactive while the motion plays.
     panel.page["Frame"].set_by_person(77)
     drawn(env)
     assert command_of(env).time_steps.tolist() == [4, 4, 4]
@@ -146,7 +146,7 @@ def test_the_slider_moves_the_reference_of_the_environment_in_view_while_paused(
     assert not panel.page["Frame"].disabled
     panel.page["Frame"].set_by_person(100)
     assert panel.asked == ["redraw"]
-    # Only when the viewer draws, which is not while a step is computed.
+    # Requests are executed when the viewer draws, not within a step.
     assert command.time_steps.tolist() == [1, 1, 1]
     drawn(env)
     assert command.time_steps.tolist() == [100, 1, 1]
@@ -186,14 +186,14 @@ def test_start_here_puts_robots_exactly_there(env, panel):
     there = command.matching_frame
     assert (there.robot_body_pos_w - there.body_pos_w)[0].abs().max() < 1e-4
     torch.testing.assert_close(command.body_pos_relative_w, command.relative_poses()[0])
-    # The policy acts on what is seen from there, and not from where the reset put the robot.
+    # The policy observes this state, not the state of the reset.
     assert torch.equal(env.get_observations()["actor"][:, :58], command.command)
     seen = env.observation_manager.compute(update_history=True)
     torch.testing.assert_close(env.obs_buf["critic"], seen["critic"])
     drawn(env)
     lines = panel.page["table"].content.splitlines()
     assert {line.split("|")[2].strip() for line in lines[2:]} == {"0.0"}
-    # It was asked for once.
+    # The request is cleared after use.
     assert not env.command_manager.apply_gui_reset(torch.tensor([0]))
 
 
@@ -222,7 +222,7 @@ def test_the_errors_of_the_bodies_are_listed(env, panel):
     panel.page["Frame"].set_by_person(110)
     drawn(env)
     lines = panel.page["table"].content.splitlines()
-    # Half way down, the pelvis of the reference is far below.
+    # Halfway down, the pelvis of the reference is far below.
     assert float(lines[2].split("|")[2]) > 15.0
 
 

@@ -1,4 +1,4 @@
-"""Evaluations: every environment plays a motion once, and errors are of matching times."""
+"""Evaluations: every environment plays a motion once; errors compare matching times."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mjlab.utils.errors import UserError
 
 @pytest.fixture
 def short(tmp_path):
-    """A motion of half a second, in which nobody can fall."""
+    """Motion of 0.5 s, too short to fall."""
     return part_of("wave", slice(0, 25), tmp_path / "short.npz")
 
 
@@ -54,7 +54,7 @@ def test_the_task_measures_these_and_calls_survival_success():
     ]  # fmt: skip
     assert evaluation.success_is_survival
     assert evaluation.prepare_env is play_motions_once
-    # What a training run hands on.
+    # Settings passed by a training run.
     assert asdict(evaluation)["metrics"] == TRACKING_ERRORS
 
 
@@ -87,7 +87,7 @@ def test_several_motions_are_played_by_as_many_environments_each(short, tmp_path
 
 
 class Motions:
-    """Keeps which motion each scored episode plays: `fall` of the robots are thrown over at once."""
+    """Records the motion of each scored episode; `fall` of the robots are thrown over at once."""
 
     def __init__(self, env: ManagerBasedRlEnv, fall: float) -> None:
         self.env, self.fall = env, fall
@@ -96,7 +96,7 @@ class Motions:
     def __call__(self, observations) -> torch.Tensor:
         if self.rounds and not self.rounds[-1]:
             self.rounds[-1] = self.env.command_manager.get_term("motion").motion_ids.tolist()
-        # What makes robots fall at different times, so that they are started differently often.
+        # Robots fall at different times, so the numbers of starts differ.
         return 50.0 * (torch.rand(self.env.num_envs, 1) < self.fall) * torch.ones(1, 29)
 
     def reset(self, dones=None) -> None:
@@ -133,14 +133,14 @@ def test_one_seed_gives_the_same_figures_and_another_one_others(short):
 
 
 def test_errors_are_of_matching_times_and_of_no_state_after_a_reset(tmp_path):
-    """The reference stands still for nine frames and is three metres away in the last one."""
+    """The reference stands still for nine frames and is 3 m away in the last one."""
     places = read_motion(shipped_motions()["wave"]).body_pos_w[:10].copy()
     places[9, :, 0] += 3.0
     path = part_of("wave", slice(0, 10), tmp_path / "jump.npz", body_pos_w=places)
     result = evaluated(path, edit=unperturbed)
     assert result.mean_length == 9
     # The policy acts at frames 0 to 8. Any pair of a state with a frame of another time, or with
-    # one before a reset, has an error of three metres.
+    # one before a reset, has an error of 3 m.
     assert result.metrics["mpkpe"].mean < 0.05
     assert evaluated(path, edit=unperturbed, max_steps=1).metrics["mpkpe"].mean < 1e-4
 
@@ -148,14 +148,14 @@ def test_errors_are_of_matching_times_and_of_no_state_after_a_reset(tmp_path):
 def test_the_command_reports_intervals_as_a_table_and_as_json(short, capsys):
     cfg = EvaluateConfig(agent="zero", num_episodes=5, device="cpu", json=True)
     cfg.options = MotionOptions(motion_file=str(short))
-    figures = run_evaluate(G1, cfg)
+    results = run_evaluate(G1, cfg)
     printed = json.loads(capsys.readouterr().out)
     for name in TRACKING_ERRORS:
         low, high = printed["metrics"][name]["interval"]
         assert low <= printed["metrics"][name]["mean"] <= high
-    assert printed["success_rate"] == figures["success_rate"] == 1.0
+    assert printed["success_rate"] == results["success_rate"] == 1.0
     assert printed["success_interval"][0] > 0.5
-    assert figures["mean_length"] == 24
+    assert results["mean_length"] == 24
     cfg.json = False
     run_evaluate(G1, cfg)
     table = capsys.readouterr().out
@@ -169,7 +169,7 @@ def test_the_script_of_the_interface_writes_its_figures(short, tmp_path, capsys)
         run_evaluate_tracking,
     )
 
-    path = tmp_path / "out" / "figures.json"
+    path = tmp_path / "out" / "metrics.json"
     cfg = EvaluateTrackingConfig(agent="zero", num_envs=3, device="cpu", output_file=str(path))
     cfg.options = MotionOptions(motion_file=str(short))
     means = run_evaluate_tracking(G1, cfg)
@@ -180,7 +180,7 @@ def test_the_script_of_the_interface_writes_its_figures(short, tmp_path, capsys)
     assert len(written["mpkpe_interval"]) == 2
     assert f"mpkpe            {means['mpkpe']:.4f}" in capsys.readouterr().out
     cfg.num_episodes = 20
-    with pytest.raises(UserError, match="plays one episode; give --num-envs 20"):
+    with pytest.raises(UserError, match="got 20; use --num-envs 20"):
         run_evaluate_tracking(G1, cfg)
-    with pytest.raises(ValueError, match="does not track motions"):
+    with pytest.raises(ValueError, match="expected a motion tracking task"):
         run_evaluate_tracking("Mjlab-Cartpole-Balance", cfg)

@@ -1,4 +1,4 @@
-"""Motion files: what is written is read, and what is no motion of the robot is refused in one message."""
+"""Motion files: write and read, and one clear error for files that do not match the robot."""
 
 from __future__ import annotations
 
@@ -82,26 +82,26 @@ def with_long_quaternion() -> np.ndarray:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"joint_vel": None}, r"lacks \['joint_vel'\]; it has .*csv-to-npz"),
+        ({"joint_vel": None}, r"missing \['joint_vel'\].*csv-to-npz"),
         (
             {"body_lin_vel_w": with_nan()},
-            "1 numbers that are NaN or infinite, the first in frame 7",
+            "body_lin_vel_w: .*got 1 .*NaN or infinite.* frame 7",
         ),
-        ({"joint_vel": np.full((10, 29), 1e39)}, "290 numbers that are NaN or infinite.*float32"),
-        ({"fps": np.array([1e39])}, "fps of the motion .* has to be one rate above 0"),
-        ({"body_quat_w": with_long_quaternion()}, "frame 4, body 2 its norm is 1.1"),
-        ({"joint_pos": SQUAT.joint_pos[:9]}, "differ in frames: .*'joint_pos': 9, 'joint_vel': 10"),
-        ({"body_pos_w": SQUAT.body_pos_w[:10, :5]}, "differ in columns: .*'body_pos_w': 5"),
-        ({"joint_pos": SQUAT.joint_pos[0]}, r"shape \(29,\); it has to be \(frames, joints\)"),
-        ({"body_quat_w": SQUAT.body_pos_w[:10]}, r"has to be \(frames, bodies, 4\)"),
-        ({key: getattr(SQUAT, key)[:0] for key in ARRAYS}, "0 frames; it needs at least 2"),
-        ({key: getattr(SQUAT, key)[:1] for key in ARRAYS}, "1 frames; it needs at least 2"),
-        ({"fps": np.array([0.0])}, "fps of the motion .* has to be one rate above 0"),
-        ({"fps": np.array([np.inf])}, "fps of the motion .* has to be one rate above 0"),
-        ({"fps": np.array([50, 60])}, "fps of the motion .* has to be one rate above 0"),
-        ({"joint_pos": np.full((10, 29), "a")}, "holds <U1, and no numbers"),
-        ({"joint_names": np.array(["a", "b"])}, "2 joint_names, and 29 columns in joint_pos"),
-        ({"body_names": np.arange(30)}, "body_names .* has to be a list of texts"),
+        ({"joint_vel": np.full((10, 29), 1e39)}, "float32.*got 290 .*NaN or infinite"),
+        ({"fps": np.array([1e39])}, "fps: expected one .* > 0"),
+        ({"body_quat_w": with_long_quaternion()}, "frame 4, body 2 .* 1.1"),
+        ({"joint_pos": SQUAT.joint_pos[:9]}, "frames, .*'joint_pos': 9, 'joint_vel': 10"),
+        ({"body_pos_w": SQUAT.body_pos_w[:10, :5]}, "columns, .*'body_pos_w': 5"),
+        ({"joint_pos": SQUAT.joint_pos[0]}, r"\(frames, joints\), got \(29,\)"),
+        ({"body_quat_w": SQUAT.body_pos_w[:10]}, r"expected shape \(frames, bodies, 4\)"),
+        ({key: getattr(SQUAT, key)[:0] for key in ARRAYS}, "at least 2 frames, got 0"),
+        ({key: getattr(SQUAT, key)[:1] for key in ARRAYS}, "at least 2 frames, got 1"),
+        ({"fps": np.array([0.0])}, "fps: expected one .* > 0"),
+        ({"fps": np.array([np.inf])}, "fps: expected one .* > 0"),
+        ({"fps": np.array([50, 60])}, "fps: expected one .* > 0"),
+        ({"joint_pos": np.full((10, 29), "a")}, "joint_pos: expected numbers, got <U1"),
+        ({"joint_names": np.array(["a", "b"])}, "joint_names: expected 29 .*joint_pos, got 2"),
+        ({"body_names": np.arange(30)}, "body_names: expected a list of strings"),
     ],
 )
 def test_what_is_no_motion_is_refused(tmp_path, changes, message):
@@ -132,19 +132,19 @@ def test_a_damaged_file_is_refused(tmp_path, content):
 @pytest.mark.parametrize(
     ("joints", "bodies", "dt", "message"),
     [
-        (SQUAT.joint_names[:23], SQUAT.body_names, 0.02, "has 29 joints, and the robot 23"),
-        (SQUAT.joint_names, SQUAT.body_names[1:], 0.02, "has 30 bodies, and the robot 29"),
+        (SQUAT.joint_names[:23], SQUAT.body_names, 0.02, "expected 23 joints, got 29"),
+        (SQUAT.joint_names, SQUAT.body_names[1:], 0.02, "expected 29 bodies, got 30"),
         (
             SQUAT.joint_names[1:] + SQUAT.joint_names[:1], SQUAT.body_names, 0.02,
-            "number 0 is 'left_hip_pitch_joint' in the motion and 'left_hip_roll_joint' in the robot",
+            "joints: .*'left_hip_roll_joint' at index 0, got 'left_hip_pitch_joint'",
         ),
         (
             SQUAT.joint_names, (*SQUAT.body_names[:-1], "hand"), 0.02,
-            "number 29 is 'right_wrist_yaw_link' in the motion and 'hand' in the robot",
+            "bodies: .*'hand' at index 29, got 'right_wrist_yaw_link'",
         ),
         (
             SQUAT.joint_names, SQUAT.body_names, 1 / 30,
-            r"has 50 frames per second, and the task is controlled 30 times .*--output-fps 30",
+            r"fps: expected 30,.* got 50; .*--output-fps 30",
         ),
     ],
 )  # fmt: skip
@@ -186,14 +186,14 @@ def test_bodies_that_a_file_lacks_are_told():
     path = shipped_motions()["wave"]
     assert MotionLoader(path, torch.tensor([0, 29])).body_pos_w.shape == (261, 2, 3)
     for wrong in (30, -1):
-        with pytest.raises(MotionFileError, match=rf"has 30 bodies, and .* indexes \[{wrong}\]"):
+        with pytest.raises(MotionFileError, match=rf"in \[0, 29\], got \[{wrong}\]"):
             MotionLoader(path, torch.tensor([0, wrong]))
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "No motion is named.*side_step, slow_walk, squat"),
+        ("", "motion_file: .*side_step, slow_walk, squat"),
         ("sqat", "'sqat'.*did you mean 'squat'"),
         ("squat,dance.npz", "motion 'dance.npz'"),
     ],
@@ -204,5 +204,5 @@ def test_motions_that_are_not_there_are_told(text, message):
 
 
 def test_a_folder_without_motions_is_told(tmp_path):
-    with pytest.raises(MotionFileError, match="has no motion"):
+    with pytest.raises(MotionFileError, match="expected motions"):
         find_motions(str(tmp_path))

@@ -1,4 +1,4 @@
-"""Drawing start frames: uniformly, or where episodes fail."""
+"""Start frame sampling: uniform and adaptive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mjlab.utils.state import capture_state, restore_state
 
 
 def library(*lengths: int) -> SimpleNamespace:
-    """Return what sampling reads of motions."""
+    """Return a stand-in with the attributes of motions that sampling reads."""
     tensor = torch.tensor(lengths)
     return SimpleNamespace(lengths=tensor, starts=torch.cumsum(tensor, 0) - tensor)
 
@@ -113,14 +113,14 @@ def test_adaptive_draws_come_from_the_likely_bin():
 def test_figures_tell_how_even_the_probabilities_are():
     one = sampler(200)
     even = torch.full((5,), 0.2)
-    entropy, top, _ = one.figures(even)
+    entropy, top, _ = one.statistics(even)
     assert entropy.item() == pytest.approx(1.0, abs=1e-6)
     assert top.item() == pytest.approx(0.2)
     uneven = torch.tensor([0.0, 0.5, 0.0, 0.5, 0.0])
-    entropy, top, where = one.figures(uneven)
+    entropy, top, where = one.statistics(uneven)
     assert entropy.item() == pytest.approx(math.log(2) / math.log(5), abs=1e-6)
     assert where.item() in (pytest.approx(0.2), pytest.approx(0.6))
-    assert sampler(20).figures(torch.ones(1))[0].item() == 1.0
+    assert sampler(20).statistics(torch.ones(1))[0].item() == 1.0
 
 
 def test_statistics_are_run_time_state():

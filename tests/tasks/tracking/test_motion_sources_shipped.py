@@ -1,4 +1,4 @@
-"""The motions that ship with the package: small, whole, and such that a robot could do them."""
+"""Bundled motions: small, complete and feasible for the robot."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mjlab.tasks.tracking.motion_sources import SHIPPED, shipped_motions
 TOOL = Path(__file__).parents[3] / "tools" / "make_motions.py"
 NAMES = ("side_step", "slow_walk", "squat", "turn_in_place", "wave")
 GRAVITY = 9.81
-# Below this height of its sole (m) a foot stands.
+# Height of the sole below which a foot is in stance (m).
 STANDS = 0.002
 
 
@@ -31,7 +31,7 @@ def robot():
 
 
 class Played:
-    """What a motion does: soles and centre of mass in every frame."""
+    """Soles and center of mass of a motion in every frame."""
 
     def __init__(self, name: str) -> None:
         self.motion = read_motion(shipped_motions()[name])
@@ -68,14 +68,14 @@ class Played:
         }
 
     def outside(self, points: np.ndarray) -> np.ndarray:
-        """Return how far points (T, 2) are outside of the area between the soles that stand."""
+        """Return the distance of points (T, 2) outside of the support polygon."""
         hulls = [ConvexHull(area).equations for area in self.points]
         return np.array(
             [(h[:, :2] @ p + h[:, 2]).max() for h, p in zip(hulls, points, strict=True)]
         )
 
-    def centre_of_pressure(self) -> np.ndarray:
-        """Return where the ground's force acts, from how the centre of mass moves, (T, 2)."""
+    def center_of_pressure(self) -> np.ndarray:
+        """Return the center of pressure, from the motion of the center of mass, (T, 2)."""
         dt = 1.0 / self.motion.fps
         acceleration = np.zeros_like(self.com)
         acceleration[1:-1] = np.diff(self.com, 2, axis=0) / dt**2
@@ -123,7 +123,7 @@ def test_feet_that_stand_do_not_slide(played):
         both = (height[1:] < STANDS) & (height[:-1] < STANDS)
         assert both.any()
         moved = np.linalg.norm(np.diff(played.feet[side][:, :2], axis=0), axis=1)[both]
-        # A tenth of a millimetre from one frame to the next.
+        # 0.1 mm from one frame to the next.
         assert moved.max() < 1e-4, side
 
 
@@ -143,13 +143,13 @@ def test_the_robot_does_not_touch_itself(played):
     assert played.self_contacts == 0
 
 
-def test_the_centre_of_mass_stays_above_the_soles(played):
+def test_the_center_of_mass_stays_above_the_soles(played):
     assert played.outside(played.com[:, :2]).max() < 0.0
 
 
 def test_the_force_of_the_ground_stays_within_the_soles(played):
-    outside = played.outside(played.centre_of_pressure())
-    # By a centimetre at least, for what the model leaves out.
+    outside = played.outside(played.center_of_pressure())
+    # Margin of at least 1 cm for unmodeled effects.
     assert outside.max() < -0.01
 
 

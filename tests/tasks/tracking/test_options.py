@@ -1,4 +1,4 @@
-"""Where the motion comes from: flags, Weights & Biases, the run of the policy, or the config."""
+"""Selection of the motion: flags, Weights & Biases, the run of the policy, or the config."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_recorded_motions_in_a_folder_with_a_comma_are_found(tmp_path):
 
 def test_a_run_that_recorded_none_is_told(tmp_path, caplog):
     prepared(MotionOptions(), PolicyOrigin(G1, tmp_path / "model_9.pt"))
-    assert "recorded no motion; squat,wave is taken" in caplog.text
+    assert "no recorded motion; using squat,wave" in caplog.text
 
 
 def test_an_artifact_of_the_registry_is_fetched_in_its_latest_version(wandb, tmp_path):
@@ -173,13 +173,17 @@ def test_a_policy_of_wandb_comes_with_the_motion_that_its_run_uploaded(wandb, tm
 @pytest.mark.parametrize(
     ("options", "origin", "message"),
     [
-        (MotionOptions("squat", "org/a"), CPU_ONLY, "and not both"),
+        (MotionOptions("squat", "org/a"), CPU_ONLY, "got both"),
         (
             MotionOptions(registry_name="org/none"),
             CPU_ONLY,
             "Cannot fetch .*'org/none:latest'.*404",
         ),
-        (MotionOptions(registry_name="org/empty"), CPU_ONLY, "'org/empty:latest' has no motion"),
+        (
+            MotionOptions(registry_name="org/empty"),
+            CPU_ONLY,
+            "'org/empty:latest': expected motions",
+        ),
         (
             MotionOptions(),
             PolicyOrigin(G1, Path("m.pt"), "org/p/none"),

@@ -1,4 +1,4 @@
-"""The actor of the `cpu` profile asks for the reference's pose before it has learned anything."""
+"""Reference actor of the `cpu` profile: targets the reference pose before training."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ACTOR = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"
 
 
 def wanted_actions(runner) -> torch.Tensor:
-    """Return the actions that ask for the pose of the reference, from the terms themselves."""
+    """Return the actions that target the reference pose, computed from the terms."""
     env, command = runner.env.unwrapped, runner.motion_command
     term = env.action_manager.get_term("joint_pos")
     joints = [command.robot.joint_names.index(name) for name in term.target_names]
@@ -44,7 +44,7 @@ def test_the_actor_asks_for_the_reference(make_runner, task, edit):
     actor = runner.alg.get_policy()
     forget_what_is_learned(actor)
     obs = runner.env.get_observations()
-    # Statistics of observations that move must not move what is asked for.
+    # Updates of the observation statistics must not change the target pose.
     for _ in range(3):
         actor.update_normalization(obs)
     torch.testing.assert_close(actor(obs), wanted_actions(runner), atol=1e-4, rtol=1e-4)
@@ -60,7 +60,7 @@ def test_what_is_learned_is_added_and_little_at_first(make_runner):
 def test_training_changes_what_is_learned_alone_and_checkpoints_keep_it(make_runner, tmp_path):
     runner = make_runner(tmp_path / "run", actor=ACTOR)
     actor = runner.alg.get_policy()
-    # Other values than a new runner has by itself, so that they have to come from the checkpoint.
+    # Values that differ from those of a new runner, so that they must come from the checkpoint.
     actor.with_reference.weight.mul_(1.5)
     actor.with_reference.bias.add_(0.25)
     weight = actor.with_reference.weight.clone()
@@ -102,7 +102,7 @@ def scale_by_one_number(cfg) -> None:
 
 
 class OneDevice(TorchDispatchMode):
-    """Refuses what a GPU refuses: operations other than copies on tensors of several devices."""
+    """Raises like a GPU: only copies may mix tensors of several devices."""
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         tensors = [leaf for leaf in tree_leaves(args) if isinstance(leaf, torch.Tensor)]
@@ -118,7 +118,7 @@ def test_actions_may_have_one_scale_and_offset_for_all_joints(make_runner, edit)
     forget_what_is_learned(actor)
     obs = runner.env.get_observations()
     torch.testing.assert_close(actor(obs), wanted_actions(runner), atol=1e-4, rtol=1e-4)
-    # The terms' numbers are brought to the networks' device, where that is another one.
+    # Scale and offset are moved to the device of the networks.
     actor.to("meta")
     with OneDevice():
         actor.follow(runner.env.unwrapped, runner.motion_command)
@@ -126,7 +126,7 @@ def test_actions_may_have_one_scale_and_offset_for_all_joints(make_runner, edit)
 
 @pytest.mark.parametrize("kind", ["HeteroscedasticGaussianDistribution", "BetaDistribution"])
 def test_distributions_that_take_more_than_the_mean_are_refused(make_runner, kind):
-    with pytest.raises(ValueError, match=f"{kind}.* Use 'GaussianDistribution'"):
+    with pytest.raises(ValueError, match=f"{kind}.* use 'GaussianDistribution'"):
         make_runner(actor=ACTOR, distribution={"class_name": kind})
 
 
@@ -147,9 +147,9 @@ def relative_actions(cfg) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (scale_command, "needs the motion command among the actor's observations"),
-        (drop_command, "needs the motion command among the actor's observations"),
-        (relative_actions, "needs one action term, of joint positions"),
+        (scale_command, "observations: expected the motion command"),
+        (drop_command, "observations: expected the motion command"),
+        (relative_actions, "expected one JointPositionAction"),
     ],
 )
 def test_what_cannot_be_followed_is_refused_when_training_is_built(make_runner, edit, message):

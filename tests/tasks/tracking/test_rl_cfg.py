@@ -1,4 +1,4 @@
-"""The `cpu` profile makes motion tracking easier to learn, and not easier to pass."""
+"""`cpu` profile: motion tracking is easier to learn, not easier to pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training: policies with their reference, motions kept with the run, failures not forgotten."""
+"""Motion tracking runner: exports with reference, motions in the run folder, failure statistics."""
 
 from __future__ import annotations
 
@@ -94,11 +94,11 @@ def test_the_exported_policy_is_played_and_scored_as_its_checkpoint_is(make_runn
     part_of("wave", slice(0, 25), folder / "motion" / "short.npz")
     cfg = EvaluateConfig(checkpoint_file=str(folder / "run.onnx"), num_episodes=3, device="cpu")
     cfg.options = MotionOptions(motion_file=str(folder / "motion" / "short.npz"))
-    figures = run_evaluate(G1, cfg)
-    assert figures["mean_length"] == 24
-    assert figures["policy"].endswith("run.onnx")
-    # A robot that is another one to the policy: without state estimation.
-    with pytest.raises(OnnxPolicyError, match="trained for another environment.*observation_names"):
+    results = run_evaluate(G1, cfg)
+    assert results["mean_length"] == 24
+    assert results["policy"].endswith("run.onnx")
+    # Different observations: without state estimation.
+    with pytest.raises(OnnxPolicyError, match="observation_names"):
         run_evaluate(G1_BLIND, cfg)
 
 
@@ -163,7 +163,7 @@ def test_statistics_of_another_motion_are_left_out(make_runner, tmp_path, caplog
     other = make_runner(motion="squat")
     other.load(str(tmp_path / "run" / "model_0.pt"))
     assert other.motion_command.sampler.failed.sum() == 0
-    assert "start anew: they are of 11 segments, and the motions have 5" in caplog.text
+    assert "checkpoint has 11 segments, the motions have 5" in caplog.text
 
 
 def test_a_run_at_wandb_uses_the_artifact_and_uploads_its_motions(
@@ -191,7 +191,7 @@ def test_motions_that_cannot_be_recorded_cost_no_checkpoint(make_runner, tmp_pat
     runner.save(str(tmp_path / "run" / "model_0.pt"))
     assert (tmp_path / "run" / "model_0.pt").is_file()
     assert (tmp_path / "run" / "run.onnx").is_file()
-    assert "The motions were not recorded" in caplog.text
+    assert "Motions not recorded" in caplog.text
 
 
 def test_a_task_without_motion_is_refused():
@@ -200,14 +200,14 @@ def test_a_task_without_motion_is_refused():
     cfg = load_env_cfg("Mjlab-Cartpole-Balance")
     env = ManagerBasedRlEnv(cfg, device="cpu")
     rl_cfg = asdict(load_rl_cfg("Mjlab-Cartpole-Balance"))
-    with pytest.raises(ValueError, match="needs a MotionCommand"):
+    with pytest.raises(ValueError, match="expected a MotionCommand"):
         MotionTrackingOnPolicyRunner(RslRlVecEnvWrapper(env), rl_cfg)
     env.close()
 
 
 @dataclass(kw_only=True)
 class OwnMotionCfg(CommandTermCfg):
-    """The config of a package's own motion command."""
+    """Config of a custom motion command."""
 
     entity_name: str = "robot"
     anchor_body_name: str = "torso_link"
@@ -218,7 +218,7 @@ class OwnMotionCfg(CommandTermCfg):
 
 
 class OwnMotion(CommandTerm):
-    """Another class than `MotionCommand`: its reference is the robot as it stands."""
+    """Custom class: the reference is the current robot state."""
 
     def __init__(self, cfg, env):
         super().__init__(cfg, env)
@@ -285,7 +285,7 @@ def test_any_command_named_motion_trains_with_the_terms_of_tracking(make_runner,
     assert isinstance(runner.motion_command, OwnMotion)
     runner.learn(1)
     env = runner.env.unwrapped
-    # The reference is the robot, as it was when the command was last updated.
+    # The reference is the robot state at the last command update.
     for name in ("motion_body_pos", "motion_body_ori"):
         index = env.reward_manager.active_terms.index(name)
         assert env.reward_manager.get_active_iterable_terms(0)[index][1][0] > 0.0

@@ -1,4 +1,4 @@
-"""Both engines show the policy the same, and reward it the same."""
+"""Both engines give equal observations and rewards."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_rewards_are_the_same_term_by_term(engines):
 
 
 def test_what_is_derived_from_a_state_is_the_same(engines):
-    """Warp takes the very state that native has reached, and sees and judges it alike."""
+    """Warp copies the state of native; observations, rewards and terminations are equal."""
     envs, _, _ = engines
     native, warp = (envs[engine] for engine in ("native", "warp"))
     for name in ("qpos", "qvel", "ctrl"):

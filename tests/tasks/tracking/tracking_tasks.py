@@ -1,4 +1,4 @@
-"""The task under test, made small, and motions with hand-known values."""
+"""Small versions of the task under test, and motions with known values."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def task_cfg(
 
 
 def unperturbed(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Start exactly on the motion, see exactly what is, and be left alone."""
+    """Remove start perturbations, observation noise and events."""
     command = cfg.commands["motion"]
     command.pose_range, command.velocity_range = {}, {}
     command.joint_position_range = (0.0, 0.0)
@@ -48,7 +48,7 @@ def unperturbed(cfg: ManagerBasedRlEnvCfg) -> None:
 
 
 def part_of(name: str, frames: slice, path: Path, **changes: Any) -> Path:
-    """Write a part of a motion that ships with the package, with other values where given."""
+    """Write a part of a bundled motion, with values replaced."""
     motion = read_motion(shipped_motions()[name])
     values = {key: getattr(motion, key) for key in motion.__dataclass_fields__}
     for key, value in values.items():

@@ -1,4 +1,4 @@
-"""Stand-ins for an environment, with just what terms read, so that values are known by hand."""
+"""Stand-ins for an environment with only the data that terms read, for values known by hand."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def yaw_quat(angle: torch.Tensor) -> torch.Tensor:
 
 
 class StandInEnv:
-    """N environments of a robot that is where a test puts it."""
+    """N environments of a robot at a state set by the test."""
 
     def __init__(self, num_envs: int = 2, **sensors: Any) -> None:
         self.num_envs = num_envs

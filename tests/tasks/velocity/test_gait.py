@@ -270,12 +270,12 @@ def test_feet_that_come_closer_or_cross_cost_the_square_of_what_is_missing(make_
     apart = (0.2 - cost[[1, 2]].sqrt()).tolist()
     sites = robot.data.site_pos_w[:, feet.site_ids]
     assert apart[0] == pytest.approx((sites[1, 0] - sites[1, 1]).norm().item(), abs=0.01)
-    # Each doubles the roll, and with it what is missing from the distance of legs that hang.
+    # Each iteration doubles the roll, and with it the shortfall of the distance of hanging legs.
     assert apart[1] < apart[0] - 0.1
 
 
 def test_observation_and_reward_read_one_phase(make_env):
-    """A reward is of the heights and the phase that the policy saw."""
+    """Rewards use the heights and the phase that the policy observed."""
     env = make_env()
     for _ in range(3):
         seen, *_ = env.step(no_action(env))
@@ -409,7 +409,7 @@ def test_joint_deviations_are_weighted_by_pattern(make_env):
     [
         ({".*": 1.0, "kne": 1.0}, "kne"),
         ({".*knee.*": 1.0}, "left_hip_pitch_joint"),
-        ({".*": -1.0}, "at least 0"),
+        ({".*": -1.0}, ">= 0, got"),
     ],
 )
 def test_weights_that_do_not_fit_the_joints_are_refused(make_env, weights, message):

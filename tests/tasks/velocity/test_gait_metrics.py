@@ -1,4 +1,4 @@
-"""Gait metrics against what they are made of."""
+"""Gait metrics against their definitions."""
 
 from __future__ import annotations
 

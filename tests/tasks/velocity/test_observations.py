@@ -1,4 +1,4 @@
-"""Observations of feet, against values known by hand."""
+"""Foot observations against values known by hand."""
 
 from __future__ import annotations
 

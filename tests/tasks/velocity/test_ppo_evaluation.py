@@ -1,4 +1,4 @@
-"""Evaluating twice: the figures depend on the policy and the seed, not on what went before."""
+"""Repeated evaluations: results depend on policy and seed, not on earlier steps."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def test_rounds_and_evaluations_leave_robots_on_the_terrain_where_they_began(mak
     assert kept[0].max() > 0
     levels = {"level": lambda env: terrain.terrain_levels.float()}
     result = score(env, num_episodes=12, metrics=levels)
-    # In the second round they are where they were in the first.
+    # The terrain levels of the second round are those of the first.
     assert result.metrics["level"].mean == pytest.approx(kept[0].float().mean().item())
     now = terrain.terrain_levels, terrain.terrain_types, terrain.env_origins
     for before, after in zip(kept, now, strict=True):
         assert torch.equal(before, after)
-    # In training they do move: nobody got far.
+    # In training, robots that did not get far move down.
     with torch.inference_mode():
         env.step(torch.zeros(6, 12))
         env.reset()

@@ -1,4 +1,4 @@
-"""Rewards about feet, against values known by hand."""
+"""Foot rewards against values known by hand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def heights(*rows: tuple[float, float]) -> Any:
 
 
 def walking(**sensors: Any) -> Any:
-    """Two environments that are told to move and to stand; the middle site is no foot."""
+    """Return two environments, moving and standing. The middle site is not a foot."""
     env: Any = StandInEnv(**sensors).command((0.4, 0.3, -0.1), (0.0, 0.0, 0.04))
     env.data.site_lin_vel_w = torch.tensor(
         [[[0.3, 0.4, 9.0], [7, 7, 7], [0.0, -2.0, 9.0]], [[1.0, 0.0, 0.0], [7, 7, 7], [0, 0, 1.0]]]
@@ -76,7 +76,7 @@ def test_slip_is_the_squared_speed_of_feet_in_contact():
     assert logged(env, "slip_velocity_mean") == pytest.approx((0.5 + 1.0 + 0.0) / 3)
     cost = mdp.feet_slip(env, "feet", "twist", asset_cfg=FEET)
     assert cost.tolist() == pytest.approx([0.25, 1.0])
-    # The live view of the simulation is left as it is.
+    # The live view of the simulation is unchanged.
     assert env.data.site_lin_vel_w[0, 0, 1] == pytest.approx(0.4)
 
 
@@ -138,7 +138,7 @@ def swings(monkeypatch: Any) -> Swings:
 def test_a_swing_costs_how_far_its_peak_was_from_the_target_when_it_lands(swings):
     for height in (0.03, 0.07, 0.05):
         assert swings.step(height, found=0.0) == [0.0, 0.0]
-    # Heights on the ground are no part of the swing.
+    # Heights on the ground do not count as part of the swing.
     assert swings.step(0.2, found=1.0, landed=True) == pytest.approx([0.09, 0.09], abs=1e-6)
     assert logged(swings.env, "peak_height_mean") == pytest.approx(0.07)
     # The next swing starts from nothing.
@@ -150,7 +150,7 @@ def test_a_landing_costs_nothing_where_no_motion_is_commanded(swings):
     swings.env.command((1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     swings.step(0.05, found=0.0)
     assert swings.step(0.0, found=1.0, landed=True) == pytest.approx([0.25, 0.0], abs=1e-6)
-    # It is a landing all the same.
+    # The landing still clears the peaks.
     assert (swings.term.peak_heights == 0.0).all()
 
 
@@ -171,7 +171,7 @@ def test_the_peak_is_cleared_when_an_environment_resets(make_env):
 
 
 def test_a_landing_of_the_robot_is_counted_once(make_env):
-    """A robot that falls onto its feet: each foot lands in one step, whichever substep it is in."""
+    """A robot falls onto its feet: each foot lands in exactly one step, at any substep."""
     env = make_env(num_envs=2)
     env.reset()
     robot = env.scene["robot"]

@@ -122,11 +122,11 @@ def to_sites(cfg: Any) -> None:
 
 
 def test_the_template_of_1_1_builds_steps_and_warns_once_a_term(make_env):
-    with pytest.warns(FutureWarning, match="takes the heights of sites above z = 0") as seen:
+    with pytest.warns(FutureWarning, match="site heights above z = 0") as seen:
         env = make_env(edit=to_sites)
         env.reset()
         observations, *_ = env.step(torch.zeros(env.num_envs, 12))
-    assert len([w for w in seen if "heights of sites" in str(w.message)]) == 3
+    assert len([w for w in seen if "site heights" in str(w.message)]) == 3
     sites, _ = env.scene["robot"].find_sites(("FR", "FL", "RR", "RL"))
     heights = env.scene["robot"].data.site_pos_w[:, sites, 2]
     windows = observations["critic"].unfold(1, 4, 1)

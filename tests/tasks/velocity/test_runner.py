@@ -1,4 +1,4 @@
-"""Training the task: checkpoints that go on exactly, and policies that come with them."""
+"""Velocity runner: exact resume from checkpoints, and export of policies."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_an_export_that_fails_costs_no_checkpoint(make_runner, tmp_path, monkeyp
     ("change", "words"),
     [
         (lambda sim: sim.pop("library"), "native engine before mujoco.batch"),
-        (lambda sim: sim.update(engine="warp"), "warp engine; this one is native"),
+        (lambda sim: sim.update(engine="warp"), "'native', got 'warp'"),
     ],
 )
 def test_a_checkpoint_of_another_engine_gives_weights_but_not_episodes(
@@ -156,6 +156,6 @@ def test_a_checkpoint_of_another_engine_gives_weights_but_not_episodes(
     resumed.learn(3)
     assert resumed.current_learning_iteration == 3
     (warning,) = [record.getMessage() for record in caplog.records if words in record.getMessage()]
-    assert "episodes and random numbers start anew" in warning
+    assert "episodes and random numbers restart" in warning
     policy_only = make_runner(None)
     policy_only.load(str(path), load_cfg={"actor": True})

@@ -1,4 +1,4 @@
-"""The stepping controller: it steps, it does not fall, and it is built for legs that it knows."""
+"""Stepping controller: steps, balance, and rejection of unsupported legs."""
 
 from __future__ import annotations
 

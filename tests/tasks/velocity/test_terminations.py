@@ -37,7 +37,7 @@ def on_terrain(*positions: tuple[float, float], rows: int = 10, cols: int = 7, *
     env: Any = StandInEnv(len(positions))
     xy = torch.tensor(positions)
     env.data.root_link_pos_w = torch.cat((xy, torch.zeros(len(xy), 1)), dim=1)
-    # What the config says is not what was built: a curriculum has a column for each kind.
+    # The grid differs from the config: a curriculum has one column per sub-terrain.
     generator = SimpleNamespace(**{"size": (8.0, 8.0), "border_width": 20.0, "num_cols": 20, **cfg})
     env.scene.terrain = SimpleNamespace(
         terrain_origins=torch.zeros(rows, cols, 3),

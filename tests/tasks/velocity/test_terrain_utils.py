@@ -1,4 +1,4 @@
-"""The normal of the ground: planes known by hand, and a general eigen-solver as reference."""
+"""Terrain normals against known planes and a general eigenvalue solver."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What viewers draw of the velocity tasks, and can switch off."""
+"""Debug visualization of the velocity tasks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mjlab.viewer.debug_visualizer import NullDebugVisualizer
 
 
 class Board(NullDebugVisualizer):
-    """Counts what is drawn, by kind and colour."""
+    """Visualizer that counts drawn shapes by type and color."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ def test_switching_a_sensor_off_hides_what_it_draws_and_nothing_else(env) -> Non
     )
     board, without = Board(), Board()
     env.update_visualizers(board)
-    # A ray at the centre of each foot, and four around it.
+    # A ray at the center of each foot, and four around it.
     assert board.spheres.count(rays) == 4 * 5
     env.sensor_visualizers.set_debug_vis("foot_height_scan", False)
     env.update_visualizers(without)

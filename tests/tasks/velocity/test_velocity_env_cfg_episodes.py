@@ -1,4 +1,4 @@
-"""The tasks as a whole: both engines, encoders, and what goes on after a resume."""
+"""Whole episodes of the tasks: both engines, encoder bias, exact resume."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_number_of_threads_does_not_matter(make_env):
     assert torch.equal(runs[0], runs[1])
 
 
-# What a step logs.
+# Logs of a step.
 
 
 def test_terms_that_are_off_log_nothing_and_the_others_do_at_every_step(make_env):
@@ -72,7 +72,7 @@ def test_actions_see_the_bias_of_the_encoders_as_observations_do(make_env):
     env.reset()
     robot, action = env.scene["robot"], env.action_manager.get_term("joint_pos")
     bias = robot.data.encoder_bias
-    # Drawn at startup: for every joint of every robot another one.
+    # Sampled at startup, per joint and environment.
     assert len(bias.unique()) == bias.numel()
     assert bias.abs().max() <= 0.015
     wanted = torch.rand(2, 12) - 0.5
@@ -83,7 +83,7 @@ def test_actions_see_the_bias_of_the_encoders_as_observations_do(make_env):
     observed = mdp.joint_pos_rel(env, biased=True)
     scale = env.action_manager.get_term("joint_pos")._scale
     torch.testing.assert_close(observed, wanted * scale, atol=1e-6, rtol=1e-5)
-    # It is really elsewhere, which the critic knows.
+    # The critic observes the true positions.
     true = mdp.joint_pos_rel(env)
     torch.testing.assert_close(true, observed - bias, atol=1e-6, rtol=1e-5)
 
@@ -139,7 +139,7 @@ def test_both_engines_give_the_same_rewards_term_by_term(task):
         torch.testing.assert_close(warp[name], value, atol=2e-3, rtol=2e-2, msg=name)
 
 
-# Going on where a run was.
+# Exact resume.
 
 
 def test_terrain_levels_and_command_ranges_go_on_in_another_environment(make_env):
@@ -202,6 +202,6 @@ def test_environments_do_not_go_on_on_another_terrain(make_env):
 
     other = make_env(GO1_ROUGH, edit=edit)
     levels = other.scene.terrain.terrain_levels.clone()
-    with pytest.raises(ValueError, match="another terrain.*resume with the seed"):
+    with pytest.raises(ValueError, match="terrain.*resume with the seed"):
         other.load_state_dict(state)
     assert torch.equal(other.scene.terrain.terrain_levels, levels)

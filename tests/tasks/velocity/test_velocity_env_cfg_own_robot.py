@@ -1,4 +1,4 @@
-"""The example of the documentation: the task for a robot of one's own."""
+"""Documentation example: the velocity task for a custom robot."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PAGE = Path(__file__).resolve().parents[3] / "docs" / "guides" / "velocity.md"
 
 @pytest.fixture
 def example(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Run the code of the page; the Go1 stands for one's own robot."""
+    """Run the code of the page with the Go1 as custom robot."""
     robots: Any = ModuleType("my_robots")
     robots.FEET, robots.TRUNK = ("FR", "FL", "RR", "RL"), "trunk"
     robots.get_my_robot_cfg = get_go1_robot_cfg

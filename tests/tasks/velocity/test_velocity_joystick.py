@@ -82,12 +82,12 @@ def test_who_lets_go_finds_the_command_as_it_went_on_below(page):
     page.widgets["Enable"].set_by_person(True)
     page.widgets["Forward (m/s)"].set_by_person(1.5)
     for _ in range(2):
-        joystick.let_go(command)
+        joystick.restore(command)
         assert torch.equal(command, drawn)
         command[1, 2] = drawn[1, 2] = 0.7  # As heading control does at every step.
         joystick.write_to(command)
         assert command[1, 0] == 1.5
     page.widgets["Enable"].set_by_person(False)
-    joystick.let_go(command)
+    joystick.restore(command)
     joystick.write_to(command)
     assert torch.equal(command, drawn)

@@ -1,4 +1,4 @@
-"""The tasks under test, made small."""
+"""Small versions of the velocity tasks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ GO1_ROUGH = "Mjlab-Velocity-Rough-Unitree-Go1"
 
 
 def task_cfg(task: str = GO1_FLAT, num_envs: int = 4, play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the config of a task with few environments, and a small grid where it has one."""
+    """Return the config of a task with few environments and a small terrain grid, if any."""
     cfg = load_env_cfg(task, play=play)
     cfg.scene.num_envs, cfg.seed, cfg.sim.engine = num_envs, 1, "native"
     cfg.sim.num_threads = 1

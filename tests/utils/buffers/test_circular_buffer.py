@@ -129,14 +129,14 @@ def test_misuse_is_refused():
         lambda: ring[0],
         lambda: ring.backfill(torch.ones(ROWS), torch.tensor([0])),
     ):
-        with pytest.raises(RuntimeError, match="nothing has been appended"):
+        with pytest.raises(RuntimeError, match="empty buffer"):
             use()
-    with pytest.raises(ValueError, match=r"\(4, 1\); its first size must be the batch size 3"):
+    with pytest.raises(ValueError, match=r"size 3 .*got shape \(4, 1\)"):
         ring.append(torch.ones(4, 1))
     ring.append(torch.ones(ROWS, 1))
-    with pytest.raises(ValueError, match=r"shape \(3, 2\); the first one had \(3, 1\)"):
+    with pytest.raises(ValueError, match=r"\(3, 1\).*got \(3, 2\)"):
         ring.append(torch.ones(ROWS, 2))
-    with pytest.raises(ValueError, match=r"lags of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"lags: .*got shape \(2,\)"):
         ring[torch.tensor([0, 1])]
 
 

@@ -235,7 +235,7 @@ def test_values_out_of_range_are_refused(options, message):
 def test_reading_before_the_first_frame_is_refused():
     buffer = DelayBuffer()
     assert not buffer.is_initialized
-    with pytest.raises(RuntimeError, match="nothing has been appended"):
+    with pytest.raises(RuntimeError, match="empty buffer"):
         buffer.compute()
 
 

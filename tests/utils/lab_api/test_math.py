@@ -73,7 +73,7 @@ def test_rotations_agree_with_scipy(seed):
     assert_close(m.quat_apply_inverse(q1, v), r1.inv().apply(v.numpy()))
     product = torch.from_numpy((r1 * r2).as_quat())
     assert_same_rotation(m.quat_mul(q1, q2), m.convert_quat(product, to="wxyz"))
-    # Where the angle is pi both directions of the axis are right, so only angles are compared.
+    # At angle pi, both directions of the axis are valid, so only angles are compared.
     assert_close(m.axis_angle_from_quat(q1).norm(dim=-1), r1.magnitude())
     assert_close(m.quat_error_magnitude(q1, q2), (r1 * r2.inv()).magnitude(), atol=1e-7)
 
@@ -175,12 +175,12 @@ def test_one_quaternion_rotates_many_vectors_and_shapes_are_kept():
 
 @pytest.mark.parametrize(("q", "v"), [((3, 4), (5, 3)), ((2, 4), (2, 2, 3)), ((3, 3), (3, 3))])
 def test_sizes_that_do_not_fit_are_refused(q, v):
-    with pytest.raises(ValueError, match=r"one quaternion for each vector or one for all"):
+    with pytest.raises(ValueError, match=r"one per vector or one for all"):
         m.quat_apply(torch.ones(q), torch.ones(v))
 
 
 def test_products_need_equal_shapes():
-    with pytest.raises(ValueError, match=r"shapes \(3, 4\) and \(1, 4\); they must be equal"):
+    with pytest.raises(ValueError, match=r"equal shapes, got \(3, 4\) and \(1, 4\)"):
         m.quat_mul(torch.ones(3, 4), torch.ones(1, 4))
 
 
@@ -335,7 +335,7 @@ def test_nothing_about_poses_is_left_to_matrix_products():
 
 
 def test_shapes_of_poses_are_checked():
-    with pytest.raises(ValueError, match=r"\(2, 3\) and rotations \(3, 3, 3\)"):
+    with pytest.raises(ValueError, match=r"got \(2, 3\) and \(3, 3, 3\)"):
         m.make_pose(torch.ones(2, 3), torch.ones(3, 3, 3))
     with pytest.raises(ValueError, match=r"\(4, 4\)"):
         m.quat_from_matrix(torch.eye(4))
@@ -375,7 +375,7 @@ def test_interpolated_poses_go_straight():
             m.interpolate_poses(ends[0], ends[1], **options)
 
 
-# Where each convention looks, and where up is.
+# View direction and up axis of each convention.
 LOOKS = {"opengl": ([0, 0, -1], [0, 1, 0]), "ros": ([0, 0, 1], [0, -1, 0])}
 LOOKS["world"] = ([1, 0, 0], [0, 0, 1])
 
@@ -403,8 +403,8 @@ def test_a_camera_looks_at_its_target_upright(up_axis):
     matrix = m.create_rotation_matrix_from_view(eyes, targets, up_axis)
     assert_close(matrix @ matrix.transpose(1, 2), torch.eye(3).double().expand(5, 3, 3), atol=1e-7)
     assert_close(torch.linalg.det(matrix), torch.ones(5).double(), atol=1e-7)
-    towards = m.normalize(targets - eyes)
-    assert_close(-matrix[:, :, 2], towards, atol=1e-7)
+    toward = m.normalize(targets - eyes)
+    assert_close(-matrix[:, :, 2], toward, atol=1e-7)
     assert_close(matrix[1:, :, 0] @ up, torch.zeros(4).double(), atol=1e-7)
     assert (matrix[1:, :, 1] @ up > 0).all()
     with pytest.raises(ValueError, match="'Y', 'Z'"):

@@ -110,10 +110,10 @@ def test_a_restored_model_has_the_bias_of_the_saved_one():
 
 
 def test_missing_configs_are_refused():
-    with pytest.raises(ValueError, match=r"noise_cfg is None"):
+    with pytest.raises(ValueError, match=r"noise_cfg: expected a NoiseCfg, got None"):
         NoiseModel(NoiseModelCfg(noise_cfg=None), 5, "cpu")  # ty: ignore[invalid-argument-type]
     cfg = NoiseModelWithAdditiveBiasCfg(noise_cfg=NO_NOISE)
-    with pytest.raises(ValueError, match=r"bias_noise_cfg is None"):
+    with pytest.raises(ValueError, match=r"bias_noise_cfg: expected a NoiseCfg, got None"):
         cfg.class_type(cfg, 5, "cpu")
 
 

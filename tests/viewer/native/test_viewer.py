@@ -1,4 +1,4 @@
-"""The native window's parts that need no window."""
+"""Native viewer, without a window."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_without_a_display_the_error_names_the_browser_viewer(monkeypatch) -> No
         NativeMujocoViewer(FakeEnv(1), push()).run()
 
 
-def test_the_environment_in_view_wraps_around_and_its_plots_start_anew() -> None:
+def test_the_environment_in_view_wraps_around_and_clears_its_plots() -> None:
     viewer = NativeMujocoViewer(FakeEnv(3), push())
     viewer.step_simulation()
     viewer.request_action("prev_env")
@@ -54,13 +54,13 @@ def test_the_environment_in_view_wraps_around_and_its_plots_start_anew() -> None
     assert viewer.env_idx == 0
 
 
-def test_all_extra_drawing_honours_the_number_of_extra_environments() -> None:
+def test_all_extra_drawing_honors_the_number_of_extra_environments() -> None:
     env = FakeEnv(6, ViewerConfig(max_extra_envs=2))
     viewer = NativeMujocoViewer(env, push())
     scene = mujoco.MjvScene(env.sim.mj_model, maxgeom=1000)
     viewer._load_selected()
-    viewer._draw_neighbours(scene)
-    assert scene.ngeom == 2 * 2  # Cart and pole of two neighbours.
+    viewer._draw_neighbors(scene)
+    assert scene.ngeom == 2 * 2  # Cart and pole of two neighbors.
 
 
 def test_the_marker_hangs_over_the_followed_body() -> None:
@@ -85,7 +85,7 @@ def test_key_codes_are_those_of_glfw() -> None:
 
 
 class TestDebugDrawing:
-    """Overridable hooks: `_update_debug_visualizers` and `_show_debug_vis`."""
+    """Hooks for subclasses: `_update_debug_visualizers` and `_show_debug_vis`."""
 
     @pytest.fixture(autouse=True)
     def _setup(self) -> None:
@@ -152,7 +152,7 @@ def test_the_model_and_the_state_in_view_are_there_for_subclasses() -> None:
 
 
 class TestMousePush:
-    """Mouse forces and those that the task applies itself."""
+    """Mouse forces combined with forces of the task."""
 
     @pytest.fixture(autouse=True)
     def _setup(self) -> None:
@@ -175,7 +175,7 @@ class TestMousePush:
         self.push.apply(self.sim, 0, self.data, self.perturb)
         assert self.forces[0, 0] > 0.1
         assert not self.forces[1].any()
-        assert (self.data.xfrc_applied[3] == 7.0).all()  # The task's own wrench.
+        assert (self.data.xfrc_applied[3] == 7.0).all()  # Wrench of the task.
 
     def test_the_tasks_own_force_is_added_to_and_comes_back_when_the_push_ends(self) -> None:
         self.forces[0] = torch.tensor([2.0, -3.0])
@@ -203,7 +203,7 @@ class TestMousePush:
 
 
 class TestRewardPlots:
-    """Curves over the window."""
+    """Reward plots in the window."""
 
     def test_the_range_leaves_outliers_out_and_pads_by_a_quarter(self) -> None:
         values = np.linspace(1.0, 2.0, 101)

@@ -43,7 +43,7 @@ def eye(name: str = "eye", camera: str = "room/down", **changes) -> CameraSensor
 
 def test_the_images_are_those_of_the_selected_environment(viser_server) -> None:
     sim, scene, feeds, _ = feeds_of(viser_server, eye())
-    # In the second environment a ball is right before the camera.
+    # In the second environment a ball is close to the camera.
     pose = torch.tensor([[0.0, 0.0, 0.5, 1, 0, 0, 0], [0.0, 0.0, 2.9, 1, 0, 0, 0]])
     scene["ball"].write_root_link_pose_to_sim(pose)
     sense(sim)
@@ -79,7 +79,7 @@ def test_the_frustum_stands_where_the_camera_is_and_can_be_hidden(viser_server) 
     feeds.update(sim.data, 0, np.array([1.0, 0.0, 0.0]))
     frustum = feed._frustum
     np.testing.assert_allclose(frustum.position, [1.0, 0.0, 3.0])
-    # It looks along its z axis, and the camera looks down.
+    # The frustum looks along its z axis, and the camera looks down.
     w, x, y, z = frustum.wxyz
     forward = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
     np.testing.assert_allclose(forward, [0.0, 0.0, -1.0], atol=1e-6)
@@ -113,14 +113,14 @@ def test_depth_grows_lighter_and_nothing_is_white() -> None:
     assert depth_colors(depth, 2.0)[0, :, 0].tolist() == [255, 63, 127, 255]
 
 
-def test_objects_have_colours_of_their_own_and_the_background_is_black() -> None:
+def test_objects_have_colors_of_their_own_and_the_background_is_black() -> None:
     ids = np.arange(-1, 100)
     objects = np.stack((ids, np.where(ids < 0, -1, 5)), axis=-1)[None]
     colors = segmentation_colors(objects)[0]
     assert colors[0].tolist() == [0, 0, 0]
     assert colors[1:].min() >= 64
     assert len(np.unique(colors[1:], axis=0)) == 100
-    # Neighbouring ids are told apart by eye.
+    # Colors of neighboring IDs differ visibly.
     step = np.abs(colors[2:].astype(int) - colors[1:-1].astype(int)).max(axis=1)
     assert np.median(step) > 40
 

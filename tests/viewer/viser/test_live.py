@@ -1,4 +1,4 @@
-"""The browser viewer of a policy that is still learning."""
+"""Browser viewer of a policy in training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STATS = {
 
 
 class Page:
-    """A page's server, whose browsers come and go as the test says."""
+    """Page server with browsers connected and disconnected by the test."""
 
     def __init__(self, server):
         self._server = server
@@ -47,7 +47,7 @@ def make(page: Page, take_stats=lambda: None) -> tuple[LiveViewer, list[bool]]:
     return viewer, watched
 
 
-def test_nothing_is_stepped_drawn_or_loaded_while_nobody_watches(page) -> None:
+def test_nothing_is_stepped_drawn_or_loaded_without_a_browser(page) -> None:
     taken = []
     viewer, watched = make(page, lambda: taken.append(1))
     drawn = []
@@ -62,7 +62,7 @@ def test_nothing_is_stepped_drawn_or_loaded_while_nobody_watches(page) -> None:
 def test_it_plays_while_a_browser_is_connected_and_does_not_catch_up(page) -> None:
     viewer, watched = make(page)
     viewer.tick()
-    # A long time passes without a browser.
+    # Long time without a browser.
     viewer._last_tick -= 1000.0
     viewer.tick()
     page.clients = {0: object()}
@@ -83,7 +83,7 @@ def test_the_page_says_how_far_training_has_got(page) -> None:
     viewer.tick()
     for part in ("A task", "30 of 120", "width:25.0%", "421 steps", "15,321 steps/s", "1:02:05"):
         assert part in viewer._panel.content
-    # Figures stay until there are newer ones.
+    # Values stay until newer ones arrive.
     viewer.tick()
     assert "30 of 120" in viewer._panel.content
 

@@ -1,4 +1,4 @@
-"""Overlays of the browser viewer, driven as another viewer would."""
+"""Overlays of the browser viewer, driven by another viewer."""
 
 from __future__ import annotations
 

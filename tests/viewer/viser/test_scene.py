@@ -1,4 +1,4 @@
-"""The scene of the browser viewer, used without a viewer around it."""
+"""Scene of the browser viewer, without the viewer."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_the_camera_is_placed_by_the_scenes_controls(viser_server, env) -> None:
 
 
 class TestReleases11And12:
-    """`ViserMujocoScene` was a class with a factory, in an own `conversions` module's company."""
+    """Former interface: `ViserMujocoScene` with a factory, and module `conversions`."""
 
     @pytest.fixture(autouse=True)
     def _forget_warnings(self) -> None:
@@ -194,6 +194,6 @@ class TestReleases11And12:
         model = spec.compile()
         mesh = mujoco_mesh_to_trimesh(model, 0, verbose=True)
         assert mesh.volume == pytest.approx(1.0 / 6.0, rel=1e-4)
-        with pytest.warns(FutureWarning, match="older name"):
+        with pytest.warns(FutureWarning, match="deprecated"):
             assert is_fixed_body(model, 0)
             assert rotation_quat_from_vectors((0, 0, 1), (0, 0, 1)).tolist() == [1, 0, 0, 0]

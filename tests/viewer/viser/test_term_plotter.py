@@ -1,4 +1,4 @@
-"""Curves of terms."""
+"""Plots of terms."""
 
 from __future__ import annotations
 

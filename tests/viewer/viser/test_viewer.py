@@ -1,4 +1,4 @@
-"""The browser viewer, without a browser."""
+"""Browser viewer, without a browser."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_serving_the_network_is_possible_and_warned_about(monkeypatch, caplog) -
 def test_a_camera_that_looks_down_starts_above_what_it_follows(viser_server) -> None:
     make(viser_server, elevation=-45.0, azimuth=90.0, distance=2.0, fovy=33.0)
     camera = viser_server.initial_camera
-    # The scene is moved so that the followed body is at the origin.
+    # The scene moves so that the followed body is at the origin.
     np.testing.assert_allclose(camera.look_at, 0.0)
     np.testing.assert_allclose(camera.position, [0, -np.sqrt(2), np.sqrt(2)], atol=1e-9)
     assert camera.fov == pytest.approx(np.deg2rad(33.0))
@@ -124,7 +124,7 @@ def test_what_is_drawn_is_a_copy_taken_between_steps(viser_server) -> None:
     rows = viewer.env.sim.data
 
     class Live:
-        """Fields that the simulation goes on writing into."""
+        """Fields that the simulation keeps writing."""
 
         data = rows
         copy_to_host = None
@@ -141,7 +141,7 @@ def test_controls_only_ask_for_a_redraw_and_never_draw_themselves(viser_server) 
     assert not viewer._update_reasons
     drawn = []
     viewer.scene._update_visualization_locked = lambda *_: drawn.append(1)
-    viewer.scene.request_update()  # What mjviser's own controls call.
+    viewer.scene.request_update()  # Called by mjviser's controls.
     assert viewer._update_reasons == {UpdateReason.SCENE_REQUEST}
     assert not drawn
     show(viewer)
@@ -206,7 +206,7 @@ def test_the_status_says_when_the_machine_is_too_slow() -> None:
 
 
 class TestCheckpoints:
-    """Choosing another policy while the viewer runs."""
+    """Selection of another policy while the viewer runs."""
 
     @pytest.fixture
     def folder(self, tmp_path: Path) -> Path:
@@ -217,7 +217,7 @@ class TestCheckpoints:
 
     def test_files_are_sorted_by_number_and_labelled_with_their_age(self, folder) -> None:
         os.utime(folder / "model_50.pt", (time.time() - 300, time.time() - 300))
-        # Of runs that learn from a replay.
+        # Replay buffer of an off-policy run.
         (folder / "replay_model_1000.pt").touch()
         source = local_checkpoints(folder, lambda path: push())
         listed = source.fetch_available()
@@ -319,7 +319,7 @@ def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
     scene.update(env.sim)
     shapes = list(scene._variants._shapes.values())
     assert [(shape.envs, len(shape.bodies)) for shape in shapes] == [([0, 1], 2), ([2], 1)]
-    assert len(scene._mesh_groups) == batches - 1  # The pole is still mjviser's.
+    assert len(scene._mesh_groups) == batches - 1  # mjviser still draws the pole.
     np.testing.assert_allclose(shapes[1].handle.batched_positions, [[0, 0, 1]])
     # Equal again: one shape for all.
     size[2, cart] = size[0, cart]
@@ -336,7 +336,7 @@ def test_a_shape_that_differs_is_found_behind_others_that_do_not(viser_server) -
     rgba[1, pole, :3] = 0.9
     env.sim.expand("geom_rgba", rgba)
     scene = MjlabViserScene(viser_server, model, 2, env.sim.model, env.sim.expanded_fields)
-    # Its batch is the last one.
+    # Sort the batch of the pole last.
     scene._mesh_groups.sort(key=lambda batch: model.geom_bodyid[pole] in batch.body_ids)
     assert len(scene._mesh_groups) > 1
     scene.update(env.sim)

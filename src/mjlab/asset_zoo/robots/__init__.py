@@ -1,6 +1,6 @@
-"""Configs of the robots that come with the library.
+"""Robot configs.
 
-The names are loaded on first use, so that a task pays for its own robot alone.
+Names are imported on first use, so that a task loads only its robot.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Position actuators from the figures of the motors that move the joints.
+"""Position actuators from motor parameters.
 
-A position actuator is a spring and a damper towards the commanded angle. Its gains follow from the
-inertia I that the motor has at the joint, as if the joint carried nothing else:
+A position actuator is a spring and damper toward the position target. Its gains follow from the
+reflected inertia I of the motor, neglecting the inertia of the links:
 
     stiffness = I w^2,  damping = 2 z I w,
 
-with the natural frequency w (`NATURAL_FREQ`) and the damping ratio z (`DAMPING_RATIO`). Torques are
-in N m, angles in rad, inertias in kg m^2.
+with natural frequency w (`NATURAL_FREQ`) and damping ratio z (`DAMPING_RATIO`). Units: N m, rad,
+kg m^2.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.utils.actuator import ElectricActuator
 
 NATURAL_FREQ = 10 * 2.0 * 3.1415926535
-"""Natural frequency of the joints, 10 Hz in rad/s. (Policies are trained with pi as it is here.)"""
+"""Natural frequency of the joints, 10 Hz (rad/s). Trained policies rely on this rounding of pi."""
 DAMPING_RATIO = 2.0
-"""Damping ratio of the joints; more than 1 creeps towards the target and never overshoots."""
+"""Damping ratio of the joints. Above 1: overdamped, no overshoot."""
 
 
 def position_actuator(
     motor: ElectricActuator, joints: tuple[str, ...], motors: int = 1
 ) -> BuiltinPositionActuatorCfg:
-    """Return the actuator of `joints` (patterns), each of which `motors` equal motors move."""
+    """Return the actuator of `joints` (patterns), with `motors` equal motors per joint."""
     stiffness, damping = gains(motor.reflected_inertia)
     return BuiltinPositionActuatorCfg(
         target_names_expr=joints,
@@ -37,14 +37,14 @@ def position_actuator(
 
 
 def gains(inertia: float, natural_freq: float = NATURAL_FREQ) -> tuple[float, float]:
-    """Return stiffness, N m/rad, and damping, N m s/rad, for an inertia at the joint."""
+    """Return stiffness (N m/rad) and damping (N m s/rad) for an inertia at the joint."""
     return inertia * natural_freq**2, 2.0 * DAMPING_RATIO * inertia * natural_freq
 
 
 def action_scale(actuators: Iterable[BuiltinPositionActuatorCfg]) -> dict[str, float]:
-    """Return the scale of joint position actions by joint pattern, rad per unit of action.
+    """Return the scale of joint position actions (rad per unit action), by joint pattern.
 
-    An action of one is a quarter of the angle at which the spring alone gives the effort limit.
+    A unit action is a quarter of the position error effort_limit / stiffness.
     """
     return {
         pattern: 0.25 * actuator.effort_limit / actuator.stiffness

@@ -1,4 +1,4 @@
-"""Curriculum terms that change a term's config at given numbers of environment steps."""
+"""Curriculum terms: change a term's config in stages, by number of environment steps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = [
 
 
 class RewardCurriculumStage(TypedDict, total=False):
-    """What changes from a number of environment steps on."""
+    """Stage of a reward curriculum: changes from a number of environment steps on."""
 
     step: int
     """First `common_step_counter` of the stage; required."""
@@ -35,18 +35,18 @@ class RewardCurriculumStage(TypedDict, total=False):
 
 
 class TerminationCurriculumStage(TypedDict, total=False):
-    """What changes from a number of environment steps on."""
+    """Stage of a termination curriculum: changes from a number of environment steps on."""
 
     step: int
     """First `common_step_counter` of the stage; required."""
     time_out: bool
-    """Whether the termination term counts as a time-out."""
+    """Count the termination term as a time-out."""
     params: dict[str, Any]
     """New values of parameters that the term already has."""
 
 
 class _StagedCurriculum:
-    """Applies stages, in order, to the live config of a term."""
+    """Curriculum that applies stages, in order, to the live config of a term."""
 
     _kind = ""
 
@@ -57,11 +57,11 @@ class _StagedCurriculum:
         previous = None
         for stage in stages:
             if "step" not in stage:
-                raise ValueError(f"Curriculum of {owner}: the stage {stage!r} has no 'step'.")
+                raise ValueError(f"Curriculum of {owner}: expected key 'step' in stage {stage!r}.")
             if previous is not None and stage["step"] < previous:
                 raise ValueError(
-                    f"Curriculum of {owner}: stages must be in order of their steps, but {stage['step']} comes "
-                    f"after {previous}."
+                    f"Curriculum of {owner}: expected stages in ascending order of step, got "
+                    f"{stage['step']} after {previous}."
                 )
             previous = stage["step"]
             for field in _fields(stage):
@@ -92,17 +92,17 @@ class _StagedCurriculum:
 
 
 class reward_curriculum(_StagedCurriculum):
-    """Changes weight and parameters of a reward term, stage by stage.
+    """Changes weight and parameters of a reward term in stages.
 
     Params:
         reward_name: Name of the reward term.
-        stages: Dicts with `step` and what changes from that number of environment steps on:
-            fields of the term's config (`weight`) and `params`. Later stages win.
+        stages: Dicts with `step`, fields of the term's config (`weight`) and `params`, applied from
+            that number of environment steps on. Later stages take precedence.
 
-    Returns, for logging, the current value of every field and parameter that any stage names.
+    Returns the current value of every field and parameter in the stages, for logging.
 
-    Raises, when built: `ValueError` for an unknown term or steps that decrease, `AttributeError`
-    for fields that the config does not have, `KeyError` for parameters that the term does not have.
+    Raises at construction: `ValueError` for an unknown term or decreasing steps, `AttributeError`
+    for unknown fields of the config, `KeyError` for unknown parameters of the term.
     """
 
     _kind = "reward"
@@ -118,9 +118,9 @@ class reward_curriculum(_StagedCurriculum):
 
 
 class termination_curriculum(_StagedCurriculum):
-    """Changes `time_out` and parameters of a termination term, stage by stage.
+    """Changes `time_out` and parameters of a termination term in stages.
 
-    As `reward_curriculum`, with `termination_name` for the name of the term.
+    Parameters as in `reward_curriculum`, with `termination_name` as the name of the term.
     """
 
     _kind = "termination"

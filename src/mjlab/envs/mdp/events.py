@@ -1,8 +1,7 @@
 """Event terms other than domain randomization (`mjlab.envs.mdp.dr`): resets, pushes, forces.
 
-Ranges over poses and twists are dicts with the keys x, y, z, roll, pitch, yaw; missing keys are
-(0, 0). States are written to `qpos` and `qvel`: what derives from them is stale until the next
-`forward`.
+Ranges over poses and twists are dicts with keys x, y, z, roll, pitch, yaw; missing keys are (0, 0).
+States are written to `qpos` and `qvel`: derived quantities are stale until the next `forward`.
 """
 
 from __future__ import annotations
@@ -48,18 +47,18 @@ _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 _SE3_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 Se3Ranges = dict[str, tuple[float, float]]
 
-# Timers of impulses are sums of float32 time steps: without a margin an impulse of exactly k steps
-# would last k or k + 1 steps depending on rounding.
+# Impulse timers are sums of float32 timesteps: without a margin an impulse of exactly k steps would
+# last k or k + 1 steps, depending on rounding.
 _TIME_MARGIN = 1e-6
 
 __getattr__ = older_names(__name__)
 
 
 def reset_scene_to_default(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None) -> None:
-    """Put every entity into its default state.
+    """Reset all entities to their default state.
 
-    Floating bases and mocap bases go to their default pose plus the environment's origin; other
-    fixed bases stay where they are.
+    Floating and mocap bases are reset to their default pose plus the environment's origin; other
+    fixed bases do not move.
     """
     ids = resolve_env_ids(env, env_ids)
     for entity in env.scene.entities.values():
@@ -84,13 +83,13 @@ def reset_root_state_uniform(
     velocity_range: Se3Ranges | None = None,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> None:
-    """Put the root at its default state plus a uniform sample and the environment's origin.
+    """Reset the root to its default state plus a uniform sample and the environment's origin.
 
-    The orientation is `default * Rz(yaw) Ry(pitch) Rx(roll)`, a turn about the body's axes. The
-    velocity (linear at the link's origin, angular) is in world axes. A mocap base takes the pose.
+    The orientation is `default * Rz(yaw) Ry(pitch) Rx(roll)`, a rotation about body axes. The
+    velocity (linear at the link origin, angular) is in world axes. A mocap base takes only the pose.
 
     Raises:
-        ValueError: the base is fixed and no mocap body, or a range has an unknown key.
+        ValueError: the base is fixed and not a mocap body, or a range has an unknown key.
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
@@ -109,14 +108,14 @@ def reset_root_state_from_flat_patches(
     velocity_range: Se3Ranges | None = None,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> None:
-    """Put the root on a random flat patch of the environment's terrain cell.
+    """Reset the root onto a random flat patch of the environment's terrain cell.
 
-    Position: the patch plus a uniform sample, and in z also the default height. Orientation and
-    velocity are those of `reset_root_state_uniform`, which is used as it is where the terrain has
-    no patches of that name.
+    Position: the patch plus a uniform sample, plus the default height in z. Orientation and
+    velocity as in `reset_root_state_uniform`, the fallback for terrains without patches called
+    `patch_name`.
 
     Raises:
-        ValueError: the base is fixed and no mocap body, or a range has an unknown key.
+        ValueError: the base is fixed and not a mocap body, or a range has an unknown key.
     """
     pose_range = pose_range or {}
     terrain = env.scene.terrain
@@ -143,7 +142,7 @@ def reset_joints_by_offset(
     velocity_range: tuple[float, float],
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> None:
-    """Put joints at their defaults plus uniform offsets; positions stay within the soft limits.
+    """Reset joints to their defaults plus uniform offsets, clamped to the soft position limits.
 
     Args:
         position_range: Bounds of the position offset (rad or m).
@@ -162,9 +161,10 @@ def reset_joints_by_offset(
 
 
 def randomize_terrain(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None) -> None:
-    """Move environments to a random row and column of a generated terrain; else nothing.
+    """Move environments to a random row and column of a generated terrain.
 
-    Place this before the terms that write root states, which read the new origins.
+    Does nothing without a terrain. Place this term before terms that write root states, because
+    those read the new origins.
     """
     if env.scene.terrain is not None:
         env.scene.terrain.randomize_env_origins(resolve_env_ids(env, env_ids))
@@ -178,8 +178,8 @@ def push_by_setting_velocity(
 ) -> None:
     """Add a uniform sample to the root's velocity: linear (m/s) and angular (rad/s), world axes.
 
-    The sample is added to `qvel`, the velocity that the last substep ended with, so that a push
-    changes the velocity by the sample and by nothing else.
+    The sample is added to `qvel`, the velocity at the end of the last substep, so that a push
+    changes the velocity by exactly the sample.
 
     Raises:
         ValueError: the base is fixed, or the range has an unknown key.
@@ -188,12 +188,12 @@ def push_by_setting_velocity(
     asset: Entity = env.scene[asset_cfg.name]
     if asset.is_fixed_base:
         raise ValueError(
-            f"push_by_setting_velocity: entity {asset_cfg.name!r} has a fixed base, which has no "
-            "velocity to change. Select an entity with a free joint."
+            f"push_by_setting_velocity: expected an entity with a free joint, got {asset_cfg.name!r} "
+            "with a fixed base."
         )
     change = _sample_se3_range(velocity_range, (len(ids), 6), env.device)
     indexing, sim_data = asset.data.indexing, env.sim.data
-    # The angular part of a free joint's velocity is in the body's frame.
+    # The angular velocity of a free joint is in the body frame.
     quat = sim_data.qpos[ids[:, None], indexing.free_joint_q_adr[3:7]]
     change[:, 3:] = quat_apply_inverse(quat, change[:, 3:])
     sim_data.qvel[ids[:, None], indexing.free_joint_v_adr] += change
@@ -206,9 +206,9 @@ def apply_external_force_torque(
     torque_range: tuple[float, float],
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> None:
-    """Apply a force (N) and a torque (N m) to bodies, each component uniform, in world axes.
+    """Apply a uniformly sampled force (N) and torque (N m), world axes, to bodies.
 
-    They act at the bodies' centres of mass until they are overwritten or the environment resets.
+    The wrench acts at the bodies' centers of mass until it is overwritten or the environment resets.
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
@@ -222,34 +222,34 @@ def apply_external_force_torque(
 
 @stateful
 class apply_body_impulse:
-    """Pushes bodies with random wrenches, each environment on timers of its own (mode "step").
+    """Pushes bodies with random wrenches on per-environment timers (mode "step").
 
-    A pause of `cooldown_s` comes first. Then force and torque act for `duration_s`, that is for
-    `ceil(duration / step_dt)` environment steps, followed by the next pause, and so on.
+    Each environment alternates between a pause of `cooldown_s`, which comes first, and a wrench
+    for `duration_s`, i.e. for `ceil(duration / step_dt)` environment steps.
 
     Params:
         force_range: Bounds of each force component (N), world axes.
         torque_range: Bounds of each torque component (N m), world axes.
-        duration_s: Bounds of how long an impulse acts (s).
-        cooldown_s: Bounds of a pause (s); read when the term is built.
+        duration_s: Bounds of the impulse duration (s).
+        cooldown_s: Bounds of the pause (s); read when the term is built.
         asset_cfg: Entity and bodies.
-        body_point_offset: Where the force acts, relative to the body's centre of mass, in the
-            frame of the body's link; this adds a torque. The centre of mass by default.
-        viz_cfg: Drawing of active impulses: a mapping or object with fields of `VizCfg`.
+        body_point_offset: Point of application relative to the body's center of mass, in the link
+            frame; adds a torque. Default: the center of mass.
+        viz_cfg: Visualization of active impulses: a mapping or object with fields of `VizCfg`.
     """
 
     @dataclass
     class VizCfg:
-        """Drawing of active impulses, one arrow a body."""
+        """Visualization of active impulses: one arrow per body."""
 
         rgba: tuple[float, float, float, float] = (0.9, 0.2, 0.8, 0.9)
-        """Color of an arrow."""
+        """Color of arrows."""
         scale: float = 0.005
-        """Length of an arrow per force (m/N)."""
+        """Length of arrows per force (m/N)."""
         width: float = 0.015
-        """Width of an arrow (m)."""
+        """Width of arrows (m)."""
         min_force: float = 1.0
-        """Smallest force that is drawn (N)."""
+        """Minimum force to draw (N)."""
 
     _transient = {"_asset", "_viz", "_bodies", "_num_bodies", "_cooldown_s", "_offset"}
 
@@ -262,7 +262,7 @@ class apply_body_impulse:
         self._num_bodies = num_selected(self._asset_cfg.body_ids, self._asset.num_bodies)
         self._cooldown_s = tuple(params["cooldown_s"])
         self._offset = params.get("body_point_offset")
-        # A mapping or any object may give some of the fields.
+        # A mapping or any object may define a subset of the fields.
         viz = params.get("viz_cfg")
         names = [field.name for field in fields(self.VizCfg)]
         if not isinstance(viz, Mapping):
@@ -284,7 +284,7 @@ class apply_body_impulse:
         body_point_offset: tuple[float, float, float] | None = None,
         viz_cfg: Any = None,
     ) -> None:
-        """Advance all timers by one environment step; end and start impulses."""
+        """Advance all timers by one environment step; start and end impulses."""
         self._remaining -= env.step_dt
         expired = (self._active & (self._remaining <= _TIME_MARGIN)).nonzero().flatten()
         if len(expired) > 0:
@@ -307,7 +307,7 @@ class apply_body_impulse:
         self._active[ids] = True
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """End the impulses of environments (None means all), which then start with a pause."""
+        """End the impulses of `env_ids` (None: all) and start a pause."""
         mask = torch.zeros_like(self._active)
         mask[slice(None) if env_ids is None else env_ids] = True
         ids = mask.nonzero().flatten()
@@ -317,7 +317,7 @@ class apply_body_impulse:
             self._end(active)
 
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Draw an arrow for each force that acts."""
+        """Draw an arrow per active force."""
         data = self._asset.data
         for env_idx in visualizer.get_env_indices(self._env.num_envs):
             if not self._active[env_idx]:
@@ -334,7 +334,7 @@ class apply_body_impulse:
 
     def _arms(self, ids: torch.Tensor, offset: tuple[float, float, float]) -> torch.Tensor:
         """Return the offset in world axes, (K, bodies, 3)."""
-        # The link's frame, not the one of the principal axes of inertia.
+        # The offset is in the link frame, not in the frame of the principal axes of inertia.
         quat = self._asset.data.body_link_quat_w[ids][:, self._bodies]
         point = torch.tensor(offset, dtype=quat.dtype, device=quat.device)
         return quat_apply(quat, point.expand(*quat.shape[:-1], 3))
@@ -353,24 +353,24 @@ def resolve_env_ids(env: ManagerBasedRlEnv, env_ids: torch.Tensor | slice | None
     """Return environment ids as an int64 tensor.
 
     Args:
-        env_ids: None (all environments), int ids, a bool mask or a slice.
+        env_ids: Integer ids, a bool mask, a slice, or None for all.
     """
     return as_ids(env_ids, env.num_envs, env.device)
 
 
 def _is_mocap(entity: Entity) -> bool:
-    # Looked up in the indexing, because resets are frequent and walking the spec is slow.
+    # Read from the indexing, because resets are frequent and walking the spec is slow.
     return entity.data.indexing.mocap_id is not None
 
 
 def _sample_se3_range(
     range_dict: Se3Ranges | None, shape: tuple[int, ...], device: str
 ) -> torch.Tensor:
-    """Draw (..., 6) in the order of the keys; all six are drawn, whichever are given."""
+    """Sample (..., 6) in the order of the keys. Missing keys are sampled too, from (0, 0)."""
     ranges = range_dict or {}
     unknown = [key for key in ranges if key not in _SE3_KEYS]
     if unknown:
-        raise ValueError(f"Ranges have unknown keys {unknown}; the keys are {list(_SE3_KEYS)}.")
+        raise ValueError(f"Unknown range keys {unknown}. Available: {list(_SE3_KEYS)}.")
     bounds = [ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS]
     return sample_ranges(bounds, shape[:-1], device)
 
@@ -382,20 +382,20 @@ def _write_root(
     pose: torch.Tensor,
     velocity_range: Se3Ranges | None,
 ) -> None:
-    """Write positions and turns (K, 6) and, for a floating base, a sampled velocity."""
+    """Write positions and Euler angles, (K, 6), and, for a floating base, a sampled velocity."""
     default = asset.data.default_root_state[ids]
-    turn = quat_from_euler_xyz(pose[:, 3], pose[:, 4], pose[:, 5])
-    root_pose = torch.cat((pose[:, :3], quat_mul(default[:, 3:7], turn)), dim=1)
+    rotation = quat_from_euler_xyz(pose[:, 3], pose[:, 4], pose[:, 5])
+    root_pose = torch.cat((pose[:, :3], quat_mul(default[:, 3:7], rotation)), dim=1)
     if _is_mocap(asset):
         asset.write_mocap_pose_to_sim(root_pose, env_ids=ids)
         return
     if asset.is_fixed_base:
         raise ValueError(
-            f"The root of entity {name!r} is fixed and no mocap body, so its pose cannot be reset. "
-            "Select an entity with a free joint or a mocap base."
+            f"reset of the root pose: expected an entity with a free joint or a mocap base, got "
+            f"{name!r} with a fixed base."
         )
     velocity = _sample_se3_range(velocity_range, (len(ids), 6), str(ids.device))
     velocity += default[:, 7:13]
-    # The pose comes first: writing the velocity rotates its angular part into the body's frame.
+    # The pose comes first: writing the velocity rotates its angular part into the body frame.
     asset.write_root_link_pose_to_sim(root_pose, env_ids=ids)
     asset.write_root_link_velocity_to_sim(velocity, env_ids=ids)

@@ -1,4 +1,4 @@
-"""Metric terms: logged, not rewarded. Each returns (N,)."""
+"""Metric terms, (N,). Logged, not rewarded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = [
 
 
 def mean_action_acc(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """Mean over the action's components of the absolute second difference of the raw action."""
+    """Mean absolute second difference of the raw action over its components."""
     actions = env.action_manager
     second = actions.action - 2.0 * actions.prev_action + actions.prev_prev_action
     return second.abs().mean(dim=1)

@@ -1,7 +1,7 @@
 """Observation terms.
 
-The root of an entity is the frame of its root body's link. Terms may return live views of the
-simulation: the observation manager copies them.
+The root frame of an entity is the link frame of its root body. Terms may return live views of
+simulation memory: the observation manager copies them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 def base_lin_vel(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Linear velocity of the root in its own frame (m/s), (N, 3)."""
+    """Linear velocity of the root in the root frame (m/s), (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.root_link_lin_vel_b
 
@@ -47,7 +47,7 @@ def base_lin_vel(
 def base_ang_vel(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Angular velocity of the root in its own frame (rad/s), (N, 3)."""
+    """Angular velocity of the root in the root frame (rad/s), (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.root_link_ang_vel_b
 
@@ -55,7 +55,7 @@ def base_ang_vel(
 def projected_gravity(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Unit vector down (world -z) in the root's frame, (N, 3); the gravity setting is ignored."""
+    """Unit vector down (world -z) in the root frame, (N, 3). Independent of `opt.gravity`."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.projected_gravity_b
 
@@ -68,7 +68,7 @@ def joint_pos_rel(
     """Joint positions minus default positions (rad or m), (N, joints).
 
     Args:
-        biased: Add the encoder bias, as a robot's own encoders would.
+        biased: Add the encoder bias, as in readings of the robot's encoders.
     """
     asset: Entity = env.scene[asset_cfg.name]
     data, joints = asset.data, as_columns(asset_cfg.joint_ids, env.device)
@@ -88,17 +88,17 @@ def joint_vel_rel(
 
 
 def last_action(env: ManagerBasedRlEnv, action_name: str | None = None) -> torch.Tensor:
-    """Last raw action: all of it (N, A), or that of one action term."""
+    """Last raw action, (N, A), or that of one action term."""
     if action_name is None:
         return env.action_manager.action
     return env.action_manager.get_term(action_name).raw_action
 
 
 def generated_commands(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """The command of a command term, (N, ...).
+    """Command of a command term, (N, ...).
 
     Raises:
-        ValueError: there is no such command.
+        ValueError: unknown command.
     """
     command = env.command_manager.get_command(command_name)
     if command is None:
@@ -110,16 +110,16 @@ def builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """Raw value of a MuJoCo sensor, (N, dim), in MuJoCo's units and frames.
 
     Raises:
-        TypeError: the sensor is of another kind.
+        TypeError: the sensor is not a `BuiltinSensor`.
     """
     return _builtin(env, sensor_name).data
 
 
 def projected_gravity_from_sensor(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Unit vector down in a sensor's frame, (N, 3), from a sensor of the up vector (framezaxis).
+    """Unit vector down in the frame of an up-vector sensor (framezaxis), (N, 3).
 
     Raises:
-        TypeError: the sensor is no MuJoCo sensor.
+        TypeError: the sensor is not a `BuiltinSensor`.
     """
     return -_builtin(env, sensor_name).data
 
@@ -130,12 +130,12 @@ def height_scan(
     offset: float = 0.0,
     miss_value: float | None = None,
 ) -> torch.Tensor:
-    """Height of each ray's frame above what the ray hits (m), (N, frames * rays), frame by frame.
+    """Height of each ray's frame above its hit (m), (N, frames * rays), frame by frame.
 
     Args:
-        sensor_name: A ray cast sensor.
-        offset: Subtracted from heights of hits.
-        miss_value: Value of rays that hit nothing; the sensor's `max_distance` by default.
+        sensor_name: Ray-cast sensor.
+        offset: Offset subtracted from the heights of hits (m).
+        miss_value: Value of rays without a hit. Default: the sensor's `max_distance`.
     """
     sensor = env.scene[sensor_name]
     data = sensor.data
@@ -150,8 +150,8 @@ def _builtin(env: ManagerBasedRlEnv, sensor_name: str) -> BuiltinSensor:
     sensor = env.scene[sensor_name]
     if not isinstance(sensor, BuiltinSensor):
         raise WrongTypeError(
-            f"{sensor_name!r} is a {type(sensor).__name__}, not a BuiltinSensor. Give the name of "
-            "a MuJoCo sensor, such as 'robot/imu_gyro'."
+            f"Sensor {sensor_name!r}: expected BuiltinSensor, got {type(sensor).__name__}; use a "
+            "MuJoCo sensor, such as 'robot/imu_gyro'."
         )
     return sensor
 

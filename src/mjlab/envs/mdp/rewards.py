@@ -1,4 +1,4 @@
-"""Reward terms, without weight. Each returns (N,)."""
+"""Unweighted reward terms, (N,)."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
 def is_alive(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """1 unless the episode terminated; a time-out counts as alive."""
+    """1 unless the episode terminated. Time-outs count as alive."""
     return (~env.termination_manager.terminated).float()
 
 
 def is_terminated(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """1 if the episode terminated; a time-out does not count."""
+    """1 if the episode terminated. Time-outs do not count."""
     return env.termination_manager.terminated.float()
 
 
 def joint_torques_l2(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Sum of squared actuator forces, before their gear, over the selected **actuators**."""
+    """Sum of squared actuator forces, before the gear, over the selected **actuators**."""
     asset: Entity = env.scene[asset_cfg.name]
     chosen = asset.data.indexing.force_columns(asset_cfg.actuator_ids)
     forces = asset.data.actuator_force[:, as_columns(chosen, env.device)]
@@ -76,7 +76,8 @@ def joint_acc_l2(
 def action_rate_l2(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Sum of squared changes of the raw action since the last step.
 
-    History is zero after a reset, so the first value of an episode is that of the action itself.
+    The previous action is zero after a reset, so the first value of an episode is the squared
+    action.
     """
     actions = env.action_manager
     return (actions.action - actions.prev_action).square().sum(dim=1)
@@ -92,7 +93,7 @@ def action_acc_l2(env: ManagerBasedRlEnv) -> torch.Tensor:
 def joint_pos_limits(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Sum of the distances by which joints are beyond their soft limits (rad or m)."""
+    """Sum of soft joint limit violations (rad or m)."""
     asset: Entity = env.scene[asset_cfg.name]
     joints = as_columns(asset_cfg.joint_ids, env.device)
     position = asset.data.joint_pos[:, joints]
@@ -105,7 +106,7 @@ def joint_pos_limits(
 def flat_orientation_l2(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Squared horizontal part of the projected gravity: sin^2 of the tilt of the root."""
+    """Squared horizontal component of projected gravity: sin^2 of the root's tilt."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.projected_gravity_b[:, :2].square().sum(dim=1)
 
@@ -114,10 +115,10 @@ def flat_orientation_l2(
 def self_collision_cost(
     env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
 ) -> torch.Tensor:
-    """Count unwanted contacts, of the robot with itself or with the ground.
+    """Number of unwanted contacts of the robot with itself or with the ground.
 
-    With a history of forces it is the number of those last substeps in which any contact had a
-    force above `force_threshold` (N), without one the number of contacts.
+    With a force history: number of substeps in the history with any force above `force_threshold`
+    (N). Without one: number of contacts.
     """
     data = env.scene[sensor_name].data
     if data.force_history is None:
@@ -130,29 +131,29 @@ class posture:
     """`exp(-mean_j ((q_j - q0_j) / std_j)^2)` over the selected joints, q0 the default positions.
 
     Params:
-        std: Dict of joint name pattern to standard deviation (rad or m). Read once; each pattern
-            must match a whole name, and every selected joint must be covered.
+        std: Dict of joint name pattern, matched in full, to standard deviation (rad or m). Read
+            once; must cover every selected joint.
         asset_cfg: Entity and joints; `joint_names` must be set.
     """
 
-    # Follows from the config, so it is no run-time state.
+    # Derived from the config; not checkpointed.
     _transient = {"std"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         asset_cfg: SceneEntityCfg = cfg.params["asset_cfg"]
         if asset_cfg.joint_names is None:
             raise ValueError(
-                "posture: asset_cfg.joint_names must be set, since std is given by joint name. "
-                "Use ('.*',) for all joints."
+                "posture asset_cfg.joint_names: expected names, because std maps joint names to "
+                "values, got None; use ('.*',) for all joints."
             )
-        # The names are in the order of the joint ids, whichever order the config asks for.
+        # `joint_names` and `joint_ids` have the same order, whatever `preserve_order`.
         names = list(asset_cfg.joint_names)
         _, covered, values = resolve_matching_names_values(cfg.params["std"], names)
         missing = [name for name in names if name not in covered]
         if missing:
             raise ValueError(
-                f"posture: std has no entry for the joints {missing}. Its patterns "
-                f"{list(cfg.params['std'])} must cover every selected joint."
+                f"posture std: expected patterns that cover every selected joint, got "
+                f"{list(cfg.params['std'])} without {missing}."
             )
         self.std = torch.tensor(values, dtype=torch.float, device=env.device)
 
@@ -166,7 +167,7 @@ class posture:
 
 
 class electrical_power_cost:
-    """Power that the actuators put into the selected joints (W), braking counted as zero."""
+    """Positive mechanical power of the actuators at the selected joints (W). Braking counts as 0."""
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         pass

@@ -1,4 +1,4 @@
-"""Termination terms. Each returns bool (N,)."""
+"""Termination terms, (N,) bool."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
 def time_out(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """The episode has reached its maximum length."""
+    """True where the episode has reached its maximum length."""
     return env.episode_length_buf >= env.max_episode_length
 
 
@@ -34,7 +34,7 @@ def bad_orientation(
     limit_angle: float,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """The root is tilted from upright by more than `limit_angle` (rad)."""
+    """True where the root is tilted from upright by more than `limit_angle` (rad)."""
     asset: Entity = env.scene[asset_cfg.name]
     up = (-asset.data.projected_gravity_b[:, 2]).clamp_(-1.0, 1.0)
     return torch.acos(up) > limit_angle
@@ -45,7 +45,7 @@ def root_height_below_minimum(
     minimum_height: float,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """The root is lower than `minimum_height` (m), in world coordinates."""
+    """True where the root is below `minimum_height` (m) in world coordinates."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.root_link_pos_w[:, 2] < minimum_height
 
@@ -54,9 +54,9 @@ def root_height_below_minimum(
 def illegal_contact(
     env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
 ) -> torch.Tensor:
-    """Something touches what it should not.
+    """True where a contact sensor reports an illegal contact.
 
-    With a history of forces: any force above `force_threshold` (N) in any of those last substeps.
+    With a force history: any force above `force_threshold` (N) in any substep of the history.
     Without one: any contact.
     """
     data = env.scene[sensor_name].data
@@ -67,5 +67,5 @@ def illegal_contact(
 
 
 def nan_detection(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """Positions, velocities, accelerations or sensor data are NaN or infinite."""
+    """True where positions, velocities, accelerations or sensor data are NaN or infinite."""
     return NanGuard.detect_nans(env.sim.data)

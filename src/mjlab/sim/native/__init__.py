@@ -1,1 +1,1 @@
-"""MuJoCo's own batch engine on CPU threads."""
+"""Native engine: MuJoCo's batch engine on CPU threads."""

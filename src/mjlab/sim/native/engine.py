@@ -1,9 +1,9 @@
-"""MuJoCo's batch engine (`mujoco.batch`) on CPU threads.
+"""Native engine: MuJoCo's batch engine (`mujoco.batch`) on CPU threads.
 
-A simulation is its double-precision state row inside `mujoco.batch.Batch`. What crosses the seam are
-float32 copies of the fields that were asked for. Before a call, elements that were written since the
-last one are copied into the rows; the others never round them. After a call, the fields that it
-computed are copied out. A field costs time only once it is read.
+A simulation is a float64 state row of `mujoco.batch.Batch`. Callers see float32 copies of the
+fields they read. Before a call, elements written since the last call are copied into the rows; all
+other elements keep their precision. After a call, the computed fields are copied out. A field costs
+time only after its first read.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# State that a step changes by itself; the rest changes only by being written.
+# State that a step advances; other state changes only when written.
 _ADVANCED = frozenset({"time", "qpos", "qvel", "act", "qacc_warmstart"})
 
 _DERIVED_CONSTANTS = (
@@ -56,8 +56,8 @@ _DERIVED_CONSTANTS = (
     *("dof_M0", "flexedge_length0", "flexedge_invweight0"),
 )
 
-# The compiler marks frames that coincide and MuJoCo then skips their transforms, so the marks
-# have to go before such a frame is randomized.
+# The compiler marks coinciding frames, and MuJoCo skips their transforms. So marks must be cleared
+# before such a frame is randomized.
 _FRAME_MARKS = {
     "body_ipos": ("body_sameframe", "geom_sameframe", "site_sameframe"),
     "body_iquat": ("body_sameframe", "geom_sameframe", "site_sameframe"),
@@ -68,9 +68,9 @@ _FRAME_MARKS = {
 }
 _INERTIAL_FRAME = ("body_ipos", "body_iquat")
 
-# Whole numbers in a model are addresses, kinds and masks, from which array sizes and the pairs that
-# may collide were compiled; changed in one environment they would act in part or not at all. These
-# are the ones that MuJoCo looks up each time and that nothing was compiled from.
+# Integers in a model are addresses, types and masks. Array sizes and collision pairs are compiled
+# from most of them, so a per-environment change would act in part or not at all. MuJoCo reads the
+# integers listed here at run time only.
 _FREE_INTEGERS = frozenset(
     {"geom_matid", "geom_dataid", "geom_condim", "geom_priority", "mat_texid", "mat_texuniform"}
     | {"site_matid", "tendon_matid", "light_active", "light_castshadow", "light_type"}
@@ -78,20 +78,20 @@ _FREE_INTEGERS = frozenset(
     | {"actuator_ctrllimited", "actuator_forcelimited", "actuator_actlimited"}
 )
 
-# Model fields from which mj_setConst computes the bounding volumes of the midphase, its results.
+# Inputs and results of mj_setConst's bounding volumes for the midphase.
 _BOUNDED = (
     *("geom_size", "geom_pos", "geom_quat", "geom_aabb", "geom_margin", "geom_gap"),
     *("body_ipos", "body_iquat"),
 )
 _BOUNDING_VOLUMES = ("bvh_aabb", "body_margin")
 
-# Positions and velocities need no contacts, whose search is half of the cost of these stages on Go1
-# and G1.
+# Position and velocity stages do not need contacts. Collision detection is half of the cost of
+# these stages on Go1 and G1.
 _WITHOUT_CONSTRAINTS = int(
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 )
 
-# Columns of `Batch.warning`: the last index that MuJoCo warned of, and the number of warnings.
+# Columns of `Batch.warning`: index of the last warning, number of warnings.
 _INDEX, _COUNT = 0, 1
 _BAD_STATES = [
     int(mujoco.mjtWarning.mjWARN_BADQPOS),
@@ -99,9 +99,9 @@ _BAD_STATES = [
     int(mujoco.mjtWarning.mjWARN_BADQACC),
 ]
 
-# Matrices of implicit integration, which only a step computes.
+# Matrices of implicit integration, computed by steps only.
 _STEP_FIELDS = frozenset({"qH", "qHDiagInv", "qDeriv", "qLU"})
-# Outputs that a stage does not compute.
+# Outputs of later stages, by stage.
 _LATER_FIELDS = {
     "pos": VELOCITY_FIELDS | ACCELERATION_FIELDS | _STEP_FIELDS,
     "vel": ACCELERATION_FIELDS | _STEP_FIELDS,
@@ -110,7 +110,7 @@ _LATER_FIELDS = {
 
 
 class NativeEngine(Engine):
-    """MuJoCo's own C code, one thread pool for all environments, bit-reproducible."""
+    """MuJoCo's C code with one thread pool for all environments. Bit-reproducible."""
 
     def __init__(
         self, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
@@ -118,16 +118,16 @@ class NativeEngine(Engine):
         check_count("SimulationCfg.num_threads", cfg.num_threads, 0)
         self.num_envs = num_envs
         self._model = copy.copy(model)
-        # MuJoCo would put a diverged environment back to qpos0 by itself and hide the NaN from
-        # the guard and from the environment, which count it and reset that environment.
+        # Autoreset would return a diverged environment to qpos0 and hide the NaN from the NaN guard
+        # and the environment. Both count it, and the environment resets.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        # `Batch` would take every core of the machine by itself.
+        # By default `Batch` uses every core of the machine.
         threads = cfg.num_threads or min(cores_per_process(), num_envs)
         try:
             self._batch = self._make_batch(self._model, num_envs, threads)
         except (ValueError, RuntimeError) as error:
             raise EngineUnavailableError(
-                f"The native engine refuses this model: {error}. Use --engine warp."
+                f"The native engine does not support this model: {error}; use --engine warp."
             ) from error
         self._rows = torch.from_numpy(self._batch.state)
         self._inputs: dict[str, _Input] = {}
@@ -143,8 +143,8 @@ class NativeEngine(Engine):
         }
         self._frame_marks: dict[str, np.ndarray] = {}
         self._bounds: Batch | None = None
-        # State before the last call of `Batch.step`, its substeps, and environments whose fields were
-        # computed by a `forward` since, up to the velocities and up to the accelerations.
+        # State before the last `Batch.step`, its number of substeps, and environments with a later
+        # `forward` of the velocity stage or the acceleration stage.
         self._before, self._substeps = self._batch.state.copy(), 0
         self._has_velocities = np.ones(num_envs, dtype=bool)
         self._has_accelerations = np.ones(num_envs, dtype=bool)
@@ -167,7 +167,7 @@ class NativeEngine(Engine):
         if name not in self._tensors:
             if name in ("contact", "nacon"):
                 raise UnknownAttributeError(
-                    f"The native engine does not offer sim.data.{name}; use a contact sensor "
+                    f"The native engine does not provide sim.data.{name}; use a contact sensor "
                     "(ContactSensorCfg)."
                 )
             if name not in DATA_FIELDS:
@@ -176,7 +176,7 @@ class NativeEngine(Engine):
                 )
             check_sensor_fed(self._model, name)
             source = _as_tensor(self._batch.bind(name))
-            dtype = torch.bool if name == "eq_active" else _seam_type(source)
+            dtype = torch.bool if name == "eq_active" else _interface_dtype(source)
             if name in INPUTS:
                 field = self._inputs[name] = _Input(source, dtype)
             else:
@@ -187,10 +187,11 @@ class NativeEngine(Engine):
         return self._tensors[name]
 
     def _fill(self, name: str, field: _Copy) -> None:
-        """Compute a field that was just bound, as if it had been bound before the last step.
+        """Compute a newly bound field as if it had been bound before the last step.
 
-        `Batch` has zeros there until the next call. Where no `forward` has computed the field since
-        the last step, the step is repeated from the state before it. Nothing else changes.
+        `Batch` holds zeros in a new field until the next call. Unless a `forward` has computed the
+        field since the last step, the step is repeated from the state before it. All other fields
+        are unchanged.
         """
         self._copy_in()
         kept = self._batch.state.copy()
@@ -204,7 +205,7 @@ class NativeEngine(Engine):
             self._batch.state[:] = kept
             field.copy_out()
         for stage, chosen in (("vel", self._has_velocities), ("acc", current)):
-            # Sensors are of several stages; those of the last overwrite the others.
+            # Sensors belong to several stages; later stages overwrite earlier ones.
             if chosen.any() and (stage == "acc" or name == "sensordata"):
                 rows = torch.from_numpy(np.flatnonzero(chosen))
                 self._call(self._batch.forward, rows, stage=STAGES[stage])
@@ -221,14 +222,14 @@ class NativeEngine(Engine):
                     self._frame_marks[mark] = self._batch.expand(mark)
                     self._frame_marks[mark][:] = 0
             values = _as_tensor(self._batch.expand(self._model_name(name)))
-            if _seam_type(values) != values.dtype:
-                self._model_copies[name] = _Input(values, _seam_type(values))
+            if _interface_dtype(values) != values.dtype:
+                self._model_copies[name] = _Input(values, _interface_dtype(values))
                 values = self._model_copies[name].values
             self.model_fields[name] = _like_mujoco(name, values)
 
     @staticmethod
     def _model_name(name: str) -> str:
-        """Return `Batch`'s name of a model field; options may leave out `opt.`."""
+        """Return the `Batch` name of a model field; `opt.` is optional for options."""
         return name if name in MODEL_FIELDS else f"opt.{name}"
 
     def _check_expandable(self, name: str) -> None:
@@ -239,7 +240,7 @@ class NativeEngine(Engine):
         if (counts and name not in _FREE_INTEGERS) or name in _BOUNDING_VOLUMES:
             raise ValueError(
                 f"Model field {name!r} is part of the model's structure and cannot differ between "
-                "environments. Use several entities, or several tasks."
+                "environments; use several entities, or several tasks."
             )
         # The world body is always simple.
         simple = np.flatnonzero(self._model.body_simple[1:]) + 1
@@ -250,12 +251,12 @@ class NativeEngine(Engine):
             ]
             raise ValueError(
                 f"Model field {name!r} cannot differ between environments, because the compiler "
-                f"simplified the inertia of bodies {', '.join(bodies)}. Build the Simulation from a "
-                "spec (spec=...), or compile those bodies with simple='false'."
+                f"simplified the inertia of bodies {', '.join(bodies)}; build the Simulation from a "
+                "spec (spec=...), or compile these bodies with simple='false'."
             )
 
     def hide_geoms(self, absent: torch.Tensor) -> None:
-        # What the compiler made of these (masks of bodies) may let more geoms through.
+        # Body masks, compiled from these, are at worst too permissive.
         for name in COLLISION_MASKS:
             array = self._batch.expand(name)
             array[absent.numpy()] = 0
@@ -282,18 +283,19 @@ class NativeEngine(Engine):
         return recorded
 
     def _step_recorded(self, nstep: int, recorded: dict[str, torch.Tensor]) -> torch.Tensor | None:
-        """Step, and fill in the values after every substep; return what `_call` does.
+        """Step and record the values after every substep; return the same ids as `_call`.
 
-        `Batch.rollout` leaves a simulation where MuJoCo warns. Those step again from the beginning,
-        one substep a call, as all do where MuJoCo raises: the same bits, at 1.08 of the time.
+        `Batch.rollout` stops a simulation at a MuJoCo warning. Such simulations, or all if MuJoCo
+        raises, are repeated from the start with one substep per call. Results are bit-identical, at
+        1.08 times the cost.
         """
         warnings = self._batch.warning.copy()
-        # `time` is no array in `MjData`, and `Batch` records it as a part of the state.
+        # `time` is a scalar in `MjData`; `Batch` records it as part of the state.
         items = {
             name: mujoco.mjtState.mjSTATE_TIME if name == "time" else name for name in recorded
         }
         again = np.ones(self.num_envs, dtype=bool)
-        # Which trees sleep could not be put back.
+        # Sleep states of trees cannot be restored.
         if not self._batch.persistent:
             with contextlib.suppress(SimulationError):
                 values = self._batch.rollout(nstep, record=tuple(items.values()))
@@ -319,7 +321,7 @@ class NativeEngine(Engine):
             self._has_velocities[chosen] = True
         if stage == "acc":
             self._has_accelerations[chosen] = True
-        # A field that is read later is computed then.
+        # Fields without a copy are computed on first read.
         if not self._outputs:
             return
         self._copy_in()
@@ -329,14 +331,14 @@ class NativeEngine(Engine):
         self._disabled[:] = self._model.opt.disableflags
         if stage == "acc" and "qacc_warmstart" in self._inputs:
             self._inputs["qacc_warmstart"].copy_out(env_ids)
-        # An `MjData` serves many environments: what a stage does not compute is another's.
+        # Environments share `MjData`: fields that a stage does not compute belong to another one.
         for name in self._outputs.keys() - _LATER_FIELDS[stage]:
             columns = self._sensor_columns[stage] if name == "sensordata" else None
             self._outputs[name].copy_out(rows, columns)
 
     def bad_states(self) -> torch.Tensor:
-        # Counted since the reset. MuJoCo looks at each substep, and at accelerations, which are not
-        # copied unless they are read.
+        # Warnings since the reset. MuJoCo checks every substep, including accelerations. These
+        # are copied only if read.
         warned = self._batch.warning[:, _BAD_STATES, _COUNT].any(axis=1)
         return super().bad_states() | torch.from_numpy(warned)
 
@@ -375,10 +377,10 @@ class NativeEngine(Engine):
     def _call(
         self, method: Callable[..., None], env_ids: torch.Tensor | None = None, **options: int
     ) -> torch.Tensor | None:
-        """Run a method of the batch; return the environments in which MuJoCo did not raise.
+        """Run a batch method; return the environments in which MuJoCo did not raise (None: all).
 
-        None means all. The others keep their state and would raise again. So their `qpos` and `qvel`
-        become NaN, by which the environment finds and resets them.
+        Environments in which MuJoCo raised keep their state and would raise again. So their `qpos`
+        and `qvel` are set to NaN, and the environment detects and resets them.
         """
         try:
             method(None if env_ids is None else env_ids.numpy(), **options)
@@ -393,16 +395,16 @@ class NativeEngine(Engine):
             return torch.from_numpy(np.setdiff1d(ids, error.ids))
 
     def _copy_in(self, thorough: bool = False) -> None:
-        """Pass on what was written into state and model fields since the last call."""
+        """Copy writes to state and model fields since the last call into the batch."""
         for field in self._inputs.values():
             field.copy_in()
         self._copy_in_model(thorough)
 
     def _copy_in_model(self, thorough: bool = False) -> None:
-        """Pass on what was written into model fields.
+        """Copy writes to model fields into the batch.
 
-        They are large and seldom written, so only a `thorough` look, once a step, sees what torch
-        does not count: writes through numpy or `.data`.
+        Model fields are large and rarely written. So only a `thorough` comparison, once per step,
+        detects writes that torch does not count: through numpy or `.data`.
         """
         moved = None
         for name, field in self._model_copies.items():
@@ -414,17 +416,17 @@ class NativeEngine(Engine):
             self._fit_bounding_volumes(torch.from_numpy(np.flatnonzero(moved)))
 
     def _fit_bounding_volumes(self, env_ids: torch.Tensor | None) -> None:
-        """Fit the boxes of the midphase, by which contacts are found, to geoms that were written.
+        """Update the midphase bounding boxes, used for collision detection, of modified geoms.
 
-        MuJoCo does this in mj_setConst, which would also replace the constants that are up to
-        `recompute_constants`. So a batch beside it computes the boxes.
+        MuJoCo does this in mj_setConst. That would also replace the constants that only
+        `recompute_constants` updates, so a second batch computes the boxes.
         """
         if self._bounds is None:
             self._bounds = self._make_batch(self._model, self.num_envs)
         for name in self._model_copies.keys() & _BOUNDED:
             self._bounds.expand(name)[:] = self._batch.expand(name)
         self._call(self._bounds.set_const, env_ids)
-        # Bounding spheres, which the rays of MuJoCo 4 mind, unless they are written by others.
+        # Bounding spheres too, unless expanded: ray casting in MuJoCo 4 uses them.
         for name in {*_BOUNDING_VOLUMES, "geom_rbound"} - self.model_fields.keys():
             self._batch.expand(name)[:] = self._bounds.expand(name)
 
@@ -434,11 +436,11 @@ class NativeEngine(Engine):
         return tuple(name for name in _DERIVED_CONSTANTS if getattr(self._model, name).size)
 
     def recompute_constants(self, level: int, env_ids: torch.Tensor | None) -> None:
-        # mj_setConst does both parts at once; the part not asked for comes out as it was.
+        # mj_setConst computes both parts; the part that was not requested is unchanged.
         self.expand(self.constants_written_by(level))
         self._copy_in(thorough=True)
         self._call(self._batch.set_const, env_ids)
-        # It also marks frames that coincide, which may be moved apart afterwards.
+        # mj_setConst marks coinciding frames, and later writes may separate them.
         for mark in self._frame_marks.values():
             mark[:] = 0
         for name in self.constants_written_by(level):
@@ -468,8 +470,8 @@ class NativeEngine(Engine):
         self, model: mujoco.MjModel, count: int, num_threads: int | None = None
     ) -> Batch:
         """Return `count` simulations of a model."""
-        # Sleep needs an `MjData` for each. Elsewhere that costs memory (0.23 MB a Go1) and saves
-        # nothing: 0.97 to 1.09 of the time of Go1 and G1, with 256 to 4,096 environments.
+        # Sleep needs one `MjData` per simulation. Without sleep that costs memory (0.23 MB per Go1)
+        # and saves no time: factor 0.97 to 1.09 on Go1 and G1 with 256 to 4,096 environments.
         sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         return Batch(model, count, num_threads or self._batch.nthread, persistent=bool(sleeps))
 
@@ -485,10 +487,10 @@ class NativeEngine(Engine):
         return {
             "library": "mujoco.batch",
             "state": self._rows.clone(),
-            # Fields that were bound are bound again, because a field that is bound in the middle of
-            # a step reads values that are one substep newer than they would have been.
+            # Bound fields are bound again on load: a field bound within a step would read values
+            # one substep newer.
             "bound": sorted(self._tensors),
-            # No forward pass gives these as the last substep did.
+            # A forward pass does not reproduce these values of the last substep.
             "results": {
                 name: field.values.clone()
                 for name, field in self._outputs.items()
@@ -502,18 +504,19 @@ class NativeEngine(Engine):
     def check_state(self, state: dict[str, Any]) -> None:
         if state.get("library") != "mujoco.batch":
             raise ValueError(
-                "The saved physics state is of the native engine before mujoco.batch, which cannot "
-                "be continued exactly; only weights can be used."
+                "Saved physics state: expected one of mujoco.batch, got one of the native engine "
+                "before mujoco.batch; exact resume is not supported, load only the weights."
             )
         if self._batch.persistent:
             raise ValueError(
-                "A model with sleep: which trees are asleep is not saved, so a run cannot continue "
-                "exactly; only weights can be used."
+                "Saved physics state: expected a model without sleep, got one with sleep. "
+                "Sleep states of trees are not saved, so exact resume is not supported; load only the "
+                "weights."
             )
         if state["state"].shape != self._rows.shape:
             raise ValueError(
-                f"The saved physics state: expected {tuple(self._rows.shape)} values, got "
-                f"{tuple(state['state'].shape)}; use the task and --num-envs that it was saved with."
+                f"Saved physics state: expected shape {tuple(self._rows.shape)}, got "
+                f"{tuple(state['state'].shape)}; use the task and --num-envs of the saved run."
             )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -538,11 +541,11 @@ class NativeEngine(Engine):
 
 
 class _Copy:
-    """Copy of an output in the type that crosses the seam."""
+    """Copy of an output in the engine interface's dtype."""
 
     def __init__(self, source: torch.Tensor, dtype: torch.dtype) -> None:
-        # A field may be read for the first time under `inference_mode`, whose tensors count no
-        # writes and could not be written outside it.
+        # A first read may happen under `inference_mode`. Inference tensors do not count writes and
+        # cannot be written outside that mode.
         with torch.inference_mode(False):
             self.source = source
             self.values = source.to(dtype, copy=True, memory_format=torch.contiguous_format)
@@ -550,7 +553,7 @@ class _Copy:
     def copy_out(
         self, rows: torch.Tensor | None = None, columns: torch.Tensor | None = None
     ) -> None:
-        """Copy the source out: all of it, or `rows`, or `columns` (a mask) of a matrix."""
+        """Copy from the source: everything, `rows`, or `columns` (a mask) of a matrix."""
         if columns is not None:
             kept = self.values.clone()
             self.copy_out(rows)
@@ -562,9 +565,9 @@ class _Copy:
 
 
 class _Input(_Copy):
-    """Copy of a state or model field. Only elements that were written are passed on.
+    """Copy of a state or model field. Only modified elements are copied to the source.
 
-    So elements that nobody writes keep the double precision of their source.
+    So unmodified elements keep the double precision of the source.
     """
 
     def __init__(self, source: torch.Tensor, dtype: torch.dtype) -> None:
@@ -578,9 +581,9 @@ class _Input(_Copy):
         return self.values._version != self._version
 
     def copy_in(self) -> np.ndarray | None:
-        """Copy elements that were written into the source; return a mask of them, None if none.
+        """Copy modified elements to the source; return their mask, None if none.
 
-        In numpy, which takes a fifth to a half of torch's time for this.
+        Uses numpy: a fifth to a half of torch's time here.
         """
         self._version = self.values._version
         values, seen = self.values.numpy(), self._seen.numpy()
@@ -600,14 +603,14 @@ class _Input(_Copy):
         self._version = self.values._version
 
 
-def _seam_type(source: torch.Tensor) -> torch.dtype:
+def _interface_dtype(source: torch.Tensor) -> torch.dtype:
     return torch.float32 if source.dtype == torch.float64 else source.dtype
 
 
 def _as_tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
-    """View an array as a tensor, without the warning about outputs, which are not written."""
+    """View an array as a tensor, without torch's warning about read-only arrays."""
     if array.dtype == np.uint64:
-        # Torch has hardly any operation on it.
+        # Torch supports few operations on uint64.
         array = array.view(np.int64)
     with torch.inference_mode(False), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -615,13 +618,13 @@ def _as_tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
 
 
 def _like_mujoco(name: str, tensor: torch.Tensor) -> torch.Tensor:
-    """View rotation matrices as (N, ..., 3, 3), and every other field as it is."""
+    """View rotation matrices as (N, ..., 3, 3); return other fields unchanged."""
     with torch.inference_mode(False):
         return tensor.view(*tensor.shape[:-1], 3, 3) if name in ROTATION_MATRICES else tensor
 
 
 def _reason(request: Any, name: str) -> str:
-    """Return why a batch does not have a field, in its own words."""
+    """Return the batch's error message for an unknown or unsupported field."""
     try:
         request(name)
     except ValueError as error:

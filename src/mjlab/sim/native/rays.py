@@ -1,7 +1,7 @@
-"""Rays of the native engine: `Batch.ray`, culled as `Engine.raycast` promises, and a ground table.
+"""Ray casting on the native engine: `Batch.ray` with the culling of `Engine.raycast`, ground table.
 
-`mj_ray` tries every geom of the model for every ray, and generated terrain has hundreds. Rays that
-point straight down at boxes, height fields and planes are looked up in `GroundTable` instead.
+`mj_ray` tests every geom of the model for every ray, and generated terrain has hundreds of geoms.
+Vertical downward rays onto boxes, height fields and planes use `GroundTable` instead.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 Array = np.ndarray
 Passed = Callable[[Array, Array, Array, "Hits"], Array]
-"""Predicate of hits to ignore: rows, their origins, directions and hits to (n, R) bool."""
+"""Predicate of hits to ignore: (rows, origins, directions, hits) -> (n, R) bool."""
 
 _T = mujoco.mjtGeom
 _PLANE, _HFIELD, _BOX, _MESH = (
@@ -32,34 +32,33 @@ _PLANE, _HFIELD, _BOX, _MESH = (
 )
 
 _UP = np.array((0.0, 0.0, 1.0), dtype=np.float32)
-# Ignored surfaces that one ray passes; the next one ends it.
+# Maximum number of ignored surfaces per ray; the next one ends the ray.
 _MAX_PASSES = 8
-# A ray starts again so far behind an ignored surface (m), and relative to its coordinates, which
-# are single precision.
+# Restart offset of rays behind an ignored surface: absolute (m), relative to float32 coordinates.
 _BEHIND, _BEHIND_RELATIVE = 1e-5, 1e-6
-# A hit so close (m) to the bottom of a height field's elevations may be on its base, and is if the
-# surface is so far (m) above it.
+# A hit within this distance (m) of zero elevation may be on the base of a height field. The hit is
+# on the base if the surface is at least this far (m) above.
 _BASE_TOLERANCE, _SURFACE_TOLERANCE = 1e-5, 1e-4
-# The cosine below which a face of a height field is one of its sides or its base.
+# Cosine below which a face of a height field is a side or the base.
 _SIDE = 1e-9
-# Edge of a ground cell (m), unless there would be more cells than this.
+# Edge of a ground cell (m), and maximum number of cells.
 _CELL, _MAX_CELLS = 0.1, 1_000_000
-# Beside other visible geoms, fewer ground geoms than this are tried faster than looked up.
+# With other visible geoms present, testing fewer ground geoms than this is faster than the table.
 _MIN_GEOMS = 12
 
 
 class NativeRays:
-    """Casts the rays of a native engine."""
+    """Ray caster of a native engine."""
 
     def __init__(self, engine: Engine, model: mujoco.MjModel, batch: Batch) -> None:
-        """Cast in `batch`, the simulations of `model` that `engine` runs."""
+        """Cast rays in `batch`, the simulations of `model` run by `engine`."""
         self._engine, self._model, self._batch = engine, model, batch
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._pos, self._mat = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
         self._rule = CullingRule(model, np.arange(model.ngeom))
         roots = model.body_rootid[model.geom_bodyid]
-        # MuJoCo counts what a mocap body carries as static.
+        # MuJoCo treats geoms of mocap bodies as static.
         self._is_carried = model.body_mocapid[roots] >= 0
         self._fields_are_carried = self._is_carried[model.geom_type == _HFIELD].any()
         self._tables: dict[Any, tuple[GroundTable | None, bool]] = {}
@@ -77,9 +76,9 @@ class NativeRays:
         return distances, normals, torch.from_numpy(hits.geoms)
 
     def _hits(self, query: RayQuery, env_ids: Array | None) -> Hits:
-        """Cast rays of which row i is of environment `env_ids[i]`; None: i."""
+        """Cast rays. Row i belongs to environment `env_ids[i]`; None: i."""
         directions, table, has_others = query.directions.numpy(), None, True
-        # Rows are compared with rows: a last dimension of three takes ten times as long.
+        # Compare whole rows: broadcasting over a last dimension of 3 takes ten times as long.
         if (directions == np.tile(-_UP, (directions.shape[1], 1))).all():
             excluded = np.unique(_excluded(query))
             key = query.geom_groups, excluded.tobytes()
@@ -99,9 +98,9 @@ class NativeRays:
     def _ground(
         self, groups: tuple[int, ...] | None, excluded: Array
     ) -> tuple[GroundTable | None, bool]:
-        """Return a table of all visible geoms that never move, and whether others are visible.
+        """Return a table of all visible static geoms, and True if other geoms are visible.
 
-        There is no table if it would miss some of them, or would not pay.
+        The table is None if it cannot hold all of them, or would not be faster.
         """
         model = self._model
         in_groups = _group_mask(groups)[model.geom_group.clip(0, 5)].astype(bool)
@@ -109,7 +108,7 @@ class NativeRays:
         carried = welded & self._is_carried
         others = bool((in_groups & ~welded).any() or model.nflex)
         static = np.flatnonzero(welded & ~carried)
-        # The opacity that counts is that of the material if a geom has one.
+        # As in MuJoCo, alpha of a material takes precedence over that of its geoms.
         material = model.geom_matid[static]
         alpha = np.append(model.mat_rgba[:, 3], 1.0)[material]
         alpha = np.where(material < 0, model.geom_rgba[static, 3], alpha)
@@ -126,7 +125,7 @@ class NativeRays:
         return GroundTable(model, ground, self._pos[ground], static), others
 
     def _cast_in_batch(self, query: RayQuery, env_ids: Array | None, static: bool) -> Hits:
-        """Cast against the geoms of the model, those that never move only if `static`."""
+        """Cast against the geoms of the model; static geoms only if `static` is True."""
         origins, directions = query.origins.numpy(), query.directions.numpy()
         pos, mat = (np.broadcast_to(x, (len(origins), *x.shape)) for x in (self._pos, self._mat))
         if self._fields_are_carried:
@@ -160,7 +159,7 @@ def _group_mask(groups: tuple[int, ...] | None) -> Array:
 
 @dataclass
 class Hits:
-    """Results of rays: distances (n, R), normals (n, R, 3), geoms (n, R); -1, 0 and -1 on a miss."""
+    """Ray hits: distances (n, R), normals (n, R, 3), geom ids (n, R); -1, 0 and -1 on a miss."""
 
     distances: Array
     normals: Array
@@ -168,7 +167,7 @@ class Hits:
 
     @classmethod
     def misses(cls, rows: int, rays: int) -> Hits:
-        """Return results of rays that meet nothing."""
+        """Return misses."""
         normals = np.zeros((rows, rays, 3), np.float32)
         misses = np.full((rows, rays), -1, np.int32)
         return cls(misses.astype(np.float32), normals, misses)
@@ -181,12 +180,12 @@ class Hits:
         self.geoms[rows] = other.geoms
 
     def forget(self, where: Array) -> None:
-        """Make the rays `where` (n, R) bool misses."""
+        """Set the rays in the mask `where`, (n, R) bool, to misses."""
         if where.any():
             self.distances[where], self.normals[where], self.geoms[where] = -1.0, 0.0, -1
 
     def take_nearer(self, other: Hits) -> None:
-        """Replace the hits that `other` has nearer."""
+        """Replace hits with those of `other` that are nearer."""
         is_nearer = (other.distances < self.distances) | (self.distances < 0.0)
         is_nearer &= other.distances >= 0.0
         self[is_nearer] = other[is_nearer]
@@ -200,15 +199,16 @@ def cast_through(
     env_ids: Array | None = None,
     **options: Any,
 ) -> Hits:
-    """Cast rays in n simulations, through surfaces that do not count.
+    """Cast rays in n simulations, passing through ignored surfaces.
 
     Rays of simulations in which MuJoCo raises are misses.
 
     Args:
         batch: Simulations.
-        origins: (n, R, 3). directions: (n, R, 3).
-        passed: Predicate of hits to ignore; None to ignore none.
-        env_ids: Simulations (n,) of the rows; None for the first n.
+        origins: World positions (m), (n, R, 3).
+        directions: Unit vectors, (n, R, 3).
+        passed: Predicate of hits to ignore. None: ignore none.
+        env_ids: Simulation of each row, (n,). None: the first n.
         options: Further arguments of `Batch.ray`.
     """
     rows = np.arange(len(origins))
@@ -239,11 +239,11 @@ def cast_through(
 def _cast(
     batch: Batch, rows: Array, origins: Array, directions: Array, options: dict[str, Any]
 ) -> Hits:
-    """Cast rays (n, R, 3) in the simulations `rows` (n,)."""
+    """Cast rays, (n, R, 3), in the simulations `rows`, (n,)."""
     try:
         distances, geoms, normals = batch.ray(origins, directions, ids=rows, normal=True, **options)
     except SimulationError as error:
-        # The results of the others are lost with it.
+        # MuJoCo's error discards the results of all simulations, so cast the good ones again.
         good = ~np.isin(rows, error.ids)
         hits = Hits.misses(*origins.shape[:2])
         hits[good] = _cast(batch, rows[good], origins[good], directions[good], options)
@@ -252,19 +252,19 @@ def _cast(
 
 
 class CullingRule:
-    """Surfaces that rays pass, though MuJoCo's C code reports them (MuJoCo Warp does not).
+    """Rule to cull surfaces that MuJoCo's C code hits and MuJoCo Warp does not.
 
-    Meshes and height fields are seen from outside only, and a height field is its top alone: its
-    sides and its base are not there.
+    Meshes and height fields are hit from outside only, and height fields on their top only: sides
+    and base are ignored.
     """
 
     def __init__(self, model: mujoco.MjModel, ids: Array) -> None:
-        """Judge hits on the geoms `ids` (G,) of a model, by their number in it; -1 and G miss."""
+        """Cull hits on the geoms `ids`, (G,), given as indices into `ids`; -1 and G are misses."""
         self._model, self._ids = model, ids
         self.is_field = np.append(model.geom_type[ids] == _HFIELD, False)
         self._is_one_sided = self.is_field | np.append(model.geom_type[ids] == _MESH, False)
         self.is_needed = bool(self._is_one_sided.any())
-        """True if there is a mesh or a height field."""
+        """True if any geom is a mesh or a height field."""
 
     def passed(
         self,
@@ -276,15 +276,16 @@ class CullingRule:
         pos: Array,
         mat: Array,
     ) -> Array:
-        """Return which hits (n, R) do not count, bool.
+        """Return hits to ignore, (n, R) bool.
 
         Args:
-            origins: (n, R, 3). directions: (n, R, 3).
-            hits: What the rays met.
-            geoms: Numbers of the geoms that they met, (n, R).
+            origins: World positions (m), (n, R, 3).
+            directions: Unit vectors, (n, R, 3).
+            hits: Ray hits.
+            geoms: Indices of the hit geoms, (n, R).
             envs: Environment of each row, (n,).
-            pos: Positions of the geoms, (N, G, 3), read of height fields only.
-            mat: Orientations, (N, G, 3, 3).
+            pos: Geom positions, (N, G, 3). Only those of height fields are read.
+            mat: Geom orientations, (N, G, 3, 3).
         """
         normals = hits.normals
         passed = self._is_one_sided[geoms]
@@ -297,7 +298,7 @@ class CullingRule:
         up = np.einsum("mk,mk->m", normals[at], mat[:, :, 2])
         points = origins[at] + directions[at] * hits.distances[at][:, None] - pos
         local = np.einsum("mkj,mk->jm", mat, points)
-        # Rays from below the surface end on the base, which looks like flat ground.
+        # Rays from below the surface hit the base, whose normal is that of flat ground.
         is_low = np.abs(local[2]) < _BASE_TOLERANCE
         surface, _ = _elevation(self._model, self._ids[fields[is_low]], local[:2, is_low])
         is_low[is_low] = surface > _SURFACE_TOLERANCE
@@ -308,7 +309,7 @@ class CullingRule:
 def _elevation(model: mujoco.MjModel, geoms: Array, local: Array) -> tuple[Array, Array]:
     """Return heights (m,) and slopes (2, m) of height fields `geoms` at local x, y (2, m).
 
-    Each cell is two triangles, cut from its first to its last corner.
+    Each cell is two triangles, split from first to last corner.
     """
     fields = model.geom_dataid[geoms]
     half, top = model.hfield_size[:, :2].T, model.hfield_size[:, 2].take(fields)
@@ -329,17 +330,17 @@ def _elevation(model: mujoco.MjModel, geoms: Array, local: Array) -> tuple[Array
 
 
 class GroundTable:
-    """Static, upright boxes, height fields and planes by place, for rays straight down.
+    """Spatial grid of static, upright boxes, height fields and planes for vertical downward rays.
 
-    The ground plan is cut into square cells, each with a list of its geoms, highest first. Results
-    are those of `mj_ray`, but for the last bit of distances. On generated terrain (Go1 rough, 1,024
-    environments) they take a hundredth of the CPU time of `Batch.ray`.
+    The xy plane is divided into square cells, each with a list of geoms, highest first. Results
+    equal those of `mj_ray` except for the last bit of distances. On generated terrain (Go1 rough,
+    1,024 environments) a lookup takes a hundredth of the CPU time of `Batch.ray`.
     """
 
     def __init__(self, model: mujoco.MjModel, geoms: Array, pos: Array, static: Array) -> None:
-        """Sort `geoms` at `pos` (G, 3) into cells.
+        """Sort `geoms` at `pos`, (G, 3), into cells.
 
-        The table holds where the geoms `static`, visible or not, are as compiled.
+        The table is valid while the geoms `static`, visible or not, are as compiled.
         """
         self._model = model
         self._compiled = _static_fields(model, static)
@@ -349,9 +350,9 @@ class GroundTable:
         is_field, is_plane = kind == _HFIELD, kind == _PLANE
         size[is_field] = model.hfield_size[model.geom_dataid[geoms[is_field]], :3]
         size[is_plane, 2] = 0.0
-        # A plane of size 0 has no end.
+        # Planes of size 0 are infinite.
         size[:, :2][size[:, :2] == 0.0] = np.inf
-        # Height of the ground if it is one endless plane.
+        # Ground height if the ground is one infinite plane.
         self._level = pos[0, 2] if len(geoms) == 1 and np.isinf(size[0, :2]).all() else None
         order = np.argsort(-(pos + size)[:, 2], kind="stable")
         geoms, pos, size, is_field = geoms[order], pos[order], size[order], is_field[order]
@@ -359,12 +360,12 @@ class GroundTable:
         origin = low.min(axis=0, initial=0.0, where=np.isfinite(low))
         extent = high.max(axis=0, initial=0.0, where=np.isfinite(high)) - origin
         self._edge = max(_CELL, math.sqrt(extent.prod() / _MAX_CELLS))
-        # The cells along the border stand for everything beyond.
+        # Border cells include everything beyond the border.
         self._origin = origin - self._edge
         self._shape = np.ceil(extent / self._edge).astype(int) + 2
 
         low, high = (low - self._origin) / self._edge, (high - self._origin) / self._edge
-        # Areas of cells that geoms touch, [start, end) along x and y.
+        # Cell ranges of geoms, [start, end) along x and y.
         start = np.clip(np.floor(low - 1e-6), 0, self._shape).astype(int)
         end = np.clip(np.floor(high + 1e-6) + 1, 0, self._shape).astype(int)
         cells = np.arange(self._shape.prod())
@@ -375,10 +376,10 @@ class GroundTable:
         entries = entries[np.argsort(cell, kind="stable")]
         count = np.bincount(cell, minlength=len(cells))
         ends = count.cumsum()
-        # Lists end with an entry for no geom, whose values are NaN, so that nothing is met there.
+        # Lists end with a sentinel of NaN values, so rays miss it.
         self._entries = np.insert(entries, ends, len(geoms)).astype(np.int32)
         self._first = ends - count + cells
-        # Boxes are listed by their surface, a field by its summit.
+        # Boxes are sorted by their top surface, height fields by their highest possible point.
         highest, place = self._entries[self._first], np.stack(np.unravel_index(cells, self._shape))
         covers = np.append(~is_field, False)[highest] | (count == 1)
         covers &= (place >= low.T.take(highest, axis=1, mode="clip")).all(axis=0)
@@ -393,18 +394,18 @@ class GroundTable:
         self._top = self._pos[2] + self._size[2]
 
     def cast(self, origins: Array) -> Hits:
-        """Cast rays straight down from `origins` (n, R, 3)."""
+        """Cast downward rays from `origins`, (n, R, 3)."""
         shape, normals = origins.shape[:2], np.zeros(origins.shape, np.float32)
         normals[..., 2] = 1.0
         if self._level is not None:
-            # 0.5 to 0.7 of the time that `sim.sense` takes otherwise (G1 and Go1 on flat ground).
+            # Reduces the time of `sim.sense` to 0.5 to 0.7 (G1 and Go1 on flat ground).
             gaps = origins[..., 2].astype(np.float64) - self._level
             hits = Hits(gaps.astype(np.float32), normals, np.full(shape, self._geoms[0]))
             hits.forget(~((gaps >= 0.0) & (gaps < np.inf)))
             return hits
         points = np.ascontiguousarray(origins.reshape(-1, 3).T, dtype=np.float64)
         x, y = (points[:2] - self._origin[:, None]) / self._edge
-        # Positions that are NaN are beyond the border too.
+        # NaN positions go to a border cell.
         x = np.fmin(np.fmax(x, 0.0), self._shape[0] - 1).astype(np.int64)
         y = np.fmin(np.fmax(y, 0.0), self._shape[1] - 1).astype(np.int64)
         cell = x * self._shape[1] + y
@@ -419,7 +420,7 @@ class GroundTable:
             geom, starts = self._entries[entry], points.take(rays, axis=1)
             normal = np.tile(_UP, (len(rays), 1))
             gap = self._gaps(geom, starts, normal)
-            # From within a box, rays meet its bottom.
+            # Rays from inside a box hit its bottom.
             is_below = gap < 0.0
             gap[is_below] = (starts[2] - self._bottom[geom])[is_below]
             normal[is_below] *= -1.0
@@ -438,7 +439,7 @@ class GroundTable:
         return hits
 
     def _gaps(self, geom: Array, points: Array, normals: Array) -> Array:
-        """Return heights (m,) of `points` (3, m) above the tops of `geom`; set normals of fields."""
+        """Return heights (m,) of `points` (3, m) above `geom`; set normals of height fields."""
         gaps = (points[2] - self._pos[2].take(geom)) - self._size[2].take(geom)
         on_field = np.flatnonzero(self._is_field.take(geom))
         if len(on_field):
@@ -451,10 +452,10 @@ class GroundTable:
         return gaps
 
     def is_current(self, fields: Mapping[str, torch.Tensor]) -> bool:
-        """Return whether static geoms are as compiled in every environment.
+        """Return True if static geoms are as compiled in every environment.
 
         `fields` are the per-environment model fields, (N, ...), compared only after a write. Other
-        fields, and what these hold of other geoms, may differ; of colors only transparency counts.
+        fields, and values of other geoms, may differ. Of colors, only transparency is compared.
         """
         versions = {name: fields[name]._version for name in self._compiled if name in fields}
         if versions != self._seen:
@@ -471,17 +472,16 @@ class GroundTable:
             if differing and not self._has_warned:
                 self._has_warned = True
                 logger.warning(
-                    "Rays try every geom of the model from now on, which is much slower: the field "
-                    "%r of geoms that never move, such as the ground, differs between environments "
-                    "or from the compiled model. Randomize it for things that move only "
-                    "(asset_cfg).",
+                    "Ray casting now tests every geom of the model and is much slower: field %r of "
+                    "static geoms, such as the ground, differs between environments or from the "
+                    "compiled model. Randomize this field for moving entities only (asset_cfg).",
                     differing[0],
                 )
         return self._is_current
 
 
 def _static_fields(model: mujoco.MjModel, geoms: Array) -> dict[str, tuple[Array, Array]]:
-    """Return by field the ids on which places and looks of static `geoms` depend, and values."""
+    """Return ids and compiled values of the fields that place and color static `geoms`."""
     chain = [model.geom_bodyid[geoms]]
     while chain[-1].any():
         chain.append(model.body_parentid[chain[-1]])

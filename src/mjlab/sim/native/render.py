@@ -1,8 +1,8 @@
-"""Rendering on the native engine: rays through pixels, shaded as MuJoCo Warp's renderer does.
+"""Native renderer: ray casting through pixels, with the shading of MuJoCo Warp's renderer.
 
-No OpenGL and no display are needed. An image is cut into tiles; a tile is a small simulation, whose
-few geoms stand for those in its sight. Everything is in the frame of the camera, which looks along
--z, with x to the right and y up, so that rays are the same from call to call.
+OpenGL and a display are not required. An image is divided into tiles. Each tile is a small
+simulation with copies of the geoms visible in the tile. Coordinates are in the camera frame, with x
+right, y up and the camera looking along -z, so rays stay the same between calls.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from mjlab.sim.native.shading import (
 )
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_conjugate, quat_from_matrix, quat_mul
 
-# Rays cast and shaded at a time: what they need stays in the caches of the CPU.
+# Number of rays cast and shaded at a time: their data fits into the CPU caches.
 _RAYS_AT_A_TIME = 131_072
 _GEOM_TYPE = int(mujoco.mjtObj.mjOBJ_GEOM)
 
 MakeBatch = Callable[..., Batch]
-"""`make_batch(model, count)` makes a batch of simulations; `num_threads=` is optional."""
+"""Factory `make_batch(model, count, num_threads=...)` of batches; `num_threads` is optional."""
 
 
 class NativeRenderer:
-    """Renderer of a native engine's cameras, on threads that share out the environments."""
+    """Renderer of a native engine's cameras. Environments are distributed over threads."""
 
     def __init__(
         self, engine: Engine, model: mujoco.MjModel, num_threads: int, make_batch: MakeBatch
     ) -> None:
-        """Render the environments of `engine`, which runs `model`.
+        """Create a renderer for the environments of `engine`, a simulation of `model`.
 
         Images do not depend on `num_threads`.
         """
@@ -65,11 +65,11 @@ class NativeRenderer:
         self._pool = ThreadPoolExecutor(self._num_workers, "render")
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
-        """Render views at the poses that derived fields have; see `Engine.render`."""
-        # A field that is bound for the first time makes the engine compute it, here and now.
+        """Render views at the poses in derived fields; see `Engine.render`."""
+        # Bind on this thread: binding a new field runs the engine.
         for name in ("xpos", "xquat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir"):
             self._engine.data_field(name)
-        # Threads of torch, which wait for each other by spinning, would be in the way.
+        # Torch's threads wait by spinning, and would compete with the render threads.
         threads, default = torch.get_num_threads(), torch.get_default_dtype()
         torch.set_num_threads(1)
         torch.set_default_dtype(torch.float32)
@@ -83,7 +83,7 @@ class NativeRenderer:
         return [workers[0].images for workers in by_view]
 
     def _workers(self, view: CameraView) -> list[_View]:
-        """Return what renders a view, one for each thread, into the same images."""
+        """Return the renderers of a view, one per thread, with shared images."""
         if view not in self._views:
             with torch.inference_mode(False):
                 images = Images.empty(view, self._engine.num_envs, "cpu")
@@ -95,12 +95,12 @@ class NativeRenderer:
         return self._views[view]
 
     def _work(self, task: tuple[int, _View]) -> None:
-        """Render the share of a worker with its number."""
+        """Render the environments of a worker, `task` = (worker index, view)."""
         number, view = task
         torch.set_num_threads(1)
         lens_varies = not LENS_FIELDS.isdisjoint(self._engine.model_fields)
         num_envs, step = self._engine.num_envs, view.envs_at_a_time
-        # Tensors that are made here are written into in later calls, in whatever mode.
+        # Later calls, in any mode, write into tensors created here.
         with torch.inference_mode(False), torch.no_grad():
             for start in range(number * step, num_envs, self._num_workers * step):
                 envs = slice(start, min(start + step, num_envs))
@@ -118,7 +118,7 @@ class NativeRenderer:
 
 
 def render_problem(model: mujoco.MjModel) -> str | None:
-    """Return why cameras do not work in a model on this engine, and what to do; None if they do."""
+    """Return an error message if cameras do not support the model; None if they do."""
     kinds = set(model.geom_type.tolist()) - KINDS
     names = sorted(mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds)
     if model.nflex:
@@ -126,13 +126,13 @@ def render_problem(model: mujoco.MjModel) -> str | None:
     if not names:
         return None
     return (
-        f"The cameras of the native engine do not see {', '.join(names)}, which this model has. "
-        "Leave out the camera sensors or these, or use --engine warp (SimulationCfg.engine='warp')."
+        f"The cameras of the native engine do not see {', '.join(names)} of this model; remove them "
+        "or the camera sensors, or use --engine warp (SimulationCfg.engine='warp')."
     )
 
 
 class _View:
-    """Renderer of one view, on one thread."""
+    """Renderer of one view on one thread."""
 
     def __init__(
         self,
@@ -142,20 +142,20 @@ class _View:
         num_envs: int,
         make_batch: MakeBatch,
     ) -> None:
-        """Prepare to render into `images`, at most `num_envs` environments at a time."""
+        """Allocate buffers to render at most `num_envs` environments at a time into `images`."""
         self.images = images
         self._model, self._view = model, view
         self._lens = _Lens(model, view)
-        # From the last geom to the first: of surfaces at the same distance, rays report the first.
+        # Last geom first: among surfaces at equal distance, rays report the first.
         self._ids = torch.tensor([*rendered_geoms(model, view.geom_groups)[::-1], BACKGROUND])
         kinds = torch.tensor(model.geom_type)[self._ids[:-1]]
         self._sight = _Sight(model, self._ids[:-1], kinds, self._lens)
-        # Depth (m) beyond which nothing is visible, unless it is 0.
+        # Far plane (m). 0: unlimited.
         self._far = float(model.vis.map.zfar * model.stat.extent) or np.inf
         self.envs_at_a_time = min(num_envs, max(1, _RAYS_AT_A_TIME // self._lens.num_rays))
         make_slots, rows = partial(_Slots, model, kinds, make_batch), self.envs_at_a_time
         self._slots = make_slots(rows * self._lens.num_tiles, self._lens.tile_rays)
-        # Shadow rays go past all geoms, not those in sight of a tile.
+        # Shadow rays test all geoms, not only those visible in a tile.
         self._shadow_slots = make_slots(rows, self._lens.num_rays) if view.use_shadows else None
         self._shading = Shading(model, kinds, view.use_textures)
         self._aimed: _Rays | None = None
@@ -164,9 +164,9 @@ class _View:
         self._has_backs = self._rule.is_needed or self._lens.is_orthographic
 
     def render(self, envs: slice, read: ReadField, lens_varies: bool) -> None:
-        """Render the environments `envs`, whose fields `read` returns.
+        """Render the environments `envs`; `read` returns their fields.
 
-        `lens_varies` says whether rays differ between environments.
+        `lens_varies`: rays differ between environments.
         """
         view, lens, images, slots = self._view, self._lens, self.images, self._slots
         pos, mat = read("cam_xpos")[:, view.camera_id], read("cam_xmat")[:, view.camera_id]
@@ -203,11 +203,11 @@ class _View:
             lens.copy_to_image(rgb, images.rgb[envs])
 
     def _passed(self, geoms: Geoms, slots: _Slots, *, is_shadow: bool = False) -> Passed:
-        """Return which hits on `geoms` do not count: those on the backs of surfaces.
+        """Return a predicate of hits to ignore: those on back faces of `geoms`.
 
-        A pinhole camera sees the back of a convex geom only from inside of it, and such geoms are
-        out of its sight. It is looked at hit by hit for meshes, height fields and parallel rays.
-        Of shadow rays, only those on height fields, of which only the top is in the way.
+        A pinhole camera sees back faces of a convex geom only from inside the geom, and such geoms
+        are culled. So back faces are tested per hit for meshes, height fields and parallel rays
+        only. For shadow rays, only height fields are culled: only their top casts shadows.
         """
         rows_per_env = slots.num_rows // self.envs_at_a_time
         pos, mat = geoms.pos.numpy(), geoms.mat.numpy()
@@ -222,7 +222,7 @@ class _View:
         return passed
 
     def _shadow_of(self, geoms: Geoms, slots: _Slots) -> Callable[..., Tensor]:
-        """Return what casts shadow rays."""
+        """Return a function that casts shadow rays."""
         n = len(geoms.pos)
         slots.load(geoms, geoms.exists)
         passed = self._passed(geoms, slots, is_shadow=True) if self._has_fields else None
@@ -235,23 +235,23 @@ class _View:
         return shadow
 
 
-# Length and width of a tile, about, in pixels: fewer geoms are in sight of a smaller tile, and each
-# tile costs something by itself. On the YAM task, one tile an image takes 1.4 times as long for
-# depth, 1.3 times for depth and segmentation.
+# Approximate edge of a tile (pixels): smaller tiles see fewer geoms, but each tile has overhead. On
+# the YAM task, one tile per image takes 1.4 times as long for depth, 1.3 times for depth and
+# segmentation.
 _TILE = 8
 
 
 @dataclass
 class _Rays:
-    """Rays (n, P) of a camera, sorted into tiles; n is 1 where all environments share them."""
+    """Rays of a camera, sorted into tiles, (n, P). n is 1 if all environments share them."""
 
     directions: Tensor
     """Unit vectors, (n, P, 3)."""
     origins: Tensor | None
-    """Where rays start if the projection is orthographic, (n, P, 3); None: at the camera."""
+    """Ray origins of an orthographic projection, (n, P, 3). None: all at the camera."""
     planes: Tensor
-    """Inward normals of the planes between which tiles are, (n, 3, F): F planes are the left sides
-    of columns, the right sides, the tops of rows and the bottoms."""
+    """Inward normals of the F planes that bound tiles, (n, 3, F): left sides of columns, right
+    sides, top sides of rows, bottom sides."""
     plane_offsets: Tensor
     """Signed distances of the camera from the planes, (n, 1, F)."""
 
@@ -260,9 +260,9 @@ class _Lens:
     """Rays through the centers of pixels, sorted into `rows` x `columns` tiles."""
 
     def __init__(self, model: mujoco.MjModel, view: CameraView) -> None:
-        """Sort the pixels of a view; tiles that reach beyond the image repeat its last pixels."""
+        """Sort the pixels of a view into tiles. Tiles beyond the image repeat its last pixels."""
         width, height = self._size = view.width, view.height
-        # Tiles are nearly full.
+        # Choose tile sizes that leave few repeated pixels.
         tile_width, tile_height = (-(-k // max(1, round(k / _TILE))) for k in self._size)
         self.columns, self.rows = -(-width // tile_width), -(-height // tile_height)
         self.num_tiles, self.tile_rays = self.rows * self.columns, tile_width * tile_height
@@ -277,7 +277,7 @@ class _Lens:
         self._tiles = (-1, self.rows, self.columns, tile_height, tile_width)
         pixels = (y[:, None] * width + x[None, :]).view(shape).transpose(1, 2).reshape(-1)
         self._u, self._v = (pixels % width + 0.5) / width, (pixels // width + 0.5) / height
-        # Where each pixel of the image is among the rays. One that is repeated is in several.
+        # Ray index of each pixel of the image. Repeated pixels use one of several equal rays.
         self._place = torch.empty(width * height, dtype=torch.int64)
         self._place[pixels] = torch.arange(len(pixels))
         self._id = view.camera_id
@@ -285,10 +285,10 @@ class _Lens:
         self.is_orthographic = projection == int(mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC)
         self._sensor_size = model.cam_sensorsize[self._id].tolist()
         self.rays = self.rays_of(lambda name: torch.tensor(getattr(model, name)[None]).float())
-        """Rays of all environments, unless these differ in `LENS_FIELDS`."""
+        """Rays shared by all environments, valid unless `LENS_FIELDS` are expanded."""
 
     def rays_of(self, read: ReadField) -> _Rays:
-        """Compute the rays of n environments, whose fields `read` returns."""
+        """Compute the rays of n environments; `read` returns their fields."""
         left, right, bottom, top = self._frustum(read)
         x, y = left + (right - left) * self._u, top + (bottom - top) * self._v
         one, none = torch.ones_like(x), torch.zeros_like(x)
@@ -308,9 +308,9 @@ class _Lens:
         return _Rays(directions, origins, torch.cat((normals, edges[:, None]), dim=1), none)
 
     def _frustum(self, read: ReadField) -> tuple[Tensor, ...]:
-        """Return the sides (n, 1) of the image: left, right, bottom, top.
+        """Return left, right, bottom and top of the image, (n, 1).
 
-        They are those at a distance of 1 m, unless rays are parallel.
+        At a distance of 1 m for perspective cameras.
         """
         fovy = read("cam_fovy")[:, self._id, None]
         aspect = self._size[0] / self._size[1]
@@ -318,7 +318,7 @@ class _Lens:
         if self.is_orthographic or height == 0.0:
             half = 0.5 * fovy if self.is_orthographic else torch.tan(torch.deg2rad(0.5 * fovy))
             return -half * aspect, half * aspect, -half, half
-        # The part of the sensor that has the shape of the image.
+        # Crop the sensor to the aspect ratio of the image.
         width, height = min(width, height * aspect), min(height, width / aspect)
         fx, fy, cx, cy = read("cam_intrinsic")[:, self._id, :, None].unbind(dim=1)
         return (
@@ -329,27 +329,27 @@ class _Lens:
         )
 
     def copy_to_image(self, values: Tensor, out: Tensor) -> None:
-        """Copy values of rays (n, P, ...) to an image (n, height, width, ...)."""
+        """Copy ray values, (n, P, ...), to an image, (n, height, width, ...)."""
         torch.index_select(values, 1, self._place, out=out.view(len(out), -1, *out.shape[3:]))
 
 
-# Which of its sizes are the half extents of a geom, if not the three in order.
+# Indices of geom sizes that are the half extents, if not (0, 1, 2).
 _AXES = {SPHERE: (0, 0, 0), CAPSULE: (0, 0, 1), CYLINDER: (0, 0, 1)}
 # Axes along which a convex geom is round.
 _ROUND = {SPHERE: (1, 1, 1), CAPSULE: (1, 1, 1), ELLIPSOID: (1, 1, 1), CYLINDER: (1, 1, 0)}
-# The color of a geom that has none of its own, so that its material's color shows.
+# Default color of geoms. A geom with this color shows its material's color.
 _NO_COLOR = (0.5, 0.5, 0.5, 1.0)
-# Half extents (metres) of what has no end; larger numbers lose the small ones beside them.
+# Half extents of infinite geoms (m). Larger values would lose float32 precision of small ones.
 _ENDLESS = 1e8
-# What rounding may hide of a geom: relative to its extents and distance, and in metres.
-_SLACK, _SLACK_METRES = 1e-5, 1e-6
+# Slack for rounding: relative to extents and distance, and absolute (m).
+_SLACK, _SLACK_METERS = 1e-5, 1e-6
 
 
 class _Sight:
-    """The geoms that a camera may see, and which of them are in sight of each tile."""
+    """Geoms visible to a camera, and view-frustum culling per tile."""
 
     def __init__(self, model: mujoco.MjModel, ids: Tensor, kinds: Tensor, lens: _Lens) -> None:
-        """Take the geoms `ids` (G,), of types `kinds` (G,), of a model."""
+        """Create culling for the geoms `ids`, (G,), of types `kinds`, (G,)."""
         self._ids, self._lens = ids, lens
         self._bodies = torch.tensor(model.geom_bodyid).long()[ids]
         self._round = torch.tensor([_ROUND.get(k, (0, 0, 0)) for k in kinds.tolist()]).view(-1, 3)
@@ -357,7 +357,7 @@ class _Sight:
         self._is_capsule = kinds == CAPSULE
         self._planes = (kinds == PLANE).nonzero().flatten()
         self._axes = torch.tensor([_AXES.get(k, (0, 1, 2)) for k in kinds.tolist()]).view(-1, 3)
-        # Center and half extents. A height field reaches from its base to its top.
+        # Center and half extents. Height fields extend from base to top.
         x, y, top, base = model.hfield_size.T
         fields = np.stack((0 * x, 0 * y, (top - base) / 2, x, y, (top + base) / 2), axis=-1)
         self._boxes = [
@@ -367,7 +367,7 @@ class _Sight:
         ]
 
     def pose(self, read: ReadField, pos: Tensor, mat: Tensor) -> Geoms:
-        """Place the geoms in the frame of a camera at `pos` (n, 3) and `mat` (n, 3, 3)."""
+        """Transform the geoms to the frame of a camera at `pos`, (n, 3), and `mat`, (n, 3, 3)."""
         body_quat = read("xquat")[:, self._bodies]
         to_camera = quat_conjugate(quat_from_matrix(mat))[:, None].expand_as(body_quat)
         in_camera = quat_mul(to_camera, body_quat)
@@ -375,10 +375,10 @@ class _Sight:
         quat = quat_mul(in_camera, read("geom_quat")[:, self._ids].expand_as(body_quat))
         size = read("geom_size")[:, self._ids].expand(len(pos), -1, -1)
         dataid = read("geom_dataid")[:, self._ids].expand(len(pos), -1)
-        # Where environments hold different things, one that is not there has no shape or no size.
+        # Geoms absent from an environment's variant have dataid -1 or size 0.
         exists = size[..., 0] > 0.0
         exists[:, self._planes] = True
-        # Boxes follow what environments hold, whether or not `geom_aabb` was written with it.
+        # Boxes are computed from per-environment values; `geom_aabb` may be out of date.
         center, half = torch.zeros_like(size), size.gather(-1, self._axes.expand_as(size))
         half[..., 2] += torch.where(self._is_capsule, size[..., 0], 0.0)
         half[:, self._planes, 2] = 0.0
@@ -406,32 +406,32 @@ class _Sight:
         )
 
     def by_tile(self, geoms: Geoms, rays: _Rays) -> Tensor:
-        """Return what rays of each tile may meet, (n, rows, columns, G) bool.
+        """Return the geoms visible in each tile, (n, rows, columns, G) bool.
 
-        A box around a geom is in sight of a tile unless it lies beyond one of the tile's sides.
+        The bounding box of a visible geom is not entirely outside any side of the tile.
         """
         visible = geoms.exists
         if rays.origins is None:
-            visible = visible & ~self._around(geoms)
+            visible = visible & ~self._contains_camera(geoms)
         middle = geoms.pos + (geoms.mat @ geoms.center[..., None]).squeeze(-1)
-        # One factor for all makes a single product.
+        # With shared planes, all environments are one matrix product.
         planes = rays.planes[0] if len(rays.planes) == 1 else rays.planes
         axes = geoms.mat.transpose(-1, -2).reshape(len(geoms.mat), -1, 3)
         along = (axes @ planes).abs_().unflatten(1, (-1, 3))
         reach = (along * geoms.half[..., None]).sum(dim=2)
         reach *= 1.0 + _SLACK
         reach += middle @ planes + rays.plane_offsets
-        reach += _SLACK_METRES + _SLACK * middle.abs().amax(dim=-1, keepdim=True)
+        reach += _SLACK_METERS + _SLACK * middle.abs().amax(dim=-1, keepdim=True)
         inside = (reach >= 0.0) & visible[..., None]
         columns, rows = self._lens.columns, self._lens.rows
         left, right, top, bottom = inside.transpose(1, 2).split((columns, columns, rows, rows), 1)
         return (top & bottom)[:, :, None] & (left & right)[:, None]
 
-    def _around(self, geoms: Geoms) -> Tensor:
-        """Return the convex geoms (n, G) that the camera is in, whose backs it does not see.
+    def _contains_camera(self, geoms: Geoms) -> Tensor:
+        """Return convex geoms that contain the camera, (n, G) bool; their back faces are culled.
 
-        Along each axis, the camera is at x of the extent beyond the core, which is a point but for
-        capsules: |x| < 1 along the flat ones, and the norm of the round ones < 1.
+        Along each axis, x is the camera position relative to the extent beyond the core, a point
+        (for capsules, a segment). Inside: |x| < 1 along flat axes, and norm < 1 of round axes.
         """
         local = (geoms.pos[..., None, :] @ geoms.mat).squeeze(-2).abs()
         core = torch.zeros_like(geoms.half)
@@ -441,33 +441,33 @@ class _Sight:
         return self._is_convex & (x < 1.0).all(dim=-1) & (norm < 1.0)
 
 
-# More slots than are needed now, so that they are still enough when the camera has turned.
+# Factor of allocated to needed slots, to leave room for other camera poses.
 _HEADROOM = 1.3
-# Group of a slot without a geom, which no ray meets, and the groups that rays meet.
+# Group of empty slots, and mask of the groups that rays hit.
 _EMPTY, _MASK = 1, np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 
 
 class _Slots:
-    """Simulations whose geoms stand for those in sight of a tile of an image, one a tile.
+    """Simulations with copies of the geoms visible in a tile, one simulation per tile.
 
-    They have no bodies, so that a query costs what its rays cost. On the YAM task (32 x 32 pixels,
-    27 of 91 geoms in the camera's groups), `Batch.ray` over the environments themselves takes 3.2
-    to 3.8 times as long as a depth image this way, and 1.4 times as long as a shaded rgb image.
+    Simulations have no bodies, so a query costs only its rays. On the YAM task (32 x 32 pixels, 27
+    of 91 geoms in the camera's groups), `Batch.ray` on the environments takes 3.2 to 3.8 times as
+    long as a depth image with slots, and 1.4 times as long as a shaded rgb image.
     """
 
     def __init__(
         self, model: mujoco.MjModel, kinds: Tensor, make_batch: MakeBatch, rows: int, rays: int
     ) -> None:
-        """Prepare `rows` simulations for `rays` rays each, against geoms of types `kinds` (G,)."""
+        """Allocate `rows` simulations of `rays` rays each, for geoms of types `kinds`, (G,)."""
         self._model, self._kinds, self._make_batch = model, kinds, make_batch
         self.num_rows, self._width = rows, 0
-        # In double precision, as the batch wants them.
+        # The batch takes float64.
         self._origins, self._directions = np.zeros((rows, rays, 3)), np.zeros((rows, rays, 3))
 
     def load(self, geoms: Geoms, in_sight: Tensor) -> None:
-        """Put into each row the geoms that are in its sight: (rows, G) bool, rows by environment.
+        """Load the visible geoms of each row, (rows, G) bool; rows are ordered by environment.
 
-        There may be fewer rows than simulations; the others keep what they have.
+        With fewer rows than simulations, the remaining simulations are unchanged.
         """
         rows, num_geoms = in_sight.shape
         count = in_sight.cumsum(dim=1, dtype=torch.int32)
@@ -481,12 +481,12 @@ class _Slots:
         self._values["geom_type"].view(-1)[place] = self._kinds[column]
         self._values["geom_group"][:rows] = _EMPTY
         self._values["geom_group"].view(-1)[place] = 0
-        # The first entry of each row is for the slot -1 of a miss.
+        # The first entry of each row is slot -1, a miss.
         self._columns[:rows] = num_geoms
         self._columns.view(-1)[place + row + 1] = column
 
     def _require(self, slots: int) -> None:
-        """Have at least so many slots."""
+        """Allocate at least `slots` slots."""
         if self._width and slots <= self._width:
             return
         self._width = max(1, min(len(self._kinds), int(_HEADROOM * slots) + 1))
@@ -498,7 +498,7 @@ class _Slots:
         self._columns = torch.full((self.num_rows, self._width + 1), len(self._kinds))
 
     def aim(self, directions: Tensor, origins: Tensor | None) -> None:
-        """Set the rays of n environments, (n or 1, P, 3); those of all if n is 1."""
+        """Set the rays of the first n environments, (n, P, 3); of all environments if n is 1."""
         for target, source in ((self._directions, directions), (self._origins, origins)):
             if source is not None:
                 n = len(source)
@@ -508,21 +508,21 @@ class _Slots:
     def cast(self, rows: int, passed: Passed | None) -> Hits:
         """Cast the rays of the first `rows` simulations; geom ids of hits are slots.
 
-        `passed` says which hits do not count.
+        `passed` is a predicate of hits to ignore.
         """
         origins, directions = self._origins[:rows], self._directions[:rows]
         return cast_through(self._batch, origins, directions, passed, geomgroup=_MASK)
 
     def columns(self, rows: Any, slots: np.ndarray) -> Tensor:
-        """Return the numbers of the geoms in `slots` (m, rays) of some rows; G for -1."""
+        """Return geom indices of `slots`, (m, rays), of some rows; G for -1."""
         return self._columns[rows].gather(1, torch.from_numpy(slots).long() + 1)
 
 
 def _slot_model(model: mujoco.MjModel, kinds: set[int], slots: int) -> mujoco.MjModel:
-    """Compile a world of placeholder geoms with the surfaces of `model`, if `kinds` have some.
+    """Compile a world of placeholder geoms, with the meshes and height fields that `kinds` need.
 
     Raises:
-        ValueError: a mesh of `model` cannot be compiled again.
+        ValueError: a mesh of `model` does not compile.
     """
     spec = mujoco.MjSpec()
     for _ in range(slots):
@@ -536,14 +536,14 @@ def _slot_model(model: mujoco.MjModel, kinds: set[int], slots: int) -> mujoco.Mj
             name=f"mesh{i}",
             uservert=model.mesh_vert[model.mesh_vertadr[i] :][: model.mesh_vertnum[i]].ravel(),
             userface=model.mesh_face[model.mesh_faceadr[i] :][: model.mesh_facenum[i]].ravel(),
-            # An open mesh has no volume.
+            # Open meshes have no volume.
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
     compiled = spec.compile()
     if HFIELD in kinds:
         compiled.hfield_data[:] = model.hfield_data
     if MESH in kinds:
-        # The compiler has centered and turned them a second time.
+        # Restore vertices: the compiler centered and rotated them a second time.
         compiled.mesh_vert[:], compiled.mesh_face[:] = model.mesh_vert, model.mesh_face
         target, source = (
             slice(m.mesh_bvhadr[0], m.mesh_bvhadr[-1] + m.mesh_bvhnum[-1])
@@ -552,6 +552,6 @@ def _slot_model(model: mujoco.MjModel, kinds: set[int], slots: int) -> mujoco.Mj
         for name in ("bvh_child", "bvh_nodeid", "bvh_depth", "bvh_aabb"):
             getattr(compiled, name)[target] = getattr(model, name)[source]
     compiled.geom_sameframe[:] = 0
-    # MuJoCo 4 lets rays pass geoms whose bounding sphere they miss; 0 is for no bound.
+    # MuJoCo 4 skips geoms whose bounding sphere a ray misses; 0 disables the check.
     compiled.geom_rbound[:] = 0.0
     return compiled

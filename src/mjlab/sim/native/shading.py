@@ -1,8 +1,8 @@
-"""Colors of surfaces and of the sky on the native engine: lights, materials and textures.
+"""Native shading: lights, materials, textures and skybox.
 
-Lights follow the formulas of MuJoCo Warp's renderer, textures the mappings of MuJoCo's and Warp's.
-Components come first: a vector of K points is (3, K). A texture laid onto a mesh by coordinates of
-its vertices shows as its mean color, because rays do not say which face of a mesh they meet.
+Lights use the formulas of MuJoCo Warp's renderer, textures the mappings of MuJoCo and Warp.
+Components come first: a vector of K points is (3, K). Textures mapped by vertex coordinates of a
+mesh show their mean color, because ray hits do not include the mesh face.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ PLANE, HFIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
 _TINY = 1e-6
 
 ReadField = Callable[[str], Tensor]
-"""A field of `MjData` or `MjModel` by name, of n environments: (n, ...), (1, ...) if they share it."""
+"""Reader of `MjData` and `MjModel` fields by name, (n, ...); (1, ...) if shared by environments."""
 
 
 @dataclass
 class Geoms:
-    """G geoms in the frame of the camera, in n environments."""
+    """G geoms of n environments in the camera frame."""
 
     pos: Tensor
     """Position, (n, G, 3)."""
@@ -39,22 +39,22 @@ class Geoms:
     size: Tensor
     """Size, (n, G, 3)."""
     center: Tensor
-    """Center of a box around the geom, in the frame of the geom, (n, G, 3)."""
+    """Center of the bounding box in the geom frame, (n, G, 3)."""
     half: Tensor
-    """Half extents of the box, (n, G, 3)."""
+    """Half extents of the bounding box, (n, G, 3)."""
     dataid: Tensor
-    """Height field or mesh, or -1, (n, G) int32."""
+    """Height field or mesh id, (n, G) int32. -1: none."""
     material: Tensor
-    """Material, -1 for none, (1 or n, G)."""
+    """Material id, (1 or n, G). -1: none."""
     rgba: Tensor
     """Color, (1 or n, G, 4)."""
     exists: Tensor
-    """True where an environment has the geom and it is not fully transparent, (n, G) bool."""
+    """True for present geoms that are not fully transparent, (n, G) bool."""
 
 
 @dataclass
 class Surfaces:
-    """Hits of n x P rays, in the camera frame."""
+    """Hits of n x P rays in the camera frame."""
 
     directions: Tensor
     """Unit vectors along the rays, (3, 1 or n, P)."""
@@ -63,32 +63,32 @@ class Surfaces:
     normals: Tensor
     """Unit normals, (3, n, P)."""
     columns: Tensor
-    """Number of the geom among those that are rendered, (n, P); G for nothing."""
+    """Index of the geom among rendered geoms, (n, P). G: miss."""
 
 
 # Lights.
 
-# What a geom without a material reflects, and its shininess; the exponent of a shininess of 1.
+# Specular and shininess of geoms without material; specular exponent at shininess 1.
 _SPECULAR, _SHININESS, _MAX_EXPONENT = 0.5, 0.5, 128.0
-# Part of a light that reaches what is in its shadow, and ambient light where there is no light.
+# Fraction of light that reaches shadowed surfaces; ambient light of models without lights.
 _IN_SHADOW, _WITHOUT_LIGHTS = 0.3, 0.3
-# Shadow rays start so far (metres) above the surface, and end so far before the light.
+# Offset of shadow rays above the surface and before the light (m).
 _ABOVE, _BEFORE = 1e-4, 1e-3
-# Distance (m) of lights that have no place.
+# Distance of directional lights (m).
 _ENDLESS = 1e8
 _SPOT = int(mujoco.mjtLightType.mjLIGHT_SPOT)
 _DIRECTIONAL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
 class Shading:
-    """Colors of surfaces, by the formulas of MuJoCo Warp's renderer.
+    """Surface colors by the formulas of MuJoCo Warp's renderer.
 
-    A light adds its diffuse color times the cosine between surface and light, and its specular color
-    times a power of the cosine between the surface and the direction halfway to the eye.
+    A light adds its diffuse color times the cosine between normal and light direction, and its
+    specular color times a power of the cosine between normal and halfway vector (Blinn-Phong).
     """
 
     def __init__(self, model: mujoco.MjModel, kinds: Tensor, use_textures: bool) -> None:
-        """Take the lights and (if wanted) textures of a model, for geoms of types `kinds` (G,)."""
+        """Load lights and, with `use_textures`, textures, for geoms of types `kinds`, (G,)."""
         self._num_lights, self._headlight = model.nlight, model.vis.headlight
         self._textures = Textures(model, torch.nn.functional.pad(kinds, (0, 1), value=-1))
         self._use_textures = use_textures and model.ntex > 0 and model.nmat > 0
@@ -102,17 +102,18 @@ class Shading:
         read: ReadField,
         shadow: Callable[[Tensor, Tensor, Tensor], Tensor] | None,
     ) -> Tensor:
-        """Return the colors of the rays, (n, P, 3) uint8.
+        """Return ray colors, (n, P, 3) uint8.
 
         Args:
-            met: What the rays met.
-            geoms: The geoms that they can meet.
-            pos: Position of the camera, (n, 3). mat: Its orientation, (n, 3, 3).
-            read: Reads fields.
-            shadow: Whether something is in the way: origins (3, n, P), directions, distances (n, P)
-                to (n, P) bool. None for no shadows.
+            met: Surfaces hit by rays.
+            geoms: Rendered geoms.
+            pos: Camera position, (n, 3).
+            mat: Camera orientation, (n, 3, 3).
+            read: Field reader.
+            shadow: Occlusion test: origins (3, n, P), directions (3, n, P), distances (n, P) ->
+                (n, P) bool. None: no shadows.
         """
-        # One entry more, for rays that met nothing.
+        # Extra entry for misses.
         material = torch.nn.functional.pad(geoms.material, (0, 1), value=-1)
         rgb = torch.nn.functional.pad(geoms.rgba.permute(2, 0, 1)[:3], (0, 1))
         rgb = of_pixels(rgb, met.columns)
@@ -145,7 +146,7 @@ class Shading:
                 strength = strength * torch.where(hidden, _IN_SHADOW, 1.0)
             brightness.addcmul_(cosine * strength, diffuse)
             if shines and specular.any():
-                # |L + V|^2 = 2 + 2 L.V, so that the direction halfway is never needed itself.
+                # |L + V|^2 = 2 + 2 L.V, so the halfway vector itself is not computed.
                 length = (2.0 - 2.0 * _dot(met.directions, direction)).clamp_(min=1e-12)
                 halfway = (cosine + facing).div_(length.sqrt_()).clamp_(0.0, 1.0)
                 halfway = halfway.pow_(exponent).masked_fill_(cosine <= 0.0, 0.0)
@@ -165,13 +166,13 @@ class Shading:
     def _lights(
         self, points: Tensor, pos: Tensor, mat: Tensor, read: ReadField
     ) -> Iterator[tuple[Tensor, ...]]:
-        """Yield what each light that shines somewhere is at the points (3, n, P).
+        """Yield the values of each active light at the points, (3, n, P).
 
         Axes n and P may be 1. Yields:
             Diffuse and specular color, (3, n, 1).
             Unit vector to the light, (3, n, P), and distance (m), (n, P).
-            Part that arrives, (n, P).
-            Whether it casts shadows, (n, 1) bool.
+            Attenuation factor, (n, P).
+            True if the light casts shadows, (n, 1) bool.
         """
         endless, one = torch.full((1, 1), _ENDLESS), torch.ones(1, 1)
         for i in range(self._num_lights):
@@ -191,7 +192,7 @@ class Shading:
                 to_light = ((read("light_xpos")[:, i] - pos)[:, None] @ mat).permute(2, 0, 1)
                 to_light = to_light - points
                 distance = _dot(to_light, to_light).sqrt_()
-                # MuJoCo raises for a ray without a direction, as one would be at the light itself.
+                # At the light itself the direction would be zero, and MuJoCo raises for such rays.
                 to_light = torch.where(distance > 0.0, to_light / distance, direction)
                 constant, linear, squared = own("attenuation").permute(2, 0, 1)
                 strength = 1.0 / (constant + distance * (linear + distance * squared))
@@ -211,13 +212,13 @@ class Shading:
                 torch.tensor(color, dtype=torch.float32).view(3, 1, 1)
                 for color in (self._headlight.diffuse, self._headlight.specular)
             )
-            # It shines along the optical axis.
+            # The headlight shines along the optical axis.
             direction = torch.tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
             yield diffuse, specular, direction, endless, one, torch.tensor(False)
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Return the products of vectors whose components come first."""
+    """Return dot products over the first dimension."""
     return torch.addcmul(a[0] * b[0], a[1], b[1]).addcmul_(a[2], b[2])
 
 
@@ -225,18 +226,19 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 _RGB = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
 _SKYBOX = int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-# Planes painted one by one: all pixels of an image at once. On the YAM task, whose ground fills
-# most of the image, rgb images are 1.9 times as fast as with the pixels of the ground picked out.
+# Maximum number of planes textured one by one, on all pixels of an image. On the YAM task, where
+# the ground fills most of the image, rgb images are 1.9 times as fast as with ground pixels
+# selected.
 _MAX_PLANES = 2
-# The cosine above which a normal is that of an end of a cylinder.
+# Cosine above which a normal belongs to an end of a cylinder.
 _END = 0.7071
 
 
 class Textures:
-    """The textures of a model, in one table of texels."""
+    """Textures of a model in one table of texels."""
 
     def __init__(self, model: mujoco.MjModel, kinds: Tensor) -> None:
-        """Take the textures of a model, for geoms of the types `kinds` (G + 1,), -1 for none."""
+        """Load the textures of a model, for geoms of types `kinds`, (G + 1,). -1: none."""
         self._kinds = kinds
         counts, texels = model.tex_width * model.tex_height, [np.zeros((0, 3), np.uint8)]
         for start, count, channels in zip(model.tex_adr, counts, model.tex_nchannel, strict=True):
@@ -257,9 +259,9 @@ class Textures:
     def paint(
         self, rgb: Tensor, met: Surfaces, geoms: Geoms, material: Tensor, read: ReadField
     ) -> None:
-        """Multiply the colors `rgb` (3, n, P) by the textures of materials.
+        """Multiply the colors `rgb`, (3, n, P), by the textures of materials.
 
-        `material` is (1 or n, G + 1): the material of each geom, -1 for none.
+        `material` is the material of each geom, (1 or n, G + 1). -1: none.
         """
         texture = of_materials(read("mat_texid")[..., _RGB].long(), material, -1)
         painted = (texture >= 0).any(dim=0)
@@ -276,7 +278,7 @@ class Textures:
                     continue
                 center = geoms.pos[:, i].t()[..., None]
                 mat = geoms.mat[:, i].permute(1, 2, 0)[..., None]
-                point = _turn_back(mat, met.points - center)
+                point = _rotate_inverse(mat, met.points - center)
                 size = geoms.size[:, i].t()[..., None]
                 uv = _plane(point, point, size, repeat[:, :, i, None], uniform[:, i, None])
                 color = self._sample(texture[:, i, None].clamp(min=0), uv)
@@ -288,9 +290,9 @@ class Textures:
         column, n = met.columns[env, pixel], len(met.columns)
         texture = texture.expand(n, -1)[env, column]
         mat = geoms.mat[env, column].permute(1, 2, 0)
-        given = (
-            _turn_back(mat, met.points[:, env, pixel] - geoms.pos[env, column].t()),
-            _turn_back(mat, met.normals[:, env, pixel]),
+        inputs = (
+            _rotate_inverse(mat, met.points[:, env, pixel] - geoms.pos[env, column].t()),
+            _rotate_inverse(mat, met.normals[:, env, pixel]),
             geoms.size[env, column].t(),
             repeat.expand(2, n, -1)[:, env, column],
             uniform.expand(n, -1)[env, column],
@@ -299,7 +301,7 @@ class Textures:
         for kind, mapping in _MAPPINGS.items():
             chosen = (kinds == kind).nonzero().squeeze(1)
             if len(chosen):
-                uv[:, chosen] = mapping(*(values[..., chosen] for values in given))
+                uv[:, chosen] = mapping(*(values[..., chosen] for values in inputs))
         color = self._sample(texture, uv)
         if self._has_coordinates.any():
             mesh = geoms.dataid[env, column].masked_fill(kinds != MESH, -1).long()
@@ -308,21 +310,21 @@ class Textures:
         rgb[:, env, pixel] *= color
 
     def paint_sky(self, rgb: Tensor, missed: Tensor, directions: Tensor) -> None:
-        """Fill the colors `rgb` (3, n, P) of the rays `missed` (n, P) with the sky.
+        """Set the colors `rgb`, (3, n, P), of the rays `missed`, (n, P) bool, to the skybox.
 
-        `directions` are those of the rays that missed, (3, K), in the world.
+        `directions` are world-frame directions of these rays, (3, K).
         """
         if self._sky is not None:
             uv = _sky_coordinates(directions, int(self._width[self._sky]))
             rgb[:, missed] = self._sample(torch.tensor(self._sky), uv)
 
     def _sample(self, texture: Tensor, uv: Tensor) -> Tensor:
-        """Return the colors (3, ...) at the places `uv` (2, ...) in [0, 1) of textures (...).
+        """Return colors, (3, ...), of textures, (...), at coordinates `uv` in [0, 1), (2, ...).
 
-        Linear between the centers of texels, and constant beyond those of the outermost.
+        Linear interpolation between texel centers, constant beyond the outermost.
         """
         width, height = self._width[texture], self._height[texture]
-        # A pose that is NaN has no place, and NaN would be an index out of range.
+        # Coordinates of NaN poses would be indices out of range.
         x, y = uv.nan_to_num()
         x = (x * width - 0.5).clamp_(min=0.0).minimum(width - 1.0)
         y = (y * height - 0.5).clamp_(min=0.0).minimum(height - 1.0)
@@ -339,9 +341,9 @@ class Textures:
 
 
 def of_materials(values: Tensor, material: Tensor, default: float | bool) -> Tensor:
-    """Return values (a, nmat, ...) of materials (b, G): (max(a, b), G, ...).
+    """Return material values per geom: (a, nmat, ...) at (b, G) -> (max(a, b), G, ...).
 
-    Geoms of material -1 get `default`.
+    Geoms with material -1 get `default`.
     """
     none = values.new_full((len(values), 1, *values.shape[2:]), default)
     n = max(len(values), len(material))
@@ -350,21 +352,21 @@ def of_materials(values: Tensor, material: Tensor, default: float | bool) -> Ten
 
 
 def of_pixels(values: Tensor, columns: Tensor) -> Tensor:
-    """Return values (..., 1 or n, G + 1) of the geoms `columns` (n, P): (..., n, P)."""
+    """Return geom values per pixel: (..., 1 or n, G + 1) at `columns` (n, P) -> (..., n, P)."""
     leading = values.shape[:-2]
     columns = columns.expand(*leading, *columns.shape)
     return values.expand(*columns.shape[:-1], -1).gather(-1, columns)
 
 
-def _turn_back(mat: Tensor, vectors: Tensor) -> Tensor:
-    """Turn vectors (3, ...) by the inverses of the rotations (3, 3, ...)."""
+def _rotate_inverse(mat: Tensor, vectors: Tensor) -> Tensor:
+    """Rotate vectors, (3, ...), by the inverses of rotations, (3, 3, ...)."""
     x, y, z = vectors
     return torch.stack([mat[0, i] * x + mat[1, i] * y + mat[2, i] * z for i in range(3)])
 
 
-# Mappings take points and normals (3, K) in the frames of geoms, the sizes of these (3, K), and the
-# material's repetitions (2, K) and whether these are per length (K,). They return places (2, K) in
-# [0, 1). Axes after the first may be others, if they can be broadcast.
+# Texture mappings: points and normals in the geom frame (3, K), geom sizes (3, K), and texrepeat
+# (2, K) and texuniform (K,) of the material -> texture coordinates in [0, 1), (2, K). Axes after
+# the first may have any broadcastable shape.
 
 
 def _wrap(u, v, repeat, offset=0.0) -> Tensor:
@@ -373,12 +375,12 @@ def _wrap(u, v, repeat, offset=0.0) -> Tensor:
 
 
 def _scaled(repeat, uniform, lengths) -> Tensor:
-    """Return repetitions along a whole geom: as given, or that many for each unit of length."""
+    """Return texture repetitions along a geom: `repeat`, per unit length if `uniform`."""
     return torch.where(uniform, repeat * lengths, repeat)
 
 
 def _azimuth(x, y) -> Tensor:
-    """Return the angle about z in turns, 0 to 1."""
+    """Return the angle about z in turns, in [0, 1)."""
     turns = torch.atan2(y, x) / (2.0 * torch.pi)
     return torch.where(turns < 0.0, turns + 1.0, turns)
 
@@ -421,7 +423,7 @@ def _capsule(point, normal, size, repeat, uniform) -> Tensor:
 
 
 def _box(point, normal, size, repeat, uniform) -> Tensor:
-    # Places from -1 to 1 along each side.
+    # Coordinates in [-1, 1] along each side.
     x, y, z = point / size.clamp(min=_TINY)
     across = normal.abs()
     on_z = (across[2] >= across[0]) & (across[2] >= across[1])
@@ -453,13 +455,13 @@ _MAPPINGS = {
     MESH: _mesh,
 }
 KINDS = frozenset(_MAPPINGS)
-"""Types of geoms that cameras see."""
+"""Geom types that cameras render."""
 
 
 def _sky_coordinates(direction: Tensor, width: int) -> Tensor:
-    """Return places (2, K) in the strip of six faces that world directions (3, K) point to.
+    """Return skybox coordinates, (2, K), of world directions, (3, K), in the strip of six faces.
 
-    The cube is turned a quarter about x. Its faces are +x, -x, +y, -y, +z and -z.
+    The cube is rotated by 90 degrees about x. Faces in order: +x, -x, +y, -y, +z, -z.
     """
     x, y, z = direction[0], direction[2], -direction[1]
     on_x = (x.abs() >= y.abs()) & (x.abs() >= z.abs())
@@ -470,7 +472,7 @@ def _sky_coordinates(direction: Tensor, width: int) -> Tensor:
     s = torch.where(on_x, -sign * z, torch.where(on_y, x, sign * x))
     t = torch.where(on_y, sign * z, -y)
     reach = main.abs().clamp(min=_TINY)
-    # Colors of neighboring faces in the strip do not mix.
+    # Clamp, so that colors of neighboring faces do not mix.
     margin = 0.5 / width
     t = ((t / reach + 1.0) / 2.0).clamp(margin, 1.0 - margin)
     return torch.stack(((s / reach + 1.0) / 2.0, (face + t) / 6.0))

@@ -1,1 +1,1 @@
-"""MuJoCo Warp on NVIDIA GPUs, or on the CPU to test that path."""
+"""Warp engine: MuJoCo Warp on NVIDIA GPUs, or on the CPU for testing."""

@@ -1,10 +1,10 @@
-"""MuJoCo Warp: all environments in one batch of GPU kernels (or, for testing, on the CPU).
+"""Warp engine: all environments in one batch of GPU kernels (on the CPU for testing).
 
-Fields are Warp arrays seen through torch without a copy. A substep and each stage of the forward
-pass are captured as graphs and replayed, on the CPU as well as on CUDA; nothing in a step waits for
-the GPU.
+Fields are Warp arrays viewed as torch tensors, without copies. A substep and each stage of the
+forward pass are captured as graphs and replayed, on the CPU and on CUDA. A step never waits for the
+GPU.
 
-The first use on a machine compiles the kernels (minutes); afterwards they come from Warp's cache.
+The first use on a machine compiles the kernels (minutes); later uses load them from Warp's cache.
 """
 
 from __future__ import annotations
@@ -53,65 +53,66 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# What the next step depends on. `reset` sets all of it, and a saved state is made of it.
+# Inputs of the next step: set by `reset`, saved in `state_dict`.
 _STATE_FIELDS = (*INPUTS, "history")
-# Held in another layout than MuJoCo's, or not per environment.
+# Fields with a different layout than in MuJoCo, or without environment dimension.
 _UNLIKE_MUJOCO = frozenset(
     {"qLD", "qLDiagInv", "qLU", "solver_niter", "contact", "efc", "flexedge_hessian"}
     | {f"island_{name}" for name in ("dofadr", "idofadr", "iefcadr", "ne", "nf", "nefc", "nv")}
     | {"map_efc2iefc", "map_iefc2efc"}
 )
-# What MuJoCo Warp overwrites in a stage beside its results: delay lines, which a substep alone is to
-# advance; forces of the last substep, used as scratch; velocities that constraints read.
+# Fields that MuJoCo Warp overwrites in a stage in addition to its results: delay buffers, to be
+# advanced by substeps only; forces of the last substep, used as scratch; velocities read by
+# constraints.
 _OVERWRITTEN = {
     "pos": ("history", "cvel", "cdof_dot"),
     "vel": ("history", "cacc", "cfrc_int"),
     "acc": ("history",),
 }
-# Results that MuJoCo's reset clears too. Poses and velocities keep their values until `forward`.
+# Results that MuJoCo's reset also clears. Poses and velocities keep their values until `forward`.
 _RESULTS_ZERO_ON_RESET = (*RESULTS_ZERO_ON_RESET, "energy", "ne", "nf", "nl", "nefc")
-# Metres from everything else.
-_NOWHERE = 1e6
-# What follows from `geom_size`, and is per environment only where sizes are.
+# Distance of hidden bounds from the rest of the world (m).
+_FAR_AWAY = 1e6
+# Bounds derived from `geom_size`; recomputed only if expanded or if sizes are.
 _GEOM_BOUNDS = ("geom_rbound", "geom_aabb")
 _NO_RAYS = (
-    "MuJoCo Warp cannot cast rays in a model with flexes. Leave out the ray sensors or the flexes, "
-    "or use --engine native (SimulationCfg.engine='native')."
+    "MuJoCo Warp cannot cast rays in a model with flexes; remove the ray sensors or the flexes, or "
+    "use --engine native (SimulationCfg.engine='native')."
 )
-# A geom that is welded to the world moves only if one of these is changed.
+# Fields that determine the poses of geoms welded to the world.
 _STATIC_POSE = frozenset({"body_pos", "body_quat", "geom_pos", "geom_quat"})
 
-# Made once for each stream.
+# Created once per stream.
 _as_warp_stream = functools.cache(wp.stream_from_torch)
 
 _RECOMPUTE = {1: mjwarp.set_const_fixed, 2: mjwarp.set_const_0, 3: mjwarp.set_const}
 
 
 class UnsupportedByWarpError(EngineUnavailableError, NotImplementedError):
-    """The model or an option needs something that MuJoCo Warp does not have."""
+    """Model or option that MuJoCo Warp does not support."""
 
 
 class WarpEngine(Engine):
     """MuJoCo Warp on one CUDA device, or on the CPU.
 
-    `wp_model`, `wp_data` and `wp_device` are MuJoCo Warp's own, for code that knows it.
+    `wp_model`, `wp_data` and `wp_device` are MuJoCo Warp's objects.
     """
 
-    judged_fields = ("qpos", "qvel", "qacc")
+    checked_fields = ("qpos", "qvel", "qacc")
 
-    # What is made here is written into later, in whatever mode torch is then.
+    # Tensors created here are written later, in any torch mode.
     @torch.inference_mode(False)
     def __init__(
         self, model: mujoco.MjModel, num_envs: int, cfg: SimulationCfg, device: str
     ) -> None:
-        """Allocate `num_envs` environments, all in the forwarded state of `qpos0`.
+        """Allocate `num_envs` environments at `qpos0`, after a forward pass.
 
         Raises:
-            UnsupportedByWarpError: the model needs what MuJoCo Warp does not have.
-            EngineUnavailableError: there is no such device.
+            UnsupportedByWarpError: MuJoCo Warp does not support the model.
+            EngineUnavailableError: device not found.
         """
         check_supported(model)
-        # Keep Warp's banner and its compile messages from users who did not ask for them.
+        # Hide Warp's banner and compile messages by default.
         if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() not in ("0", "false", "no"):
             wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
         self.num_envs = num_envs
@@ -123,7 +124,7 @@ class WarpEngine(Engine):
         self._velocity_constraints = bool(
             np.isin(model.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)).any()
         )
-        # MuJoCo leaves these at zero; Warp fills them up when it recomputes constants.
+        # Zero in MuJoCo; Warp substitutes nonzero values when recomputing constants.
         self._zero_invweight0 = torch.as_tensor(model.body_invweight0 == 0, device=device)
         with self.ordered():
             self._allocate(model, cfg)
@@ -139,7 +140,7 @@ class WarpEngine(Engine):
         # Columns of `sensordata` by the stage that computes them.
         stages = np.repeat(model.sensor_needstage, model.sensor_dim)
         self._sensor_stages = torch.as_tensor(stages, device=self.device)
-        # Read or not, these have to be kept.
+        # Always bound, because `forward` must preserve these.
         forces = ("cacc", "cfrc_int") if self.wp_model.sensor_rne_postconstraint else ()
         for name in ("sensordata", "history", *forces):
             self.data_field(name)
@@ -155,12 +156,12 @@ class WarpEngine(Engine):
         self.create_graph()
 
     def _allocate(self, model: mujoco.MjModel, cfg: SimulationCfg) -> None:
-        # At `qpos0` all robots are at the origin of the world, which may be deep inside a generated
-        # terrain. No episode starts there, so its contacts say nothing about the sizes needed.
+        # At `qpos0` all robots are at the world origin, possibly deep inside generated terrain.
+        # Episodes do not start at `qpos0`, so its contacts say nothing about the required sizes.
         if cfg.nconmax is not None and self._host.ncon > cfg.nconmax:
             logger.warning(
-                "The reference pose has %d contacts, more than SimulationCfg.nconmax=%d. They are "
-                "left out until the first reset. If later poses have as many, set nconmax to that.",
+                "The reference pose has %d contacts, more than SimulationCfg.nconmax=%d; its contacts "
+                "are ignored until the first reset. If later poses have as many, increase nconmax.",
                 self._host.ncon, cfg.nconmax,
             )  # fmt: skip
             flags = model.opt.disableflags
@@ -174,16 +175,16 @@ class WarpEngine(Engine):
             )
         except NotImplementedError as error:
             raise UnsupportedByWarpError(
-                f"The warp engine cannot simulate this model: {error} "
-                "Change it, or use --engine native (SimulationCfg.engine='native')."
+                f"The warp engine does not support this model: {error} "
+                "Change the model, or use --engine native (SimulationCfg.engine='native')."
             ) from error
         except ValueError as error:
             raise ValueError(
-                f"MuJoCo Warp refuses nconmax={cfg.nconmax}, njmax={cfg.njmax} or the model: "
-                f"{error}. Change SimulationCfg.nconmax or njmax; None estimates them."
+                f"MuJoCo Warp rejects nconmax={cfg.nconmax}, njmax={cfg.njmax} or the model: "
+                f"{error}; change SimulationCfg.nconmax or njmax (None: estimated)."
             ) from error
-        # Kernels would print to the standard output at every overflow. The flags that they set
-        # besides are read now and then, and each kind of overflow is logged once.
+        # Kernels would print to stdout at every overflow. Instead, `OverflowWatch` polls the
+        # overflow flags and logs each kind once.
         self.wp_model.opt.warn_overflow = 0
         if self._on_cuda:
             self.wp_model.opt.graph_conditional = wp.is_conditional_graph_supported()
@@ -196,10 +197,10 @@ class WarpEngine(Engine):
 
     @contextmanager
     def ordered(self) -> Generator[None]:
-        """Run Warp's work after what torch has queued and before what torch will queue.
+        """Order Warp's work after torch's queued work and before torch's later work.
 
-        Warp works on its own stream, because memory that it frees is freed in that stream's
-        order and because a capture is not allowed on torch's default stream. The two streams
+        Warp uses a separate stream, because it frees memory in that stream's order, and because
+        captures are not allowed on torch's default stream. The two streams
         wait for each other on the device; the host waits for neither.
         """
         with wp.ScopedDevice(self.wp_device):
@@ -214,11 +215,11 @@ class WarpEngine(Engine):
     def launch(
         self, name: Hashable, work: Callable[[], None], times: int = 1, on_cpu: bool = True
     ) -> None:
-        """Run `work` some times by replaying its graph.
+        """Run `work` `times` times by replaying its graph.
 
-        On CUDA the first run is a plain one that loads the kernels, because older drivers cannot
-        load them during a capture. All runs on the CPU are plain without `on_cpu`, for work that a
-        capture does not record there: filling arrays, and refitting trees.
+        On CUDA the first run is not captured: it loads the kernels, because older drivers cannot
+        load them during a capture. `on_cpu=False` disables graphs on the CPU, for work that CPU
+        captures do not record: filling arrays and refitting bounding volume hierarchies.
         """
         with self.ordered():
             if name not in self._graphs:
@@ -232,9 +233,9 @@ class WarpEngine(Engine):
                 work() if graph is None else wp.capture_launch(graph)
 
     def _capture(self, work: Callable[[], None]) -> Any:
-        """Return the graph of `work`, or None where capturing is refused."""
+        """Return the graph of `work`, or None if capturing is not supported."""
         collects = gc.isenabled()
-        # A collection may free memory of the GPU, which a capture does not survive.
+        # Garbage collection may free GPU memory, which breaks a capture.
         gc.disable()
         try:
             with wp.ScopedCapture(device=self.wp_device) as capture:
@@ -243,8 +244,8 @@ class WarpEngine(Engine):
         except RuntimeError as error:
             self._captures = False
             logger.warning(
-                "Warp captures no graph here, so that kernels are launched one by one, which is "
-                "slower: %s", error,
+                "Warp graph capture failed; launching kernels one by one is slower: %s",
+                error,
             )  # fmt: skip
             return None
         finally:
@@ -253,9 +254,9 @@ class WarpEngine(Engine):
 
     @torch.inference_mode(False)
     def create_graph(self) -> None:
-        """Drop captured graphs. On CUDA capture those of `step` and `forward` at once.
+        """Drop captured graphs. On CUDA, recapture those of `step` and `forward` immediately.
 
-        Elsewhere, and after `expand`, they are captured when next needed. State and results keep
+        On the CPU, and after `expand`, graphs are captured at the next use. State and results keep
         their values. Overflow during warm-up is not reported.
         """
         self._graphs.clear()
@@ -263,7 +264,7 @@ class WarpEngine(Engine):
             return
         data = self.wp_data
         arrays = [a for part in (data, data.contact, data.efc) for a in vars(part).values()]
-        with _keeping([(as_torch(a), None) for a in arrays if isinstance(a, wp.array)]):
+        with _restoring([(as_torch(a), None) for a in arrays if isinstance(a, wp.array)]):
             self.launch("step", self._substep)
             for stage in STAGES:
                 self.launch(stage, lambda stage=stage: self._forward(stage))
@@ -281,13 +282,13 @@ class WarpEngine(Engine):
             offered = offered_data_fields(self.wp_data)
             if name == "ncon" or name.startswith("efc"):
                 raise UnknownAttributeError(
-                    f"The warp engine does not offer MjData.{name}; read contacts by a contact "
-                    "sensor, or those of all environments together from sim.data.nacon and "
-                    "sim.data.contact."
+                    f"The warp engine does not provide MjData.{name}; use a contact sensor, or "
+                    "sim.data.nacon and sim.data.contact for the contacts of all environments "
+                    "together."
                 )
             if name not in offered:
                 raise UnknownAttributeError(
-                    f"The warp engine has no per-environment MjData field {name!r}. Available: "
+                    f"Unknown per-environment MjData field {name!r} of the warp engine. Available: "
                     f"{name_list(sorted(offered), near=(name,))}."
                 )
             check_sensor_fed(self.mj_model, name)
@@ -303,7 +304,7 @@ class WarpEngine(Engine):
             tensor = as_torch(array)
             # MuJoCo stores centers and half sizes in one row.
             self.model_fields[name] = tensor.flatten(-2) if name == "geom_aabb" else tensor
-        # A graph keeps the addresses of the arrays it was captured with.
+        # Graphs hold the addresses of the arrays they were captured with.
         if new and self.num_envs > 1:
             self._graphs.clear()
 
@@ -312,7 +313,7 @@ class WarpEngine(Engine):
         self.expand(_GEOM_BOUNDS)
         hide_geoms(self.wp_model, absent)
         self._absent = absent
-        # For those who read them: Warp itself has one for all environments.
+        # For readers of these fields: Warp itself shares the masks between environments.
         for name in COLLISION_MASKS:
             mask = torch.as_tensor(getattr(self.mj_model, name), device=self.device)
             self.model_fields[name] = mask.expand(absent.shape).masked_fill(absent, 0)
@@ -332,21 +333,22 @@ class WarpEngine(Engine):
         self.expand(written)
         others = self._rows_except(env_ids)
         kept = [(self.model_fields[name], others) for name in written if others is not None]
-        with _keeping(kept):
+        with _restoring(kept):
             with self.ordered():
                 _RECOMPUTE[level](self.wp_model, self.wp_data)
             if "body_invweight0" in written:
-                # A body that only slides has no rotational inverse weight, and one that turns about
-                # its center of mass no translational one. Warp puts the other one in its place.
+                # Bodies that only slide have zero rotational inverse weight, and bodies that only
+                # rotate about their center of mass zero translational inverse weight. Warp
+                # substitutes the other weight.
                 weights = as_torch(self.wp_model.body_invweight0)
                 substituted = (weights[..., :1] == weights[..., 1:]) & self._zero_invweight0
                 weights.masked_fill_(substituted, 0.0)
-            # Bounds come from sizes again, which brings back what is hidden by its bounds.
+            # Recomputed bounds make hidden geoms collide, so hide them again.
             if self._absent is not None and "geom_rbound" in written:
                 hide_geoms(self.wp_model, self._absent)
 
     def _rows_except(self, env_ids: torch.Tensor | None) -> torch.Tensor | None:
-        """Return a mask (N,) of the environments that are not in `env_ids`; None if all are."""
+        """Return a mask of environments not in `env_ids`, (N,) bool; None if `env_ids` is None."""
         if env_ids is None:
             return None
         mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
@@ -374,32 +376,32 @@ class WarpEngine(Engine):
         mjwarp.step(self.wp_model, self.wp_data)
 
     def _refresh_velocities(self) -> None:
-        """Make `cvel` current where constraints read it before MuJoCo Warp computes it.
+        """Compute `cvel` before constraints that read it.
 
-        Connect and weld constraints use body velocities, which Warp computes after them. They
-        would use those of the previous substep, and after a reset those of the previous episode,
-        NaN included.
+        Connect and weld constraints use body velocities, but Warp computes `cvel` after them.
+        Constraints would use velocities of the previous substep and, after a reset, of the previous
+        episode, NaN included.
         """
         if self._velocity_constraints:
             mjwarp.fwd_kinematics(self.wp_model, self.wp_data)
             mjwarp.com_vel(self.wp_model, self.wp_data)
 
     def forward_after_reset(self, reset_ids: torch.Tensor) -> None:
-        # One full pass, because a partial one costs as much as one of all.
+        # One full pass: a pass of some environments costs the same as a pass of all.
         self.forward(reset_ids, kept_from="acc")
 
     def forward(
         self, env_ids: torch.Tensor | None, stage: Stage = "acc", kept_from: Stage = "pos"
     ) -> None:
-        """Compute stages up to `stage`; other environments keep their results of some stages.
+        """Compute stages up to `stage`; other environments keep results from `kept_from` on.
 
-        Warp computes all environments and uses fields of later stages as scratch. Those get their
-        values back: fields that are one substep old stay so, as on native.
+        Warp computes all environments and uses fields of later stages as scratch. These fields are
+        restored: values that are one substep old stay so, as on native.
 
         Args:
-            env_ids: Environments, or None for all.
-            stage: Last stage.
-            kept_from: First stage of the results that the others keep, "pos" (all) or "acc".
+            env_ids: Environments. None: all.
+            stage: Last stage to compute.
+            kept_from: First stage whose results other environments keep, "pos" (all) or "acc".
         """
         others = self._rows_except(env_ids)
         results = ACCELERATION_FIELDS if kept_from == "acc" else self._data_tensors.keys()
@@ -414,20 +416,20 @@ class WarpEngine(Engine):
                 kept.append((tensor, None))
             elif others is not None and name in results and name not in _STATE_FIELDS:
                 kept.append((tensor, others))
-        with _keeping(kept):
+        with _restoring(kept):
             if not _STATIC_POSE.isdisjoint(self.model_fields):
                 self.launch("kinematics", self._place_static_geoms)
             self.launch(stage, lambda: self._forward(stage))
 
     def _forward(self, stage: str) -> None:
-        """Compute stages up to `stage` in all environments, overwriting fields of later ones."""
+        """Compute stages up to `stage` in all environments; overwrites fields of later stages."""
         model, data = self.wp_model, self.wp_data
         self._refresh_velocities()
         if stage == "acc":
             mjwarp.forward(model, data)
             return
         mjwarp.fwd_position(model, data, factorize=False)
-        # Sensors write nothing where there is nothing to measure, like a limit that is far away.
+        # Sensors without a measurement, such as inactive limits, do not write their value.
         data.sensordata.zero_()
         mjwarp.sensor_pos(model, data)
         has_energy = model.opt.enableflags & mjwarp.EnableBit.ENERGY
@@ -440,7 +442,7 @@ class WarpEngine(Engine):
                 mjwarp.energy_vel(model, data)
 
     def _place_static_geoms(self) -> None:
-        """Compute the poses of geoms that are welded to the world, which Warp does only once."""
+        """Compute the poses of geoms welded to the world. Warp itself computes them only once."""
         unwelded = dataclasses.replace(self.wp_model, body_weldid=self._unwelded)
         mjwarp.kinematics(unwelded, self.wp_data)
 
@@ -450,7 +452,7 @@ class WarpEngine(Engine):
             for name, tensor in self._data_tensors.items()
             if name not in _STATE_FIELDS
         }
-        # A pass computes all environments anyway, and all are put back.
+        # A pass computes all environments anyway, and `look_back` restores all.
         self.forward(None, "vel")
         return fields
 
@@ -459,8 +461,8 @@ class WarpEngine(Engine):
             self._data_tensors[name].copy_(values)
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
-        # `mjwarp.reset_data` clears the contacts of all environments together with those of the
-        # first, and overflow flags before they are read; so each field is reset here.
+        # `mjwarp.reset_data` clears the contacts of all environments with those of the first, and
+        # overflow flags before they are read. So fields are reset one by one.
         for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
             tensor = self.data_field(name)
             tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
@@ -483,9 +485,9 @@ class WarpEngine(Engine):
                 mjwarp.reset_history(self.wp_model, self.wp_data, reset=mask)
 
     def measure_sizes(self) -> torch.Tensor:
-        """Return what is needed now of each of `SIZES`, (3,).
+        """Return the current requirement of each of `SIZES`, (3,).
 
-        No sensor can match more contacts than its environment has.
+        The matches of a sensor are bounded by the contacts of its environment.
         """
         data = self.wp_data
         rows, contacts = as_torch(data.nefc).amax(), as_torch(data.nacon)
@@ -494,11 +496,11 @@ class WarpEngine(Engine):
         exists = torch.arange(len(environments), device=self.device) < contacts
         totals = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
         totals.scatter_add_(0, environments.clamp(0, self.num_envs - 1).long(), exists.long())
-        # Contacts are pooled, so only their mean has to fit. It is rounded up.
+        # Contacts are pooled, so only their mean (rounded up) must fit.
         return torch.stack([rows, -(-pooled // self.num_envs), totals.amax()])
 
     def close(self) -> None:
-        """Log, once a kind, what exceeded its capacity so far. Waits for the GPU."""
+        """Log exceeded capacities, once per kind. Waits for the GPU."""
         self._overflow.check(wait=True)
 
     # Queries.
@@ -520,7 +522,7 @@ class WarpEngine(Engine):
     def state_dict(self) -> dict[str, Any]:
         tensors = {
             "data": {name: self.data_field(name) for name in _STATE_FIELDS},
-            # No forward pass gives these as the last substep did.
+            # A forward pass does not reproduce these values of the last substep.
             "results": self._last_results(),
             "model": self.model_fields,
         }
@@ -533,15 +535,16 @@ class WarpEngine(Engine):
         for name, value in state["data"].items():
             if value.shape != self.data_field(name).shape:
                 raise ValueError(
-                    f"The saved simulation holds {name} as {tuple(value.shape)}, but here it is "
-                    f"{tuple(self.data_field(name).shape)}. Resume with the same model and --num-envs."
+                    f"Saved physics state {name}: expected shape "
+                    f"{tuple(self.data_field(name).shape)}, got {tuple(value.shape)}; use the model "
+                    "and --num-envs of the saved run."
                 )
         self.expand(tuple(state["model"]))
         for name, value in state["model"].items():
             self.model_fields[name].copy_(value)
         for name, value in state["data"].items():
             self.data_field(name).copy_(value)
-        # Earlier releases saved no results, or those that were read.
+        # Earlier releases saved no results, or only the fields that were read.
         results = state.get("results", {})
         self.forward(None, "vel" if results else "acc")
         for name, tensor in self._last_results().items():
@@ -549,16 +552,16 @@ class WarpEngine(Engine):
                 tensor.copy_(results[name])
 
     def _last_results(self) -> dict[str, torch.Tensor]:
-        """Return the results of the acceleration stage, read by someone or not, and all sensors."""
+        """Return all results of the acceleration stage and all sensors, including unread fields."""
         names = sorted(offered_data_fields(self.wp_data) & (ACCELERATION_FIELDS | {"sensordata"}))
         return {name: as_torch(getattr(self.wp_data, name)) for name in names}
 
 
 def check_supported(model: mujoco.MjModel) -> None:
-    """Raise if options of the model are unknown to MuJoCo Warp, naming each and what to change.
+    """Check that MuJoCo Warp supports the options and actuators of a model.
 
     Raises:
-        UnsupportedByWarpError: with everything that is unsupported, not only the first.
+        UnsupportedByWarpError: lists everything unsupported, with alternatives.
     """
     problems = []
     if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
@@ -573,7 +576,7 @@ def check_supported(model: mujoco.MjModel) -> None:
             problems.append(f"the <{element}> actuators {names}; use {instead} instead")
     for kind, known in (("disable", mjwarp.DisableBit), ("enable", mjwarp.EnableBit)):
         option = f"{kind}flags"
-        # Which environments sleep is no part of the state that is reset and saved here.
+        # Sleep states are not part of the state that is reset and saved here.
         supported = sum(int(bit) for bit in known if bit.name != "SLEEP")
         problems += [
             f"the {kind} flag {flag!r}; leave it out of MujocoCfg.{option} and of the XML"
@@ -581,15 +584,15 @@ def check_supported(model: mujoco.MjModel) -> None:
         ]
     if problems:
         raise UnsupportedByWarpError(
-            "The warp engine cannot simulate this model:\n"
+            "The warp engine does not support this model:\n"
             + "\n".join(f"  - {problem}" for problem in problems)
             + "\nOr use --engine native (SimulationCfg.engine='native'), which supports all of it."
         )
 
 
 @contextmanager
-def _keeping(kept: Sequence[tuple[torch.Tensor, torch.Tensor | None]]) -> Generator[None]:
-    """Undo what happens within where a mask over the first dimensions is true (None: everywhere)."""
+def _restoring(kept: Sequence[tuple[torch.Tensor, torch.Tensor | None]]) -> Generator[None]:
+    """Restore tensors on exit, where a mask over the first dimensions is True (None: all)."""
     before = [tensor.clone() for tensor, _ in kept]
     yield
     for (tensor, mask), old in zip(kept, before, strict=True):
@@ -599,12 +602,12 @@ def _keeping(kept: Sequence[tuple[torch.Tensor, torch.Tensor | None]]) -> Genera
         tensor.copy_(old)
 
 
-# Warp's structs.
+# Warp structs.
 
 
 @torch.inference_mode(False)
 def as_torch(array: Any) -> torch.Tensor:
-    """View a Warp array as a torch tensor that shares its memory; vectors become last dimensions."""
+    """View a Warp array as a torch tensor with shared memory; vectors become last dimensions."""
     if array.size == 0:
         inner = getattr(array.dtype, "_shape_", ())
         scalar = wp.dtype_to_torch(getattr(array.dtype, "_wp_scalar_type_", array.dtype))
@@ -614,18 +617,18 @@ def as_torch(array: Any) -> torch.Tensor:
 
 
 def offered_data_fields(data: Any) -> set[str]:
-    """Return the names of the `MjData` fields that every environment has."""
+    """Return the names of the per-environment `MjData` fields."""
     fields = _fields_over(type(data), "nworld") - _UNLIKE_MUJOCO
     return {name for name in fields if hasattr(mujoco.MjData, name)}
 
 
 def find_model_field(model: Any, name: str) -> tuple[Any, str]:
-    """Return the struct (model or its options) and attribute of a model field.
+    """Return the struct (model or its options) and attribute name of a model field.
 
-    Options go by their own name or as `opt.<name>`.
+    Options are named `<name>` or `opt.<name>`.
 
     Raises:
-        ValueError: no such field, or one that cannot differ between environments.
+        ValueError: unknown field, or one that cannot differ between environments.
     """
     attribute = name.removeprefix("opt.")
     for struct in (model, model.opt):
@@ -633,15 +636,17 @@ def find_model_field(model: Any, name: str) -> tuple[Any, str]:
             return struct, attribute
     if hasattr(mujoco.MjModel, attribute) or hasattr(mujoco.MjOption, attribute):
         raise ValueError(
-            f"MuJoCo Warp shares model field {name!r} between all environments; it cannot differ. "
-            "Set it in the model instead, or use --engine native."
+            f"MuJoCo Warp shares model field {name!r} between all environments; set it in the model "
+            "before building the simulation, or use --engine native."
         )
     known = sorted(_fields_over(type(model), "*"))
-    raise ValueError(f"MjModel has no field {name!r}. Available: {name_list(known, near=(name,))}.")
+    raise ValueError(
+        f"Unknown MjModel field {name!r}. Available: {name_list(known, near=(name,))}."
+    )
 
 
 def _fields_over(struct: type[Any], dimension: str) -> set[str]:
-    """Return the names of a struct's array fields whose first dimension is `dimension`."""
+    """Return the names of array fields with first dimension `dimension`."""
     return {
         field.name
         for field in dataclasses.fields(struct)
@@ -650,13 +655,13 @@ def _fields_over(struct: type[Any], dimension: str) -> set[str]:
 
 
 def expand_arrays(model: Any, nworld: int, names: list[str]) -> list[Any]:
-    """Give each of `nworld` worlds its own row of fields of a `mujoco_warp.Model`, in place.
+    """Expand fields of a `mujoco_warp.Model` to one row per world, in place.
 
     Returns:
-        The arrays of the fields.
+        Arrays of the fields.
 
     Raises:
-        ValueError: a field that does not exist or that MuJoCo Warp cannot hold per world.
+        ValueError: unknown field, or one that MuJoCo Warp cannot hold per world.
     """
     found = [find_model_field(model, name) for name in names]
     for struct, attribute in found:
@@ -677,7 +682,7 @@ def _torch_on_warps_stream(device: Any) -> AbstractContextManager[Any]:
 
 
 def put_variant_model(model: mujoco.MjModel, nworld: int, values: VariantValues) -> Any:
-    """Return a `mujoco_warp.Model` on the current device, with each world's own values."""
+    """Return a `mujoco_warp.Model` with per-world values, on the current device."""
     wp_model = mjwarp.put_model(model)
     device = wp_model.geom_pos.device
     fields = [name for name in values.fields if name not in COLLISION_MASKS]
@@ -693,26 +698,26 @@ def put_variant_model(model: mujoco.MjModel, nworld: int, values: VariantValues)
 
 
 def hide_geoms(model: Any, absent: torch.Tensor) -> None:
-    """Keep geoms (N, ngeom) out of all contacts: put their bounds where nothing else is.
+    """Disable contacts of geoms, (N, ngeom) bool, by moving their bounds out of reach.
 
-    Which geoms may touch is compiled for all environments alike, but the search for geoms that are
-    near goes by bounds, and these differ. A hugely negative radius is above every plane, and a box
-    out there, in another place for each geom, meets no other box.
+    Collision filters are compiled once for all environments, but the broad phase uses bounds, which
+    can differ. A large negative radius is above every plane. Distant boxes, at a different position
+    for each geom, do not overlap.
 
     Raises:
-        ValueError: the search does not compare bounds with planes, or not boxes with boxes.
+        ValueError: broad phase does not test bounds against planes, or boxes against boxes.
     """
     filters, known = int(model.opt.broadphase_filter), mjwarp.BroadphaseFilter
     if not (filters & known.PLANE and filters & (known.AABB | known.OBB)):
         raise ValueError(
-            "SimulationCfg.broadphase_filter must hold 'plane', and 'aabb' or 'obb', where "
-            "variants of an entity have different numbers or types of geoms. Add them, leave "
-            "the option at None, or use --engine native."
+            "SimulationCfg.broadphase_filter: expected 'plane' and one of 'aabb' and 'obb' for "
+            "entities whose variants have different numbers or types of geoms; add them, use None "
+            "(the default), or use --engine native."
         )
-    as_torch(model.geom_rbound).masked_fill_(absent, -_NOWHERE / 10)
-    centres = as_torch(model.geom_aabb)[:, :, 0]
-    places = _NOWHERE * torch.arange(1, absent.shape[1] + 1, device=absent.device)
-    centres.copy_(torch.where(absent[..., None], places[:, None], centres))
+    as_torch(model.geom_rbound).masked_fill_(absent, -_FAR_AWAY / 10)
+    centers = as_torch(model.geom_aabb)[:, :, 0]
+    places = _FAR_AWAY * torch.arange(1, absent.shape[1] + 1, device=absent.device)
+    centers.copy_(torch.where(absent[..., None], places[:, None], centers))
 
 
 def _find_device(device: torch.device) -> Any:
@@ -724,8 +729,8 @@ def _find_device(device: torch.device) -> Any:
     index = torch.cuda.current_device() if count and device.index is None else device.index or 0
     if index >= count:
         raise EngineUnavailableError(
-            f"The warp engine needs an NVIDIA GPU for device {str(device)!r}, expected one of "
-            f"{['cpu', *(f'cuda:{i}' for i in range(count))]}. Use --device cpu (with --engine "
-            "native, which is faster there)."
+            f"Warp engine device: expected one of "
+            f"{['cpu', *(f'cuda:{i}' for i in range(count))]}, got {str(device)!r}, which needs an "
+            "NVIDIA GPU; use --device cpu (faster with --engine native)."
         )
     return wp.get_cuda_device(index)

@@ -1,6 +1,6 @@
-"""Reports that a simulation outgrew the memory that MuJoCo Warp allocated for it.
+"""Overflow reports: contacts and constraint rows beyond MuJoCo Warp's capacities.
 
-Warp allocates room for a given number of contacts and constraint rows, and drops what does not fit.
+Warp allocates memory for a fixed number of contacts and constraint rows, and drops the excess.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Dispatches of `step` between two looks at the overflow flags.
+# Number of `step` dispatches between checks of the overflow flags.
 _CHECK_PERIOD = 64
 
 SIZES = ("njmax", "nconmax", "contact_sensor_maxmatch")
-"""Options of `SimulationCfg` that say how much memory there is."""
+"""Capacity options of `SimulationCfg`."""
 
-# By name of an `OverflowType`: the option to raise, and the quantity that exceeded it. Reaching an iteration
-# limit of the solver is left out: native MuJoCo does not report it either.
-_OUTGROWN = {
+# Option to increase and quantity that exceeded it, by name of `OverflowType`. Iteration limits of
+# the solver are omitted: native MuJoCo does not report them either.
+_CAPACITIES = {
     "NEFC": ("njmax", "constraint rows"),
     "NJMAX_NNZ": ("njmax", "entries of the sparse constraint Jacobian"),
     "BROADPHASE": ("nconmax", "candidate collisions"),
@@ -33,32 +33,32 @@ _OUTGROWN = {
     "CCD": ("nconmax", "convex collisions"),
     "CONTACT_MATCH": ("contact_sensor_maxmatch", "contacts that match a sensor"),
 }
-# Overflows that no option prevents.
+# Overflows without an option to increase.
 _OTHER = {
-    "HFIELD": "one geom touched more height-field cells than can be kept. Use a coarser height "
-    "field or smaller geoms",
+    "HFIELD": "a geom touched too many height-field cells. Use a coarser height field or smaller "
+    "geoms",
     "NVMAX": "more active degrees of freedom than were allocated",
-    "EPA_HORIZON": "a deep penetration was resolved approximately. Reduce the time step or simplify "
+    "EPA_HORIZON": "a deep penetration was resolved approximately. Reduce the timestep or simplify "
     "the collision geometry",
-    "TACTILE": "a tactile sensor met more geoms than it keeps",
+    "TACTILE": "a tactile sensor touched more geoms than it can store",
 }
 
 
 class OverflowWatch:
-    """Logs, once a kind, that some environment exceeded a capacity, without waiting for the GPU.
+    """Overflow logger: one warning per kind, without waiting for the GPU.
 
-    Every so many steps the flags of all environments are gathered, together with the sizes needed
-    just then, and copied to the host in the background; they are read when they have arrived.
+    Every `_CHECK_PERIOD` steps, the flags of all environments and the sizes currently needed are
+    copied to the host in the background, and read once the copy is complete.
     """
 
     def __init__(self, engine: WarpEngine, flags: torch.Tensor) -> None:
-        """Watch `flags` (N,) int32 of an engine, which Warp sets and does not clear."""
+        """Watch `flags`, (N,) int32, of an engine. Warp sets flags and never clears them."""
         self._engine, self._flags = engine, flags
         data, matches = engine.wp_data, engine.wp_model.opt.contact_sensor_maxmatch
-        # Room for constraint rows and contacts per environment, and for matches of a sensor.
+        # Capacities: constraint rows and contacts per environment, matches per sensor.
         sizes = data.njmax, data.naconmax // data.nworld, matches
         self._sizes = dict(zip(SIZES, sizes, strict=True))
-        self._kinds = [kind for kind in mjwarp.OverflowType if kind.name in _OUTGROWN | _OTHER]
+        self._kinds = [kind for kind in mjwarp.OverflowType if kind.name in _CAPACITIES | _OTHER]
         self._reported: set[str] = set()
         self._bits = torch.tensor(self._kinds, dtype=torch.int32, device=flags.device)
         self._arrived = torch.zeros(len(self._kinds) + len(SIZES), dtype=torch.int32)
@@ -68,13 +68,13 @@ class OverflowWatch:
         self._steps = 0
 
     def tick(self) -> None:
-        """Count a dispatch of `step`; look at the flags after the first and then now and then."""
+        """Count a dispatch of `step`; check the flags after the first, then periodically."""
         self._steps += 1
         if self._steps % _CHECK_PERIOD == 1:
             self.check(wait=False)
 
     def check(self, wait: bool) -> None:
-        """Log what has exceeded its capacity; without `wait`, what is known by now."""
+        """Log exceeded capacities; without `wait`, only those already copied to the host."""
         if self._event is None or wait:
             found = (self._flags[:, None] & self._bits).amax(dim=0)
             values = torch.cat([found, self._engine.measure_sizes().to(torch.int32)])
@@ -96,14 +96,14 @@ class OverflowWatch:
             self._reported.add(kind.name)
             message = _OTHER.get(kind.name)
             if message is None:
-                option, what = _OUTGROWN[kind.name]
+                option, quantity = _CAPACITIES[kind.name]
                 size, need = self._sizes[option], needed[option]
-                # Twice what was not enough at some time, or a quarter more than is needed now.
-                enough, hint = 2 * size, ", and to more if this comes again"
+                # Twice the exceeded capacity, or a quarter more than the current need.
+                enough, hint = 2 * size, ", and more if the overflow recurs"
                 if need > size:
                     enough, hint = 1.25 * need, f" or more ({need} are needed now)"
                 message = (
-                    f"more {what} than {option}={size} per environment allows; the excess was "
+                    f"more {quantity} than {option}={size} per environment allows; the excess was "
                     f"dropped. Set SimulationCfg.{option} to {8 * math.ceil(enough / 8)}{hint}"
                 )
             logger.warning("MuJoCo Warp overflow in some environment: %s.", message)

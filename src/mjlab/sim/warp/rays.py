@@ -1,8 +1,7 @@
-"""Rays on the Warp engine, cast through a tree of bounding boxes over the geoms of each world.
+"""Ray casting on the Warp engine, with a bounding volume hierarchy per world.
 
-MuJoCo Warp's rays through its render context pass the inside of meshes and height fields, and see
-of a height field the top alone, which is what `Engine.raycast` promises. Its rays without one do
-not, and try every geom for every ray.
+With a render context, MuJoCo Warp's rays hit meshes from outside and height fields on their top
+only, as `Engine.raycast` requires. Without a context, rays do not, and every ray tests every geom.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class WarpRays:
-    """Rays of one Warp engine. Each number of rays into some geom groups is one graph."""
+    """Ray caster of a Warp engine. One graph per number of rays and set of geom groups."""
 
     def __init__(self, engine: WarpEngine) -> None:
         self._engine = engine
@@ -44,7 +43,7 @@ class WarpRays:
         missed = buffers.distances < 0.0
         if query.max_distances is not None:
             missed = missed | (buffers.distances > query.max_distances)
-        # The buffers are overwritten by the next call.
+        # Copies: the next call overwrites the buffers.
         return (
             buffers.distances.masked_fill(missed, -1.0),
             buffers.normals.masked_fill(missed[..., None], 0.0),
@@ -67,7 +66,7 @@ class WarpRays:
             data,
             wp.from_torch(buffers.origins, dtype=wp.vec3),
             wp.from_torch(buffers.directions, dtype=wp.vec3),
-            # The context holds the geoms of these groups and no others.
+            # The context has only geoms of the selected groups.
             wp.types.vector(length=6, dtype=float)(*[-1.0] * 6),
             True,
             wp.from_torch(buffers.excluded),
@@ -79,7 +78,7 @@ class WarpRays:
 
 
 class _Buffers:
-    """Memory of R rays in each of N worlds, at the addresses that a graph was captured with."""
+    """Buffers of R rays in each of N worlds, at the addresses used by a captured graph."""
 
     @torch.inference_mode(False)
     def __init__(self, origins: torch.Tensor, groups: list[int]) -> None:

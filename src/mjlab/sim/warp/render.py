@@ -1,4 +1,4 @@
-"""Rendering on the Warp engine, with MuJoCo Warp's batch renderer."""
+"""Warp renderer, built on MuJoCo Warp's batch renderer."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     from mjlab.sim.warp.engine import WarpEngine
 
 
-# What a context depends on besides, where environments differ in it.
+# Model fields that a render context depends on when expanded.
 _CONTEXT_FIELDS = LENS_FIELDS | {"light_attenuation", "light_type", "geom_dataid"}
 _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 
 class WarpRenderer:
-    """Renders the views of a Warp engine.
+    """Renderer of a Warp engine's views.
 
-    MuJoCo Warp keeps geom groups, textures and shadows with a render context, which renders all
-    its cameras at once; so there is one for all views that agree in these.
+    In MuJoCo Warp, geom groups, textures and shadows are settings of a render context, and a
+    context renders all its cameras at once. So views with equal settings share a context.
     """
 
     def __init__(self, engine: WarpEngine) -> None:
@@ -35,7 +35,7 @@ class WarpRenderer:
         self._scenes: dict[Any, _Scene] = {}
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
-        """Render views at the poses that derived fields have; see `Engine.render`."""
+        """Render views at the poses in derived fields; see `Engine.render`."""
         by_settings: dict[Any, dict[int, CameraView]] = {}
         for i, view in enumerate(views):
             settings = (view.geom_groups, view.use_textures, view.use_shadows)
@@ -45,7 +45,7 @@ class WarpRenderer:
         for settings, members in by_settings.items():
             scene = self._scenes.get((views, settings))
             if scene is None or scene.expanded != relevant:
-                # Images that are made here are written into in later calls, in whatever mode.
+                # Later calls, in any torch mode, write into images created here.
                 with self._engine.ordered(), torch.inference_mode(False):
                     scene = _Scene(self._engine, members, relevant)
                 self._scenes[views, settings] = scene
@@ -53,15 +53,15 @@ class WarpRenderer:
         return [images[i] for i in range(len(views))]
 
     def context_of(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
-        """Return the `mujoco_warp.RenderContext` that has rendered `view` last, one of `views`."""
+        """Return the `mujoco_warp.RenderContext` that last rendered `view`, one of `views`."""
         for key, scene in self._scenes.items():
             if key[0] == views and view in scene.views.values():
                 return scene.context
-        raise WrongStateError("The view has not been rendered yet; call Simulation.sense() first.")
+        raise WrongStateError("View not rendered yet; call Simulation.sense() first.")
 
 
 class _Scene:
-    """One render context, and the views that are rendered with it."""
+    """Render context and the views rendered with it."""
 
     def __init__(
         self, engine: WarpEngine, views: dict[int, CameraView], expanded: frozenset[str]
@@ -86,10 +86,10 @@ class _Scene:
                 enabled_geom_groups=np.unique(host.geom_group[shown]).tolist(),
                 render_skybox=True,
                 use_precomputed_rays=LENS_FIELDS.isdisjoint(expanded),
-                # Faces of meshes are flat on both engines; rays of MuJoCo know no others.
+                # Flat mesh faces on both engines: MuJoCo's rays do not interpolate normals.
                 enable_vertex_normals=False,
             )
-            # The model says what may be left out; environments may differ from it.
+            # The context skips work based on the model, but environments may differ from the model.
             if "light_attenuation" in expanded:
                 self.context.light_attenuation_is_default = False
             if "light_type" in expanded:
@@ -99,7 +99,7 @@ class _Scene:
         self._images = {
             i: Images.empty(view, engine.num_envs, engine.device) for i, view in views.items()
         }
-        # Packed colors and the images they are copied to; the other images are the context's memory.
+        # Packed colors and their target images. Other images view the context's memory.
         self._packed: list[tuple[torch.Tensor, torch.Tensor]] = []
         if shown:
             for camera, images in enumerate(self._images.values()):
@@ -114,7 +114,7 @@ class _Scene:
             return rows[:, : view.height * view.width].unflatten(1, (view.height, view.width))
 
         if images.rgb is not None:
-            # Blue, green, red and alpha, from the first byte of each number on.
+            # Byte order: blue, green, red, alpha.
             packed = pixels(rc.rgb_data, rc.rgb_adr)[..., None].view(torch.uint8)
             self._packed.append((packed[..., :3], images.rgb))
         if images.depth is not None:
@@ -141,9 +141,9 @@ class _Scene:
 
 
 def _without_absent_meshes(host: mujoco.MjModel, model: Any, context: Any) -> Any:
-    """Return `geom_dataid` for `context`, with a mesh that nobody sees in place of none at all.
+    """Return `geom_dataid` for `context`, with -1 of mesh geoms replaced by an invisible mesh.
 
-    MuJoCo Warp would look up the mesh -1. The one that is added to the context is a point.
+    MuJoCo Warp would look up mesh -1. The invisible mesh, added to the context, is a point.
     """
     is_mesh = torch.as_tensor(host.geom_type == _MESH, device=wp.device_to_torch(wp.get_device()))
     dataid = wp.to_torch(model.geom_dataid)
@@ -157,6 +157,6 @@ def _without_absent_meshes(host: mujoco.MjModel, model: Any, context: Any) -> An
     context.mesh_bvh_id = wp.array(ids, dtype=wp.uint64)
     context.mesh_bounds_size = wp.array(bounds, dtype=wp.vec3)
     shared = wp.from_torch(own, dtype=wp.int32)
-    # The array does not keep the tensor whose memory it is.
+    # The array does not hold a reference to its tensor.
     shared.keep = own
     return shared

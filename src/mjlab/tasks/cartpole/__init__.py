@@ -1,4 +1,4 @@
-"""Cartpole: a pole on a cart, to be swung up, or only to be kept upright."""
+"""Cartpole tasks: swing-up and balance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _CFG = "mjlab.tasks.cartpole.cartpole_env_cfg"
 
-# Functions are given by name, so that listing the tasks imports neither torch nor MuJoCo.
+# Functions are registered by name: listing tasks must import neither torch nor MuJoCo.
 register_mjlab_task(
     task_id="Mjlab-Cartpole-Balance",
     env_cfg=f"{_CFG}:cartpole_balance_env_cfg",

@@ -1,7 +1,7 @@
-"""The cartpole tasks: swing a pole up by pushing its cart, or keep it balanced.
+"""Cartpole tasks: swing up a pole by pushing its cart, or balance the pole.
 
-A cart slides on a rail and carries a pole on a hinge. The agent pushes the cart. Model and reward
-are those of the DeepMind Control Suite (Tassa et al., 2018, https://arxiv.org/abs/1801.00690).
+A cart slides on a rail and carries a pole on a hinge; the action is the force on the cart. Model and
+reward are those of the DeepMind Control Suite (Tassa et al., 2018, https://arxiv.org/abs/1801.00690).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def cartpole_balance_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
 
 
 def cartpole_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of both tasks."""
+    """Return the PPO config of both tasks."""
     return RslRlOnPolicyRunnerCfg(
         actor=RslRlModelCfg(
             hidden_dims=(64, 64),
@@ -92,7 +92,7 @@ cpu = cpu_profile(
 """The `cpu` profile of the swing-up. `docs/guides/learning.md` has the experiments."""
 
 
-# The environments.
+# Environment config.
 
 
 def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
@@ -138,10 +138,10 @@ def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
 
 
 def _cartpole(pole_angle: float) -> EntityCfg:
-    """Return the model, whose pole starts at `pole_angle` (rad); 0 is upright."""
+    """Return the cartpole entity with initial pole angle `pole_angle` (rad); 0 is upright."""
     return EntityCfg(
         spec_fn=_get_spec,
-        # The motor of the XML is used as it is.
+        # Motor from the XML, unchanged.
         articulation=EntityArticulationInfoCfg(
             actuators=(XmlActuatorCfg(target_names_expr=("slider",)),)
         ),
@@ -194,7 +194,7 @@ _CART, _HINGE = _joint("slider"), _joint("hinge_1")
 def pole_angle_cos_sin(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _HINGE) -> torch.Tensor:
     """Return cosine and sine of the hinge angle, (N, 2).
 
-    The angle of a hinge without limits grows with every turn; these repeat.
+    The angle itself is unbounded, because the hinge has no limits.
     """
     asset: Entity = env.scene[asset_cfg.name]
     angle = asset.data.joint_pos[:, as_columns(asset_cfg.joint_ids, env.device)]
@@ -213,8 +213,8 @@ def cartpole_smooth_reward(
 
         r = (cos θ + 1) / 2 * (1 + g(x)) / 2 * (4 + q(u)) / 5 * (1 + g(θ̇)) / 2
 
-    g is 0.1 at 2 m and at 5 rad/s; q is 0 at |u| = 1. As a product, the reward is high only while
-    the pole is upright, the cart centred, the control small and the pole still, all at once.
+    g is 0.1 at 2 m and at 5 rad/s; q is 0 at |u| = 1. The product is high only if the pole is upright,
+    the cart centered, the control small and the pole slow, all at the same time.
     """
     data = env.scene[cart_cfg.name].data
     slider = as_columns(cart_cfg.joint_ids, env.device)
@@ -232,10 +232,10 @@ def cartpole_smooth_reward(
 
 
 def _gaussian_tolerance(value: torch.Tensor, margin: float) -> torch.Tensor:
-    """Return 1 at 0, falling along a Gaussian to 0.1 at |value| = margin."""
+    """Return a Gaussian of `value`: 1 at 0, and 0.1 at |value| = margin."""
     return torch.exp(math.log(0.1) * torch.square(value / margin))
 
 
 def _quadratic_tolerance(value: torch.Tensor, margin: float) -> torch.Tensor:
-    """Return 1 at 0, falling along a parabola to 0 at |value| = margin, and 0 beyond."""
+    """Return a parabola of `value`: 1 at 0, and 0 at and beyond |value| = margin."""
     return (1.0 - torch.square(value / margin)).clamp(min=0.0)

@@ -1,4 +1,4 @@
-"""Manipulation: an arm lifts a cube to a goal, from the state or from what its camera sees."""
+"""Manipulation tasks: an arm lifts a cube to a goal, from state or camera observations."""
 
-# Registers its tasks, by name, so that nothing heavy is imported.
+# Register the tasks by name, so that nothing heavy is imported.
 from mjlab.tasks.manipulation.config import yam as _yam  # noqa: F401

@@ -1,6 +1,6 @@
-"""The base config of the lifting task: bring a cube from the table to a goal in the air.
+"""Base config of the lifting task: lift a cube to a goal in the air.
 
-A robot's package starts from `make_lift_cube_env_cfg()` and fills in what depends on the robot. See
+Robot packages call `make_lift_cube_env_cfg()` and fill in the robot-specific fields. See
 `config/yam`.
 """
 
@@ -27,7 +27,7 @@ from mjlab.terrains import TerrainEntityCfg
 from mjlab.utils.noise import UniformNoiseCfg
 from mjlab.viewer import ViewerConfig
 
-# Filled in by the robot.
+# Placeholders for robot-specific names.
 _NO_NAMES: tuple[str, ...] = ()
 _NO_BODY = "(body of the hand)"
 
@@ -35,22 +35,22 @@ _NO_BODY = "(body of the hand)"
 def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
     """Return a new config of the task, without a robot and a cube.
 
-    It shares nothing with other configs, so that all of it may be edited. To be filled in are:
+    The config shares no objects with other configs and may be edited freely. Fill in:
 
     - `scene.entities["robot"]` and `scene.entities["cube"]`;
     - the action's scale; the site of the observations `ee_to_cube` and of the reward `lift`; the
       geoms of the events `fingertip_friction_*`; the primary of the sensor `ee_ground_collision`;
     - `viewer.body_name`.
 
-    Sites and sensors left empty are refused when the environment is built. Events without geoms
-    change nothing, and there is a warning.
+    Building the environment raises for empty sites and sensors. Events without geoms change nothing
+    and log a warning.
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,
         episode_length_s=20.0,
         scene=SceneCfg(
             terrain=TerrainEntityCfg(terrain_type="plane"),
-            # The hand's strongest contact with the ground, in every substep.
+            # Strongest contact between hand and ground, per substep.
             sensors=(
                 ContactSensorCfg(
                     name="ee_ground_collision",
@@ -118,7 +118,7 @@ def _observations() -> dict[str, ObservationGroupCfg | None]:
         ),
         "actions": ObservationTermCfg(func=mdp.last_action),
     }
-    # The critic sees the same without noise: its group has no corruption.
+    # Critic: same terms without noise, since its group has no corruption.
     return {
         "actor": ObservationGroupCfg(terms=terms, enable_corruption=True),
         "critic": ObservationGroupCfg(terms=copy.deepcopy(terms)),
@@ -155,8 +155,8 @@ def _events() -> dict[str, EventTermCfg | None]:
                 "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
             },
         ),
-        # Fingertips of condim 6 also resist spinning and rolling, which spread over orders of
-        # magnitude. Each of them has a friction of its own.
+        # Fingertips with condim 6 also have torsional and rolling friction. These coefficients span
+        # orders of magnitude, hence log-uniform. Each fingertip geom is sampled separately.
         "fingertip_friction_slide": _fingertip_friction(0, (0.3, 1.5), "uniform"),
         "fingertip_friction_spin": _fingertip_friction(1, (1e-4, 2e-2), "log_uniform"),
         "fingertip_friction_roll": _fingertip_friction(2, (1e-5, 5e-3), "log_uniform"),
@@ -221,7 +221,7 @@ def _terminations() -> dict[str, TerminationTermCfg | None]:
 
 
 def _curriculum() -> dict[str, CurriculumTermCfg | None]:
-    # First to lift at all, then gently. In environment steps: iterations of 24 steps.
+    # Learn to lift first, then to move gently. Steps are environment steps, 24 per iteration.
     stages: list[mdp.RewardCurriculumStage] = [
         {"step": 0, "weight": -0.01},
         {"step": 500 * 24, "weight": -0.1},

@@ -1,4 +1,4 @@
-"""Motion tracking: a robot moves as a recording does."""
+"""Motion tracking tasks: a robot imitates reference motions."""
 
-# Registers its tasks, by name, so that nothing heavy is imported.
+# Register the tasks by name, so that nothing heavy is imported.
 from mjlab.tasks.tracking.config import g1 as _g1  # noqa: F401

@@ -1,16 +1,17 @@
-"""Motion files: what is in them, reading them with all checks, and writing them.
+"""Motion files: format, validated reading, and writing.
 
-A motion is an `.npz` file with the frame axis first. World frame, SI units, quaternions (w, x, y, z):
+A motion is an `.npz` file with the frame axis first. World frame, SI units, quaternions (w, x, y,
+z):
 
 | key | shape | content |
 | --- | --- | --- |
 | `fps` | (1,) | frames per second |
-| `joint_pos`, `joint_vel` | (T, nj) | all joints but the free one, in the order of the robot |
-| `body_pos_w`, `body_quat_w` | (T, nb, 3), (T, nb, 4) | poses of all bodies, in the order of the robot |
-| `body_lin_vel_w`, `body_ang_vel_w` | (T, nb, 3) | velocities of the origins of the bodies |
-| `joint_names`, `body_names` | (nj,), (nb,) | their names; files of other tools lack them |
+| `joint_pos`, `joint_vel` | (T, nj) | all joints except the free joint, in robot order |
+| `body_pos_w`, `body_quat_w` | (T, nb, 3), (T, nb, 4) | poses of all bodies, in robot order |
+| `body_lin_vel_w`, `body_ang_vel_w` | (T, nb, 3) | velocities of the body origins |
+| `joint_names`, `body_names` | (nj,), (nb,) | optional names; absent from files of other tools |
 
-The world of a file is the environment's: origins of environments are added where it is used.
+The world frame of a file is relative to the environment's origin.
 """
 
 from __future__ import annotations
@@ -37,60 +38,60 @@ _ARRAYS: dict[str, int | None] = {
     "body_lin_vel_w": 3,
     "body_ang_vel_w": 3,
 }
-"""The arrays of a motion with the size of their last axis; None: the number of joints."""
+"""Arrays of a motion with the size of their last axis; None: number of joints."""
 _MIN_FRAMES = 2
 _QUAT_TOLERANCE = 1e-3
 _RATE_TOLERANCE = 1e-3
 
 
 class MotionFileError(MjlabError, ValueError):
-    """Raised for a file that is no motion, or none of this robot; the text says why."""
+    """File that is not a motion, or does not match the robot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """A motion of T frames, of a robot with nj joints and nb bodies; see the module's table."""
+    """Motion of T frames, of a robot with nj joints and nb bodies; see the module's table."""
 
     fps: float | None
-    """Frames per second; None where the file does not say."""
+    """Frames per second; None if not in the file."""
     joint_pos: np.ndarray
-    """(T, nj) in rad."""
+    """Joint positions (rad), (T, nj)."""
     joint_vel: np.ndarray
-    """(T, nj) in rad/s."""
+    """Joint velocities (rad/s), (T, nj)."""
     body_pos_w: np.ndarray
-    """(T, nb, 3) in m."""
+    """Body positions (m), (T, nb, 3)."""
     body_quat_w: np.ndarray
-    """(T, nb, 4), unit quaternions."""
+    """Body orientations, unit quaternions (w, x, y, z), (T, nb, 4)."""
     body_lin_vel_w: np.ndarray
-    """(T, nb, 3) in m/s."""
+    """Linear body velocities (m/s), (T, nb, 3)."""
     body_ang_vel_w: np.ndarray
-    """(T, nb, 3) in rad/s, world axes."""
+    """Angular body velocities in world axes (rad/s), (T, nb, 3)."""
     joint_names: tuple[str, ...] = ()
-    """Names of the joints; empty where the file does not say."""
+    """Joint names; empty if not in the file."""
     body_names: tuple[str, ...] = ()
-    """Names of the bodies; empty where the file does not say."""
+    """Body names; empty if not in the file."""
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """Number of frames T."""
         return len(self.joint_pos)
 
 
 def read_motion(path: str | Path) -> Motion:
-    """Return the motion in a file, as float32. Nothing in the file is ever executed (no pickle).
+    """Read a motion as float32. Nothing in the file is executed (no pickle).
 
     Raises:
-        MotionFileError: there is no such file, it is no motion, or what it holds cannot be: another
-            number of frames from one array to the next, fewer than two frames, numbers that are
-            not finite, quaternions that are not unit quaternions.
+        MotionFileError: file not found, not a motion, or invalid content: arrays with different
+            numbers of frames, fewer than two frames, NaN or infinite values, quaternions without
+            unit norm.
     """
     path = Path(path)
     content = _load(path)
     missing = [key for key in _ARRAYS if key not in content]
     if missing:
         raise MotionFileError(
-            f"The motion {path} lacks {missing}; it has {sorted(content)}. "
-            "`mjlab csv-to-npz` makes a motion from joint angles."
+            f"Motion {path}: missing {missing}, got {sorted(content)}; use `mjlab csv-to-npz` to "
+            "make a motion from joint angles."
         )
     arrays = {key: _checked_array(path, key, content[key], size) for key, size in _ARRAYS.items()}
     _check_sizes(path, arrays)
@@ -112,54 +113,53 @@ def check_motion_fits(
     body_names: Sequence[str],
     step_dt: float,
 ) -> None:
-    """Refuse a motion that is not of this robot or plays at another speed.
+    """Check that a motion matches the robot and the control timestep.
 
     Args:
-        path: Where it was read from, for messages.
+        path: Path of the file, for messages.
         motion: The motion.
         joint_names: Joints of the robot, in order.
         body_names: Bodies of the robot, in order.
-        step_dt: The control period, in seconds.
+        step_dt: Control timestep (s).
 
     Raises:
-        MotionFileError: another number of joints or bodies, or, where the file names them, others
-            or in another order; a frame rate that is not that of control.
+        MotionFileError: the number, names or order of joints or bodies differs (names only if the
+            file has them), or the frame rate is not the control rate.
     """
-    for what, wanted, names, columns in (
+    for kind, expected, names, columns in (
         ("joints", joint_names, motion.joint_names, motion.joint_pos),
         ("bodies", body_names, motion.body_names, motion.body_pos_w),
     ):
-        if columns.shape[1] != len(wanted):
+        if columns.shape[1] != len(expected):
             raise MotionFileError(
-                f"The motion {path} has {columns.shape[1]} {what}, and the robot {len(wanted)}: "
-                f"{list(wanted)}."
+                f"Motion {path}: expected {len(expected)} {kind}, got {columns.shape[1]}. The robot "
+                f"has {list(expected)}."
             )
-        if names and tuple(names) != tuple(wanted):
-            pairs = zip(names, wanted, strict=True)
+        if names and tuple(names) != tuple(expected):
+            pairs = zip(names, expected, strict=True)
             first = next(i for i, (name, other) in enumerate(pairs) if name != other)
             raise MotionFileError(
-                f"The {what} of the motion {path} are not those of the robot in its order: number "
-                f"{first} is {names[first]!r} in the motion and {wanted[first]!r} in the robot."
+                f"Motion {path} {kind}: expected the names and order of the robot, "
+                f"{expected[first]!r} at index {first}, got {names[first]!r}."
             )
     if motion.fps is not None and abs(motion.fps * step_dt - 1.0) > _RATE_TOLERANCE:
         raise MotionFileError(
-            f"The motion {path} has {motion.fps:g} frames per second, and the task is controlled "
-            f"{1.0 / step_dt:g} times per second (every {step_dt:g} s), so that it would play at "
-            "the wrong speed. Resample it: `mjlab csv-to-npz --input-file "
-            f"{path} --output-fps {1.0 / step_dt:g} --output-file ...`."
+            f"Motion {path} fps: expected {1.0 / step_dt:g}, the control rate (timestep {step_dt:g} "
+            f"s), got {motion.fps:g}; resample it with `mjlab csv-to-npz --input-file {path} "
+            f"--output-fps {1.0 / step_dt:g} --output-file ...`."
         )
 
 
 def write_motion(path: str | Path, motion: Motion) -> Path:
-    """Write a motion, compressed, and return its path; folders are made, `.npz` is added.
+    """Write a compressed motion and return its path. Creates folders; appends `.npz` if missing.
 
-    The same motion always gives the same bytes.
+    Output is deterministic: equal motions give equal bytes.
 
     Raises:
-        MotionFileError: the motion has no frame rate, or numbers that are not finite as float32.
+        MotionFileError: the motion has no frame rate, or values that are not finite as float32.
     """
     if motion.fps is None:
-        raise MotionFileError(f"The motion to write to {path} has no fps.")
+        raise MotionFileError(f"Motion {path} fps: expected frames per second, got None.")
     path = npz_path(path)
     entries = {"fps": np.array([motion.fps], dtype=np.float32)}
     entries |= {
@@ -176,14 +176,14 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
         for key, array in entries.items():
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, array, allow_pickle=False)
-            # A fixed date, because `np.savez` would write that of today.
+            # ZipInfo has a fixed date; `np.savez` would write the current date.
             info = zipfile.ZipInfo(f"{key}.npy")
             archive.writestr(info, buffer.getvalue(), zipfile.ZIP_DEFLATED, 9)
     return path
 
 
 def npz_path(path: str | Path) -> Path:
-    """Return where a motion of that name goes: `.npz` is added where it is missing."""
+    """Return `path` with `.npz` appended if missing."""
     path = Path(path)
     return path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
 
@@ -197,12 +197,14 @@ def _load(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             if not hasattr(archive, "files"):
-                raise MotionFileError(f"{path} is a single array and no motion (.npz).")
+                raise MotionFileError(
+                    f"Motion {path}: expected an .npz archive, got a single array."
+                )
             return {key: archive[key] for key in archive.files}
     except MotionFileError:
         raise
     except Exception as error:
-        # Whatever a damaged or hostile file makes zipfile and NumPy raise.
+        # Damaged or hostile files make zipfile and NumPy raise many types of errors.
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise MotionFileError(f"{path} cannot be read as a motion (.npz): {reason}") from error
 
@@ -210,35 +212,34 @@ def _load(path: Path) -> dict[str, np.ndarray]:
 def _names(
     path: Path, key: str, value: np.ndarray | None, like: str, count: int
 ) -> tuple[str, ...]:
-    """Return names of the columns of the array `like`, of which there are `count`, or none."""
+    """Return the names of the `count` columns of the array `like`, or () without names."""
     if value is None:
         return ()
     if value.ndim != 1 or value.dtype.kind != "U":
-        raise MotionFileError(f"{key} of the motion {path} has to be a list of texts.")
+        raise MotionFileError(f"Motion {path} {key}: expected a list of strings, got {value!r}.")
     if len(value) not in (0, count):
         raise MotionFileError(
-            f"The motion {path} has {len(value)} {key}, and {count} columns in {like}."
+            f"Motion {path} {key}: expected {count} names, one per column of {like}, got "
+            f"{len(value)}."
         )
     return tuple(str(name) for name in value)
 
 
 def _checked_array(path: Path, key: str, value: np.ndarray, size: int | None) -> np.ndarray:
     if value.dtype.kind not in "fiu":
-        raise MotionFileError(f"{key} of the motion {path} holds {value.dtype}, and no numbers.")
+        raise MotionFileError(f"Motion {path} {key}: expected numbers, got {value.dtype}.")
     dims = 2 if size is None else 3
     if value.ndim != dims or (size is not None and value.shape[-1] != size):
-        wanted = "(frames, joints)" if size is None else f"(frames, bodies, {size})"
-        raise MotionFileError(
-            f"{key} of the motion {path} has the shape {value.shape}; it has to be {wanted}."
-        )
-    # What is read and written is float32, in which numbers above 3.4e38 are infinite.
+        expected = "(frames, joints)" if size is None else f"(frames, bodies, {size})"
+        raise MotionFileError(f"Motion {path} {key}: expected shape {expected}, got {value.shape}.")
+    # Motions are stored as float32: values above 3.4e38 become infinite.
     with np.errstate(over="ignore"):
         is_finite = np.isfinite(value.astype(np.float32))
     if not is_finite.all():
         frame = int(np.argwhere(~is_finite)[0][0])
         raise MotionFileError(
-            f"{key} of the motion {path} has {int((~is_finite).sum())} numbers that are NaN or "
-            f"infinite, the first in frame {frame}; expected float32, up to 3.4e38."
+            f"Motion {path} {key}: expected finite float32 values (up to 3.4e38), got "
+            f"{int((~is_finite).sum())} that are NaN or infinite, the first in frame {frame}."
         )
     return value
 
@@ -246,15 +247,17 @@ def _checked_array(path: Path, key: str, value: np.ndarray, size: int | None) ->
 def _check_sizes(path: Path, arrays: dict[str, np.ndarray]) -> None:
     frames = {key: len(value) for key, value in arrays.items()}
     if len(set(frames.values())) > 1:
-        raise MotionFileError(f"The arrays of the motion {path} differ in frames: {frames}.")
+        raise MotionFileError(f"Motion {path}: expected equal numbers of frames, got {frames}.")
     if frames["joint_pos"] < _MIN_FRAMES:
         raise MotionFileError(
-            f"The motion {path} has {frames['joint_pos']} frames; it needs at least {_MIN_FRAMES}."
+            f"Motion {path}: expected at least {_MIN_FRAMES} frames, got {frames['joint_pos']}."
         )
     for group in (("joint_pos", "joint_vel"), [key for key, size in _ARRAYS.items() if size]):
         columns = {key: arrays[key].shape[1] for key in group}
         if len(set(columns.values())) > 1:
-            raise MotionFileError(f"The arrays of the motion {path} differ in columns: {columns}.")
+            raise MotionFileError(
+                f"Motion {path}: expected equal numbers of columns, got {columns}."
+            )
 
 
 def _unit_quaternions(path: Path, quats: np.ndarray) -> np.ndarray:
@@ -264,8 +267,8 @@ def _unit_quaternions(path: Path, quats: np.ndarray) -> np.ndarray:
     if wrong.any():
         frame, body = (int(i) for i in np.argwhere(wrong)[0])
         raise MotionFileError(
-            f"body_quat_w of the motion {path} is no unit quaternion in {int(wrong.sum())} places: "
-            f"in frame {frame}, body {body} its norm is {norms[frame, body, 0]:.4g}."
+            f"Motion {path} body_quat_w: expected unit quaternions, got {int(wrong.sum())} without "
+            f"unit norm; in frame {frame}, body {body} the norm is {norms[frame, body, 0]:.4g}."
         )
     return quats / norms
 
@@ -278,6 +281,6 @@ def _fps(path: Path, value: Any) -> float | None:
     with np.errstate(over="ignore", under="ignore"):
         if not (is_number and 0.0 < float(np.float32(array.item())) < math.inf):
             raise MotionFileError(
-                f"fps of the motion {path} is {value!r}; it has to be one rate above 0."
+                f"Motion {path} fps: expected one finite number > 0, got {value!r}."
             )
     return float(array.item())

@@ -1,7 +1,8 @@
-"""From joint angles to motions: recordings, their resampling, velocities and bodies; and as CSV.
+"""Recordings of root and joint poses: resampling, conversion to motions, and CSV I/O.
 
-A CSV file is in the layout of the retargeted LAFAN1 sets: no header, comma separated, one pose a line:
-position of the root (m), its quaternion x y z w, and the angles of all joints (rad) in the order of the robot.
+CSV files have the layout of the retargeted LAFAN1 data: no header, comma-separated, one pose per
+line:
+root position (m), root quaternion (x, y, z, w), and all joint angles (rad) in robot order.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ _QUAT_TOLERANCE = 1e-2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """T poses of a robot with a floating base and nj joints, at equal intervals."""
+    """T equally spaced poses of a robot with a floating base and nj joints."""
 
     fps: float
     """Poses per second."""
     root_pos: np.ndarray
-    """(T, 3) position of the floating base, in m."""
+    """Position of the floating base (m), (T, 3)."""
     root_quat: np.ndarray
-    """(T, 4) its orientation, unit quaternions (w, x, y, z)."""
+    """Orientation of the floating base, unit quaternions (w, x, y, z), (T, 4)."""
     joint_pos: np.ndarray
-    """(T, nj) in rad, in the order of the robot."""
+    """Joint positions (rad) in robot order, (T, nj)."""
 
     def __len__(self) -> int:
         return len(self.root_pos)
@@ -44,26 +45,26 @@ def make_motion(
     joint_names: tuple[str, ...] = (),
     body_names: tuple[str, ...] = (),
 ) -> Motion:
-    """Return the motion of a recording: velocities, and poses and velocities of all bodies.
+    """Return the motion of a recording: adds velocities, and poses and velocities of all bodies.
 
-    Velocities of the root and of the joints are central differences, and those of the bodies follow
-    from them. At both ends linear and joint velocities are one-sided differences, and the angular
-    velocity of the root is that of the neighboring pose, as release 1.6 of the interface has them.
+    Root and joint velocities are central differences; body velocities follow from them. At both
+    ends, linear and joint velocities are one-sided differences, and the angular velocity of the
+    root is that of the neighboring pose, as in mjlab 1.6.
 
     Args:
         recording: At least two poses.
-        model: The robot alone, whose first joint is a free one.
-        joint_names: Names to write down with the motion.
-        body_names: Likewise.
+        model: Model of the robot alone; its first joint is a free joint.
+        joint_names: Joint names of the motion.
+        body_names: Body names of the motion.
 
     Raises:
-        ValueError: fewer than two poses, another number of joints, or a robot without a free joint.
+        ValueError: fewer than two poses, different number of joints, or no free joint.
     """
     if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-        raise ValueError("The robot has no free joint, so that it cannot be put onto a motion.")
+        raise ValueError("Robot: expected a free joint as the first joint, got a fixed base.")
     if recording.joint_pos.shape[1] != model.nq - 7:
         raise ValueError(
-            f"The recording has {recording.joint_pos.shape[1]} joints, and the robot {model.nq - 7}."
+            f"Recording: expected {model.nq - 7} joints, got {recording.joint_pos.shape[1]}."
         )
     dt = 1.0 / recording.fps
     lin_vel = np.gradient(recording.root_pos, dt, axis=0)
@@ -74,7 +75,7 @@ def make_motion(
     for t in range(len(recording)):
         data.qpos[:3], data.qpos[3:7] = recording.root_pos[t], recording.root_quat[t]
         data.qpos[7:] = recording.joint_pos[t]
-        # The angular velocity of a free joint is in the frame of the body.
+        # Angular velocity in qvel of a free joint is in the body frame.
         back = recording.root_quat[t] * (1.0, -1.0, -1.0, -1.0)
         mujoco.mju_rotVecQuat(data.qvel[3:6], ang_vel[t], back)
         data.qvel[:3], data.qvel[6:] = lin_vel[t], joint_vel[t]
@@ -94,13 +95,14 @@ def make_motion(
 
 
 def _bodies(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, ...]:
-    """Return positions, orientations, linear and angular velocities of all bodies but the world."""
+    """Return positions, orientations, linear and angular velocities of all bodies except the
+    world."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_comVel(model, data)
     pos, angular = data.xpos[1:].copy(), data.cvel[1:, :3].copy()
-    centre = data.subtree_com[model.body_rootid[1:]]
-    linear = data.cvel[1:, 3:] + np.cross(angular, pos - centre)
+    center = data.subtree_com[model.body_rootid[1:]]
+    linear = data.cvel[1:, 3:] + np.cross(angular, pos - center)
     return pos, data.xquat[1:].copy(), linear, angular
 
 
@@ -116,10 +118,10 @@ def recording_of(motion: Motion, fps: float) -> Recording:
 
 
 def angular_velocities(quats: np.ndarray, dt: float) -> np.ndarray:
-    """Return the angular velocities (T, 3), in world axes, of orientations (T, 4) dt apart.
+    """Return angular velocities in world axes, (T, 3), of orientations (T, 4) dt apart.
 
-    log(q_(t+1) q_(t-1)*) / (2 dt). The first and the last are those of their neighbors; of two
-    orientations, both are the one difference.
+    log(q_(t+1) q_(t-1)*) / (2 dt). The first and last values repeat their neighbors; for two
+    orientations, both are the forward difference.
     """
     if len(quats) < 3:
         return np.repeat(_rotation_vectors(quats[:-1], quats[1:]) / dt, len(quats), axis=0)
@@ -139,24 +141,24 @@ def _rotation_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def resampled(recording: Recording, fps: float) -> Recording:
-    """Return the recording at another rate: positions linear, orientations on the shortest arc.
+    """Resample a recording: linear positions, slerp orientations on the shortest arc.
 
-    Times are 0, 1/fps, 2/fps, ... up to, and without, the last pose: 301 poses at 30 per second are
-    500 at 50 per second.
+    Times are 0, 1/fps, 2/fps, ... up to, but excluding, the last pose: 301 poses at 30 per second
+    become 500 at 50 per second.
 
     Raises:
-        ValueError: fewer than two are left.
+        ValueError: fewer than two poses remain.
     """
     intervals = len(recording) - 1
-    # The small number keeps a duration of 10.000000001 s at 10 s.
+    # 1e-6 absorbs rounding, so that 10.000000001 s counts as 10 s.
     count = math.ceil(intervals * fps / recording.fps - 1e-6)
     if count < 2:
         raise ValueError(
-            f"{len(recording)} poses at {recording.fps:g} per second make {max(count, 0)} at {fps:g} "
-            "per second; at least 2 are needed."
+            f"Recording: expected at least 2 poses at {fps:g} per second, got {max(count, 0)} from "
+            f"{len(recording)} poses at {recording.fps:g} per second."
         )
     phase = np.arange(count) * (recording.fps / fps)
-    # Where a time is that of a pose, the pose is taken as it is.
+    # Times that coincide with a pose return the pose without interpolation.
     phase = np.where(
         np.abs(phase - np.round(phase)) < 1e-9 * len(recording), np.round(phase), phase
     )
@@ -176,10 +178,10 @@ def resampled(recording: Recording, fps: float) -> Recording:
 
 
 def slerp(start: np.ndarray, end: np.ndarray, blend: np.ndarray) -> np.ndarray:
-    """Interpolate unit quaternions (..., 4) at a constant rate, the short way.
+    """Interpolate unit quaternions (..., 4) at constant angular velocity on the shortest arc.
 
-    (sin((1 - t) a) q0 + sin(t a) q1) / sin(a), where a is the angle between them, written with
-    sin(x)/x so that it holds for angles however small: slow turns do not become stairs.
+    (sin((1 - t) a) q0 + sin(t a) q1) / sin(a), a: angle between q0 and q1, written with sin(x)/x
+    for accuracy at small angles: slow rotations stay smooth.
 
     Args:
         start: (..., 4).
@@ -187,12 +189,12 @@ def slerp(start: np.ndarray, end: np.ndarray, blend: np.ndarray) -> np.ndarray:
         blend: (..., 1), 0 for `start` and 1 for `end`.
     """
     end = np.where((start * end).sum(axis=-1, keepdims=True) < 0.0, -end, end)
-    # Of the arc between two unit vectors, this is precise where it is small, and acos is not.
+    # atan2 of chord lengths is accurate at small angles, acos is not.
     chord = np.linalg.norm(end - start, axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(chord, np.linalg.norm(end + start, axis=-1, keepdims=True))
 
-    def weight(share: np.ndarray) -> np.ndarray:
-        return share * np.sinc(share * angle / np.pi) / np.sinc(angle / np.pi)
+    def weight(t: np.ndarray) -> np.ndarray:
+        return t * np.sinc(t * angle / np.pi) / np.sinc(angle / np.pi)
 
     mixed = weight(1.0 - blend) * start + weight(blend) * end
     return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
@@ -207,45 +209,44 @@ def read_csv(
     joint_names: Sequence[str],
     line_range: tuple[int, int] | None = None,
 ) -> Recording:
-    """Return the recording in a file.
+    """Read a recording from a CSV file.
 
     Args:
-        path: The file.
-        fps: Its poses per second.
+        path: CSV file.
+        fps: Poses per second of the file.
         joint_names: Joints of the robot, in order.
-        line_range: First and last line to read, counted from 1; both are read. None reads all.
+        line_range: First and last line to read, 1-based, inclusive. None: all lines.
 
     Raises:
-        MotionFileError: there is no such file, a line is not of numbers, there are more or fewer
-            columns than the robot needs, the lines do not exist, fewer than two are left, or a
-            quaternion is not a unit quaternion.
+        MotionFileError: file not found, not a table of numbers, wrong number of columns, line range
+            outside of the file, fewer than two poses, or quaternions without unit norm.
     """
     path = Path(path)
     table = _table(path)
     first, last = (1, len(table)) if line_range is None else line_range
     if line_range is not None and not 1 <= first <= last <= len(table):
         raise MotionFileError(
-            f"Lines {first} to {last} were asked for, and {path} has lines 1 to {len(table)}."
+            f"line_range: expected lines within 1 to {len(table)} of {path}, got {first} to {last}."
         )
     table = table[first - 1 : last]
     if len(table) < 2:
-        raise MotionFileError(f"{path} has {len(table)} poses to read; at least 2 are needed.")
+        raise MotionFileError(f"{path}: expected at least 2 poses, got {len(table)}.")
     expected = _ROOT_COLUMNS + len(joint_names)
     if table.shape[1] != expected:
         raise MotionFileError(
-            f"{path} has {table.shape[1]} columns, and the robot needs {expected}: 3 of position, 4 "
-            f"of orientation (x y z w), and {len(joint_names)} of joints: {list(joint_names)}."
+            f"{path}: expected {expected} columns, got {table.shape[1]}. The columns are position "
+            f"(3), orientation x y z w (4) and joints ({len(joint_names)}): {list(joint_names)}."
         )
     if not np.isfinite(table).all():
         line = int(np.argwhere(~np.isfinite(table))[0][0]) + first
-        raise MotionFileError(f"Line {line} of {path} has a number that is NaN or infinite.")
+        raise MotionFileError(f"Line {line} of {path}: expected finite numbers, got NaN or inf.")
     quat = table[:, [6, 3, 4, 5]]
     norms = np.linalg.norm(quat, axis=1, keepdims=True)
     wrong = np.flatnonzero(np.abs(norms[:, 0] - 1.0) > _QUAT_TOLERANCE)
     if len(wrong) > 0:
         raise MotionFileError(
-            f"Columns 4 to 7 of {path} have to be unit quaternions (x y z w); in line {wrong[0] + first} "
-            f"the norm is {norms[wrong[0], 0]:.4g}."
+            f"Line {wrong[0] + first} of {path}: expected a unit quaternion (x y z w) in columns 4 to "
+            f"7, got norm {norms[wrong[0], 0]:.4g}."
         )
     return Recording(
         fps=fps, root_pos=table[:, :3], root_quat=quat / norms, joint_pos=table[:, _ROOT_COLUMNS:]
@@ -254,20 +255,20 @@ def read_csv(
 
 def _table(path: Path) -> np.ndarray:
     if not path.is_file():
-        raise MotionFileError(f"There is no file {path}.")
+        raise MotionFileError(f"File {path} not found.")
     try:
         with warnings.catch_warnings():
-            # Of an empty file, which has a message below.
+            # np.loadtxt warns about empty files; `read_csv` raises for them.
             warnings.simplefilter("ignore", UserWarning)
             return np.loadtxt(path, delimiter=",", ndmin=2)
     except ValueError as error:
         raise MotionFileError(
-            f"{path} is not a table of numbers, separated by commas and without a header: {error}"
+            f"{path} is not a table of numbers (comma-separated, without a header): {error}"
         ) from error
 
 
 def write_csv(path: str | Path, recording: Recording) -> None:
-    """Write a recording."""
+    """Write a recording to a CSV file."""
     quat = recording.root_quat[:, [1, 2, 3, 0]]
     table = np.hstack((recording.root_pos, quat, recording.joint_pos))
     np.savetxt(path, table, delimiter=",", fmt="%.8f")

@@ -1,9 +1,9 @@
-"""Finding motions: files, folders, those that ship with the package, Weights & Biases, folders of runs.
+"""Sources of motions: files, folders, bundled motions, Weights & Biases, run folders.
 
-A run keeps the motions that it was trained on in its folder: copies, where they came from, and hashes.
+A run folder contains the training motions: copies, their sources, and hashes.
 
     <run>/motion/motions.json   [{"file": "squat.npz", "source": "...", "sha256": "..."}, ...]
-    <run>/motion/squat.npz      the copies, in that order
+    <run>/motion/squat.npz      copies, listed in order in motions.json
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from mjlab.utils.os import own_folder, replacing
 from mjlab.utils.string import suggest
 
 FOLDER = "motion"
-"""Name of the folder, in that of the run."""
+"""Name of the motion folder in the run folder."""
 INDEX = "motions.json"
-"""Name of the list, in the folder."""
+"""Name of the index file in the motion folder."""
 _ARTIFACT_TYPE = "motions"
 _ARTIFACT_FILE = "motion.npz"
 _DEFAULT_ALIAS = "latest"
 SHIPPED = Path(__file__).parent / "motions"
-"""Folder of the motions that ship with the package; a README there says what they are."""
-# Commas that a path in a list may have; more are looked for in a single path only.
+"""Folder of the bundled motions, described in its README."""
+# Maximum number of commas in a path of a list. A single path may contain any number.
 _MAX_COMMAS = 8
 
 
 def find_motions(text: str) -> list[Path]:
-    """Return the files that `text` names: one or several, separated by commas.
+    """Return the files of one or several motions, separated by commas in `text`.
 
-    Each is a file, a folder (all `.npz` files in it, by name), or the name of a motion that ships
-    with the package, such as `squat`. Commas within a path that exists separate nothing.
+    Each motion is a file, a folder (all `.npz` files in it, by name), or the name of a bundled
+    motion such as `squat`. Commas within an existing path do not separate.
 
     Raises:
-        MotionFileError: nothing is named, or one of them does not exist.
+        MotionFileError: `text` is empty, or a motion is not found.
     """
     parts = [part for part in _parts_of(text) if part]
     if not parts:
         raise MotionFileError(
-            "No motion is named. Give a file (--motion-file, or motion_file of the command), or "
-            f"one that ships with the package: {', '.join(shipped_motions())}."
+            f"motion_file: expected a motion, got {text!r}; use a file (--motion-file, or "
+            f"motion_file of the command) or a bundled motion. Available: {', '.join(shipped_motions())}."
         )
     return [path for part in parts for path in _files_of(part)]
 
 
 def _parts_of(text: str) -> list[str]:
-    """Split `text` at commas, but not at those of a path that exists; the longest one is meant."""
+    """Split `text` at commas outside existing paths; the longest existing path wins."""
     if _exists(text):
         return [text]
     pieces, parts = text.split(","), []
@@ -67,7 +67,7 @@ def _parts_of(text: str) -> list[str]:
 
 
 def _exists(path: str) -> bool:
-    # Unlike `Path.exists`, which raises for a text too long for a path, as a long list is.
+    # `Path.exists` raises for strings longer than a path may be, such as long lists.
     return os.path.exists(os.path.expanduser(path))
 
 
@@ -76,36 +76,36 @@ def _files_of(part: str) -> list[Path]:
     if os.path.isdir(path):
         files = sorted(path.glob("*.npz"))
         if not files:
-            raise MotionFileError(f"The folder {path} has no motion (.npz) in it.")
+            raise MotionFileError(f"Folder {path}: expected motions (.npz), got none.")
         return files
     shipped = shipped_motions()
     if not _exists(part) and part in shipped:
         return [shipped[part]]
     if not os.path.isfile(path):
         raise MotionFileError(
-            f"Unknown motion {part!r}; give a file, a folder, or a motion that ships with the package: "
+            f"Unknown motion {part!r}; use a file, a folder, or a bundled motion: "
             f"{suggest(part, shipped)}"
         )
     return [path]
 
 
 def shipped_motions() -> dict[str, Path]:
-    """Return the motions that ship with the package, by name."""
+    """Return the paths of the bundled motions by name."""
     return {path.stem: path for path in sorted(SHIPPED.glob("*.npz"))}
 
 
-# Folders of runs.
+# Run folders.
 
 
 def record_motions(
     files: Sequence[Path], run_dir: Path, registry_name: str | None = None
 ) -> list[Path]:
-    """Copy motions into the folder of a run, and say where they came from; return what is new.
+    """Copy motions into a run folder and record their sources; return the new files.
 
     Args:
-        files: The motions, in order.
-        run_dir: Folder of the run. What it holds already stays as it is.
-        registry_name: The Weights & Biases artifact that they come from.
+        files: Motions, in order.
+        run_dir: Run folder. An existing record is unchanged.
+        registry_name: Weights & Biases artifact of the motions, recorded as their source.
     """
     folder = run_dir / FOLDER
     if (folder / INDEX).is_file():
@@ -117,21 +117,21 @@ def record_motions(
         free = (f"{path.stem}-{number}.npz" for number in itertools.count(2))
         while name in taken:
             name = next(free)
-        # Runs that go on from another one take their motions from that one's folder.
+        # Resumed runs copy the motions from the folder of the run they resume.
         shutil.copyfile(path, folder / name)
         source = registry_name if registry_name is not None else str(path.resolve())
         entries.append({"file": name, "source": source, "sha256": motion_hash(folder / name)})
-    # Last, because its presence says that all the others are there.
+    # Written last: the index marks a complete record.
     with replacing(folder / INDEX) as file:
         file.write((json.dumps(entries, indent=2) + "\n").encode())
     return [*(folder / entry["file"] for entry in entries), folder / INDEX]
 
 
 def recorded_motions(run_dir: Path) -> list[Path]:
-    """Return the motions that a run was trained on, in order; none where it recorded none.
+    """Return the training motions of a run, in order; empty without a record.
 
     Raises:
-        MotionFileError: the record is damaged, or a copy is not what was recorded.
+        MotionFileError: the record is damaged, or a copy is missing or does not match its hash.
     """
     index = run_dir / FOLDER / INDEX
     if not index.is_file():
@@ -141,15 +141,15 @@ def recorded_motions(run_dir: Path) -> list[Path]:
         listed = [(Path(str(entry["file"])).name, str(entry["sha256"])) for entry in entries]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise MotionFileError(
-            f"{index} is damaged ({error}). Name the motion with --motion-file."
+            f"{index} is damaged ({error}); select the motion with --motion-file."
         ) from error
     paths = []
     for name, expected in listed:
         path = run_dir / FOLDER / name
         if not path.is_file() or motion_hash(path) != expected:
             raise MotionFileError(
-                f"The run in {run_dir} was trained on a motion whose copy {path} is missing or was "
-                "changed since. Name the motion with --motion-file."
+                f"Run {run_dir}: the copy {path} of a training motion is missing or was changed "
+                "since; select the motion with --motion-file."
             )
         paths.append(path)
     return paths
@@ -159,10 +159,10 @@ def recorded_motions(run_dir: Path) -> list[Path]:
 
 
 def fetch_artifact(registry_name: str) -> list[Path]:
-    """Return the motions in an artifact such as `org/motions/dance` or `.../dance:v3`, downloaded.
+    """Download an artifact such as `org/motions/dance` or `.../dance:v3`; return its motions.
 
     Raises:
-        MotionFileError: it cannot be fetched, or has no motion in it.
+        MotionFileError: the artifact cannot be fetched, or contains no motion.
     """
     import wandb
 
@@ -173,21 +173,22 @@ def fetch_artifact(registry_name: str) -> list[Path]:
     except MotionFileError:
         raise
     except Exception as error:
-        # wandb raises errors of many kinds, of its own and of what it is built on.
+        # wandb raises its own errors and those of its dependencies.
         raise MotionFileError(
-            f"Cannot fetch the motion {name!r} from Weights & Biases: {error}"
+            f"Cannot fetch motion {name!r} from Weights & Biases: {error}"
         ) from error
 
 
 def full_artifact_name(registry_name: str) -> str:
-    """Return the name with an alias: `:latest` where there is none."""
+    """Return the name with alias; the default alias is `:latest`."""
     return registry_name if ":" in registry_name else f"{registry_name}:{_DEFAULT_ALIAS}"
 
 
 def fetch_motions_of_run(run_path: str) -> list[Path]:
-    """Return the motions that a run was trained on, downloaded.
+    """Download the training motions of a run; return their paths.
 
-    Those that the run recorded and uploaded, or the artifact of type `motions` that it used.
+    Motions are those recorded and uploaded by the run, or those of its used artifact of type
+    `motions`.
 
     Args:
         run_path: entity/project/run.
@@ -213,20 +214,20 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
         raise
     except Exception as error:
         raise MotionFileError(
-            f"Cannot read the run {run_path!r} at Weights & Biases: {error}"
+            f"Cannot read run {run_path!r} at Weights & Biases: {error}"
         ) from error
     raise MotionFileError(
-        f"The run {run_path!r} has neither recorded motions nor an artifact of type "
-        f"{_ARTIFACT_TYPE!r}. Name the motion with --motion-file or --registry-name."
+        f"Run {run_path!r} has neither recorded motions nor an artifact of type "
+        f"{_ARTIFACT_TYPE!r}; select the motion with --motion-file or --registry-name."
     )
 
 
 def _motions_in(artifact: Any, name: str) -> list[Path]:
-    """Return the motions in an artifact; `motion.npz`, as mjlab 1.6 calls it, or all there are."""
+    """Return the motions of an artifact: `motion.npz` (mjlab 1.6), else all `.npz` files."""
     folder = Path(artifact.download())
     if (folder / _ARTIFACT_FILE).is_file():
         return [folder / _ARTIFACT_FILE]
     files = sorted(folder.glob("*.npz"))
     if not files:
-        raise MotionFileError(f"The artifact {name!r} has no motion (.npz) in it.")
+        raise MotionFileError(f"Artifact {name!r}: expected motions (.npz), got none.")
     return files

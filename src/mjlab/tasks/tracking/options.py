@@ -1,4 +1,4 @@
-"""How motion tracking gets its motion: flags, the run that the policy comes from, or its config."""
+"""Selection of the reference motion: flags, the run of the policy, or the task config."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class MotionOptions(TaskOptions):
-    """Flags that say which motion is imitated.
+    """Flags that select the reference motion.
 
-    The first that applies: `motion_file`, `registry_name`, the motion of the environment's config
-    where it was changed, the motions that the policy's run recorded, and the config's own.
+    Priority: `motion_file`, `registry_name`, the motion of the environment config if changed, the
+    motions recorded by the policy's run, the default of the environment config.
     """
 
     motion_file: str | None = None
-    """Motions to imitate: files, folders, or names of motions that ship with the package (such as
-    squat), separated by commas. None: those that the policy was trained on, or the task's own."""
+    """Motions to imitate: files, folders, or names of bundled motions (e.g. squat), separated by
+    commas. None: the motions the policy was trained on, or the task's default."""
     registry_name: str | None = None
-    """Weights & Biases artifact with the motion, as org/collection/name or name:alias; without an
-    alias, the latest."""
+    """Weights & Biases artifact of the motion, as org/collection/name or name:alias. Default alias:
+    latest."""
 
     def prepare(self, env_cfg: ManagerBasedRlEnvCfg, origin: PolicyOrigin) -> None:
         """Write the motion into the command's config.
 
         Raises:
-            MotionFileError: both flags are given, or a motion is not there.
+            MotionFileError: both flags are set, or a motion is not found.
         """
         command = motion_cfg(env_cfg)
         files = self._files(command, origin)
@@ -53,13 +53,13 @@ class MotionOptions(TaskOptions):
         logger.info("Motion:  %s", ", ".join(names))
 
     def runner_kwargs(self) -> dict[str, Any]:
-        """Return the registry's name, with which a run is marked."""
+        """Return the registry name, recorded by the run as a used artifact."""
         return {"registry_name": self.registry_name}
 
     def _files(self, command: MotionCommandCfg, origin: PolicyOrigin) -> Sequence[Path] | None:
-        """Return the motions to imitate; None leaves those of the config."""
+        """Return the motions to imitate; None keeps the motions of the config."""
         if self.motion_file is not None and self.registry_name is not None:
-            raise MotionFileError("Give --motion-file or --registry-name, and not both.")
+            raise MotionFileError("Expected --motion-file or --registry-name, got both; use one.")
         if self.motion_file is not None:
             return find_motions(self.motion_file)
         if self.registry_name is not None:
@@ -73,19 +73,17 @@ class MotionOptions(TaskOptions):
         recorded = recorded_motions(origin.checkpoint.parent)
         if not recorded:
             logger.warning(
-                "The run of %s recorded no motion; %s is taken. --motion-file names another.",
+                "The run of %s has no recorded motion; using %s. Use --motion-file to select one.",
                 origin.checkpoint, command.motion_file,
             )  # fmt: skip
         return recorded or None
 
 
 def motion_cfg(env_cfg: Any) -> MotionCommandCfg:
-    """Return the config of the motion command; raises `ValueError` if there is none."""
+    """Return the config of the motion command; raises `ValueError` if not found."""
     from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg
 
     for cfg in env_cfg.commands.values():
         if isinstance(cfg, MotionCommandCfg):
             return cfg
-    raise ValueError(
-        f"The task has no MotionCommandCfg; its commands are {list(env_cfg.commands)}."
-    )
+    raise ValueError(f"Task commands: expected a MotionCommandCfg, got {list(env_cfg.commands)}.")

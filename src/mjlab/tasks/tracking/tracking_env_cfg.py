@@ -1,6 +1,6 @@
-"""The base config of motion tracking: move as a recording does.
+"""Base config of motion tracking: imitate reference motions.
 
-A robot's package starts from `make_tracking_env_cfg()` and fills in what depends on the robot. See
+Robot packages call `make_tracking_env_cfg()` and fill in the robot-specific fields. See
 `config/g1`.
 """
 
@@ -23,7 +23,7 @@ from mjlab.terrains import TerrainEntityCfg
 from mjlab.utils.noise import UniformNoiseCfg
 from mjlab.viewer import ViewerConfig
 
-# Filled in by the robot.
+# Placeholder for robot-specific names.
 _NO_NAMES: tuple[str, ...] = ()
 
 VELOCITY_RANGE = {
@@ -34,22 +34,22 @@ VELOCITY_RANGE = {
     "pitch": (-0.52, 0.52),
     "yaw": (-0.78, 0.78),
 }
-"""Perturbation of the root's velocity, by pushes and at starts (m/s, rad/s)."""
+"""Perturbation of the root velocity by pushes and at episode starts (m/s, rad/s)."""
 
 
 def make_tracking_env_cfg() -> ManagerBasedRlEnvCfg:
     """Return a new config of the task, without robot and motion.
 
-    It shares nothing with other configs, so that all of it may be edited. To be filled in are:
+    The config shares no objects with other configs and may be edited freely. Fill in:
 
-    - `scene.entities["robot"]`, and a contact sensor `self_collision` that the reward
-      `self_collisions` reads;
+    - `scene.entities["robot"]`, and a contact sensor `self_collision` for the reward
+      `self_collisions`;
     - the motion, the anchor and the tracked bodies of the command `motion`;
     - the action's scale; the geoms of `foot_friction`, the bodies of `base_com` and of the
       termination `ee_body_pos`;
     - `viewer.body_name`.
 
-    What is left empty is refused when the environment is built.
+    Building the environment raises for fields left empty.
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,
@@ -115,7 +115,7 @@ def _observations() -> dict[str, ObservationGroupCfg | None]:
         "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, noise=_noise(0.5)),
         "actions": ObservationTermCfg(func=mdp.last_action),
     }
-    # The critic sees more, all of it without noise and without the bias of the encoders.
+    # Critic: privileged terms, without noise and encoder bias.
     critic: dict[str, ObservationTermCfg | None] = {
         "command": _of_motion(mdp.generated_commands),
         "motion_anchor_pos_b": _of_motion(mdp.motion_anchor_pos_b),
@@ -186,7 +186,7 @@ def _events() -> dict[str, EventTermCfg | None]:
                 "asset_cfg": SceneEntityCfg("robot", geom_names=_NO_NAMES),
                 "operation": "abs",
                 "ranges": (0.3, 1.2),
-                # All feet of an environment have the same.
+                # Same friction for all feet of an environment.
                 "shared_random": True,
             },
         ),
@@ -238,7 +238,7 @@ def _terminations() -> dict[str, TerminationTermCfg | None]:
             func=mdp.bad_motion_body_pos_z_only,
             params={"command_name": "motion", "threshold": 0.25, "body_names": _NO_NAMES},
         ),
-        # Where the recording ends there is nothing left to imitate, which is no failure.
+        # The end of the motion truncates the episode; it is not a failure.
         "motion_ended": TerminationTermCfg(
             func=mdp.motion_ended, time_out=True, params={"command_name": "motion"}
         ),

@@ -1,5 +1,5 @@
-"""Velocity: a legged robot walks and turns as commanded, on flat ground or on rough terrain."""
+"""Velocity tasks: legged robots track velocity commands on flat ground and rough terrain."""
 
-# Each registers its tasks, by name, so that nothing heavy is imported.
+# Robot packages register tasks by name, so torch and MuJoCo are not imported.
 from mjlab.tasks.velocity.config import g1 as _g1  # noqa: F401
 from mjlab.tasks.velocity.config import go1 as _go1  # noqa: F401

@@ -1,6 +1,6 @@
-"""Gait metrics of evaluations: torque, power, slip and smoothness, whatever the scale of actions.
+"""Gait metrics of evaluations: torque, power, slip and smoothness, independent of the action scale.
 
-Read between steps, when forces and contacts are those of the last physics substep.
+Evaluated between environment steps; forces and contacts are those of the last physics substep.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _HEIGHTS = "foot_height_scan"
 
 
 def joint_torque(env: Any) -> torch.Tensor:
-    """Return the mean over joints of |tau|, (num_envs,), in N m: torque of their actuators."""
+    """Return the mean actuator torque |tau| over joints (N m), (num_envs,)."""
     return env.scene[_ROBOT].data.qfrc_actuator.abs().mean(dim=1)
 
 
 def torque_share(env: Any) -> torch.Tensor:
-    """Return the largest |force| / limit of any actuator, (num_envs,).
+    """Return the maximum of |force| / limit over actuators, (num_envs,).
 
     Actuators without a force limit in the model count as 0.
     """
@@ -48,15 +48,15 @@ def torque_share(env: Any) -> torch.Tensor:
 
 
 def mechanical_power(env: Any) -> torch.Tensor:
-    """Return the sum over joints of |tau q_dot|, (num_envs,), in W."""
+    """Return the sum of |tau q_dot| over joints (W), (num_envs,)."""
     data = env.scene[_ROBOT].data
     return (data.qfrc_actuator * data.joint_vel).abs().sum(dim=1)
 
 
 def action_rate(env: Any) -> torch.Tensor:
-    """Return the mean over actions of |a_t - a_(t-1)| times their scale, (num_envs,).
+    """Return the mean of scale |a_t - a_(t-1)| over actions, (num_envs,).
 
-    For joint positions that is the change of the target in a step, in rad, before any clip.
+    For joint position actions: change of the target per step (rad), before clipping.
     """
     manager = env.action_manager
     terms = [manager.get_term(name) for name in manager.active_terms]
@@ -71,19 +71,20 @@ def action_rate(env: Any) -> torch.Tensor:
 
 
 def foot_slip(env: Any) -> torch.Tensor:
-    """Return the mean horizontal speed of feet in contact, (num_envs,), in m/s; 0 in the air.
+    """Return the mean horizontal speed of feet in contact (m/s), (num_envs,); 0 without contact.
 
-    Feet are the sites of `foot_height_scan`, and touch the ground where `feet_ground_contact` says so.
+    Foot velocities are those of the sites of `foot_height_scan`, contacts those of
+    `feet_ground_contact`.
 
     Raises:
-        ValueError: one of these sensors does not exist, or they are of other feet.
+        ValueError: a sensor does not exist, or the two sensors measure different feet.
     """
     check_feet_sensor(env, _CONTACTS)
     feet = height_columns(env, _HEIGHTS)
     check_same_feet(
         env,
-        (f"The contact sensor {_CONTACTS!r}", contact_columns(env, _CONTACTS)),
-        (f"the height sensor {_HEIGHTS!r}", feet),
+        (f"contact sensor {_CONTACTS!r}", contact_columns(env, _CONTACTS)),
+        (f"height sensor {_HEIGHTS!r}", feet),
     )
     in_contact = env.scene[_CONTACTS].data.found > 0
     robot = env.scene[_ROBOT]
@@ -99,4 +100,4 @@ GAIT_METRICS = {
     "action_rate": action_rate,
     "foot_slip": foot_slip,
 }
-"""The metrics by the name under which evaluations report them."""
+"""Gait metrics by their names in evaluations."""

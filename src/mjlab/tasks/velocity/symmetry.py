@@ -1,12 +1,11 @@
-"""Mirror images of what a legged robot senses and does, so that PPO learns from both sides at once.
+"""Left-right symmetry augmentation of observations and actions of legged robots.
 
-A robot whose left is made like its right can take the mirror image of each sample as one more
-sample, which costs no physics (Mittal et al., "Symmetry Considerations for Learning Task Symmetric
-Robot Policies", ICRA 2024). `mirror_left_right` is what `symmetry_cfg` of `RslRlPpoAlgorithmCfg`
-names.
+For a robot that is symmetric, the mirror image of each sample is a further sample without simulation cost
+(Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024). Name
+`mirror_left_right` in `symmetry_cfg` of `RslRlPpoAlgorithmCfg`.
 
-The mirror is the plane of x and z of the robot's root. In it directions change the sign of y, and axes of
-rotation those of x and z.
+The mirror plane is the x-z plane of the robot's root. Mirroring flips the sign of y of polar vectors, and
+of x and z of axial vectors.
 """
 
 from __future__ import annotations
@@ -31,44 +30,43 @@ ROTATION = (-1.0, 1.0, -1.0)
 _SIDES = {"left": "right", "FL": "FR", "RL": "RR"}
 _OTHER_SIDE = _SIDES | {right: left for left, right in _SIDES.items()}
 
-# By how much partners may differ: axes (unit vectors), default positions (rad), places (m).
-_AXIS_TOLERANCE, _POSE_TOLERANCE, PLACE_TOLERANCE = 1e-4, 1e-3, 5e-3
-WITHOUT = "To learn without mirror images, set agent.algorithm.symmetry_cfg to None."
+# Tolerances between partners: axes (unit vectors), default positions (rad), anchor positions (m).
+_AXIS_TOLERANCE, _POSE_TOLERANCE, _ANCHOR_TOLERANCE = 1e-4, 1e-3, 5e-3
+_HINT = "To learn without mirror images, set agent.algorithm.symmetry_cfg to None."
 _ROBOT = "robot"
 _PLANAR_VELOCITY = (1.0, -1.0, -1.0)
-# Of (sin, cos): the other side steps then, for walks and trots.
+# Signs of (sin, cos) half a cycle later, the phase of the other side in walks and trots.
 _HALF_A_CYCLE_LATER = (-1.0, -1.0)
-_OF_SENSOR = {
+_SENSOR_SIGNS = {
     mujoco.mjtSensor.mjSENS_GYRO: ROTATION,
     mujoco.mjtSensor.mjSENS_VELOCIMETER: DIRECTION,
     mujoco.mjtSensor.mjSENS_ACCELEROMETER: DIRECTION,
 }
-# Metres, or parts of a unit vector, that rays and axes may be off.
+# Tolerance of ray positions (m) and axes (unit vectors).
 _TOLERANCE = 1e-4
-_known: WeakKeyDictionary[Any, _Mirrors] = WeakKeyDictionary()
+_cache: WeakKeyDictionary[Any, _Mirrors] = WeakKeyDictionary()
 
 
 def mirror_left_right(
     env: Any, obs: Any = None, actions: torch.Tensor | None = None
 ) -> tuple[Any, torch.Tensor | None]:
-    """Append their mirror images to observations and actions.
+    """Append mirror images to observations and actions.
 
     Args:
-        env: The environments, wrapped or not.
-        obs: Observation groups by name, each (N, numbers), as a TensorDict; or None.
-        actions: (N, actions), or None.
+        env: Environment, wrapped or not.
+        obs: TensorDict of observation groups, each (N, D), or None.
+        actions: Actions (N, A), or None.
 
     Returns:
-        Both with 2 N rows, the given ones first.
+        Observations and actions with 2 N rows, the originals first.
 
     Raises:
-        ValueError: the robot is not the same on both sides, or what a term is in the mirror is not
-            known.
+        ValueError: the robot is not symmetric, or a term has no known mirror image.
     """
     env = env.unwrapped
-    mirrors = _known.get(env)
+    mirrors = _cache.get(env)
     if mirrors is None:
-        mirrors = _known[env] = _Mirrors(env)
+        mirrors = _cache[env] = _Mirrors(env)
     if obs is not None:
         image = obs.clone()
         for group in set(image.keys()):
@@ -80,7 +78,7 @@ def mirror_left_right(
 
 
 class _Mirrors:
-    """The mirrors of an environment's observation groups, by name, and of its actions."""
+    """Mirrors of the observation groups and actions of an environment."""
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         manager = env.observation_manager
@@ -88,8 +86,8 @@ class _Mirrors:
         for group, names in manager.active_terms.items():
             if not manager.group_obs_concatenate[group]:
                 raise ValueError(
-                    f"The observation group {group!r} has concatenate_terms=False, and mirror_left_right "
-                    f"takes groups that are one tensor. {WITHOUT}"
+                    f"Observation group {group!r}: mirror_left_right expected concatenate_terms=True, got "
+                    f"concatenate_terms=False. {_HINT}"
                 )
             shapes = manager.group_obs_term_dim[group]
             terms = {
@@ -98,7 +96,7 @@ class _Mirrors:
             }
             starts = accumulate(map(len, terms.values()), initial=0)
             couplings = _lever_arms(env, group, dict(zip(terms, starts, strict=False)))
-            self.groups[group] = Mirror.joined(list(terms.values()), couplings)
+            self.groups[group] = Mirror.concatenate(list(terms.values()), couplings)
         self.actions = _of_actions(env)
 
 
@@ -107,116 +105,116 @@ def _mirror_of_term(
 ) -> Mirror:
     configs: Any = env.cfg.observations
     cfg = configs[group].terms[name]
-    label = f"The observation {group}/{name}"
+    owner = f"Observation {group}/{name}"
     kind = _KINDS.get(cfg.func)
     if kind is None:
         raise ValueError(
-            f"{label}: mirror_left_right does not know what it is in the mirror. It knows "
-            f"{', '.join(sorted(func.__name__ for func in _KINDS))}. Name a function of your own in "
-            f"symmetry_cfg. {WITHOUT}"
+            f"{owner}: mirror_left_right does not support this term. Supported: "
+            f"{', '.join(sorted(func.__name__ for func in _KINDS))}. Use a custom function in "
+            f"symmetry_cfg. {_HINT}"
         )
     clip = cfg.clip
     is_even = clip is None or clip[0] == -clip[1]
     if not isinstance(cfg.scale, int | float | None) or not is_even:
         raise ValueError(
-            f"{label} has scale {cfg.scale!r} and clip {clip!r}; mirror_left_right takes one number "
-            f"as scale, and a clip that is the same on both sides of 0. {WITHOUT}"
+            f"{owner}: mirror_left_right expected a scalar scale and a clip (-c, c), got scale "
+            f"{cfg.scale!r} and clip {clip!r}. {_HINT}"
         )
-    mirror = Mirror.joined([kind(env, cfg.params)] * _num_instants(env, group, name))
+    mirror = Mirror.concatenate([kind(env, cfg.params)] * _num_instants(env, group, name))
     if shape != (len(mirror),):
         raise ValueError(
-            f"{label} has shape {shape} for each environment, and mirror_left_right expects "
-            f"({len(mirror)},): everything that the term measures, with any history flattened. {WITHOUT}"
+            f"{owner}: mirror_left_right expected shape ({len(mirror)},) per environment, got {shape}; "
+            f"select all joints, and flatten the history. {_HINT}"
         )
     return mirror
 
 
 def _num_instants(env: ManagerBasedRlEnv, group: str, name: str) -> int:
-    """Return the number of steps whose values a term shows, one behind the other."""
+    """Return the number of time steps in a term, concatenated."""
     return max(1, env.observation_manager.get_term_cfg(group, name).history_length)
 
 
-# Terms: what each measures, and so its mirror image.
+# Mirrors of terms.
 
 
 def _of_sensor(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
-    """Return the mirror of a gyro or the like, apart from the lever arm of its place."""
+    """Return the mirror of a gyro, velocimeter or accelerometer, without lever arm effects."""
     sensor = _sensor(env, params["sensor_name"])
-    is_off = abs(sensor.y) > PLACE_TOLERANCE
-    if sensor.kind == mujoco.mjtSensor.mjSENS_ACCELEROMETER and is_off:
+    is_off_center = abs(sensor.y) > _ANCHOR_TOLERANCE
+    if sensor.kind == mujoco.mjtSensor.mjSENS_ACCELEROMETER and is_off_center:
         raise ValueError(
-            f"Accelerometer {sensor.name!r} stands {sensor.y:.3g} m to the left of the middle. What "
-            "it reads in the mirror depends on the angular acceleration, which is not observed; "
-            f"place it in the middle. {WITHOUT}"
+            f"Accelerometer {sensor.name!r}: expected a position on the mirror plane, got "
+            f"{sensor.y:.3g} m to its left. Its mirror image would need the angular acceleration, "
+            f"an unobserved quantity. {_HINT}"
         )
-    return Mirror(range(3), _OF_SENSOR[sensor.kind])
+    return Mirror(range(3), _SENSOR_SIGNS[sensor.kind])
 
 
 class _Sensor(NamedTuple):
-    """A sensor at a site."""
+    """Sensor at a site."""
 
     name: str
     kind: mujoco.mjtSensor
     body: int
-    """Id of the body that carries it."""
+    """Id of the body of the site."""
     y: float
     """Distance from the mirror plane (m), positive to the left."""
 
 
 def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
-    """Return a gyro, velocimeter or accelerometer at a site that is turned as the root is."""
+    """Return a gyro, velocimeter or accelerometer. Raises unless its site is aligned with the root."""
     model = env.sim.mj_model
     found = model.sensor(name)
     kind, site = mujoco.mjtSensor(int(found.type.item())), int(found.objid.item())
-    if kind not in _OF_SENSOR:
+    if kind not in _SENSOR_SIGNS:
         raise ValueError(
-            f"mirror_left_right knows gyros, velocimeters and accelerometers; sensor {name!r} is "
-            f"none of these. {WITHOUT}"
+            f"Sensor {name!r}: mirror_left_right expected a gyro, velocimeter or accelerometer, got "
+            f"{kind.name}. {_HINT}"
         )
     data, root = _reference_pose(env)
     body = int(model.site_bodyid[site])
     if np.abs(data.site_xmat[site] - data.xmat[root]).max() > _TOLERANCE:
         raise ValueError(
-            f"Sensor {name!r} is turned against the robot's root, so mirror_left_right does not know "
-            f"which of its axes points to the left. {WITHOUT}"
+            f"Sensor {name!r}: mirror_left_right expected the orientation of the robot's root at qpos0, got "
+            f"a rotated site. {_HINT}"
         )
-    carrier = model.body(body).name
-    if other_side(carrier.split("/")[-1]) != carrier.split("/")[-1]:
+    body_name = model.body(body).name
+    if other_side(body_name.split("/")[-1]) != body_name.split("/")[-1]:
         raise ValueError(
-            f"Sensor {name!r} is on body {carrier!r}, on one side of the robot; expected a body in "
-            f"the middle. {WITHOUT}"
+            f"Sensor {name!r}: expected a body on the mirror plane, got {body_name!r} on one side of "
+            f"the robot. {_HINT}"
         )
-    return _Sensor(name, kind, body, _to_left(data, root, data.site_xpos[site]))
+    return _Sensor(name, kind, body, _lateral_offset(data, root, data.site_xpos[site]))
 
 
 def _reference_pose(env: ManagerBasedRlEnv) -> tuple[mujoco.MjData, int]:
-    """Return the kinematics at `qpos0`, and the id of the robot's root."""
+    """Return the kinematics at `qpos0` and the body id of the robot's root."""
     data = mujoco.MjData(env.sim.mj_model)
     mujoco.mj_kinematics(env.sim.mj_model, data)
     robot: Any = env.scene[_ROBOT]
     return data, robot.indexing.root_body_id
 
 
-def _to_left(data: mujoco.MjData, root: int, point: np.ndarray) -> float:
-    """Return the distance of a point from the mirror plane of the body `root` (m)."""
+def _lateral_offset(data: mujoco.MjData, root: int, point: np.ndarray) -> float:
+    """Return the signed distance of a point from the mirror plane of body `root` (m), left positive."""
     return float((point - data.xpos[root]) @ data.xmat[root].reshape(3, 3)[:, 1])
 
 
 def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> list[Coupling]:
-    """Return what the angular velocity adds to the mirror images of linear velocities.
+    """Return the lever arm corrections of mirrored linear velocities.
 
-    The mirror image of a sensor at distance y from the mirror plane is at distance -y, where the
-    mirrored robot has none: its own reads, for w' the mirrored angular velocity,
+    The mirror image of a sensor at distance y from the mirror plane is at -y, but the sensor of the
+    mirrored robot is at y. With the mirrored angular velocity w', the sensor reads
 
         v' = S v + w' x (0, 2 y, 0) = S v + 2 y (w_z, 0, -w_x).
 
     Args:
         env: The environment.
-        group: Name of the observation group.
-        starts: First column of each of its terms.
+        group: Observation group name.
+        starts: First column of each term of the group.
 
     Raises:
-        ValueError: the group does not observe the angular velocity that is needed.
+        ValueError: the group does not observe the required angular velocity.
     """
     configs: Any = env.cfg.observations
     terms = {name: configs[group].terms[name] for name in starts}
@@ -258,19 +256,19 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
                     starts[gyro] + 3 * instant, starts[gyro] + 3 * instant + 3
                 )
                 couplings += [Coupling(x, turn_z, factor), Coupling(z, turn_x, -factor)]
-        elif abs(sensor.y) > PLACE_TOLERANCE:
+        elif abs(sensor.y) > _ANCHOR_TOLERANCE:
             raise ValueError(
-                f"The observation {group}/{name} is the velocity of a point {sensor.y:.3g} m to the "
-                "left of the middle. Its mirror image depends on the angular velocity of "
-                f"{env.sim.mj_model.body(sensor.body).name!r}; observe that in group {group!r} too, "
-                "with the same history_length, and without delay or with the same fixed one, or use "
-                f"base_lin_vel. {WITHOUT}"
+                f"Observation {group}/{name}: expected a velocimeter on the mirror plane, got one "
+                f"{sensor.y:.3g} m to its left. Its mirror image depends on the angular velocity of "
+                f"{env.sim.mj_model.body(sensor.body).name!r}; add that to group {group!r}, with the same "
+                "history_length, and without delay or with the same fixed delay, or use "
+                f"base_lin_vel. {_HINT}"
             )
     return couplings
 
 
 def _factor(cfg: Any) -> float:
-    """Return the scale of a term, which is one number."""
+    """Return the scalar scale of a term."""
     return 1.0 if cfg.scale is None else float(cfg.scale)
 
 
@@ -281,8 +279,8 @@ def _of_command(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     if isinstance(term, mdp.GaitClockCommand):
         return Mirror(range(2), _HALF_A_CYCLE_LATER)
     raise ValueError(
-        "mirror_left_right knows velocity commands (UniformVelocityCommandCfg) and gait clocks "
-        f"(GaitClockCommandCfg); {params['command_name']!r} is a {type(term).__name__}. {WITHOUT}"
+        f"Command {params['command_name']!r}: mirror_left_right expected a UniformVelocityCommand or "
+        f"GaitClockCommand, got {type(term).__name__}. {_HINT}"
     )
 
 
@@ -290,7 +288,7 @@ def _of_joints(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     asset_cfg = params.get("asset_cfg")
     if asset_cfg is not None and asset_cfg.preserve_order:
         raise ValueError(
-            f"mirror_left_right takes joints in the robot's own order, without preserve_order. {WITHOUT}"
+            f"mirror_left_right asset_cfg: expected joints in model order, got preserve_order=True. {_HINT}"
         )
     return mirror_of_joints(
         env.sim.mj_model, env.scene[_ROBOT if asset_cfg is None else asset_cfg.name]
@@ -301,21 +299,25 @@ def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) ->
     robot: Any = env.scene[_ROBOT]
     joints = mirror_of_joints(env.sim.mj_model, robot)
     manager = env.action_manager
-    named = {name: manager.get_term(name) for name in manager.active_terms}
-    (term, *others) = named.values()
+    terms = {name: manager.get_term(name) for name in manager.active_terms}
+    (term, *others) = terms.values()
     if others or not isinstance(term, envs_mdp.JointPositionAction):
-        kinds = ", ".join(f"{name} ({type(term).__name__})" for name, term in named.items())
+        kinds = ", ".join(f"{name} ({type(term).__name__})" for name, term in terms.items())
         raise ValueError(
-            f"mirror_left_right knows one action term, of joint positions; there are: {kinds}. {WITHOUT}"
+            f"mirror_left_right actions: expected one JointPositionAction, got {kinds}. {_HINT}"
         )
     driven = [robot.joint_names.index(name) for name in term.target_names]
-    across = joints.sources[driven].tolist()
-    if set(across) != set(driven):
-        raise ValueError(f"The actions drive joints of one side only. {WITHOUT}")
-    sources = [driven.index(joint) for joint in across]
+    partner_ids = joints.sources[driven].tolist()
+    if set(partner_ids) != set(driven):
+        raise ValueError(
+            f"mirror_left_right actions: expected joints of both sides, got {term.target_names}. {_HINT}"
+        )
+    sources = [driven.index(joint) for joint in partner_ids]
     scale = torch.as_tensor(term.scale, dtype=torch.float32).expand(env.num_envs, len(driven))
     if not torch.allclose(scale[:, sources], scale):
-        raise ValueError(f"The actions have another scale on the left than on the right. {WITHOUT}")
+        raise ValueError(
+            f"mirror_left_right actions: expected the same scale on both sides, got {term.cfg.scale}. {_HINT}"
+        )
     return Mirror(sources, joints.signs[driven].tolist())
 
 
@@ -337,13 +339,13 @@ def _feet(env: ManagerBasedRlEnv, sensor_name: str) -> list[str]:
 
 
 def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
-    """Return the mirror of a sensor's rays from one frame in the middle of the robot."""
+    """Return the mirror of the rays of a sensor with one frame on the mirror plane."""
     cfg: Any = env.scene[params["sensor_name"]].cfg
     frames = cfg.frame if isinstance(cfg.frame, tuple) else (cfg.frame,)
     rays = torch.cat(cfg.pattern.generate_rays(env.sim.mj_model, "cpu"), dim=1)
-    apart = ((rays * torch.tensor(2 * DIRECTION, dtype=torch.float32))[:, None] - rays[None]).norm(
-        dim=-1
-    )
+    distances = (
+        (rays * torch.tensor(2 * DIRECTION, dtype=torch.float32))[:, None] - rays[None]
+    ).norm(dim=-1)
     data, root = _reference_pose(env)
     frame = frames[0]
     element = getattr(env.sim.mj_model, frame.type)(frame.prefixed_name())
@@ -351,15 +353,14 @@ def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     is_central = (
         len(frames) == 1
         and other_side(frame.name) == frame.name
-        and abs(_to_left(data, root, points[element.id])) <= PLACE_TOLERANCE
+        and abs(_lateral_offset(data, root, points[element.id])) <= _ANCHOR_TOLERANCE
     )
-    if not is_central or (apart.min(dim=1).values > _TOLERANCE).any():
+    if not is_central or (distances.min(dim=1).values > _TOLERANCE).any():
         raise ValueError(
-            f"The rays of sensor {params['sensor_name']!r} are not the same on both sides, so that "
-            "mirror_left_right cannot swap them. Give it one frame in the middle of the robot, and a "
-            f"pattern with as much on the left as on the right. {WITHOUT}"
+            f"Sensor {params['sensor_name']!r}: mirror_left_right expected symmetric rays; use one frame on "
+            f"the mirror plane of the robot, and a pattern that is symmetric in y. {_HINT}"
         )
-    return Mirror(apart.argmin(dim=1).tolist(), [1.0] * len(rays))
+    return Mirror(distances.argmin(dim=1).tolist(), [1.0] * len(rays))
 
 
 _KINDS: dict[Any, Callable[..., Mirror]] = {
@@ -380,19 +381,16 @@ _KINDS: dict[Any, Callable[..., Mirror]] = {
 }
 
 
-# Mirrors of vectors, and the left and right of joints and feet.
+# Mirrors of vectors, and left-right partners of joints and feet.
 
 
 class Mirror:
-    """Mirror image of a vector of numbers.
-
-    Number i is `signs[i]` times number `sources[i]`, and what the couplings of i add.
-    """
+    """Mirror image of a vector: x'_i = signs[i] x_sources[i] + sum of the couplings with target i."""
 
     def __init__(
         self, sources: Sequence[int], signs: Sequence[float], couplings: Sequence[Coupling] = ()
     ) -> None:
-        """Take indices and signs, of one length."""
+        """Store `sources` and `signs`, of equal length, and `couplings`."""
         self.sources = torch.tensor(sources)
         self.signs = torch.tensor(signs, dtype=torch.float32)
         self._targets = torch.tensor([coupling.target for coupling in couplings]).long()
@@ -405,7 +403,7 @@ class Mirror:
         return len(self.signs)
 
     def __call__(self, values: torch.Tensor) -> torch.Tensor:
-        """Return the mirror image of `values` (N, numbers)."""
+        """Return the mirror image of `values`, (N, D)."""
         if self.signs.device != values.device:
             for name in ("sources", "signs", "_targets", "_read", "_factors"):
                 setattr(self, name, getattr(self, name).to(values.device))
@@ -415,8 +413,8 @@ class Mirror:
         return image
 
     @staticmethod
-    def joined(mirrors: Sequence[Mirror], couplings: Sequence[Coupling] = ()) -> Mirror:
-        """Return the mirror of vectors that stand one behind the other, coupled as given."""
+    def concatenate(mirrors: Sequence[Mirror], couplings: Sequence[Coupling] = ()) -> Mirror:
+        """Return the mirror of concatenated vectors, with `couplings` between them."""
         sources: list[int] = []
         signs: list[float] = []
         for mirror in mirrors:
@@ -426,27 +424,27 @@ class Mirror:
 
 
 class Coupling(NamedTuple):
-    """A share of one number in the mirror image of another."""
+    """Summand `factor * x_source` of the mirrored component `target`."""
 
     target: int
-    """Number of the image."""
+    """Index of the mirrored component."""
     source: int
-    """Number that is read."""
+    """Index of the original component."""
     factor: float
 
 
 def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
-    """Return the mirror of the joints of `robot`, an entity, in its order.
+    """Return the mirror of the joints of entity `robot`, in entity order.
 
-    Joints belong together by their names. A joint turns, or slides, the other way in the mirror
-    where the mirror image of its axis points against its partner's.
+    Partners are found by name. The sign of a joint is -1 if the mirror image of its axis is opposite to
+    the partner's axis.
 
     Raises:
         ValueError: a joint is not the mirror image of its partner.
     """
     names = robot.joint_names
     pairs = partners(names)
-    axes, places, is_slide = _joint_frames(model, robot)
+    axes, anchors, is_slide = _joint_frames(model, robot)
     reflect = torch.where(
         is_slide[:, None],
         torch.tensor(DIRECTION, dtype=torch.float32),
@@ -454,19 +452,20 @@ def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
     )
     signs = ((axes * reflect)[pairs] * axes).sum(dim=1)
     pose = robot.data.default_joint_pos[0].cpu()
-    apart = (places[pairs] * torch.tensor(DIRECTION, dtype=torch.float32) - places).norm(dim=1)
+    distances = (anchors[pairs] * torch.tensor(DIRECTION, dtype=torch.float32) - anchors).norm(
+        dim=1
+    )
     for i, partner in enumerate(pairs):
         if (
             abs(abs(signs[i]) - 1) > _AXIS_TOLERANCE
-            or apart[i] > PLACE_TOLERANCE
+            or distances[i] > _ANCHOR_TOLERANCE
             or abs(pose[i] - signs[i] * pose[partner]) > _POSE_TOLERANCE
         ):
             raise ValueError(
                 f"Joint {names[i]!r} is not the mirror image of {names[partner]!r}: axes "
-                f"{_shown(axes[i])} and {_shown(axes[partner])}, places {_shown(places[i])} and "
-                f"{_shown(places[partner])}, default positions {pose[i]:.4g} and {pose[partner]:.4g}. "
-                "Joints belong together by these parts of their names: "
-                f"{', '.join(_OTHER_SIDE)}. {WITHOUT}"
+                f"{_format(axes[i])} and {_format(axes[partner])}, anchors {_format(anchors[i])} and "
+                f"{_format(anchors[partner])}, default positions {pose[i]:.4g} and {pose[partner]:.4g}. "
+                f"Partners are found by these parts of names: {', '.join(_OTHER_SIDE)}. {_HINT}"
             )
     return Mirror(pairs, signs.round().tolist())
 
@@ -474,42 +473,42 @@ def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
 def _joint_frames(
     model: mujoco.MjModel, robot: Any
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return axes and places (joints, 3) in the frame of the root at `qpos0`, and which slide."""
+    """Return axes and anchors (J, 3) in the root frame at `qpos0`, and a mask of slide joints (J,)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     root = int(robot.indexing.root_body_id)
     ids = robot.indexing.joint_ids.tolist()
     to_root = data.xmat[root].reshape(3, 3)
     axes = data.xaxis[ids] @ to_root
-    places = (data.xanchor[ids] - data.xpos[root]) @ to_root
+    anchors = (data.xanchor[ids] - data.xpos[root]) @ to_root
     is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
     return (
         torch.tensor(axes, dtype=torch.float32),
-        torch.tensor(places, dtype=torch.float32),
+        torch.tensor(anchors, dtype=torch.float32),
         torch.tensor(is_slide),
     )
 
 
-def _shown(vector: torch.Tensor) -> str:
+def _format(vector: torch.Tensor) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in vector.tolist()) + ")"
 
 
 def partners(names: Sequence[str]) -> list[int]:
-    """Return the index of what is on the other side, for each name; what is in the middle stays.
+    """Return the index of the left-right partner of each name; central names are their own partner.
 
     Raises:
-        ValueError: the other side of a name is not among them.
+        ValueError: a name has no partner in `names`.
     """
     others = [other_side(name) for name in names]
     missing = sorted(set(others) - set(names))
     if missing:
         raise ValueError(
-            f"mirror_left_right finds no {', '.join(missing)} among {', '.join(names)}. It knows the "
-            f"sides by these parts of names: {', '.join(_OTHER_SIDE)}. {WITHOUT}"
+            f"mirror_left_right: {', '.join(missing)} not found. Available: {', '.join(names)}. "
+            f"Sides are found by these parts of names: {', '.join(_OTHER_SIDE)}. {_HINT}"
         )
     return [list(names).index(other) for other in others]
 
 
 def other_side(name: str) -> str:
-    """Return the name of what is on the other side; the same for what is in the middle."""
+    """Return the name of the left-right partner; central names are returned unchanged."""
     return "_".join(_OTHER_SIDE.get(part, part) for part in name.split("_"))

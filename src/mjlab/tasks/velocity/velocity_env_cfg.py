@@ -1,8 +1,8 @@
-"""The base config of the velocity task: walk as fast, and turn as fast, as commanded.
+"""Base config of the velocity task: track commanded linear velocity and yaw rate.
 
-A robot's package starts from `make_velocity_env_cfg()` and fills in what depends on the robot: the
-entity, its feet, sensors and gains. See `config/go1` and `config/g1`.
-`make_flat` and `make_playable` change what flat ground and playing change, whatever the robot.
+A robot package calls `make_velocity_env_cfg()` and fills in robot-specific settings: entity, feet,
+sensors, gains. See `config/go1` and `config/g1`. `make_flat` and `make_playable` adapt the config of
+any robot to flat ground and to play mode.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from mjlab.utils.noise import UniformNoiseCfg
 from mjlab.utils.string import suggest
 from mjlab.viewer import ViewerConfig
 
-# Filled in by the robot.
+# Placeholder that robot packages replace.
 _NO_NAMES: tuple[str, ...] = ()
 
 
 @offers_older_sites
 def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
-    """Return a new config of the task on rough terrain, without a robot.
+    """Return a new config of the rough-terrain task, without a robot.
 
-    It shares nothing with other configs, so that all of it may be edited. To be filled in are:
+    The config shares no objects with other configs and may be edited freely. Fill in:
 
     - `scene.entities["robot"]`, the frames of the sensors `terrain_scan` and `foot_height_scan`
       and the latter's pattern, and a contact sensor `feet_ground_contact`;
@@ -51,9 +51,9 @@ def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
       `body_ang_vel`, `foot_clearance` and `foot_slip`; and the standard deviations of `pose`;
     - `viewer.body_name`.
 
-    Names of sensors and rewards left empty are refused when the environment is built. There is only
-    a warning for events, which then change nothing, and for rewards of weight 0 (here
-    `body_ang_vel` and `angular_momentum`), which are refused once they get a weight.
+    Empty names of sensors and rewards raise `ValueError` when the environment is built. Empty names of
+    events, and of rewards of weight 0 (here `body_ang_vel` and `angular_momentum`), only log a
+    warning. Such events have no effect; such rewards raise once they get a nonzero weight.
     """
     return ManagerBasedRlEnvCfg(
         decimation=4,
@@ -96,10 +96,10 @@ def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
 
 
 def make_flat(cfg: ManagerBasedRlEnvCfg, play: bool) -> None:
-    """Turn the config of a robot on rough terrain into that on flat ground.
+    """Convert a rough-terrain config to flat ground, in place.
 
-    What sees the terrain, or belongs to a grid of it, goes; so does the memory that only many
-    contacts need. To play, commands reach as far as in the second stage of the curriculum.
+    Removes terrain sensing and terrain generation, and reduces contact memory. In play mode, command
+    ranges are those of the second curriculum stage.
     """
     cfg.sim.njmax = 300
     cfg.sim.nconmax = None
@@ -127,10 +127,10 @@ def make_flat(cfg: ManagerBasedRlEnvCfg, play: bool) -> None:
 
 
 def make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Turn a config to train with into one to look at what was learned.
+    """Convert a training config to play mode, in place.
 
-    Episodes do not end by time, observations are without noise, nothing pushes, and the robot
-    starts anywhere on a small grid of terrain.
+    Episodes are effectively infinite, observations without noise, and pushes and curricula disabled.
+    The robot starts on a random cell of a small terrain grid.
     """
     cfg.episode_length_s = int(1e9)
     actor = cfg.observations["actor"]
@@ -139,7 +139,7 @@ def make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
     cfg.events.pop("push_robot", None)
     cfg.terminations.pop("out_of_terrain_bounds", None)
     cfg.curriculum = {}
-    # First, so that the events after it put the robot onto the terrain that this one draws.
+    # First event, because later reset events place the robot on the sampled terrain.
     randomize_terrain = EventTermCfg(func=mdp.randomize_terrain, mode="reset")
     cfg.events = {"randomize_terrain": randomize_terrain, **cfg.events}
     terrain = cfg.scene.terrain
@@ -151,7 +151,7 @@ def make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
 
 
 def get_sensor(cfg: ManagerBasedRlEnvCfg, name: str) -> Any:
-    """Return the config of a sensor of the scene; raises `KeyError`, with the names, if unknown."""
+    """Return the config of a scene sensor. Raises `KeyError` listing the available names."""
     for sensor in cfg.scene.sensors:
         if sensor.name == name:
             return sensor
@@ -164,7 +164,7 @@ def remove_sensors(cfg: ManagerBasedRlEnvCfg, *names: str) -> None:
     cfg.scene.sensors = tuple(s for s in cfg.scene.sensors if s.name not in names)
 
 
-# Parts of the config.
+# Config sections.
 
 
 def _sensors() -> tuple[SensorCfg, ...]:
@@ -174,7 +174,7 @@ def _sensors() -> tuple[SensorCfg, ...]:
         pattern=GridPatternCfg(size=(1.6, 1.0), resolution=0.1),
         ray_alignment="yaw",
         max_distance=5.0,
-        # Of the ground only: the robot's own geoms are in other groups.
+        # Terrain only: geoms of the robot are in other groups.
         include_geom_groups=(0,),
         debug_vis=True,
     )
@@ -217,26 +217,26 @@ def _observations() -> dict[str, ObservationGroupCfg | None]:
             func=mdp.height_scan,
             params={"sensor_name": "terrain_scan"},
             noise=_noise(0.1),
-            # By the reach of the rays.
+            # 1 / max_distance of the rays.
             scale=1.0 / 5.0,
         ),
     }
 
-    def of_feet(func: object, sensor_name: str) -> ObservationTermCfg:
+    def foot_term(func: object, sensor_name: str) -> ObservationTermCfg:
         return ObservationTermCfg(func=func, params={"sensor_name": sensor_name})
 
-    # The critic sees the same without noise (its group has no corruption) and without the bias of
-    # the encoders, and more about the feet.
+    # The critic observes the actor's terms without noise (no corruption in its group) and without
+    # encoder bias, and further foot terms.
     critic = {
         **copy.deepcopy(actor),
         "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
         "height_scan": ObservationTermCfg(
             func=mdp.height_scan, params={"sensor_name": "terrain_scan"}, scale=1.0 / 5.0
         ),
-        "foot_height": of_feet(mdp.foot_height, "foot_height_scan"),
-        "foot_air_time": of_feet(mdp.foot_air_time, "feet_ground_contact"),
-        "foot_contact": of_feet(mdp.foot_contact, "feet_ground_contact"),
-        "foot_contact_forces": of_feet(mdp.foot_contact_forces, "feet_ground_contact"),
+        "foot_height": foot_term(mdp.foot_height, "foot_height_scan"),
+        "foot_air_time": foot_term(mdp.foot_air_time, "feet_ground_contact"),
+        "foot_contact": foot_term(mdp.foot_contact, "feet_ground_contact"),
+        "foot_contact_forces": foot_term(mdp.foot_contact_forces, "feet_ground_contact"),
     }
     return {
         "actor": ObservationGroupCfg(terms=actor, enable_corruption=True),
@@ -315,7 +315,7 @@ def _events() -> dict[str, EventTermCfg | None]:
                 "asset_cfg": SceneEntityCfg("robot", geom_names=_NO_NAMES),
                 "operation": "abs",
                 "ranges": (0.3, 1.2),
-                # All feet of an environment have the same.
+                # Same friction for all feet of an environment.
                 "shared_random": True,
             },
         ),
@@ -337,13 +337,13 @@ def _events() -> dict[str, EventTermCfg | None]:
 
 
 def _rewards() -> dict[str, RewardTermCfg | None]:
-    def of_body() -> SceneEntityCfg:
+    def body_cfg() -> SceneEntityCfg:
         return SceneEntityCfg("robot", body_names=_NO_NAMES)
 
-    def of_feet() -> SceneEntityCfg:
+    def feet_cfg() -> SceneEntityCfg:
         return SceneEntityCfg("robot", site_names=_NO_NAMES)
 
-    # Feet cost nothing while the robot is asked to stand.
+    # No foot penalties for standing commands.
     commanded = {"command_name": "twist", "command_threshold": 0.05}
     return {
         "track_linear_velocity": RewardTermCfg(
@@ -359,7 +359,7 @@ def _rewards() -> dict[str, RewardTermCfg | None]:
         "upright": RewardTermCfg(
             func=mdp.upright,
             weight=1.0,
-            params={"std": math.sqrt(0.2), "asset_cfg": of_body()},
+            params={"std": math.sqrt(0.2), "asset_cfg": body_cfg()},
         ),
         "pose": RewardTermCfg(
             func=mdp.variable_posture,
@@ -377,7 +377,7 @@ def _rewards() -> dict[str, RewardTermCfg | None]:
         "body_ang_vel": RewardTermCfg(
             func=mdp.body_angular_velocity_penalty,
             weight=0.0,
-            params={"asset_cfg": of_body()},
+            params={"asset_cfg": body_cfg()},
         ),
         "angular_momentum": RewardTermCfg(
             func=mdp.angular_momentum_penalty,
@@ -404,7 +404,7 @@ def _rewards() -> dict[str, RewardTermCfg | None]:
                 "target_height": 0.1,
                 "height_sensor_name": "foot_height_scan",
                 **commanded,
-                "asset_cfg": of_feet(),
+                "asset_cfg": feet_cfg(),
             },
         ),
         "foot_swing_height": RewardTermCfg(
@@ -420,7 +420,7 @@ def _rewards() -> dict[str, RewardTermCfg | None]:
         "foot_slip": RewardTermCfg(
             func=mdp.feet_slip,
             weight=-0.1,
-            params={"sensor_name": "feet_ground_contact", **commanded, "asset_cfg": of_feet()},
+            params={"sensor_name": "feet_ground_contact", **commanded, "asset_cfg": feet_cfg()},
         ),
         "soft_landing": RewardTermCfg(
             func=mdp.soft_landing,
@@ -436,13 +436,13 @@ def _terminations() -> dict[str, TerminationTermCfg | None]:
         "fell_over": TerminationTermCfg(
             func=mdp.bad_orientation, params={"limit_angle": math.radians(70.0)}
         ),
-        # To walk off the terrain is no failure of the robot.
+        # Leaving the terrain truncates, it does not terminate.
         "out_of_terrain_bounds": TerminationTermCfg(func=mdp.out_of_terrain_bounds, time_out=True),
     }
 
 
 def _curriculum() -> dict[str, CurriculumTermCfg | None]:
-    # In environment steps: iterations of 24 steps.
+    # Steps are environment steps: iterations times 24.
     stages: list[mdp.VelocityStage] = [
         {"step": 0, "lin_vel_x": (-1.0, 1.0), "ang_vel_z": (-0.5, 0.5)},
         {"step": 5000 * 24, "lin_vel_x": (-1.5, 2.0), "ang_vel_z": (-0.7, 0.7)},

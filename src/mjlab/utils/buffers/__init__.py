@@ -1,4 +1,4 @@
-"""Batched buffers of recent values: a ring of frames, and a random delay on top of it."""
+"""Batched buffers: ring buffer and random delay."""
 
 from mjlab.utils.buffers.circular_buffer import CircularBuffer as CircularBuffer
 from mjlab.utils.buffers.delay_buffer import DelayBuffer as DelayBuffer

@@ -1,4 +1,4 @@
-"""The last few frames of a batched signal."""
+"""Batched ring buffer."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ BatchIds = Sequence[int] | torch.Tensor | slice
 
 @stateful
 class CircularBuffer:
-    """A ring of the last `max_len` frames of a signal of shape (batch_size, ...).
+    """Ring buffer of the last `max_len` frames of a signal, (batch_size, ...).
 
-    The shape and type of a frame are those of the first one appended. The first frame of a row,
-    after construction or `reset`, fills all its slots: before there is a history, the signal is
-    taken to have been constant.
+    The first frame appended sets the shape and type of frames. The first frame of a row, after
+    construction or `reset`, fills all slots of the row: earlier values are assumed constant.
     """
 
     _transient = frozenset({"_rows", "_max_len", "_batch_size"})
 
     def __init__(self, max_len: int, batch_size: int, device: str) -> None:
-        """Make an empty buffer. Raises `ValueError` if `max_len` is less than 1."""
+        """Create an empty buffer. Raises `ValueError` if `max_len` < 1."""
         check_count("max_len", max_len)
         self._max_len = max_len
         self._batch_size = batch_size
         self._device = device
-        # Slots first, so that writing one frame touches one contiguous block.
+        # Slots first, so that writing a frame touches one contiguous block.
         self._buffer: torch.Tensor | None = None
         self._pointer = -1
         self._num_pushes = torch.zeros(batch_size, dtype=torch.int64, device=device)
-        # Known without asking the device. May say True where no row is empty, never the reverse.
+        # Host-side flag that avoids a device synchronization. May be True without empty rows, never
+        # False with empty rows.
         self._may_have_empty_rows = True
         self._rows = torch.arange(batch_size, device=device)
 
@@ -54,17 +54,17 @@ class CircularBuffer:
 
     @property
     def current_length(self) -> torch.Tensor:
-        """Frames pushed since the last reset, at most `max_length`; (batch_size,) int64."""
+        """Number of frames since the last reset, at most `max_length`, (batch_size,) int64."""
         return self._num_pushes.clamp(max=self._max_len)
 
     @property
     def is_initialized(self) -> bool:
-        """Whether a frame has been appended, so that shape and type are known."""
+        """True once a frame has been appended, so that shape and type are known."""
         return self._buffer is not None
 
     @property
     def buffer(self) -> torch.Tensor:
-        """A copy of the frames, oldest first; (batch_size, max_length, ...).
+        """Copy of the frames, oldest first, (batch_size, max_length, ...).
 
         Raises `RuntimeError` before the first `append`.
         """
@@ -76,44 +76,44 @@ class CircularBuffer:
         return frames
 
     def __getitem__(self, key: torch.Tensor | int) -> torch.Tensor:
-        """Return a copy of the frame `key` pushes back (0: the newest), (batch_size, ...).
+        """Return a copy of the frame with lag `key` (0: newest), (batch_size, ...).
 
         Args:
-            key: One lag, or one for each row, (batch_size,). A lag that goes back further than a
-                row does gives its oldest frame; a negative one the newest.
+            key: Lag: a scalar, or one per row, (batch_size,). Lags beyond a row's history give its
+                oldest frame, negative lags the newest.
 
         Raises `RuntimeError` before the first `append`, `ValueError` for a wrong number of lags.
         """
         ring = self._ring("read")
-        # The first frame of a row fills all its slots, so lags need not be bounded row by row.
+        # The first frame of a row fills all its slots, so lags need no bound per row.
         if not isinstance(key, torch.Tensor):
             lag = min(max(key, 0), self._max_len - 1)
             return ring[(self._pointer - lag) % self._max_len].clone()
         if key.shape not in ((), (1,), (self._batch_size,)):
             raise ValueError(
-                f"Got lags of shape {tuple(key.shape)}; expected one lag, or one for each of the "
-                f"{self._batch_size} rows."
+                f"CircularBuffer lags: expected a scalar or shape ({self._batch_size},), got shape "
+                f"{tuple(key.shape)}."
             )
         lags = key.to(self._device).clamp(0, self._max_len - 1)
         return ring[(self._pointer - lags) % self._max_len, self._rows]
 
     def append(self, data: torch.Tensor) -> None:
-        """Push a frame of shape (batch_size, ...). Raises `ValueError` for another shape."""
+        """Append a frame, (batch_size, ...). Raises `ValueError` for a wrong shape."""
         if self._buffer is None:
             self._check_batch(data)
-            # A first frame under `inference_mode` must not forbid later ones without it.
+            # If the first frame is appended under `inference_mode`, later appends outside it must work.
             with torch.inference_mode(False):
                 self._buffer = torch.zeros(
                     (self._max_len, *data.shape), dtype=data.dtype, device=self._device
                 )
         elif data.shape != self._buffer.shape[1:]:
             raise ValueError(
-                f"Got a frame of shape {tuple(data.shape)}; the first one had "
-                f"{tuple(self._buffer.shape[1:])}."
+                f"CircularBuffer frame: expected shape {tuple(self._buffer.shape[1:])} of the first "
+                f"frame, got {tuple(data.shape)}."
             )
         self._pointer = (self._pointer + 1) % self._max_len
         if self._may_have_empty_rows:
-            # A mask, because finding the empty rows would make a GPU wait.
+            # A mask, because indexing empty rows would synchronize the GPU.
             empty = (self._num_pushes == 0).view(1, -1, *(1,) * (data.dim() - 1))
             torch.where(empty, data.to(self._buffer).unsqueeze(0), self._buffer, out=self._buffer)
             self._may_have_empty_rows = False
@@ -121,10 +121,10 @@ class CircularBuffer:
         self._num_pushes += 1
 
     def backfill(self, data: torch.Tensor, batch_ids: BatchIds) -> None:
-        """Start the rows `batch_ids` anew with their rows of `data`, (batch_size, ...).
+        """Reset the rows `batch_ids` and fill them with their rows of `data`, (batch_size, ...).
 
-        Every slot of those rows gets the frame, and they count as pushed once. Other rows do not
-        change. Raises `RuntimeError` before the first `append`.
+        All slots of these rows get the frame, and `current_length` is 1. Other rows are unchanged.
+        Raises `RuntimeError` before the first `append`.
         """
         ring = self._ring("backfill")
         self._check_batch(data)
@@ -132,7 +132,7 @@ class CircularBuffer:
         self._num_pushes[batch_ids] = 1
 
     def reset(self, batch_ids: BatchIds | None = None) -> None:
-        """Forget the frames of the given rows (None: all). They read as zero until the next."""
+        """Clear the frames of `batch_ids` (None: all). Cleared rows read as zero until `append`."""
         rows = slice(None) if batch_ids is None else batch_ids
         if self._buffer is not None:
             self._buffer[:, rows] = 0
@@ -141,12 +141,12 @@ class CircularBuffer:
 
     def _ring(self, purpose: str) -> torch.Tensor:
         if self._buffer is None:
-            raise WrongStateError(f"Cannot {purpose} a buffer nothing has been appended to.")
+            raise WrongStateError(f"Cannot {purpose} an empty buffer; call append first.")
         return self._buffer
 
     def _check_batch(self, data: torch.Tensor) -> None:
         if data.dim() == 0 or data.shape[0] != self._batch_size:
             raise ValueError(
-                f"Got data of shape {tuple(data.shape)}; its first size must be the batch size "
-                f"{self._batch_size}."
+                f"CircularBuffer data: expected leading size {self._batch_size} (batch size), got shape "
+                f"{tuple(data.shape)}."
             )

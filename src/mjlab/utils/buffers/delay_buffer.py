@@ -1,4 +1,4 @@
-"""A batched signal seen a random number of steps late."""
+"""Random delay of a batched signal."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from mjlab.utils.state import stateful
 
 @stateful
 class DelayBuffer:
-    """Delays a signal of shape (batch_size, ...) by a random whole number of steps.
+    """Delays a signal, (batch_size, ...), by a random integer number of steps.
 
-    Each step: `append` a frame, then `compute` the delayed one. Lags are uniform integers in
-    [min_lag, max_lag], drawn at construction, at reset, and whenever a row is due: at every
-    `compute`, or every `update_period` of them. A row that is due keeps its lag with probability
-    `hold_prob`. A lag that goes back before the first frame gives the first frame.
+    Each step: `append` a frame, then `compute` the delayed frame. Lags are uniform integers in
+    [min_lag, max_lag], sampled at construction, at reset, and whenever a row is due: at every
+    `compute`, or at every `update_period`-th one. A row that is due keeps its lag with probability
+    `hold_prob`. Lags beyond the first frame give the first frame.
     """
 
-    # Settings come from the config; a run that resumes may have changed them on purpose.
+    # Settings come from the config; a resumed run may change them on purpose.
     _transient = frozenset(
         {
             "_min_lag",
@@ -46,21 +46,21 @@ class DelayBuffer:
         per_env_phase: bool = True,
         generator: torch.Generator | None = None,
     ) -> None:
-        """Make an empty buffer.
+        """Create an empty buffer.
 
         Args:
-            min_lag: Smallest lag, in steps.
-            max_lag: Largest lag, in steps.
+            min_lag: Minimum lag, in steps.
+            max_lag: Maximum lag, in steps.
             batch_size: Number of rows.
             device: Device of the frames.
-            per_env: Each row has a lag of its own; False: one lag, drawn once for all rows.
+            per_env: Sample a separate lag per row. False: one lag for all rows.
             hold_prob: Probability of keeping the lag when due.
-            update_period: Steps between draws; 0 draws at every step.
-            per_env_phase: Rows are due at different steps. Without `per_env` there is one phase,
-                random all the same.
-            generator: Source of random numbers; None takes torch's own.
+            update_period: Steps between lag samples. 0: sample at every step.
+            per_env_phase: Rows are due at different steps. Without `per_env`, all rows share one
+                random phase.
+            generator: Random number generator. None: torch's default generator.
 
-        Raises `ValueError` for lags, a probability or a period out of range.
+        Raises `ValueError` for lags, probability or period out of range.
         """
         check_count("min_lag", min_lag, minimum=0)
         check_count("max_lag", max_lag, minimum=min_lag)
@@ -75,59 +75,59 @@ class DelayBuffer:
         self._update_period = update_period
         self._random_phase = per_env_phase and update_period > 0
         self._generator = generator
-        # A generator only makes numbers on its own device.
+        # A generator samples only on its own device.
         self._draw_device = device if generator is None else generator.device
         self._buffer = CircularBuffer(max_lag + 1, batch_size, device)
-        # What is drawn: one entry a row, or a single one for all of them.
+        # Sampled lags: one per row, or a single one for all rows.
         self._num_draws = batch_size if per_env else 1
         self._drawn_lags = self._draw_lags()
         self._phase = self._draw_phases()
         self._step_count = torch.zeros_like(self._drawn_lags)
-        # What is in use differs from what was drawn only where `set_lags` was called.
+        # Lags in use differ from sampled lags only after `set_lags`.
         self._current_lags = self._drawn_lags.expand(batch_size).clone()
 
     @property
     def is_initialized(self) -> bool:
-        """Whether a frame has been appended."""
+        """True once a frame has been appended."""
         return self._buffer.is_initialized
 
     @property
     def current_lags(self) -> torch.Tensor:
-        """The lags in use; (batch_size,) int64."""
+        """Lags in use, (batch_size,) int64."""
         return self._current_lags
 
     def append(self, data: torch.Tensor) -> None:
-        """Push a frame of shape (batch_size, ...). Raises `ValueError` for another shape."""
+        """Append a frame, (batch_size, ...). Raises `ValueError` for a wrong shape."""
         self._buffer.append(data)
 
     def backfill(self, data: torch.Tensor, batch_ids: BatchIds) -> None:
-        """Start the rows `batch_ids` anew with their rows of `data`, (batch_size, ...).
+        """Reset the rows `batch_ids` and fill them with their rows of `data`, (batch_size, ...).
 
-        This is their first step, as `append` and `compute` are on the other path, so that reading
-        with `peek` afterwards leaves them where that path would. Other rows do not change. Raises
-        `RuntimeError` before the first `append`.
+        This is the first step of these rows: `backfill` and `peek` have the same effect on them as
+        `append` and `compute`. Other rows are unchanged. Raises `RuntimeError` before the first
+        `append`.
         """
         self._buffer.backfill(data, batch_ids)
         if self._per_env:
             self._step_count[batch_ids] = 1
 
     def compute(self) -> torch.Tensor:
-        """Draw lags where due, and return the delayed frame, (batch_size, ...)."""
+        """Resample lags of rows that are due, and return the delayed frame, (batch_size, ...)."""
         if self._min_lag < self._max_lag:
             self._update_lags()
         return self.peek()
 
     def peek(self) -> torch.Tensor:
-        """Return the delayed frame, (batch_size, ...), without drawing lags.
+        """Return the delayed frame, (batch_size, ...), without resampling lags.
 
         Raises `RuntimeError` before the first `append`.
         """
         return self._buffer[self._current_lags]
 
     def reset(self, batch_ids: BatchIds | None = None) -> None:
-        """Forget the frames of the given rows (None: all) and draw new lags for them.
+        """Clear the frames of `batch_ids` (None: all) and resample their lags.
 
-        Without `per_env` the lag belongs to all rows: only a reset of all of them draws it anew.
+        Without `per_env`, all rows share the lag: only a reset of all rows resamples it.
         """
         rows = slice(None) if batch_ids is None else batch_ids
         self._buffer.reset(rows)
@@ -142,11 +142,11 @@ class DelayBuffer:
         self._current_lags[rows] = self._drawn_lags.expand(self._batch_size)[rows]
 
     def set_lags(self, lags: torch.Tensor, batch_ids: BatchIds | None = None) -> None:
-        """Use the given lags, brought into [min_lag, max_lag], until the next draw.
+        """Set lags, clamped to [min_lag, max_lag], until the next resampling.
 
         Args:
-            lags: One lag, or one for each of the given rows.
-            batch_ids: The rows; None for all.
+            lags: A scalar, or one lag per row in `batch_ids`.
+            batch_ids: Rows. None: all.
         """
         rows = slice(None) if batch_ids is None else batch_ids
         lags = torch.as_tensor(lags, device=self._device)

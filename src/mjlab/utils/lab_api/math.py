@@ -1,9 +1,9 @@
-"""Maths of rotations, poses and random samples, batched over leading axes.
+"""Batched math: rotations, poses, random samples and pinhole cameras.
 
-Quaternions are (w, x, y, z) with the Hamilton product; angles are in radians; rotation vectors are
-axis times angle. A pinhole camera looks along +z with x to the right and y down: with the intrinsic
-matrix K, pixel (u, v) at depth z is the point z K^-1 (u, v, 1). Pixels are counted from the upper left,
-u along a row.
+Functions are batched over leading axes. Quaternions are (w, x, y, z) with the Hamilton product; angles
+are in radians; rotation vectors are axis times angle. Pinhole cameras look along +z with x to the right
+and y down: with intrinsic matrix K, pixel (u, v) at depth z is the point z K^-1 (u, v, 1). Pixel (0, 0)
+is the upper left one; u counts along a row.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ __all__ = [
 ]
 ArrayT = TypeVar("ArrayT", torch.Tensor, np.ndarray)
 Size = int | tuple[int, ...]
-# A camera's axes (columns) in those of the OpenGL convention: there it looks along -z with +y up.
+# Camera axes (columns) of each convention in OpenGL camera axes (looking along -z, up is +y).
 _IN_OPENGL = {
     "opengl": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     # Looks along +z, up is -y.
@@ -100,11 +100,10 @@ def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
     """Return q1 * q2: rotate by q2, then by q1. `ValueError` unless the shapes are equal."""
     if q1.shape != q2.shape:
         raise ValueError(
-            f"quat_mul got shapes {tuple(q1.shape)} and {tuple(q2.shape)}; they must be equal "
-            "(expand one of them)."
+            f"quat_mul: expected equal shapes, got {tuple(q1.shape)} and {tuple(q2.shape)}; expand "
+            "one of them."
         )
-    # Each component of q1 times all of q2: 16 operations, where the components of the product, one
-    # by one, take 29.
+    # Each component of q1 times all of q2: 16 operations, instead of 29 component by component.
     product = q1[..., :1] * q2
     w, x, y, z = (product[..., k] for k in range(4))
     xw, xx, xy, xz = (q1[..., 1:2] * q2).unbind(-1)
@@ -146,16 +145,16 @@ def quat_apply(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
     """Rotate vectors: R(q) v.
 
     Args:
-        quat: Unit quaternions, one for each vector or one for all; (..., 4).
-        vec: (..., 3).
+        quat: Unit quaternions, one per vector or one for all, (..., 4).
+        vec: Vectors, (..., 3).
 
-    Returns a tensor of the shape of `vec`. Raises `ValueError` if sizes do not fit.
+    Returns a tensor of the shape of `vec`. Raises `ValueError` for incompatible shapes.
     """
     return _rotate(_fit_to(quat, vec), vec, sign=1.0)
 
 
 def quat_apply_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors back: R(q)' v. Arguments and errors are those of `quat_apply`."""
+    """Rotate vectors by the inverse: R(q)' v. Arguments and errors as in `quat_apply`."""
     return _rotate(_fit_to(quat, vec), vec, sign=-1.0)
 
 
@@ -169,7 +168,7 @@ def quat_apply_yaw(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
 
 
 def yaw_quat(quat: torch.Tensor) -> torch.Tensor:
-    """Return the rotation about z by the yaw angle of the quaternions; (..., 4)."""
+    """Return the rotation about z by the yaw angle of the quaternions, (..., 4)."""
     w, x, y, z = quat.unbind(-1)
     half = 0.5 * torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     zero = torch.zeros_like(half)
@@ -177,7 +176,7 @@ def yaw_quat(quat: torch.Tensor) -> torch.Tensor:
 
 
 def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: float) -> torch.Tensor:
-    """Return v + 2 (s w c + xyz x c) with c = xyz x v; `sign` s is -1 for the inverse rotation."""
+    """Return v + 2 (s w c + xyz x c) with c = xyz x v; sign s = -1 gives the inverse rotation."""
     w, xyz = quat[..., :1], quat[..., 1:]
     cross = torch.linalg.cross(xyz, vec)
     change = torch.linalg.cross(xyz, cross).addcmul_(w, cross, value=sign)
@@ -185,7 +184,7 @@ def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: float) -> torch.Tensor:
 
 
 def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
-    """Return `quat` in a shape whose leading sizes broadcast to those of `vec`."""
+    """Reshape `quat` such that its leading sizes broadcast to those of `vec`."""
     if quat.shape[-1] == 4 and vec.shape[-1] == 3:
         if quat.shape[:-1] == vec.shape[:-1]:
             return quat
@@ -199,43 +198,42 @@ def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
         ):
             return quat
     raise ValueError(
-        f"Cannot rotate vectors of shape {tuple(vec.shape)} by quaternions of shape "
-        f"{tuple(quat.shape)}; expected (..., 3) and (..., 4), one quaternion for each vector or "
-        "one for all."
+        "Expected vectors (..., 3) and quaternions (..., 4), one per vector or one for all, got "
+        f"shapes {tuple(vec.shape)} and {tuple(quat.shape)}."
     )
 
 
 def quat_from_angle_axis(angle: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
-    """Return the rotation by `angle` (...) rad about `axis` (..., 3), normalized here."""
+    """Return the rotation by `angle` (...) rad about `axis` (..., 3). Normalizes `axis`."""
     half = 0.5 * angle.unsqueeze(-1)
     direction = normalize(axis)
     vector = direction * torch.sin(half)
-    # Normalized again for the sake of axes of length zero.
+    # Normalized because the axis may have zero length.
     return normalize(torch.cat((torch.cos(half).expand_as(vector[..., :1]), vector), dim=-1))
 
 
 def axis_angle_from_quat(quat: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
-    """Return the rotation vector, axis times angle in [0, pi]; (..., 3).
+    """Return the rotation vector, axis times angle in [0, pi], (..., 3).
 
-    Half angles with a sine of at most `eps` use the series of angle / sin(angle / 2).
+    If sin(angle / 2) <= `eps`, uses the series of angle / sin(angle / 2).
     """
     quat = quat_unique(quat)
     real, vector = quat[..., :1], quat[..., 1:]
     sine = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
     angle = 2.0 * torch.atan2(sine, real)
     is_small = sine <= eps
-    # A divisor of 1 where the series is used keeps gradients finite.
+    # Divisor 1 for entries that use the series, to keep gradients finite.
     ratio = angle / torch.where(is_small, 1.0, sine)
     return vector * torch.where(is_small, 2.0 + angle.square() / 12.0, ratio)
 
 
 def quat_box_minus(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
-    """Return log(q1 * conj(q2)): the rotation vector, in world axes, that takes q2 to q1."""
+    """Return log(q1 * conj(q2)), the rotation vector from q2 to q1 in world axes."""
     return axis_angle_from_quat(quat_mul(q1, quat_conjugate(q2)))
 
 
 def quat_box_plus(q: torch.Tensor, delta: torch.Tensor, eps: float = 1.0e-6) -> torch.Tensor:
-    """Return exp(delta) * q: q rotated by the rotation vector `delta` (..., 3) in world axes.
+    """Return exp(delta) * q: rotate q by the rotation vector `delta` (..., 3) in world axes.
 
     Rotations by an angle of at most `eps` leave q unchanged.
     """
@@ -245,23 +243,23 @@ def quat_box_plus(q: torch.Tensor, delta: torch.Tensor, eps: float = 1.0e-6) -> 
 
 
 def quat_error_magnitude(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
-    """Return the angle between two orientations, unit quaternions, in [0, pi]; (...)."""
+    """Return the angle between two unit quaternions in [0, pi], (...)."""
     # Chords of the unit sphere are cheap, and precise for small angles: |q1 - q2| = 2 sin(angle / 4)
-    # and |q1 + q2| = 2 cos(angle / 4), or the other way round where one of them is to be negated.
+    # and |q1 + q2| = 2 cos(angle / 4), or the reverse if q1 and q2 are in opposite hemispheres.
     away = torch.linalg.vector_norm(q1 - q2, dim=-1)
     along = torch.linalg.vector_norm(q1 + q2, dim=-1)
     return 4.0 * torch.atan2(torch.minimum(away, along), torch.maximum(away, along))
 
 
 def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
-    """Interpolate the short way between two quaternions, (4,) each; tau 0 gives q1, 1 gives q2.
+    """Interpolate along the shortest path between two quaternions, (4,) each, from q1 (tau = 0) to q2.
 
-    (Nearly) equal rotations give q1. The arguments are not changed. Raises `ValueError` for
-    other shapes.
+    (Nearly) equal rotations give q1. The arguments are unchanged. Raises `ValueError` for wrong
+    shapes.
     """
     if q1.shape != (4,) or q2.shape != (4,):
         raise ValueError(
-            f"quat_slerp takes two quaternions of shape (4,), got {tuple(q1.shape)} and "
+            f"quat_slerp: expected two quaternions of shape (4,), got {tuple(q1.shape)} and "
             f"{tuple(q2.shape)}."
         )
     if tau == 0.0:
@@ -269,7 +267,7 @@ def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
     if tau == 1.0:
         return q2.clone()
     target = torch.where(torch.dot(q1, q2) < 0, -q2, q2)
-    # Precise for small angles too, where the arc cosine is not.
+    # Unlike the arc cosine, precise for small angles.
     angle = 2.0 * torch.atan2((q1 - target).norm(), (q1 + target).norm())
     sine = torch.sin(angle)
     if sine <= 4.0 * torch.finfo(q1.dtype).eps:
@@ -283,18 +281,18 @@ def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
 def convert_quat(quat: ArrayT, to: Literal["xyzw", "wxyz"] = "xyzw") -> ArrayT:
     """Reorder quaternions (..., 4) from (w, x, y, z) to (x, y, z, w), or back.
 
-    Raises `ValueError` for another target or last size.
+    Raises `ValueError` for an unknown target or a wrong last size.
     """
     check_one_of("to", to, ("xyzw", "wxyz"))
     if quat.shape[-1] != 4:
-        raise ValueError(f"Expected quaternions of shape (..., 4), got {tuple(quat.shape)}.")
+        raise ValueError(f"quat: expected shape (..., 4), got {tuple(quat.shape)}.")
     shift = -1 if to == "xyzw" else 1
     roll: Any = torch.roll if isinstance(quat, torch.Tensor) else np.roll
     return roll(quat, shift, -1)
 
 
 def matrix_from_quat(quaternions: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (..., 3, 3) of quaternions of any norm but zero."""
+    """Return rotation matrices (..., 3, 3) of quaternions of any nonzero norm."""
     w, x, y, z = quaternions.unbind(-1)
     s = 2.0 / quaternions.square().sum(dim=-1)
     entries = (
@@ -314,13 +312,13 @@ def matrix_from_quat(quaternions: torch.Tensor) -> torch.Tensor:
 def quat_from_matrix(matrix: torch.Tensor) -> torch.Tensor:
     """Return the quaternions (..., 4) of rotation matrices (..., 3, 3).
 
-    The component of largest magnitude is positive (so w can be negative). Raises `ValueError` for
-    another shape.
+    The component of largest magnitude is positive, so w can be negative. Raises `ValueError` for a
+    wrong shape.
     """
     if matrix.shape[-2:] != (3, 3):
-        raise ValueError(f"Expected matrices of shape (..., 3, 3), got {tuple(matrix.shape)}.")
+        raise ValueError(f"matrix: expected shape (..., 3, 3), got {tuple(matrix.shape)}.")
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.flatten(-2).unbind(-1)
-    # Row i of 4 q q' is 4 q_i q: any of them gives q, the one with the largest q_i most precisely.
+    # Row i of 4 q q' is 4 q_i q. Each row gives q; the row with the largest q_i is the most precise.
     products = torch.stack(
         (
             *(1.0 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01),
@@ -365,21 +363,21 @@ def euler_xyz_from_quat(
 
 
 def matrix_from_euler(euler_angles: torch.Tensor, convention: str) -> torch.Tensor:
-    """Return the matrices (..., 3, 3) of rotations about the body's own axes, one after another.
+    """Return the matrices (..., 3, 3) of intrinsic rotations (about the rotated axes).
 
     Args:
-        euler_angles: (..., 3), rad.
-        convention: Three letters of X, Y and Z, neighbours different: "XYZ" is Rx Ry Rz.
+        euler_angles: Angles (rad), (..., 3).
+        convention: Three letters of X, Y and Z, adjacent letters different: "XYZ" is Rx Ry Rz.
 
-    Raises `ValueError` for another convention or last size.
+    Raises `ValueError` for an invalid convention or a wrong last size.
     """
     if euler_angles.shape[-1] != 3:
-        raise ValueError(f"Expected angles of shape (..., 3), got {tuple(euler_angles.shape)}.")
+        raise ValueError(f"euler_angles: expected shape (..., 3), got {tuple(euler_angles.shape)}.")
     is_valid = len(convention) == 3 and set(convention) <= set("XYZ")
     if not is_valid or convention[1] in (convention[0], convention[2]):
         raise ValueError(
-            f"The convention is {convention!r}; it must be three letters of X, Y and Z, no letter "
-            "twice in a row, as 'XYZ' or 'ZXZ'."
+            "convention: expected three letters of X, Y and Z, adjacent letters different, such as "
+            f"'XYZ' or 'ZXZ', got {convention!r}."
         )
     first, second, third = (
         _axis_rotation(axis, angle)
@@ -404,16 +402,16 @@ def convert_camera_frame_orientation_convention(
     origin: Literal["opengl", "ros", "world"] = "opengl",
     target: Literal["opengl", "ros", "world"] = "ros",
 ) -> torch.Tensor:
-    """Return the orientation (..., 4) of the same camera in another convention for its axes.
+    """Convert a camera orientation (..., 4) between conventions of camera axes.
 
     "opengl" looks along -z with +y up, "ros" along +z with -y up, "world" along +x with +z up.
-    Raises `ValueError` for another convention.
+    Raises `ValueError` for an unknown convention.
     """
     check_one_of("origin", origin, _IN_OPENGL)
     check_one_of("target", target, _IN_OPENGL)
     if origin == target:
         return orientation.clone()
-    # Rows of the table are rows of matrices that take coordinates of a convention to OpenGL's.
+    # Table rows are rows of matrices from coordinates of a convention to OpenGL coordinates.
     from_origin = orientation.new_tensor(_IN_OPENGL[origin])
     from_target = orientation.new_tensor(_IN_OPENGL[target])
     turned = matrix_product(matrix_from_quat(orientation), from_origin.T)
@@ -429,13 +427,13 @@ def create_rotation_matrix_from_view(
     """Return orientations (N, 3, 3) of cameras (OpenGL convention) at `eyes` looking at `targets`.
 
     Args:
-        eyes: (N, 3).
-        targets: (N, 3).
-        up_axis: The axis of the world that points up in the image.
-        device: Where the result lies.
+        eyes: Camera positions, (N, 3).
+        targets: Target positions, (N, 3).
+        up_axis: World axis that points up in the image.
+        device: Device of the result.
 
-    A camera that looks straight up or down takes the world's x axis as its right. Raises
-    `ValueError` for another `up_axis`.
+    Cameras that look straight up or down use the world's x axis as right. Raises `ValueError` for an
+    unknown `up_axis`.
     """
     check_one_of("up_axis", up_axis, ("Y", "Z"))
     backward = normalize((eyes - targets).to(device))
@@ -456,7 +454,7 @@ def combine_frame_transforms(
     t12: torch.Tensor | None = None,
     q12: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the pose of 2 in 0 from those of 1 in 0 and 2 in 1; None is zero or identity."""
+    """Return the pose of 2 in 0, from poses of 1 in 0 and 2 in 1. None: zero or identity."""
     t02 = t01 if t12 is None else t01 + quat_apply(q01, t12)
     q02 = q01 if q12 is None else quat_mul(q01, q12)
     return t02, q02
@@ -468,7 +466,7 @@ def subtract_frame_transforms(
     t02: torch.Tensor | None = None,
     q02: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the pose of 2 in 1, from those of 1 and 2 in 0; None is zero or identity."""
+    """Return the pose of 2 in 1, from poses of 1 and 2 in 0. None: zero or identity."""
     t12 = quat_apply_inverse(q01, -t01 if t02 is None else t02 - t01)
     q10 = quat_inv(q01)
     return t12, q10 if q02 is None else quat_mul(q10, q02)
@@ -481,10 +479,10 @@ def compute_pose_error(
     q02: torch.Tensor,
     rot_error_type: Literal["quat", "axis_angle"] = "axis_angle",
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what takes pose 1 to pose 2: t02 - t01, and the rotation q02 * q01^-1.
+    """Return the error from pose 1 to pose 2: t02 - t01 and the rotation q02 * q01^-1.
 
     The rotation is in world axes, as a rotation vector (..., 3) or a quaternion ("quat"). Raises
-    `ValueError` for another `rot_error_type`.
+    `ValueError` for an unknown `rot_error_type`.
     """
     check_one_of("rot_error_type", rot_error_type, ("quat", "axis_angle"))
     rotation = quat_mul(q02, quat_inv(q01))
@@ -499,7 +497,7 @@ def apply_delta_pose(
     delta_pose: torch.Tensor,
     eps: float = 1.0e-6,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the pose moved by `delta_pose` (..., 6): a shift, then a rotation vector (world).
+    """Return the pose moved by `delta_pose` (..., 6): translation, rotation vector (world axes).
 
     Rotations by an angle of at most `eps` leave the orientation unchanged.
     """
@@ -509,7 +507,7 @@ def apply_delta_pose(
 def rigid_body_twist_transform(
     v0: torch.Tensor, w0: torch.Tensor, t01: torch.Tensor, q01: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return linear and angular velocity of a rigid body in another frame fixed to it.
+    """Return linear and angular velocity of a rigid body in another body-fixed frame.
 
     Args:
         v0: Linear velocity of the origin of frame 0, in frame 0.
@@ -517,7 +515,7 @@ def rigid_body_twist_transform(
         t01: Position of frame 1 in frame 0.
         q01: Orientation of frame 1 in frame 0.
 
-    Returns both for the origin of frame 1, in frame 1.
+    Returns both velocities for the origin of frame 1, in frame 1.
     """
     v1 = quat_apply_inverse(q01, v0 + torch.linalg.cross(w0, t01))
     return v1, quat_apply_inverse(q01, w0)
@@ -526,14 +524,14 @@ def rigid_body_twist_transform(
 def transform_points(
     points: torch.Tensor, pos: torch.Tensor | None = None, quat: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Return points given in a frame in the frame's surroundings: R(quat) point + pos.
+    """Transform points from a frame to its parent frame: R(quat) point + pos.
 
     Args:
-        points: (P, 3), or (N, P, 3).
-        pos: Position of the frame, (3,) or (N, 3); None for zero.
-        quat: Orientation of the frame, (4,) or (N, 4); None for identity.
+        points: Points, (P, 3) or (N, P, 3).
+        pos: Position of the frame, (3,) or (N, 3). None: zero.
+        quat: Orientation of the frame, (4,) or (N, 4). None: identity.
 
-    Returns (P, 3), or (N, P, 3) where any argument has N.
+    Returns (P, 3), or (N, P, 3) if any argument has N.
     """
     is_batched = points.dim() == 3 or any(
         part is not None and part.dim() == 2 for part in (pos, quat)
@@ -550,7 +548,7 @@ def transform_points(
 
 
 def is_identity_pose(pos: torch.Tensor, rot: torch.Tensor) -> bool:
-    """Return whether all poses, (..., 3) and (..., 4), are (nearly) the identity."""
+    """Return True if all poses, (..., 3) and (..., 4), are (nearly) the identity."""
     no_shift = torch.allclose(pos, torch.zeros_like(pos))
     # q and -q are the same rotation.
     identity = torch.zeros_like(rot)
@@ -569,8 +567,8 @@ def make_pose(pos: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
     """
     if pos.shape[:-1] != rot.shape[:-2] or pos.shape[-1] != 3 or rot.shape[-2:] != (3, 3):
         raise ValueError(
-            f"make_pose got positions {tuple(pos.shape)} and rotations {tuple(rot.shape)}; "
-            "expected (..., 3) and (..., 3, 3) with equal leading sizes."
+            "make_pose: expected positions (..., 3) and rotations (..., 3, 3) with equal leading "
+            f"sizes, got {tuple(pos.shape)} and {tuple(rot.shape)}."
         )
     pose = torch.zeros(*pos.shape[:-1], 4, 4, dtype=pos.dtype, device=pos.device)
     pose[..., :3, :3] = rot
@@ -592,17 +590,17 @@ def pose_inv(pose: torch.Tensor) -> torch.Tensor:
 
 
 def pose_in_A_to_pose_in_B(pose_in_A: torch.Tensor, pose_A_in_B: torch.Tensor) -> torch.Tensor:
-    """Return a pose given in frame A in frame B, whose pose of A is `pose_A_in_B`."""
+    """Transform a pose from frame A to frame B, given the pose of A in B."""
     return matrix_product(pose_A_in_B, pose_in_A)
 
 
 def transform_poses_from_frame_A_to_frame_B(
     src_poses: torch.Tensor, frame_A: torch.Tensor, frame_B: torch.Tensor
 ) -> torch.Tensor:
-    """Return poses that stand to frame B as `src_poses` stand to frame A.
+    """Return poses that have the same pose relative to frame B as `src_poses` relative to frame A.
 
     Args:
-        src_poses: (N, 4, 4), in the world.
+        src_poses: Poses in the world, (N, 4, 4).
         frame_A: Pose of A in the world, (4, 4).
         frame_B: Pose of B in the world, (4, 4).
     """
@@ -612,15 +610,15 @@ def transform_poses_from_frame_A_to_frame_B(
 def interpolate_rotations(
     R1: torch.Tensor, R2: torch.Tensor, num_steps: int, axis_angle: bool = True
 ) -> torch.Tensor:
-    """Return rotation matrices from R1 to R2 at equal steps, (num_steps + 1, 3, 3).
+    """Interpolate rotation matrices from R1 to R2 in equal steps, (num_steps + 1, 3, 3).
 
     Args:
-        R1: First, (3, 3).
-        R2: Last, (3, 3).
+        R1: First matrix, (3, 3).
+        R2: Last matrix, (3, 3).
         num_steps: Number of steps.
-        axis_angle: Turn about one axis; False interpolates quaternions, which is the same path.
+        axis_angle: Rotate about a fixed axis. False: interpolate quaternions (same path).
 
-    Raises `ValueError` for fewer than one step.
+    Raises `ValueError` if `num_steps` < 1.
     """
     check_count("num_steps", num_steps)
     fractions = [step / num_steps for step in range(num_steps)]
@@ -642,22 +640,22 @@ def interpolate_poses(
     step_size: float | None = None,
     perturb: bool = False,
 ) -> tuple[torch.Tensor, int]:
-    """Return both poses with poses between them, and the number of those between.
+    """Return both poses with interpolated poses in between, and the number of poses in between.
 
     Args:
-        pose_1: First, (4, 4).
-        pose_2: Last, (4, 4).
-        num_steps: Number of poses between; or give
-        step_size: Largest distance (m) between positions, from which their number follows.
-        perturb: Shift the positions between at random along the path, by up to half a step.
+        pose_1: First pose, (4, 4).
+        pose_2: Last pose, (4, 4).
+        num_steps: Number of poses in between.
+        step_size: Maximum distance (m) between positions, as an alternative to `num_steps`.
+        perturb: Shift interpolated positions randomly along the path, by up to half a step.
 
-    Returns (number between + 2, 4, 4) and that number. Raises `ValueError` unless exactly one of
-    `num_steps` and `step_size` is given.
+    Returns (number in between + 2, 4, 4) and the number in between. Raises `ValueError` unless
+    exactly one of `num_steps` and `step_size` is not None.
     """
     if (num_steps is None) == (step_size is None):
         raise ValueError(
-            f"Give either num_steps or step_size (got num_steps={num_steps}, "
-            f"step_size={step_size})."
+            f"Expected either num_steps or step_size, got num_steps={num_steps} and "
+            f"step_size={step_size}."
         )
     (pos_1, rot_1), (pos_2, rot_2) = unmake_pose(pose_1), unmake_pose(pose_2)
     if num_steps is None:
@@ -683,7 +681,7 @@ def generate_random_translation(pos_boundary: float = 1) -> torch.Tensor:
 def generate_random_transformation_matrix(
     pos_boundary: float = 1, rot_boundary: float = 2 * math.pi
 ) -> torch.Tensor:
-    """Return a pose (4, 4) from a random translation and a random rotation, as above."""
+    """Return a random pose (4, 4): see `generate_random_rotation` and `generate_random_translation`."""
     return make_pose(
         generate_random_translation(pos_boundary), generate_random_rotation(rot_boundary)
     )
@@ -703,36 +701,36 @@ def unscale_transform(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor)
 
 
 def saturate(x: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor) -> torch.Tensor:
-    """Limit `x` to [lower, upper], element by element."""
+    """Clamp `x` to [lower, upper], element-wise."""
     return torch.maximum(torch.minimum(x, upper), lower)
 
 
 def normalize(x: torch.Tensor, eps: float = 1e-9) -> torch.Tensor:
-    """Return the vectors on the last axis at unit length; those shorter than `eps` stay short."""
+    """Normalize vectors along the last axis. Vectors shorter than `eps` are divided by `eps`."""
     return x / torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp(min=eps)
 
 
 def wrap_to_pi(angles: torch.Tensor) -> torch.Tensor:
-    """Return the angles (rad) in [-pi, pi]: odd multiples of pi keep their sign."""
+    """Wrap angles (rad) to [-pi, pi]. Odd multiples of pi keep their sign."""
     turned = torch.remainder(angles + torch.pi, 2.0 * torch.pi)
     return torch.where((turned == 0) & (angles > 0), torch.pi, turned - torch.pi)
 
 
 def copysign(mag: float, other: torch.Tensor) -> torch.Tensor:
-    """Return numbers of size `mag` with the signs of `other`."""
+    """Return numbers of magnitude `mag` with the signs of `other`."""
     return torch.copysign(torch.full_like(other, abs(mag)), other)
 
 
 def matrix_product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """Return the products (..., i, k) of small matrices (..., i, j) and (..., j, k).
 
-    They are sums, because a GPU may round the operands of `@` to TF32: 8 mm at 10 m.
+    Computed as sums, because GPUs may round the operands of `@` to TF32: an error of 8 mm at 10 m.
     """
     return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(dim=-2)
 
 
 def skew_symmetric_matrix(vec: torch.Tensor) -> torch.Tensor:
-    """Return S with S u = vec x u; (..., 3) gives (..., 3, 3)."""
+    """Return the skew-symmetric matrix S with S u = vec x u, (..., 3, 3)."""
     x, y, z = vec.unbind(-1)
     zero = torch.zeros_like(x)
     rows = (zero, -z, y, z, zero, -x, -y, x, zero)
@@ -745,12 +743,12 @@ def skew_symmetric_matrix(vec: torch.Tensor) -> torch.Tensor:
 def sample_uniform(
     lower: torch.Tensor | float, upper: torch.Tensor | float, size: Size, device: str
 ) -> torch.Tensor:
-    """Return numbers uniform in [lower, upper). The bounds may be tensors that broadcast."""
+    """Sample uniformly in [lower, upper). The bounds may be tensors that broadcast."""
     return torch.rand(_shape(size), dtype=torch.float32, device=device) * (upper - lower) + lower
 
 
 def sample_ranges(ranges: Iterable[tuple[float, float]], size: Size, device: str) -> torch.Tensor:
-    """Return numbers (*size, n), those of column i uniform in the i-th of n ranges [low, high)."""
+    """Sample (*size, n), with column i uniform in the i-th of n ranges [low, high)."""
     low, high = (
         constant_tensor(tuple(map(float, side)), device) for side in zip(*ranges, strict=True)
     )
@@ -760,7 +758,7 @@ def sample_ranges(ranges: Iterable[tuple[float, float]], size: Size, device: str
 def sample_log_uniform(
     lower: torch.Tensor | float, upper: torch.Tensor | float, size: Size, device: str
 ) -> torch.Tensor:
-    """Return numbers whose logarithm is uniform between those of the (positive) bounds."""
+    """Sample log-uniformly between positive bounds."""
     low = torch.as_tensor(lower, dtype=torch.float32, device=device).log()
     high = torch.as_tensor(upper, dtype=torch.float32, device=device).log()
     return torch.exp(sample_uniform(low, high, size, device))
@@ -769,16 +767,16 @@ def sample_log_uniform(
 def sample_gaussian(
     mean: torch.Tensor | float, std: torch.Tensor | float, size: Size, device: str
 ) -> torch.Tensor:
-    """Return normally distributed numbers.
+    """Sample a normal distribution.
 
-    Where `mean` is a tensor, its shape is that of the result and `size` is not used.
+    If `mean` is a tensor, the result has its shape, and `size` is not used.
     """
     shape = mean.shape if isinstance(mean, torch.Tensor) else _shape(size)
     return torch.randn(shape, dtype=torch.float32, device=device) * std + mean
 
 
 def sample_triangle(lower: float, upper: float, size: Size, device: str) -> torch.Tensor:
-    """Return numbers of the triangular distribution on [lower, upper], densest in the middle."""
+    """Sample the symmetric triangular distribution on [lower, upper]."""
     # The mean of two uniform numbers has this distribution.
     mean = 0.5 * (
         torch.rand(_shape(size), dtype=torch.float32, device=device)
@@ -790,7 +788,7 @@ def sample_triangle(lower: float, upper: float, size: Size, device: str) -> torc
 def sample_cylinder(
     radius: float, h_range: tuple[float, float], size: Size, device: str
 ) -> torch.Tensor:
-    """Return points (*size, 3) uniform on the side of a cylinder about z; z in `h_range`."""
+    """Sample points (*size, 3) uniformly on the side of a cylinder about z, with z in `h_range`."""
     angle = sample_uniform(-torch.pi, torch.pi, size, device)
     height = sample_uniform(h_range[0], h_range[1], size, device)
     return torch.stack((radius * torch.cos(angle), radius * torch.sin(angle), height), dim=-1)
@@ -804,13 +802,13 @@ def default_orientation(num: int, device: str) -> torch.Tensor:
 
 
 def random_orientation(num: int, device: str) -> torch.Tensor:
-    """Return quaternions (num, 4) uniform over all orientations."""
+    """Sample quaternions (num, 4) uniformly over all orientations."""
     # The direction of a normally distributed vector is uniform on the sphere.
     return normalize(torch.randn(num, 4, dtype=torch.float32, device=device))
 
 
 def random_yaw_orientation(num: int, device: str) -> torch.Tensor:
-    """Return quaternions (num, 4) of rotations about z, uniform in angle."""
+    """Sample quaternions (num, 4) of rotations about z with uniform angle."""
     zero = torch.zeros(num, dtype=torch.float32, device=device)
     return quat_from_euler_xyz(zero, zero, sample_uniform(0.0, 2.0 * torch.pi, num, device))
 
@@ -826,18 +824,18 @@ def project_points(points: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tens
     """Return pixel coordinates and depth (u, v, z) of points.
 
     Args:
-        points: Points in the camera's frame, (P, 3) or (N, P, 3).
+        points: Points in the camera frame, (P, 3) or (N, P, 3).
         intrinsics: K, (3, 3) or (N, 3, 3).
 
     Returns:
-        (N, P, 3), with N = 1 where neither has a batch dimension.
+        (N, P, 3), with N = 1 if neither argument has a batch dimension.
 
     Raises:
-        ValueError: `points` has another number of dimensions.
+        ValueError: `points` has a wrong number of dimensions.
     """
     if points.ndim not in (2, 3):
         raise ValueError(f"points: expected (P, 3) or (N, P, 3), got {tuple(points.shape)}.")
-    # No matrix product, which a GPU may compute in TF32.
+    # Not a matrix product, because GPUs may compute it in TF32.
     scaled = (intrinsics.unsqueeze(-3) * points.unsqueeze(-2)).sum(-1)
     scaled = scaled if scaled.ndim == 3 else scaled.unsqueeze(0)
     return torch.cat((scaled[..., :2] / scaled[..., 2:], scaled[..., 2:]), dim=-1)
@@ -846,19 +844,19 @@ def project_points(points: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tens
 def unproject_depth(
     depth: torch.Tensor, intrinsics: torch.Tensor, is_ortho: bool = True
 ) -> torch.Tensor:
-    """Return the points of a depth image in the camera's frame, column by column of the image.
+    """Return the points of a depth image in the camera frame, column by column of the image.
 
     Args:
-        depth: (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1).
+        depth: Image, (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1).
         intrinsics: K, (3, 3) or (N, 3, 3).
         is_ortho: True for depths along the camera's z axis, False for distances from the camera.
 
     Returns:
-        (W H, 3), or (N, W H, 3) where the image or K has a batch dimension; point u H + v is that of
+        (W H, 3), or (N, W H, 3) if the image or K has a batch dimension. Point u H + v belongs to
         pixel (u, v).
 
     Raises:
-        ValueError: `depth` has another number of dimensions.
+        ValueError: `depth` has a wrong number of dimensions.
     """
     if not is_ortho:
         depth = orthogonalize_perspective_depth(depth, intrinsics)
@@ -868,17 +866,17 @@ def unproject_depth(
 
 
 def orthogonalize_perspective_depth(depth: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tensor:
-    """Return depths along the camera's z axis from distances to the camera.
+    """Convert distances to the camera to depths along the camera's z axis.
 
     Args:
-        depth: (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1).
+        depth: Image, (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1).
         intrinsics: K, (3, 3) or (N, 3, 3).
 
     Returns:
-        The shape of `depth`, with N in front where only K has a batch dimension.
+        The shape of `depth`, with a leading N if only K has a batch dimension.
 
     Raises:
-        ValueError: `depth` has another number of dimensions.
+        ValueError: `depth` has a wrong number of dimensions.
     """
     image = _without_channel(depth)
     result = image / torch.linalg.vector_norm(_rays(image, intrinsics), dim=-1)

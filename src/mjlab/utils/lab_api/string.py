@@ -1,7 +1,7 @@
-"""Strict matching of names by regular expression, and conversions to and from strings.
+"""Strict name matching by regular expression, and string conversions.
 
-Every pattern must match a whole name (`re.fullmatch`), and mistakes are errors. The lenient kind
-is in `mjlab.utils.string`.
+Every pattern must match a whole name (`re.fullmatch`), and mismatches raise. For lenient matching,
+see `mjlab.utils.string`.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ def resolve_matching_names(
     list_of_strings: Sequence[str],
     preserve_order: bool = False,
 ) -> tuple[list[int], list[str]]:
-    """Return the indices and the names that the patterns match.
+    """Return indices and names of matches.
 
     Args:
-        keys: One regular expression or several. No expressions select nothing.
-        list_of_strings: The names to choose from.
-        preserve_order: False keeps the order of the names. True groups them by pattern, in the
-            order of `keys`, with the order of the names inside a group.
+        keys: One or several regular expressions. An empty sequence selects nothing.
+        list_of_strings: Candidate names.
+        preserve_order: Group matches by pattern, in the order of `keys`, and in name order within
+            each group. False: name order.
 
     Raises `ValueError` if a pattern matches no name, or two patterns match one name.
     """
@@ -36,7 +36,7 @@ def resolve_matching_names(
     owners = _match_names(keys, list_of_strings)
     indices = [index for index, owner in enumerate(owners) if owner is not None]
     if preserve_order:
-        # `sorted` is stable, so the order of the names remains inside a group.
+        # `sorted` is stable, so names stay in order within a group.
         indices = sorted(indices, key=lambda index: owners[index] or 0)
     return indices, [list_of_strings[index] for index in indices]
 
@@ -44,10 +44,10 @@ def resolve_matching_names(
 def resolve_matching_names_values(
     data: dict[str, Any], list_of_strings: Sequence[str], preserve_order: bool = False
 ) -> tuple[list[int], list[str], list[Any]]:
-    """Return the indices, the names and the values of the names that the keys of `data` match.
+    """Return indices, names and values of the names matched by the keys of `data`.
 
-    The keys are regular expressions under the rules of `resolve_matching_names`. Raises
-    `TypeError` if `data` is not a dict, and `ValueError` as there.
+    Keys are regular expressions, matched as in `resolve_matching_names`. Raises `TypeError` if `data`
+    is not a dict, and `ValueError` as `resolve_matching_names`.
     """
     if not isinstance(data, dict):
         raise WrongTypeError(
@@ -60,7 +60,7 @@ def resolve_matching_names_values(
 
 
 def _match_names(keys: Sequence[str], names: Sequence[str]) -> list[int | None]:
-    """Return, for each name, the position of the key that matches it, or None."""
+    """Return the index of the matching key for each name, or None."""
     patterns = [compile_pattern(key) for key in keys]
     owners: list[int | None] = []
     for name in names:
@@ -89,7 +89,7 @@ def _matches_report(keys: Sequence[str], names: Sequence[str]) -> str:
 def to_camel_case(snake_str: str, to: str = "cC") -> str:
     """Convert `snake_case` to `camelCase` ("cC") or `CamelCase` ("CC").
 
-    Raises `ValueError` for another `to`.
+    Raises `ValueError` for an unknown `to`.
     """
     check_one_of("to", to, ("cC", "CC"))
     first, *rest = snake_str.split("_")
@@ -98,25 +98,25 @@ def to_camel_case(snake_str: str, to: str = "cC") -> str:
 
 
 def to_snake_case(camel_str: str) -> str:
-    """Convert `CamelCase` to `snake_case`; runs of capitals are one word."""
+    """Convert `CamelCase` to `snake_case`. Consecutive capitals are one word."""
     words = re.sub(r"([A-Z]+)([A-Z][a-z])", r"\1_\2", camel_str)
     return re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", words).lower()
 
 
 def string_to_slice(s: str) -> slice:
-    """Convert "slice(0, 3, None)", as `str` of a slice writes it, back to the slice.
+    """Convert the string form of a slice, such as "slice(0, 3, None)", to a slice.
 
-    Raises `ValueError` for anything else.
+    Raises `ValueError` for other strings.
     """
     match = re.fullmatch(r"slice\((.*)\)", s.strip())
     parts = [part.strip() for part in match.group(1).split(",")] if match else []
     if not 1 <= len(parts) <= 3 or any(not re.fullmatch(r"None|-?\d+", part) for part in parts):
-        raise ValueError(f"{s!r} is no slice; expected a form like 'slice(0, 3, None)'.")
+        raise ValueError(f"Expected a slice such as 'slice(0, 3, None)', got {s!r}.")
     return slice(*(None if part == "None" else int(part) for part in parts))
 
 
 def is_lambda_expression(name: str) -> bool:
-    """Return whether the string is the source of a lambda expression."""
+    """Return True if the string is the source of a lambda expression."""
     try:
         parsed = ast.parse(name.strip(), mode="eval")
     except (SyntaxError, ValueError):
@@ -127,11 +127,11 @@ def is_lambda_expression(name: str) -> bool:
 def callable_to_string(value: Callable) -> str:
     """Return "module:qualified.name" of a callable, or the source of a lambda.
 
-    Raises `ValueError` if the value is not callable, or is a lambda whose source is not found.
+    Raises `ValueError` if the value is not callable, or if the source of a lambda is not found.
     """
     if not callable(value):
         found = f"{type(value).__name__}: {value!r}"
-        raise ValueError(f"Expected something callable, got {found}.")
+        raise ValueError(f"Expected a callable, got {found}.")
     if getattr(value, "__name__", "") == "<lambda>":
         return _lambda_source(value)
     return qualified_name(value)
@@ -139,40 +139,39 @@ def callable_to_string(value: Callable) -> str:
 
 def _lambda_source(function: Callable) -> str:
     try:
-        # A lambda inside a call or a dict is no complete statement: take the text from "lambda"
-        # on and drop characters at the end until what is left is one expression.
+        # A lambda inside a call or dict is not a complete statement: take the text from "lambda"
+        # and drop characters at the end until the rest is one expression.
         text = inspect.getsource(function).strip()
     except (OSError, TypeError) as error:
-        raise ValueError(f"The source of the lambda {function!r} is not available.") from error
+        raise ValueError(f"Source of lambda {function!r} not found.") from error
     if text.count("lambda") == 1:
         text = text[text.index("lambda") :]
         for end in range(len(text), 0, -1):
             if is_lambda_expression(text[:end]):
                 return text[:end].strip()
     raise ValueError(
-        f"The source of {function!r} cannot be told apart from its surroundings; "
-        "use a named function, or a lambda that is alone on its line."
+        f"Source of {function!r} is ambiguous; use a named function, or a lambda on a separate line."
     )
 
 
 def string_to_callable(name: str) -> Callable:
-    """Return the callable that "module:qualified.name" or the source of a lambda stands for.
+    """Return the callable for "module:qualified.name" or for the source of a lambda.
 
-    A lambda is evaluated: pass only strings you trust. Raises `ValueError` if the string has
-    neither form, or if what it names does not exist or is not callable.
+    Lambdas are evaluated: pass only trusted strings. Raises `ValueError` if the string has neither
+    form, or if the named object does not exist or is not callable.
     """
     if is_lambda_expression(name):
         return eval(name.strip())
     module_name, separator, attribute = name.partition(":")
     if not separator or not module_name or not attribute:
-        raise ValueError(f"{name!r} names no callable; expected 'module:name' or a lambda.")
+        raise ValueError(f"Expected 'module:name' or a lambda, got {name!r}.")
     try:
         found: Any = importlib.import_module(module_name)
         for part in attribute.split("."):
             found = getattr(found, part)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"{name!r} cannot be found: {error}.") from error
+        raise ValueError(f"Callable {name!r} not found: {error}.") from error
     if not callable(found):
         kind = type(found).__name__
-        raise ValueError(f"{name!r} is a {kind}, which is not callable.")
+        raise ValueError(f"{name!r}: expected a callable, got {kind}.")
     return found

@@ -1,4 +1,4 @@
-"""Noise on observations: independent draws (`NoiseCfg`), and models that keep state."""
+"""Observation noise: independent samples (`NoiseCfg`), and models with state."""
 
 from mjlab.utils.noise.noise_cfg import ConstantNoiseCfg as ConstantNoiseCfg
 from mjlab.utils.noise.noise_cfg import GaussianNoiseCfg as GaussianNoiseCfg

@@ -1,6 +1,6 @@
-"""Noise on observations: independent draws, and models that keep state between calls.
+"""Observation noise: independent samples, and models with state.
 
-Independent draws are configs that apply themselves; a `NoiseModelCfg` has one model built from it.
+`NoiseCfg` samples independently and applies itself; a `NoiseModelCfg` builds a model with state.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from mjlab.utils.state import stateful
 from mjlab.utils.torch import constant_tensor
 
 NoiseParam = float | tuple[float, ...]
-"""One value, or one for each entry of the last axis of the data."""
+"""A scalar, or one value per entry of the last axis of the data."""
 
 _OPERATIONS = ("add", "scale", "abs")
 
 
 @dataclass(kw_only=True)
 class NoiseCfg(ABC):
-    """Noise n on data x. Configs hold no state: an edited field counts from the next call on."""
+    """Noise n on data x. Configs have no state: edited fields apply from the next call."""
 
     operation: Literal["add", "scale", "abs"] = "add"
-    """add: x + n; scale: x * n; abs: n, whatever x is."""
+    """Combination with the data: `add` (x + n), `scale` (x * n) or `abs` (n, independent of x)."""
 
     def __post_init__(self) -> None:
         self._check_operation()
 
     @abstractmethod
     def apply(self, data: torch.Tensor) -> torch.Tensor:
-        """Return a new tensor of the shape of `data`: the data with noise."""
+        """Return the data with noise, as a new tensor of the same shape."""
 
     def _combine(self, data: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Combine into `noise`, a new tensor of the shape of `data`, which is given away."""
+        """Combine data and noise in place in `noise`, a new tensor of the shape of `data`."""
         if self.operation == "add":
             return noise.add_(data)
         if self.operation == "scale":
@@ -50,10 +50,10 @@ class NoiseCfg(ABC):
 
 @dataclass
 class ConstantNoiseCfg(NoiseCfg):
-    """The same offset (or factor, or value) always."""
+    """Constant offset, factor or value."""
 
     bias: NoiseParam = 0.0
-    """n, one value or one for each component."""
+    """n, a scalar or one value per component."""
 
     def apply(self, data: torch.Tensor) -> torch.Tensor:
         """Return the data with n = bias."""
@@ -62,20 +62,20 @@ class ConstantNoiseCfg(NoiseCfg):
 
 @dataclass
 class UniformNoiseCfg(NoiseCfg):
-    """Uniform noise, drawn for each element."""
+    """Uniform noise, sampled per element."""
 
     n_min: NoiseParam = -1.0
-    """Smallest n, one value or one for each component."""
+    """Lower bound of n (inclusive), a scalar or one value per component."""
     n_max: NoiseParam = 1.0
-    """Bound of n from above, which n does not reach."""
+    """Upper bound of n (exclusive), a scalar or one value per component."""
 
     def __post_init__(self) -> None:
         """Raise `ValueError` unless n_min < n_max (components of tuples may be equal)."""
         super().__post_init__()
         if not _in_order(self.n_min, self.n_max):
             raise ValueError(
-                f"UniformNoiseCfg has n_min={self.n_min} and n_max={self.n_max}; "
-                "n_min must be less than n_max."
+                f"UniformNoiseCfg: expected n_min < n_max, got n_min={self.n_min}, "
+                f"n_max={self.n_max}."
             )
 
     def apply(self, data: torch.Tensor) -> torch.Tensor:
@@ -86,18 +86,18 @@ class UniformNoiseCfg(NoiseCfg):
 
 @dataclass
 class GaussianNoiseCfg(NoiseCfg):
-    """Normally distributed noise, drawn for each element."""
+    """Gaussian noise, sampled per element."""
 
     mean: NoiseParam = 0.0
-    """Mean of n, one value or one for each component."""
+    """Mean of n, a scalar or one value per component."""
     std: NoiseParam = 1.0
-    """Standard deviation of n, one value or one for each component."""
+    """Standard deviation of n, a scalar or one value per component."""
 
     def __post_init__(self) -> None:
         """Raise `ValueError` unless std is positive (components of tuples may be 0)."""
         super().__post_init__()
         if not _in_order(0.0, self.std):
-            raise ValueError(f"GaussianNoiseCfg.std is {self.std}; it must be positive.")
+            raise ValueError(f"GaussianNoiseCfg.std: expected a number > 0, got {self.std}.")
 
     def apply(self, data: torch.Tensor) -> torch.Tensor:
         """Return the data with n = mean + std z, z standard normal."""
@@ -107,12 +107,14 @@ class GaussianNoiseCfg(NoiseCfg):
 
 @stateful
 class NoiseModel:
-    """Applies the noise of its config; subclasses keep state for each environment."""
+    """Noise model that applies the noise of its config. Subclasses keep per-environment state."""
 
     def __init__(self, noise_model_cfg: NoiseModelCfg, num_envs: int, device: str) -> None:
-        """Make the model. Raises `ValueError` if the config has no noise."""
+        """Create the model. Raises `ValueError` if `noise_cfg` is None."""
         if noise_model_cfg.noise_cfg is None:
-            raise ValueError(f"{type(noise_model_cfg).__name__}.noise_cfg is None; set a NoiseCfg.")
+            raise ValueError(
+                f"{type(noise_model_cfg).__name__}.noise_cfg: expected a NoiseCfg, got None."
+            )
         self._noise_model_cfg = noise_model_cfg
         self._num_envs = num_envs
         self._device = device
@@ -122,21 +124,21 @@ class NoiseModel:
         return self._noise_model_cfg.noise_cfg.apply(data)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Start the given environments (None: all) anew."""
+        """Reset the state of `env_ids` (None: all)."""
 
 
 @dataclass(kw_only=True)
 class NoiseModelCfg:
-    """Config of a noise model, of which one is made for each observation term.
+    """Noise model configuration. Each observation term builds a separate model.
 
-    The class it builds is given as a class keyword: `class MyCfg(NoiseModelCfg, class_type=My)`.
+    Set the model class by a class keyword: `class MyCfg(NoiseModelCfg, class_type=My)`.
     """
 
     class_type: ClassVar[type[NoiseModel]] = NoiseModel
-    """The model, made as `class_type(cfg, num_envs, device)`."""
+    """Model class, constructed as `class_type(cfg, num_envs, device)`."""
 
     noise_cfg: NoiseCfg
-    """Noise applied at each call."""
+    """Noise of each call."""
 
     def __init_subclass__(cls, class_type: type[NoiseModel] | None = None, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -145,7 +147,7 @@ class NoiseModelCfg:
 
 
 class NoiseModelWithAdditiveBias(NoiseModel):
-    """Noise plus a bias, drawn for each environment when it is reset."""
+    """Noise plus a per-environment bias, resampled at reset."""
 
     _noise_model_cfg: NoiseModelWithAdditiveBiasCfg
 
@@ -155,14 +157,14 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         num_envs: int,
         device: str,
     ) -> None:
-        """Make the model. Raises `ValueError` if the noise or the bias is missing."""
+        """Create the model. Raises `ValueError` if `noise_cfg` or `bias_noise_cfg` is None."""
         super().__init__(noise_model_cfg, num_envs, device)
         if noise_model_cfg.bias_noise_cfg is None:
             raise ValueError(
-                f"{type(noise_model_cfg).__name__}.bias_noise_cfg is None; set a NoiseCfg."
+                f"{type(noise_model_cfg).__name__}.bias_noise_cfg: expected a NoiseCfg, got None."
             )
         self._bias_noise_cfg = noise_model_cfg.bias_noise_cfg
-        # One bias an environment; one a component once the first data shows how many there are.
+        # One bias per environment, expanded to one per component when the first data arrives.
         self._bias = torch.zeros(num_envs, 1, dtype=torch.float32, device=device)
         self._waits_for_components = noise_model_cfg.sample_bias_per_component
 
@@ -170,7 +172,7 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         """Return `data`, (num_envs, ..., components), with noise and bias."""
         if self._waits_for_components:
             self._waits_for_components = False
-            # Data that comes first under `inference_mode` must not forbid later resets without it.
+            # If the first data arrives under `inference_mode`, later resets outside it must work.
             with torch.inference_mode(False):
                 self._bias = torch.zeros(
                     self._num_envs, data.shape[-1], dtype=self._bias.dtype, device=self._device
@@ -182,26 +184,26 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         return super().__call__(data) + bias
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Draw a new bias for the given environments (None: all)."""
+        """Resample the bias of `env_ids` (None: all)."""
         if self._waits_for_components:
             return
         ids = slice(None) if env_ids is None else env_ids
-        # Applied to zeros: a bias drawn on top of the old one would wander from reset to reset.
+        # Applied to zeros: adding to the previous bias would be a random walk over resets.
         self._bias[ids] = self._bias_noise_cfg.apply(torch.zeros_like(self._bias[ids]))
 
 
 @dataclass(kw_only=True)
 class NoiseModelWithAdditiveBiasCfg(NoiseModelCfg, class_type=NoiseModelWithAdditiveBias):
-    """Noise at each call, plus a bias that is drawn at reset and kept until the next."""
+    """Noise at each call, plus a bias that is resampled at reset."""
 
     bias_noise_cfg: NoiseCfg | None = None
-    """The bias: this noise applied to zero. Required."""
+    """Bias distribution: this noise applied to zero. Required."""
     sample_bias_per_component: bool = True
-    """Each component has a bias of its own; False: one for all components of an environment."""
+    """Sample a separate bias per component. False: one bias for all components."""
 
 
 def _param(value: Any, data: torch.Tensor) -> Any:
-    """Return a parameter as a number, or as a tensor that broadcasts on the last axis."""
+    """Return a parameter as a number, or as a tensor that broadcasts along the last axis."""
     if isinstance(value, (int, float)):
         return value
     if isinstance(value, torch.Tensor):

@@ -1,4 +1,4 @@
-"""Public path of the noise models, which live in `mjlab.utils.noise.noise_cfg`."""
+"""Public path of the noise models of `mjlab.utils.noise.noise_cfg`."""
 
 from mjlab.utils.noise.noise_cfg import NoiseModel as NoiseModel
 from mjlab.utils.noise.noise_cfg import NoiseModelWithAdditiveBias as NoiseModelWithAdditiveBias

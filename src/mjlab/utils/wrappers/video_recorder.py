@@ -1,6 +1,6 @@
-"""Videos of an environment that something else steps.
+"""Video recording of environments.
 
-`VideoRecorder` wraps the environment and writes clips; `ClipWriter` writes one file, whole or not at all.
+`VideoRecorder` wraps an environment and writes clips; `ClipWriter` writes one file atomically.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ log = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
 _CODECS = {
     ".mp4": "-an -c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart",
-    # One palette for the whole clip keeps colours from flickering.
+    # One palette for the whole clip keeps colors from flickering.
     ".gif": "-an -vf split[a][b];[a]palettegen[p];[b][p]paletteuse",
 }
 
 
 class VideoRecorder(ManagerBasedRlEnv):
-    """Wraps an environment: steps it, and writes clips of what it renders.
+    """Environment wrapper that records video clips.
 
-    It stands in for the environment everywhere: every attribute that is not the recorder's own is
-    read from, and written to, the environment.
+    The recorder can replace the environment everywhere: all attributes except those of the recorder
+    are read from, and written to, the environment.
 
-    Before each step the triggers are asked, and a clip starts if one of them says so and none is
-    being recorded; the frame is taken after the step. A clip ends after `video_length` frames, or
-    at the end of environment 0's episode where that is None, and whenever stepping fails or the
-    recorder is closed: what was recorded is never lost. Where this machine cannot render, that is
-    logged once and stepping goes on (`unavailable_reason`).
+    Triggers are evaluated before each step; a clip starts if a trigger returns True and no clip is
+    being recorded. The frame is rendered after the step. A clip ends after `video_length` frames, or
+    with None at the end of environment 0's episode. It also ends if stepping fails or the recorder is
+    closed, so recorded frames are never lost. If this machine cannot render, the recorder logs this
+    once and continues stepping (`unavailable_reason`).
     """
 
     def __init__(
@@ -60,21 +60,22 @@ class VideoRecorder(ManagerBasedRlEnv):
         """Wrap `env`.
 
         Args:
-            env: Environment made with `render_mode="rgb_array"`.
-            video_folder: Where `<prefix>-step-<n>.mp4` and `<prefix>-episode-<n>.mp4` go.
-            episode_trigger: Asked once an episode of environment 0, with its number from 0,
-                whether to record it.
-            step_trigger: Asked before every step, with its number from 0, whether to start.
-            video_length: Frames a clip; None records until environment 0's episode ends.
-            name_prefix: Start of the file names.
-            disable_logger: Do not log the name of each file written.
+            env: Environment with `render_mode="rgb_array"`.
+            video_folder: Folder for `<prefix>-step-<n>.mp4` and `<prefix>-episode-<n>.mp4`.
+            episode_trigger: Function of the index (from 0) of environment 0's episode, called once
+                per episode; True records the episode.
+            step_trigger: Function of the step index (from 0), called before every step; True
+                starts a clip.
+            video_length: Frames per clip. None: record until the end of environment 0's episode.
+            name_prefix: Prefix of file names.
+            disable_logger: Do not log the names of written files.
 
         Raises:
-            ValueError: There is no trigger, or `video_length` is not positive.
+            ValueError: No trigger, or `video_length` is not positive.
         """
         if episode_trigger is None and step_trigger is None:
             raise ValueError(
-                "VideoRecorder would never record: give it an episode_trigger or a step_trigger."
+                "VideoRecorder: expected an episode_trigger or a step_trigger, got neither."
             )
         if video_length is not None:
             check_count("video_length", video_length)
@@ -91,12 +92,12 @@ class VideoRecorder(ManagerBasedRlEnv):
         self._episode_count = 0
         self._episode_steps = 0
         self._asked_episode = -1
-        # Last: attributes set before it are the recorder's, all others are the environment's.
+        # Set last: attributes set before belong to the recorder, all others to the environment.
         self.env = env
 
     def __getattribute__(self, name: str) -> Any:
-        # Not __getattr__: the base class has properties of the environment, which would be found
-        # first and evaluated on the recorder.
+        # Not __getattr__: properties inherited from the environment class would be found first and
+        # evaluated on the recorder.
         own = object.__getattribute__(self, "__dict__")
         if name in own or name in vars(VideoRecorder) or name.startswith("__"):
             return object.__getattribute__(self, name)
@@ -115,7 +116,7 @@ class VideoRecorder(ManagerBasedRlEnv):
         return self.env.unwrapped
 
     def step(self, action: torch.Tensor) -> Any:
-        """Step the environment, and record if it is time to."""
+        """Step the environment, and record a frame if due."""
         self._start_due_clip()
         try:
             result = self.env.step(action)
@@ -127,13 +128,13 @@ class VideoRecorder(ManagerBasedRlEnv):
         return result
 
     def reset(self, **kwargs: Any) -> Any:
-        """Reset the environment; a clip of one episode ends here."""
+        """Reset the environment. Ends a clip of one episode."""
         if self._episode_steps > 0 and kwargs.get("env_ids") is None:
             self._count_step(episode_over=True, stepped=False)
         return self.env.reset(**kwargs)
 
     def render(self, camera: str | int | None = None) -> np.ndarray | None:
-        """The environment's own picture."""
+        """Return the environment's rendering."""
         return self.env.render(camera) if camera is not None else self.env.render()
 
     def close(self) -> None:
@@ -149,8 +150,8 @@ class VideoRecorder(ManagerBasedRlEnv):
         suffix = None
         if self._step_trigger is not None and self._step_trigger(self._step_count):
             suffix = f"step-{self._step_count}"
-        # Asked once an episode, or a clip shorter than its episode would be recorded again and
-        # again into the same file.
+        # Once per episode, because clips shorter than the episode would otherwise be recorded
+        # repeatedly to the same file.
         elif self._episode_trigger is not None and self._asked_episode != self._episode_count:
             self._asked_episode = self._episode_count
             if self._episode_trigger(self._episode_count):
@@ -167,15 +168,15 @@ class VideoRecorder(ManagerBasedRlEnv):
             frame = self.env.render()
             if frame is not None:
                 image = np.asarray(frame)
-                # Of one image per environment, (n, H, W, 3), the clip shows environment 0.
+                # Batched images, (n, H, W, 3): record environment 0.
                 self._clip.add(image[0] if image.ndim == 4 else image)
         except RenderingUnavailableError as error:
             self.unavailable_reason = str(error)
             self._finish_clip()
             log.warning("No video is recorded. %s", error)
         except OSError as error:
-            # A full disk must not end a training run for the sake of a video.
-            log.error("The video is not complete. %s", error)
+            # A full disk must not end a training run.
+            log.error("Incomplete video. %s", error)
             self._finish_clip()
 
     def _count_step(self, episode_over: bool, stepped: bool = True) -> None:
@@ -207,19 +208,19 @@ class VideoRecorder(ManagerBasedRlEnv):
 
 
 class ClipWriter:
-    """Streams frames into an mp4 or gif that appears under its name only once it is complete.
+    """Streams frames to an mp4 or gif file that appears under its name only when complete.
 
-    The file is finished by `close`, also when the program ends without calling it. Frames go to
-    the encoder (the ffmpeg that the package imageio-ffmpeg brings) at once, so that a long clip
-    needs no memory. Without frames there is no file.
+    `close` finishes the file; it also runs at program exit. Frames are sent to the encoder (ffmpeg
+    of the package imageio-ffmpeg) immediately, so memory does not grow with the clip. Without
+    frames, no file is written.
     """
 
     def __init__(self, path: Path, fps: float):
-        """Prepare a clip.
+        """Create a writer. The file is opened at the first frame.
 
         Args:
-            path: Where the finished file goes; its folder is made if needed.
-            fps: Frames per second of the clip.
+            path: Path of the finished file; missing folders are created.
+            fps: Frames per second.
 
         Raises:
             ValueError: The name does not end in .mp4 or .gif.
@@ -228,18 +229,18 @@ class ClipWriter:
         self.path = path
         self.fps = fps
         self.num_frames = 0
-        # The encoder writes into it, and this process holds its lock.
+        # The encoder writes to this file; this process holds its lock.
         self._partial: IO[bytes] | None = None
         self._encoder: subprocess.Popen[bytes] | None = None
         self._messages: IO[bytes] | None = None
         self._shape: tuple[int, ...] = ()
 
     def add(self, frame: np.ndarray) -> None:
-        """Append a frame (height, width, 3), uint8 or float in [0, 1]; all must be of one size.
+        """Append a frame, (height, width, 3), uint8 or float in [0, 1]. All frames have the same size.
 
         Raises:
-            ValueError: The frame is no RGB image, or of another size than the first.
-            OSError: The encoder or the disk refused it.
+            ValueError: The frame is not an RGB image, or its size differs from the first frame.
+            OSError: The encoder or the disk failed.
         """
         image = _even_uint8(frame)
         if self._encoder is None:
@@ -248,19 +249,19 @@ class ClipWriter:
         assert self._encoder.stdin is not None
         if image.shape != self._shape:
             raise ValueError(
-                f"Frame {self.num_frames} of {self.path.name} has the shape {image.shape}; "
-                f"the first one had {self._shape}."
+                f"Frame {self.num_frames} of {self.path.name}: expected shape {self._shape} of the "
+                f"first frame, got {image.shape}."
             )
         try:
             self._encoder.stdin.write(image.tobytes())
         except OSError as error:
             raise OSError(
-                f"Cannot write the video {self.path}: {self._complaint(error)}"
+                f"Cannot write the video {self.path}: {self._encoder_message(error)}"
             ) from error
         self.num_frames += 1
 
     def close(self) -> Path | None:
-        """Finish the file and return its path, or None where there is nothing (more) to finish.
+        """Finish the file and return its path. Returns None if already closed or without frames.
 
         Raises:
             OSError: The encoder or the disk failed; the unfinished file is removed.
@@ -269,7 +270,7 @@ class ClipWriter:
         if encoder is None or encoder.stdin is None:
             return None
         atexit.unregister(self.close)
-        # An encoder that is gone already says why by its exit status.
+        # If the encoder has already ended, its exit status gives the reason.
         with contextlib.suppress(OSError):
             encoder.stdin.close()
         assert self._partial is not None
@@ -277,7 +278,7 @@ class ClipWriter:
             self._partial.close()
             Path(self._partial.name).unlink(missing_ok=True)
             raise OSError(
-                f"Cannot write the video {self.path}: {self._complaint(encoder.returncode)}"
+                f"Cannot write the video {self.path}: {self._encoder_message(encoder.returncode)}"
             )
         rename_locked(self._partial, self.path)
         return self.path
@@ -289,7 +290,7 @@ class ClipWriter:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         remove_temporary_files(self.path.parent)
         self._partial = create_locked(temporary_path(self.path))
-        # A pipe for its messages could fill up and block it.
+        # Not a pipe: a full pipe would block the encoder.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         height, width = image.shape[:2]
         raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps:g} -i -"
@@ -305,13 +306,13 @@ class ClipWriter:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._messages,
-            # A Ctrl+C is for the program, which then finishes the clip.
+            # Ctrl+C must reach only this program, which then finishes the clip.
             start_new_session=True,
         )
         atexit.register(self.close)
 
-    def _complaint(self, fallback: object) -> str:
-        """What the encoder said, or else `fallback`."""
+    def _encoder_message(self, fallback: object) -> str:
+        """Return the encoder's output, or `fallback` if empty."""
         if self._messages is None:
             return str(fallback)
         self._messages.seek(0)
@@ -320,13 +321,13 @@ class ClipWriter:
 
 
 def _even_uint8(frame: np.ndarray) -> np.ndarray:
-    """The frame as bytes, its last row or column repeated where their number is odd.
+    """Return the frame as uint8, with an odd last row or column repeated.
 
-    H.264 stores colour at half resolution, which needs even sides.
+    H.264 stores color at half resolution and requires even sizes.
     """
     image = np.asarray(frame)
     if image.ndim != 3 or image.shape[2] != 3:
-        raise ValueError(f"A frame has the shape (height, width, 3); this one has {image.shape}.")
+        raise ValueError(f"Frame: expected shape (height, width, 3), got {image.shape}.")
     if np.issubdtype(image.dtype, np.floating):
         image = np.round(np.clip(image, 0.0, 1.0) * 255.0)
     image = image.astype(np.uint8)

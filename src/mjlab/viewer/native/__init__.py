@@ -1,6 +1,6 @@
-"""MuJoCo's own window, and drawing into MuJoCo scenes.
+"""Native viewer: MuJoCo's window, and debug drawing into MuJoCo scenes.
 
-The window is loaded on first use: the offscreen renderer needs the drawing only.
+The window is imported on first use: the offscreen renderer only needs the debug drawing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Keys of the native window.
+"""Key bindings of the native window.
 
-MuJoCo's window binds every letter, `,` and the digits 0 to 5 to switches of its own and also acts
-on them when we do, so none of those is used here.
+MuJoCo's window binds every letter, `,` and the digits 0 to 5, and handles them even if a callback
+does. The bindings here avoid those keys.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ KEY_HELP = (
     ("8", "reward plots"),
     ("9 / F9", "debug drawings / of all envs"),
 )
-"""Keys and what they do, as the window shows them."""
+"""Keys and their actions, as shown in the window."""
 
 
 def action_of_key(key: int) -> ViewerAction | None:
-    """The action of a GLFW key code, if it has one."""
+    """Return the action of a GLFW key code, or None."""
     return _ACTIONS.get(key)

@@ -1,6 +1,6 @@
-"""MuJoCo's own window, following one environment of a running policy.
+"""Native viewer: MuJoCo's window on one environment of a running policy.
 
-The mouse pushes bodies (`MousePush`), and curves of the reward terms can be drawn over the picture.
+The mouse pushes bodies (`MousePush`); reward terms can be plotted over the image.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class PlotCfg:
     grid_size: tuple[int, int] = (3, 4)
     """Number of grid lines along x and y."""
     max_viewports: int = 12
-    """Number of terms plotted; the rest is left out."""
+    """Maximum number of plotted terms."""
     min_rows_per_col: int = 4
-    """Smallest number of rows a column is divided into."""
+    """Minimum number of rows per column."""
     max_rows_per_col: int = 6
-    """Number of plots in a column before the next one begins."""
+    """Maximum number of plots per column."""
     plot_strip_fraction: float = 1 / 3
     """Fraction of the window's width that all columns together take."""
     background_alpha: float = 0.5
@@ -76,11 +76,11 @@ class PlotCfg:
 
 
 class NativeMujocoViewer(BaseViewer):
-    """Shows one environment, its nearest neighbours, rewards and debug drawings in a window.
+    """Window with one environment, its nearest neighbors, rewards and debug drawings.
 
-    Double-click selects a body, Ctrl-drag pushes or twists it. Keys are listed in the window;
-    they are ones that MuJoCo's window does not use itself. What is computed for display (contacts,
-    say) comes from a CPU forward pass, also where the environment runs on a GPU.
+    Double-click selects a body, Ctrl-drag pushes or twists it. The window lists its keys, none of
+    which MuJoCo's window uses. Derived quantities on display, e.g. contacts, come from a CPU
+    forward pass even if the environment runs on a GPU.
 
     Attributes:
         mjm: Private copy of the model, with the values of the environment in view.
@@ -98,16 +98,16 @@ class NativeMujocoViewer(BaseViewer):
         enable_perturbations: bool = True,
         verbosity: int = VerbosityLevel.SILENT,
     ) -> None:
-        """Prepare; the window opens in `run` (or `setup`).
+        """Create the viewer; `run` (or `setup`) opens the window.
 
         Args:
             env: Environment or wrapper whose observations `policy` takes.
             policy: Maps observations to actions.
             frame_rate: Displayed frames per second of wall time.
-            key_callback: Also called with every key (GLFW code), in the window's thread.
+            key_callback: Called with every key (GLFW code), in the window's thread.
             plot_cfg: Size and range of the reward plots.
             enable_perturbations: Let the mouse push bodies.
-            verbosity: How much to log, a `VerbosityLevel`.
+            verbosity: Log verbosity, a `VerbosityLevel`.
         """
         super().__init__(env, policy, frame_rate, verbosity)
         self._user_key_callback = key_callback
@@ -115,8 +115,8 @@ class NativeMujocoViewer(BaseViewer):
         unwrapped = env.unwrapped
         self.mjm = host_model(unwrapped.sim.mj_model)
         prepare_sun(self.mjm, self.cfg.distance)
-        # Neighbours are posed in a model of their own, so that the window's is changed only
-        # while it is locked.
+        # Neighbors are posed in a separate model, so that the window's model changes only while
+        # locked.
         self._extra_model = host_model(unwrapped.sim.mj_model)
         self.mjd = mujoco.MjData(self.mjm)
         self._extra_data = mujoco.MjData(self._extra_model)
@@ -141,7 +141,7 @@ class NativeMujocoViewer(BaseViewer):
         """Open the window.
 
         Raises:
-            RenderingUnavailableError: There is no display.
+            RenderingUnavailableError: No display found.
         """
         require_display()
         import mujoco.viewer
@@ -158,7 +158,7 @@ class NativeMujocoViewer(BaseViewer):
             )
         except Exception as error:
             raise RenderingUnavailableError(
-                f"Cannot open MuJoCo's window: {error}. Use the browser viewer (--viewer viser)."
+                f"Cannot open MuJoCo's window: {error}; use the browser viewer (--viewer viser)."
             ) from error
         self._window_threads = set(threading.enumerate()) - others
         with self._handle.lock():
@@ -172,8 +172,8 @@ class NativeMujocoViewer(BaseViewer):
             self._push.release(self.env.unwrapped.sim)
             self._handle.close()
             self._handle = None
-        # The window's thread draws a last frame after it was told to end. A program that ends
-        # meanwhile takes the graphics library away from under it, and crashes.
+        # The window's thread draws a last frame after `close`. A program that exits meanwhile
+        # unloads the graphics library in use, and crashes.
         for thread in self._window_threads:
             thread.join(timeout=_CLOSING_TIMEOUT_S)
         self._window_threads = set()
@@ -189,7 +189,7 @@ class NativeMujocoViewer(BaseViewer):
                 handle.cam.lookat[:] = self._view.target(self.mjd.xpos)
             if self.env.unwrapped.num_envs > 1:
                 self._mark_selected(self._visualizer_of(handle.user_scn))
-                self._draw_neighbours(handle.user_scn)
+                self._draw_neighbors(handle.user_scn)
         handle.set_texts(self._overlay())
         if self._show_plots and handle.viewport is not None:
             handle.set_figures(reward_figures(self._rewards, handle.viewport, self._plot_cfg))
@@ -199,7 +199,7 @@ class NativeMujocoViewer(BaseViewer):
         handle = self._handle
         if handle is None or not self._enable_perturbations:
             return
-        # Without a push there is nothing to wait for the window's lock for.
+        # Do not wait for the window's lock without a push.
         if handle.perturb.active or self._push.active:
             with handle.lock():
                 self._push.apply(self.env.unwrapped.sim, self.env_idx, self.mjd, handle.perturb)
@@ -230,13 +230,13 @@ class NativeMujocoViewer(BaseViewer):
         return True
 
     def select_env(self, env_idx: int) -> None:
-        """Show another environment; numbers wrap around. A push on the old one ends."""
+        """Show environment `env_idx` modulo `num_envs`; release a push on the previous one."""
         self._push.release(self.env.unwrapped.sim)
         self.env_idx = env_idx % self.env.unwrapped.num_envs
         self._rewards.clear()
 
     def _on_key(self, key: int) -> None:
-        # This is the window's thread; the main thread performs the action.
+        # Called in the window's thread; the main thread performs the action.
         action = action_of_key(key)
         if action is not None:
             self.request_action(action.value)
@@ -268,10 +268,10 @@ class NativeMujocoViewer(BaseViewer):
         move_sun(self.mjm, self.mjd, self._view.target(self.mjd.xpos))
 
     def _update_debug_visualizers(self, viewer: mujoco.viewer.Handle) -> None:
-        """Replace the geoms of `viewer.user_scn` by the environment's debug drawings.
+        """Replace the geoms of `viewer.user_scn` with the environment's debug drawings.
 
-        Called for every displayed frame with the window locked, also while `_show_debug_vis` is
-        False. Subclasses may extend it to draw more.
+        Called for every displayed frame with the window locked, even while `_show_debug_vis` is
+        False. Subclasses may override it to draw more.
         """
         viewer.user_scn.ngeom = 0
         if self._show_debug_vis:
@@ -286,20 +286,21 @@ class NativeMujocoViewer(BaseViewer):
 
     @property
     def _com_differs(self) -> bool:
-        """True if the center of mass, which a tracking camera follows, differs per environment.
+        """True if the center of mass differs per environment.
 
-        The camera then follows the body's origin, so that it does not jump between environments.
+        A tracking camera follows the center of mass and would jump between environments, so the
+        camera then follows the body's origin.
         """
         return bool(self.env.unwrapped.sim.expanded_fields & VIEWER_INERTIAL_FIELDS)
 
     def _mark_selected(self, visualizer: MujocoNativeDebugVisualizer) -> None:
-        """Hang a red arrow over the followed body of the environment in view."""
+        """Draw a red arrow above the followed body of the environment in view."""
         if self._marked_body is None:
             return
         tip = self.mjd.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
         visualizer.add_arrow(tip + np.array([0.0, 0.0, 0.4]), tip, _MARKER_COLOR, width=0.03)
 
-    def _draw_neighbours(self, scn: mujoco.MjvScene) -> None:
+    def _draw_neighbors(self, scn: mujoco.MjvScene) -> None:
         env, sim = self.env.unwrapped, self.env.unwrapped.sim
         origins = to_numpy(env.scene.env_origins)
         option = mujoco.MjvOption()
@@ -335,32 +336,32 @@ class NativeMujocoViewer(BaseViewer):
 
 
 def require_display() -> None:
-    """Check that a window can be opened.
+    """Check that a window can be opened; without a display GLFW would end the program.
 
     Raises:
-        RenderingUnavailableError: There is no display. (GLFW itself would end the program.)
+        RenderingUnavailableError: No display found.
     """
     if sys.platform != "linux":
         return
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RenderingUnavailableError(
-            "MuJoCo's window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
-            "Use the browser viewer instead (--viewer viser)."
+            "MuJoCo's window: expected a display, but DISPLAY and WAYLAND_DISPLAY are not set; "
+            "use the browser viewer (--viewer viser)."
         )
     import glfw
 
     if not glfw.init():
         raise RenderingUnavailableError(
             f"MuJoCo's window cannot open on DISPLAY={os.environ.get('DISPLAY')!r}: the display "
-            "server does not answer. Use the browser viewer instead (--viewer viser)."
+            "server does not answer; use the browser viewer (--viewer viser)."
         )
 
 
 class MousePush:
-    """Turns the window's mouse force into `qfrc_applied` of one environment.
+    """Conversion of the window's mouse force into `qfrc_applied` of one environment.
 
-    Wrenches that tasks script stay in `xfrc_applied`, and generalised forces that a task wrote
-    itself are added to, not replaced: they are put back when the push ends.
+    Wrenches of the task stay in `xfrc_applied`. The push adds to generalized forces of the task,
+    which are restored when the push ends.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -371,33 +372,33 @@ class MousePush:
 
     @property
     def active(self) -> bool:
-        """Whether a force of the mouse stands in an environment."""
+        """True if a mouse force is applied to an environment."""
         return self._env_idx is not None
 
     def apply(
         self, sim: Any, env_idx: int, data: mujoco.MjData, perturb: mujoco.MjvPerturb
     ) -> None:
-        """Write the force of `perturb` for the next step; `data` holds the state it acts on."""
+        """Write the force of `perturb`, acting on the state in `data`, for the next step."""
         if not perturb.active or perturb.select <= 0:
             self.release(sim)
             return
         if self._env_idx != env_idx:
             self.release(sim)
-        # A reset or the task overwrote the row: what stands there now is the task's.
-        if self._base is None or not self._is_ours(sim, env_idx):
+        # If a reset or the task overwrote the row, its values are those of the task.
+        if self._base is None or not self._is_unchanged(sim, env_idx):
             self._base = _row(sim, env_idx)
         self._env_idx = env_idx
-        self._write(sim, env_idx, self._base + self._generalised_force(data, perturb))
+        self._write(sim, env_idx, self._base + self._generalized_force(data, perturb))
 
     def release(self, sim: Any) -> None:
-        """Take the push back; what the environment itself applies stays."""
+        """Remove the push; forces applied by the environment stay."""
         if self._env_idx is None or self._base is None:
             return
-        if self._is_ours(sim, self._env_idx):
+        if self._is_unchanged(sim, self._env_idx):
             self._write(sim, self._env_idx, self._base)
         self._env_idx = self._base = self._written = None
 
-    def _is_ours(self, sim: Any, env_idx: int) -> bool:
+    def _is_unchanged(self, sim: Any, env_idx: int) -> bool:
         return self._written is not None and np.array_equal(_row(sim, env_idx), self._written)
 
     def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
@@ -405,7 +406,7 @@ class MousePush:
         rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
         self._written = _row(sim, env_idx)
 
-    def _generalised_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
+    def _generalized_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
         scripted = data.xfrc_applied.copy()
         data.xfrc_applied[:] = 0.0
         mujoco.mjv_applyPerturbForce(self._model, data, perturb)
@@ -424,7 +425,7 @@ def _row(sim: Any, env_idx: int) -> np.ndarray:
 def reward_figures(
     history: TermHistory, viewport: mujoco.MjrRect, cfg: PlotCfg
 ) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
-    """Return one figure per term and its place, for the first `cfg.max_viewports` terms."""
+    """Return one figure per term and its viewport, for the first `cfg.max_viewports` terms."""
     figures = []
     for place, name in zip(
         compute_viewports(len(history.names), viewport, cfg), history.names, strict=False
@@ -438,7 +439,7 @@ def reward_figures(
         figure.linewidth = 2.0
         figure.range[0][:] = (-cfg.history, 0)
         figure.linergb[0][:] = (0.3, 0.8, 1.0)
-        # The points are x, y pairs in one row; values that are not finite leave a gap.
+        # Points are x, y pairs in one row; non-finite values are left out.
         latest = values[-(figure.linedata.shape[1] // 2) :]
         steps = np.arange(1 - len(latest), 1)
         shown = np.isfinite(latest)
@@ -451,15 +452,15 @@ def reward_figures(
 
 
 def compute_viewports(num_plots: int, rect: mujoco.MjrRect, cfg: PlotCfg) -> list[mujoco.MjrRect]:
-    """Return the places of `num_plots` plots in `rect`: from the top, columns from the right."""
+    """Return the viewports of `num_plots` plots in `rect`: from the top, columns from the right."""
     count = min(num_plots, cfg.max_viewports)
     if count < 1:
         return []
-    most_columns = math.ceil(cfg.max_viewports / cfg.max_rows_per_col)
+    max_columns = math.ceil(cfg.max_viewports / cfg.max_rows_per_col)
     columns = math.ceil(count / cfg.max_rows_per_col)
     rows = max(math.ceil(count / columns), cfg.min_rows_per_col)
     rows = min(rows, cfg.max_rows_per_col)
-    width = int(cfg.plot_strip_fraction * rect.width) // most_columns
+    width = int(cfg.plot_strip_fraction * rect.width) // max_columns
     height = rect.height // rows
     right, top = rect.left + rect.width, rect.bottom + rect.height
     cells = (divmod(index, rows) for index in range(count))
@@ -482,7 +483,7 @@ def make_empty_figure(
         title: Title of the figure.
         grid_size: Number of grid lines along x and y.
         yrange: Lowest and highest y shown.
-        history: Number of points, at most what MuJoCo has room for (1001).
+        history: Number of points, at most MuJoCo's maximum (1001).
         alpha: Opacity of the black background.
     """
     figure = mujoco.MjvFigure()
@@ -508,6 +509,6 @@ def plot_scale(values: np.ndarray, cfg: PlotCfg) -> tuple[int, float, float]:
         return 0, *cfg.init_yrange
     exponent = 0 if 0.01 <= magnitude < 1000.0 else math.floor(math.log10(magnitude))
     low, high = np.percentile(finite / 10.0**exponent, [cfg.p_lo, cfg.p_hi])
-    # A flat curve gets a range too, wide enough for the labels of its axis to differ.
+    # Widen the range of a flat curve so that the labels of its axis differ.
     padding = cfg.pad * max(high - low, 0.4 * abs(high), 0.4 * abs(low), cfg.min_span)
     return exponent, float(low - padding), float(high + padding)

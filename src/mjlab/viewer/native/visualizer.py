@@ -1,4 +1,4 @@
-"""Debug drawing into an `MjvScene`, used by the native window and the offscreen renderer."""
+"""Debug visualizer for `MjvScene`, used by the native window and the offscreen renderer."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ log = logging.getLogger(__name__)
 
 
 class MujocoNativeDebugVisualizer(DebugVisualizer):
-    """Appends what terms draw to the geoms of a MuJoCo scene.
+    """Debug visualizer that appends geoms to a MuJoCo scene.
 
-    A scene has room for a fixed number of geoms. What does not fit is left out, with one warning.
+    A scene has a maximum number of geoms. Further geoms are dropped, with one warning.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         self._ghost_data: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         self._ghost_option = mujoco.MjvOption()
         self._ghost_option.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = True
-        # A ghost is a shape: its sites, joint axes and tendons would only clutter the view.
+        # Hide sites and tendons of ghosts: they clutter the view.
         self._ghost_option.sitegroup[:] = 0
         self._ghost_option.tendongroup[:] = 0
 
@@ -44,7 +44,7 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         return float(self.mj_model.stat.meansize)
 
     def begin(self, env_idx: int, show_all_envs: bool) -> None:
-        """Start a frame: draw after what the scene holds now, for these environments."""
+        """Start a frame: append to the current geoms of the scene, for these environments."""
         self.env_idx = env_idx
         self.show_all_envs = show_all_envs
         self._first_geom = self.scn.ngeom
@@ -107,7 +107,7 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         alpha: float = 0.5,
         label: str | None = None,
     ) -> None:
-        # The model is kept beside its data, so that its id cannot be reused by another model.
+        # Keep a reference to the model, so that another model cannot reuse its id.
         _, data = self._ghost_data.setdefault(id(model), (model, mujoco.MjData(model)))
         pose_ghost(data, qpos, mocap_pos, mocap_quat)
         compute_poses(model, data)
@@ -124,8 +124,8 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         if not self._warned_full:
             self._warned_full = True
             log.warning(
-                "The drawing is full: it holds %d geoms. Some debug drawings are left out; "
-                "draw fewer environments or fewer items.",
+                "The scene is full (%d geoms) and some debug drawings are left out; draw fewer "
+                "environments or fewer items.",
                 self.scn.maxgeom,
             )
 

@@ -1,4 +1,4 @@
-"""The browser viewer, built on viser and mjviser."""
+"""Browser viewer, based on viser and mjviser."""
 
 from __future__ import annotations
 

@@ -14,13 +14,13 @@ import viser.transforms as vtf
 from mjlab.sensor import CameraSensor
 from mjlab.viewer.model_sync import to_numpy
 
-# Enlarged images are not wider than the panel.
+# Maximum size of enlarged images: the width of the panel.
 _PANEL_PIXELS = 384
-# Metres shown white: least, most, step and first value of the slider.
-_RANGE, _STEP, _FIRST_RANGE = (0.1, 10.0), 0.1, 1.0
+# Slider of the depth shown white (m): range, step and initial value.
+_RANGE, _STEP, _INITIAL_RANGE = (0.1, 10.0), 0.1, 1.0
 _FRUSTUM_LENGTH = 0.08
 _FRUSTUM_COLOR = (250, 176, 5)
-# A camera looks along -z with y up; the page's frustums look along z with y down.
+# MuJoCo cameras look along -z with y up; viser's frustums look along z with y down.
 _TO_FRUSTUM = vtf.SO3(np.array([0.0, 1.0, 0.0, 0.0]))
 
 
@@ -37,15 +37,15 @@ class ViserCameraViewer:
         sim_model: Any | None = None,
         request_redraw: Callable[[], None] | None = None,
     ) -> None:
-        """Add the folder to the current place in the page.
+        """Add the folder to the current GUI container.
 
         Args:
             server: The page's server.
             camera_sensor: Initialized camera sensor.
-            mj_model: The compiled model.
-            min_display_size: Size in pixels that images are enlarged to, if the panel has room.
-            sim_model: Batched model, for fields of view that differ per environment.
-            request_redraw: Called when a control was changed.
+            mj_model: Compiled model.
+            min_display_size: Size that images are enlarged to, if the panel has room (pixels).
+            sim_model: Batched model, for per-environment fields of view.
+            request_redraw: Called when a control changes.
         """
         self._server, self._sensor = server, camera_sensor
         self._model, self._sim_model = mj_model, sim_model
@@ -65,11 +65,11 @@ class ViserCameraViewer:
                         min=_RANGE[0],
                         max=_RANGE[1],
                         step=_STEP,
-                        initial_value=_FIRST_RANGE,
-                        hint="What is so far away or farther, or not there, is white.",
+                        initial_value=_INITIAL_RANGE,
+                        hint="Depths from here on, and pixels without depth, are white.",
                     )
             self._shows_frustum = gui.add_checkbox(
-                "Frustum", True, hint="Show in the scene what the camera looks at."
+                "Frustum", True, hint="Show the camera's view frustum in the scene."
             )
         if request_redraw is not None:
             for control in (self._range, self._shows_frustum):
@@ -83,8 +83,8 @@ class ViserCameraViewer:
 
         Args:
             sim_data: Batched data of the simulation.
-            env_idx: The environment.
-            scene_offset: Translation of the drawn scene, (3,); None: not moved.
+            env_idx: Environment.
+            scene_offset: Translation of the drawn scene, (3,). None: zero.
         """
         data = self._sensor.data
         for kind, handle in self._images.items():
@@ -140,13 +140,13 @@ class ViserCameraViewer:
 
 
 def vertical_angle(fovy: float, sensorsize: np.ndarray, focal: float, aspect: float) -> float:
-    """Return the vertical field of view, in radians, of an image with this width by height.
+    """Return the vertical field of view of an image with this aspect ratio (rad).
 
     Args:
-        fovy: The camera's own, in degrees; for a camera without a sensor.
-        sensorsize: (2,) width and height of the sensor, of which the image's shape is used.
+        fovy: Vertical field of view of the camera (degrees), used if it has no sensor.
+        sensorsize: Width and height of the sensor, cropped to the image's aspect ratio, (2,).
         focal: Vertical focal length.
-        aspect: Width by height of the image.
+        aspect: Width / height of the image.
     """
     width, height = (float(side) for side in sensorsize)
     if height == 0.0:
@@ -155,7 +155,7 @@ def vertical_angle(fovy: float, sensorsize: np.ndarray, focal: float, aspect: fl
 
 
 def enlarged(image: np.ndarray, min_size: int = 128) -> np.ndarray:
-    """Enlarge an image (H, W, 3) by a whole factor, to `min_size` pixels or the panel's size."""
+    """Enlarge an image (H, W, 3) by an integer, to `min_size` pixels or the panel's size."""
     height, width = image.shape[:2]
     factor = -(-min_size // min(height, width))
     factor = max(1, min(factor, _PANEL_PIXELS // max(height, width)))
@@ -163,21 +163,21 @@ def enlarged(image: np.ndarray, min_size: int = 128) -> np.ndarray:
 
 
 def depth_colors(depth: np.ndarray, white: float) -> np.ndarray:
-    """Return grey levels (H, W, 3) of depths (H, W, 1) in metres: black is near.
+    """Return gray levels (H, W, 3) of depths (m), (H, W, 1): black is near.
 
-    What is `white` metres away or farther is white, and so is where there is nothing (0).
+    Depths >= `white` are white. Depth 0 (no hit) is white too.
     """
     brightness = np.clip(np.where(depth > 0.0, depth / white, 1.0), 0.0, 1.0)
     return np.repeat((255.0 * brightness).astype(np.uint8), 3, axis=-1)
 
 
 def segmentation_colors(objects: np.ndarray) -> np.ndarray:
-    """Return colours (H, W, 3) of objects (H, W, 2), ids and types; black where there is none.
+    """Return colors (H, W, 3) of object IDs and types (H, W, 2); background pixels are black.
 
-    An object has the same colour in all images, and neighbouring ids have different ones.
+    An object has the same color in all images, and neighboring IDs have different colors.
     """
     ids, kinds = objects[..., 0].astype(np.uint32), objects[..., 1].astype(np.uint32)
-    # Bits of a product with a large odd number are spread out (Knuth's multiplicative hash).
+    # Knuth's multiplicative hash: multiplying by a large odd number spreads the bits.
     mixed = ids * np.uint32(2654435761) + kinds * np.uint32(40503)
     mixed ^= mixed >> np.uint32(15)
     mixed *= np.uint32(2246822519)

@@ -1,4 +1,4 @@
-"""The module where releases 1.1 and 1.2 made meshes for the browser; today mjviser does."""
+"""Mesh conversions of releases 1.1 and 1.2, now done by mjviser."""
 
 from __future__ import annotations
 

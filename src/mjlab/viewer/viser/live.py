@@ -1,4 +1,4 @@
-"""The browser viewer of a policy that is still learning."""
+"""Browser viewer of a policy during training."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
 
-# Times in seconds between two looks: for a browser while there is none, and for new weights.
+# Polling periods (s): for browsers while none is connected, for new weights, for the panel.
 _SLEEP_UNWATCHED = 0.25
 _WEIGHTS_PERIOD = 0.25
 _PANEL_PERIOD = 0.5
@@ -23,12 +23,12 @@ Stats = Mapping[str, Any]
 
 
 class LiveViewer(ViserPlayViewer):
-    """Plays the newest policy of a training run, and says how far training has got.
+    """Viewer that plays the newest policy of a training run and shows the training progress.
 
-    Without a browser nothing is stepped or drawn.
+    Without a connected browser, the viewer neither steps nor draws.
     """
 
-    # Half of what the eye would like: what is left to do is training's.
+    # Low rate, to leave the cores to training.
     scene_period = 1.0 / 20.0
 
     def __init__(
@@ -45,11 +45,11 @@ class LiveViewer(ViserPlayViewer):
         Args:
             env: Environment or wrapper whose observations `policy` takes.
             policy: Maps observations to actions; `take_stats` changes its weights.
-            viser_server: The page's server.
-            title: What is trained.
-            take_stats: Takes new weights over; returns the figures (`IterationStats`) of their
-                iteration, or None if there are no new ones.
-            set_watched: Is told whether a browser is connected, when that changes.
+            viser_server: Server of the page.
+            title: Name of the task.
+            take_stats: Loads new weights; returns the statistics (`IterationStats`) of their iteration, or
+                None if unchanged.
+            set_watched: Called with True when a browser connects, False when the last one disconnects.
         """
         super().__init__(env, policy, frame_rate=20.0, viser_server=viser_server)
         self._title = title
@@ -62,14 +62,14 @@ class LiveViewer(ViserPlayViewer):
         self._panel: viser.GuiHtmlHandle | None = None
 
     def tick(self) -> bool:
-        """Do what is due, while a browser is connected; sleep while none is."""
+        """Step, draw and load weights if a browser is connected; otherwise sleep."""
         watched = bool(self._server.get_clients())
         if watched != self._watched:
             self._watched = watched
             self._set_watched(watched)
         if not watched:
             time.sleep(_SLEEP_UNWATCHED)
-            # No time has passed for the simulation either.
+            # The simulation is paused as well.
             self._last_tick = time.perf_counter()
             return True
         now = time.perf_counter()
@@ -84,7 +84,7 @@ class LiveViewer(ViserPlayViewer):
         return super().tick()
 
     def add_first_panels(self) -> None:
-        """Add the progress of training."""
+        """Add the panel of training progress."""
         with self._server.gui.add_folder("Training"):
             self._panel = self._server.gui.add_html("")
         self._show_progress()
@@ -98,12 +98,12 @@ class LiveViewer(ViserPlayViewer):
 
 
 def progress_html(title: str, stats: Stats | None, age: float) -> str:
-    """How far training has got, with a bar.
+    """Return the training progress as HTML, with a progress bar.
 
     Args:
-        title: What is trained.
-        stats: Figures of the iteration that the shown policy comes from; None before the first.
-        age: Seconds since the policy came.
+        title: Name of the task.
+        stats: Statistics of the shown policy's iteration; None before the first iteration.
+        age: Age of the policy (s).
     """
     name = f"<div><strong>{html.escape(title)}</strong></div>"
     style = "padding:0.25em 1em;font-size:0.85em;line-height:1.5"
@@ -123,7 +123,9 @@ def progress_html(title: str, stats: Stats | None, age: float) -> str:
         ("Policy", f"{age:.0f} s old"),
     ]
     lines = "".join(f"<div><strong>{row}:</strong> {value}</div>" for row, value in rows)
-    lines += '<div style="opacity:0.6">The view takes only the time that training leaves.</div>'
+    lines += (
+        '<div style="opacity:0.6">The view runs at low priority; training takes precedence.</div>'
+    )
     return f'<div style="{style}">{name}{bar}{lines}</div>'
 
 

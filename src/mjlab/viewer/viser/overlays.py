@@ -1,4 +1,4 @@
-"""Parts of the browser viewer that follow the environment in view: plots, cameras, drawings."""
+"""Overlays of the browser viewer for the environment in view: plots, cameras, drawings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mjlab.viewer.viser.term_plotter import ViserTermPlotter
 if TYPE_CHECKING:
     from mjlab.viewer.viser.scene import MjlabViserScene
 
-# Plots are sent at most this often, however fast the environment is stepped.
+# Minimum wall time between updates of the plots, regardless of the step rate.
 _REFRESH_PERIOD_S = 0.2
 
 
@@ -28,19 +28,19 @@ class ViserTermOverlays:
 
     server: viser.ViserServer
     env: Any
-    """Environment, unwrapped."""
+    """Unwrapped environment."""
     scene: MjlabViserScene
     frame_time: float
     """Time between two calls of `update` that record (s)."""
     reward_bar_max_terms: int = 20
-    """Number of reward terms that have a bar."""
+    """Number of reward terms shown as bars."""
     reward_plotter: ViserTermPlotter | None = None
     reward_bar_panel: RewardBarPanel | None = None
     metrics_plotter: ViserTermPlotter | None = None
     _next_refresh: float = field(default=0.0, init=False, repr=False)
 
     def setup_tabs(self, tabs: viser.GuiTabGroupHandle) -> None:
-        """Add a tab for the rewards and, if the environment has any, one for the metrics."""
+        """Add a Rewards tab and, if the environment has metrics, a Metrics tab."""
         env_idx = self.scene.env_idx
         names = list(self.env.reward_manager.active_terms)
         with tabs.add_tab("Rewards", icon=viser.Icon.CHART_BAR):
@@ -56,8 +56,8 @@ class ViserTermOverlays:
                 )
 
     def update(self, paused: bool) -> None:
-        """Record the terms of the environment in view unless `paused`; show them a few times a
-        second."""
+        """Record the terms of the environment in view unless `paused`; refresh the plots a few
+        times per second."""
         if not paused:
             env_idx = self.scene.env_idx
             rewards = list(self.env.reward_manager.get_active_iterable_terms(env_idx))
@@ -74,14 +74,14 @@ class ViserTermOverlays:
                 panel.refresh()
 
     def on_env_switch(self) -> None:
-        """Start over with the environment that is now in view."""
+        """Clear the plots and switch them to the environment now in view."""
         for plotter in (self.reward_plotter, self.metrics_plotter):
             if plotter is not None:
                 plotter.update_env_idx(self.scene.env_idx)
         self.clear_histories()
 
     def clear_histories(self) -> None:
-        """Forget the recorded values."""
+        """Clear the recorded values."""
         for panel in self._panels:
             panel.clear_histories()
 
@@ -103,20 +103,20 @@ class ViserCameraOverlays:
 
     server: viser.ViserServer
     env: Any
-    """Environment, unwrapped."""
+    """Unwrapped environment."""
     mj_model: mujoco.MjModel
     camera_viewers: list[ViserCameraViewer] | None = None
     request_redraw: Callable[[], None] | None = None
-    """Called when a control was changed."""
+    """Called when a control changes."""
     _folder: viser.GuiFolderHandle | None = field(default=None, init=False, repr=False)
 
     @property
     def has_cameras(self) -> bool:
-        """True if there is an image to show."""
+        """True if the environment has a camera sensor."""
         return bool(self.camera_viewers)
 
     def setup_controls(self) -> None:
-        """Add a folder with one viewer per camera sensor to the current place in the page."""
+        """Add a folder with one viewer per camera sensor to the current GUI container."""
         sensors = [s for s in self.env.scene.sensors.values() if isinstance(s, CameraSensor)]
         self.camera_viewers = []
         if not sensors:
@@ -154,17 +154,17 @@ class ViserDebugOverlays:
     """Debug drawings of the environment."""
 
     env: Any
-    """Environment, unwrapped."""
+    """Unwrapped environment."""
     scene: MjlabViserScene
 
     def queue(self) -> None:
-        """Let the environment draw; the scene shows it at its next update."""
+        """Let the environment draw; the next scene update shows the drawings."""
         if self.scene.debug_visualization_enabled:
             self.scene.clear()
             self.env.update_visualizers(self.scene)
 
     def on_env_switch(self) -> None:
-        """Remove the drawings of the environment that was in view."""
+        """Remove the drawings of the previous environment."""
         self.scene.clear_debug_all()
 
 
@@ -175,10 +175,10 @@ class ViserContactOverlays:
     scene: MjlabViserScene
 
     def is_enabled(self) -> bool:
-        """Return whether contact points or forces are shown."""
+        """Return True if contact points or forces are shown."""
         return bool(self.scene.show_contact_points or self.scene.show_contact_forces)
 
     def on_env_switch(self) -> None:
-        """Ask for a redraw with the contacts of the environment that is now in view."""
+        """Request a redraw with the contacts of the environment now in view."""
         if self.is_enabled():
             self.scene.request_update()

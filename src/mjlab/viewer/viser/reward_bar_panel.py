@@ -1,4 +1,4 @@
-"""Bars that compare the terms of the reward."""
+"""Bar chart of reward terms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POSITIVE, _NEGATIVE = "#2f9e44", "#e03131"
 class RewardBarPanel:
     """One bar per reward term: its mean over the last second.
 
-    The longest bar is the largest magnitude; green adds to the reward, red takes from it.
+    The longest bar is the largest magnitude. Green: positive, red: negative.
     """
 
     def __init__(
@@ -29,17 +29,17 @@ class RewardBarPanel:
         update_dt: float,
         max_terms: int = 20,
     ) -> None:
-        """Add the panel to the current place in the page.
+        """Add the panel to the current GUI container.
 
         Args:
             server: The page's server.
             term_names: Names of the reward terms.
             update_dt: Time between two calls of `update` (s).
-            max_terms: Number of terms shown; the rest is left out, with a warning.
+            max_terms: Maximum number of terms shown. More terms log a warning.
         """
         if len(term_names) > max_terms:
             log.warning(
-                "The reward has %d terms; bars show the first %d. Raise "
+                "The reward has %d terms and bars show the first %d; increase "
                 "viewer.reward_bar_max_terms to see more.",
                 len(term_names),
                 max_terms,
@@ -51,12 +51,12 @@ class RewardBarPanel:
         self.refresh()
 
     def update(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
-        """Record a value per term, and show the means."""
+        """Record a value per term and show the means."""
         self.add(terms)
         self.refresh()
 
     def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
-        """Record a value per term; the page changes at the next `refresh`."""
+        """Record a value per term; the next `refresh` shows it."""
         self._history.add(terms)
 
     def refresh(self) -> None:
@@ -72,7 +72,7 @@ class RewardBarPanel:
             self._shown = self._html.content = content
 
     def clear_histories(self) -> None:
-        """Forget the recorded values."""
+        """Clear the recorded values."""
         self._history.clear()
 
     def cleanup(self) -> None:

@@ -1,6 +1,6 @@
-"""The 3-D scene of the browser viewer: mjviser's scene, our camera, debug drawings.
+"""3-D scene of the browser viewer: mjviser's scene with a camera and debug drawings.
 
-`MjlabViserScene` is the scene; `GeomVariants` draws the shapes that differ between its environments.
+`MjlabViserScene` is the scene; `GeomVariants` draws per-environment shapes.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _CHECK_PERIOD_S = 1.0
 
 @offers_older_static_methods
 class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
-    """mjviser's scene of all environments, a debug visualizer, and a camera.
+    """mjviser's scene of all environments, with a debug visualizer and a camera.
 
-    Following a body moves the scene, not the camera, so that the person keeps control of it.
-    `add_*` queues debug drawings, which `update` and its siblings show until `clear`. A control of
-    the page redraws the last state in a thread of the server; where the state belongs to another
-    thread, `set_refresh_handler` lets controls only ask for a redraw.
+    Following a body moves the scene, not the camera, so that the user keeps control of the camera.
+    `add_*` queues debug drawings; `update*` shows them until `clear`. Controls of the page redraw
+    the last state in a thread of the server. If another thread owns the state, use
+    `set_refresh_handler` to make controls only request a redraw.
     """
 
     def __init__(
@@ -62,24 +62,24 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         geom_group: tuple[int, ...] = (1, 1, 1, 0, 0, 0),
         site_group: tuple[int, ...] = (1, 1, 1, 0, 0, 0),
     ) -> None:
-        """Send the shapes of `mj_model` to the page, `num_envs` times.
+        """Send the geoms of `mj_model` to the page for `num_envs` environments.
 
         Args:
             server: The page's server.
-            mj_model: The compiled scene. mjviser writes colors and sizes into its visual settings.
+            mj_model: Compiled scene. mjviser writes colors and sizes into its visual settings.
             num_envs: Number of environments to draw.
             sim_model: Batched model, to draw the randomized fields of each environment. The scene
-                then works on a copy of `mj_model`.
+                then copies `mj_model`.
             expanded_fields: Names of the per-environment fields of `sim_model`.
-            view: Camera. None: the whole model, then the arguments of `create_scene_gui`.
-            geom_group: Geom groups that are visible at first.
-            site_group: Site groups that are visible at first.
+            view: Camera. None: the whole model until `create_scene_gui` sets the camera.
+            geom_group: Initially visible geom groups.
+            site_group: Initially visible site groups.
         """
         if sim_model is not None:
             mj_model = host_model(mj_model)
         ViserMujocoScene.__init__(self, server, mj_model, num_envs)
         ViserDebugVisualizer.__init__(self, server, mj_model)
-        # As mjviser has them, contact points disappear in a robot's feet.
+        # mjviser's default contact points are hidden inside a robot's feet.
         mj_model.vis.scale.contactwidth *= _CONTACT_WIDENING
         self._has_own_view = view is not None
         self.view = view if view is not None else whole_model_view(mj_model)
@@ -99,7 +99,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
 
     @property
     def offset(self) -> np.ndarray:
-        """Translation of the scene when it was drawn last, (3,)."""
+        """Translation of the scene at the last update, (3,)."""
         return self._scene_offset
 
     @property
@@ -109,18 +109,17 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         return float(self.mj_model.stat.meansize) if override is None else override
 
     def get_env_indices(self, num_envs: int) -> Iterable[int]:
-        """Return the environments that debug drawings are for: of the visible ones."""
+        """Return the environments to draw debug items for, among the visible ones."""
         if self.show_only_selected:
             return (self.env_idx,) if self.env_idx < num_envs else ()
         return super().get_env_indices(num_envs)
 
     def update(self, wp_data: Any, env_idx: int | None = None) -> None:
-        """Show the present state of all environments; call it between steps.
+        """Show the current state of all environments; call between steps.
 
         Args:
-            wp_data: A `Simulation` or its data. Everything drawn is copied before it is sent.
-            env_idx: Environment whose overlays are drawn and whose body is followed. None: the
-                selected one.
+            wp_data: A `Simulation` or its data. All values are copied before sending.
+            env_idx: Environment of the overlays and the followed body. None: the selected one.
         """
         if env_idx is None:
             env_idx = self.env_idx
@@ -153,9 +152,9 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         qvel: np.ndarray | None = None,
         ctrl: np.ndarray | None = None,
     ) -> None:
-        """Show body poses; (num_envs, nbody, 3) and (num_envs, nbody, 3, 3).
+        """Show body poses, (num_envs, nbody, 3) and (num_envs, nbody, 3, 3).
 
-        `qpos` and `qvel` are for contacts and other overlays that MuJoCo computes.
+        `qpos` and `qvel` are for contacts and other overlays computed by MuJoCo.
         """
         self._sync_model_fields(self.env_idx if env_idx is None else env_idx)
         super().update_from_arrays(
@@ -163,7 +162,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         )
 
     def aim(self) -> None:
-        """Put every connected camera where the configuration wants it."""
+        """Move the camera of every connected client to the configured view."""
         for client in self.server.get_clients().values():
             client.camera.position = self._look_at() + self.view.offset()
             client.camera.look_at = self._look_at()
@@ -176,15 +175,16 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         show_debug_viz_control: bool = True,
         debug_viz_extra_gui: Callable[[], None] | None = None,
     ) -> None:
-        """Add environment, camera and debug controls to the current place in the page.
+        """Add environment, camera and debug controls to the current GUI container.
 
         Args:
-            camera_distance: Distance of the camera (m), unless the scene was given a `view`. Not
-                positive: the whole model is in view.
-            camera_azimuth: Azimuth of that camera in degrees.
-            camera_elevation: Elevation of that camera in degrees; positive is above the scene.
-            show_debug_viz_control: Add the switches of debug drawings.
-            debug_viz_extra_gui: Called to add more switches beside those.
+            camera_distance: Distance of the camera (m), for scenes without `view`. <= 0: show the
+                whole model.
+            camera_azimuth: Azimuth of the camera (degrees), for scenes without `view`.
+            camera_elevation: Elevation of the camera (degrees), for scenes without `view`.
+                Positive: above the scene.
+            show_debug_viz_control: Add controls of debug drawings.
+            debug_viz_extra_gui: Called to add further controls of debug drawings.
         """
         if not self._has_own_view:
             self.view = dataclasses.replace(
@@ -244,7 +244,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         return tabs
 
     def create_groups_gui(self, tabs: viser.GuiTabGroupHandle | None = None) -> None:
-        """Add the switches of geom and site groups to the current place, or to a tab of `tabs`."""
+        """Add geom and site group checkboxes to the current container, or to a tab of `tabs`."""
         place = contextlib.nullcontext()
         if tabs is not None:
             place = tabs.add_tab("Groups", icon=viser.Icon.LAYERS_INTERSECT)
@@ -324,7 +324,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             "Track camera",
             self.camera_tracking_enabled,
             disabled=self._tracked_body_id is None,
-            hint="Keep the followed body in the middle.",
+            hint="Keep the followed body centered.",
         )
         fov = gui.add_slider(
             "FOV (°)",
@@ -334,7 +334,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             initial_value=round(self._fov()),
             hint="Vertical field of view.",
         )
-        again = gui.add_button("Reset camera", icon=viser.Icon.VIDEO)
+        reset = gui.add_button("Reset camera", icon=viser.Icon.VIDEO)
 
         @track.on_update
         def _(_: Any) -> None:
@@ -348,16 +348,16 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             for client in self.server.get_clients().values():
                 client.camera.fov = float(np.deg2rad(fov.value))
 
-        @again.on_click
+        @reset.on_click
         def _(_: Any) -> None:
             self.aim()
 
 
 class GeomVariants:
-    """Replaces mjviser's one shape for all environments where randomisation made them differ.
+    """Per-environment shapes of randomized geoms, in place of mjviser's shared shape.
 
-    Environments and bodies that look alike share a batch. Shapes are sent again when the fields
-    have changed, at most once a second: randomisation at resets changes them often.
+    Environments and bodies with equal appearance share a batch. Changed fields resend the shapes,
+    at most once per second: randomization at resets changes them often.
     """
 
     def __init__(self, scene: ViserMujocoScene, sim_model: Any, expanded_fields: set[str]):
@@ -365,7 +365,7 @@ class GeomVariants:
         self._scene = scene
         self._sim_model = sim_model
         self._fields = _SHAPE_FIELDS & expanded_fields
-        # What mjviser drew. The scene's own model is overwritten with the selected environment's.
+        # Model that mjviser drew. The scene's model is overwritten for the selected environment.
         self._base = copy.copy(scene.mj_model)
         self._shapes: dict[Any, _Shape] = {}
         self._taken_over: set[tuple[int, int]] = set()
@@ -375,7 +375,7 @@ class GeomVariants:
     def update(
         self, body_xpos: np.ndarray, body_xmat: np.ndarray, env_idx: int, offset: np.ndarray
     ) -> None:
-        """Move the shapes to (num_envs, nbody, ...) poses; make them again if they changed."""
+        """Move the shapes to poses (num_envs, nbody, ...); rebuild them if the fields changed."""
         now = time.perf_counter()
         if now >= self._next_check:
             self._next_check = now + _CHECK_PERIOD_S
@@ -404,13 +404,13 @@ class GeomVariants:
         for shape in self._shapes.values():
             shape.handle.remove()
         self._shapes = {}
-        # Batches of mjviser with a varying geom are removed: they are drawn here from now on.
+        # Remove mjviser's batches with a varying geom: their bodies are drawn here instead.
         model, varying = self._base, _varying_geoms(self._base, values)
         for batch in list(self._scene._mesh_groups):
             geoms = np.isin(model.geom_bodyid, batch.body_ids)
             if (varying & geoms & (model.geom_group == batch.group_id)).any():
                 batch.handle.remove()
-                # Batches hold arrays, so that they cannot be compared as `remove` would do.
+                # `list.remove` fails: batches hold arrays, and == on arrays is elementwise.
                 groups = self._scene._mesh_groups
                 groups[:] = [other for other in groups if other is not batch]
                 self._taken_over |= {(int(body), batch.group_id) for body in batch.body_ids}
@@ -419,16 +419,16 @@ class GeomVariants:
 
     def _build(self) -> None:
         model = copy.copy(self._base)
-        borrowed = False
+        exceeded = False
         for env_idx in range(self._scene.num_envs):
             sync_model_fields(model, self._sim_model, self._fields, env_idx)
             for body, group in sorted(self._taken_over):
                 for part, geom_ids in enumerate(_drawn_geoms(model, body, group)):
-                    look = self._scene._geom_subgroup_fingerprint(model, geom_ids, False)
-                    key: Any = (look, group)
+                    appearance = self._scene._geom_subgroup_fingerprint(model, geom_ids, False)
+                    key: Any = (appearance, group)
                     if key not in self._shapes and len(self._shapes) >= _MAX_SHAPES:
-                        # Past the limit, a body keeps the look that the model file gives it.
-                        borrowed, key = True, (body, group, part)
+                        # Beyond the limit, bodies keep the appearance of the model file.
+                        exceeded, key = True, (body, group, part)
                         model_of_key = self._base
                     else:
                         model_of_key = model
@@ -444,13 +444,13 @@ class GeomVariants:
                         self._shapes[key] = _Shape(handle, group)
                     self._shapes[key].envs.append(env_idx)
                     self._shapes[key].bodies.append(body)
-        if borrowed:
-            log.warning("More than %d different shapes; the rest are drawn alike.", _MAX_SHAPES)
+        if exceeded:
+            log.warning("More than %d distinct shapes; others use the model's shape.", _MAX_SHAPES)
 
 
 @dataclass
 class _Shape:
-    """One look, and the environments and bodies that have it."""
+    """Batched mesh, and the environments and bodies that use it."""
 
     handle: viser.BatchedGlbHandle
     group: int
@@ -459,7 +459,7 @@ class _Shape:
 
 
 def _varying_geoms(model: mujoco.MjModel, values: dict[str, np.ndarray]) -> np.ndarray:
-    """Which geoms (ngeom,) look unlike those of `model` in some environment."""
+    """Return the mask of geoms that differ from `model` in some environment, (ngeom,)."""
     varying = np.zeros(model.ngeom, dtype=bool)
     for name, value in values.items():
         base = np.asarray(getattr(model, name)).reshape(value.shape[1:])
@@ -474,7 +474,7 @@ def _varying_geoms(model: mujoco.MjModel, values: dict[str, np.ndarray]) -> np.n
 
 
 def _drawn_geoms(model: mujoco.MjModel, body: int, group: int) -> list[list[int]]:
-    """Drawn geoms of one body and group, split where textures keep them from being merged."""
+    """Return the drawn geoms of one body and group, split by textures that prevent merging."""
     ids = np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == group))
     drawn = [int(i) for i in ids if model.geom_rgba[i, 3] > 0]
     return group_geoms_by_visual_compat(model, drawn) if drawn else []

@@ -1,4 +1,4 @@
-"""Curves of named terms over the last environment steps, one plot a term."""
+"""Plots of terms over the last environment steps, one per term."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _COLORS = ("#1c7ed6", "#2f9e44", "#e8590c", "#9c36b5", "#0c8599", "#e03131")
 
 
 class ViserTermPlotter:
-    """Plots the terms that are ticked; a filter and All / None help with long lists."""
+    """Plots of the selected terms, with a name filter and All / None buttons."""
 
     def __init__(
         self,
@@ -28,14 +28,14 @@ class ViserTermPlotter:
         history_length: int = 150,
         env_idx: int = 0,
     ) -> None:
-        """Add the selection and the plots to the current place in the page.
+        """Add the selection and the plots to the current GUI container.
 
         Args:
             server: The page's server.
             term_names: Names of the terms.
-            name: Kind of terms, as the panel shows it.
+            name: Kind of terms, shown in the panel.
             history_length: Number of points per plot.
-            env_idx: Environment the values come from, as the panel shows it.
+            env_idx: Environment of the values, shown in the panel.
         """
         self._gui = server.gui
         self._name = name
@@ -66,16 +66,16 @@ class ViserTermPlotter:
         self.update_env_idx(env_idx)
 
     def update(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
-        """Record a point per term, and show it in the plots that are visible."""
+        """Record a point per term and update the visible plots."""
         self.add(terms)
         self.refresh()
 
     def add(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
-        """Record a point per term; the page changes at the next `refresh`."""
+        """Record a point per term; the next `refresh` shows it."""
         self.history.add(terms)
 
     def refresh(self) -> None:
-        """Send the recorded points to the plots that are visible and have changed."""
+        """Send the recorded points to the visible plots that changed."""
         for name, plot in self._plots.items():
             if not plot.visible:
                 continue
@@ -83,17 +83,17 @@ class ViserTermPlotter:
             if np.array_equal(values, self._sent.get(name, np.zeros(0)), equal_nan=True):
                 continue
             self._sent[name] = values
-            # The newest point is at 0, older ones at negative numbers of steps.
+            # x = 0 is the newest point; older points have negative x.
             steps = np.arange(1 - len(values), 1, dtype=float)
             plot.data = (steps, values) if len(values) else _EMPTY
 
     def update_env_idx(self, env_idx: int) -> None:
-        """Say that values come from another environment from now on, and forget the others."""
+        """Switch to the values of another environment and clear the recorded points."""
         self._label.content = f"<small>{self._name} terms of environment {env_idx}</small>"
         self.clear_histories()
 
     def clear_histories(self) -> None:
-        """Forget the recorded points."""
+        """Clear the recorded points."""
         self.history.clear()
 
     def cleanup(self) -> None:
@@ -104,7 +104,9 @@ class ViserTermPlotter:
         self._plots.clear()
 
     def _add_selection(self, names: list[str]) -> None:
-        pattern = self._gui.add_text("Filter", "", hint="Show only terms whose name holds this.")
+        pattern = self._gui.add_text(
+            "Filter", "", hint="Show only terms whose name contains this text."
+        )
         buttons = self._gui.add_button_group("Select", ["All", "None"])
 
         def show_chosen() -> None:

@@ -1,7 +1,7 @@
-"""The browser viewer: a page, served from this machine, that shows and controls a running policy.
+"""Browser viewer: page that shows and controls a running policy.
 
-`ViserPlayViewer` is the viewer. Its Controls tab has the status and the buttons of `SimulationControls`,
-its Checkpoints tab the `CheckpointPanel` of a `CheckpointManager`.
+`ViserPlayViewer` is the viewer. Its Controls tab has the status and buttons of
+`SimulationControls`, its Checkpoints tab the `CheckpointPanel` of a `CheckpointManager`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import torch
 import viser
 
 from mjlab.utils.errors import WrongStateError
-from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, forget
+from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, reset_policy
 from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
 from mjlab.viewer.page_server import DEFAULT_PORT as DEFAULT_PORT
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Wall time from one look at the status to the next, in seconds.
+# Wall time between updates of the status.
 _PANEL_PERIOD_S = 0.2
 _SPEED_ACTIONS = {"Slower": "speed_down", "1x": "reset_speed", "Faster": "speed_up"}
 _NONE_FOUND = "(none)"
@@ -53,37 +53,37 @@ class CheckpointManager:
     current_name: str
     """Name of the checkpoint in use."""
     fetch_available: Callable[[], list[tuple[str, str]]]
-    """Function that lists (name, age) of the checkpoints, oldest first. Called in a thread of the
+    """Function that lists (name, age) of checkpoints, oldest first. Called in a thread of the
     server."""
     load_checkpoint: Callable[[str], PolicyProtocol]
     """Function that returns the policy of a checkpoint by name. Called in the viewer's thread."""
     run_name: str | None = None
     """Name of the run. None: checkpoints are local files."""
     run_url: str | None = None
-    """Address of the run's page."""
+    """URL of the run's page."""
     run_status: str | None = None
     """Status of the run."""
 
 
 class UpdateReason(enum.Enum):
-    """Reason why the scene must be drawn again."""
+    """Reason to redraw the scene."""
 
     ACTION = enum.auto()
-    """The environment was stepped or reset."""
+    """Step or reset of the environment."""
     ENV_SWITCH = enum.auto()
-    """Another environment is in view."""
+    """Switch to another environment."""
     SCENE_REQUEST = enum.auto()
-    """A control of the page was changed."""
+    """Change of a control on the page."""
 
 
 class ViserPlayViewer(BaseViewer):
-    """Shows all environments in a web page, with controls, rewards, metrics and checkpoints.
+    """Web page with all environments, controls, rewards, metrics and checkpoints.
 
-    The page is served to this machine only, unless `host` says otherwise: whoever can open it can
-    control the run. Everything that touches the environment happens in the thread of `run`.
+    By default the page is served to this machine only, because all visitors can control the run.
+    Only the thread of `run` accesses the environment.
     """
 
-    # Wall time from one drawing of the scene to the next, in seconds.
+    # Minimum wall time between scene updates (s).
     scene_period = 1.0 / 30.0
 
     def __init__(
@@ -97,20 +97,20 @@ class ViserPlayViewer(BaseViewer):
         host: str = DEFAULT_HOST,
         port: int = DEFAULT_PORT,
     ) -> None:
-        """Start serving; `url` says where. The page fills when `run` begins.
+        """Start serving at `url`; `run` fills the page.
 
         Args:
             env: Environment or wrapper whose observations `policy` takes.
             policy: Maps observations to actions.
             frame_rate: Display updates per second of wall time.
-            verbosity: How much to log, a `VerbosityLevel`.
-            viser_server: A server to use instead of starting one at `host` and `port`.
-            checkpoint_manager: Checkpoints to choose from. None: no such tab.
+            verbosity: Log verbosity, a `VerbosityLevel`.
+            viser_server: Server to use instead of starting one at `host` and `port`.
+            checkpoint_manager: Selectable checkpoints. None: no Checkpoints tab.
             host: Address to serve on; `0.0.0.0` serves the whole network.
-            port: Port to serve on; the next free one where it is taken.
+            port: Port to serve on; if in use, the next free one.
 
         Raises:
-            ValueError: this machine does not have the address `host`.
+            ValueError: `host` is not an address of this machine, or `port` not in [1, 65535].
         """
         super().__init__(env, policy, frame_rate, verbosity)
         self._server = viser_server or serve_page(host, port)
@@ -125,7 +125,7 @@ class ViserPlayViewer(BaseViewer):
         self._checkpoint_panel: CheckpointPanel | None = None
         self._shown_env = 0
         self._next_scene = self._next_panels = 0.0
-        # Only ever changed in place: threads of the server add to it.
+        # Modify in place only: threads of the server add reasons.
         self._update_reasons = {UpdateReason.ACTION}
 
     @property
@@ -135,20 +135,18 @@ class ViserPlayViewer(BaseViewer):
 
     @property
     def url(self) -> str:
-        """Where to point a browser on this machine."""
+        """URL of the page for a browser on this machine."""
         return page_url(self._server)
 
     @property
     def scene(self) -> MjlabViserScene:
-        """The 3-D scene.
+        """3-D scene.
 
         Raises:
             RuntimeError: `setup` has not been called.
         """
         if self._scene is None:
-            raise WrongStateError(
-                "The viewer's scene does not exist yet; call setup() or run() first."
-            )
+            raise WrongStateError("The viewer's scene is not set up; call setup() or run() first.")
         return self._scene
 
     def setup(self) -> None:
@@ -174,11 +172,11 @@ class ViserPlayViewer(BaseViewer):
         )
         self._debug_overlays = ViserDebugOverlays(env, scene)
         self._contact_overlays = ViserContactOverlays(scene)
-        # Reading a field has the engine provide it.
+        # Reading a field makes the engine provide it.
         for name in ("xpos", "xmat", *(("mocap_pos", "mocap_quat") if model.nmocap > 0 else ())):
             getattr(env.sim.data, name)
         self._create_gui()
-        log.debug("The viewer is at %s", self.url)
+        log.debug("Viewer URL: %s", self.url)
 
     def is_running(self) -> bool:
         return not self._closed
@@ -189,10 +187,10 @@ class ViserPlayViewer(BaseViewer):
             self._server.stop()
 
     def add_first_panels(self) -> None:
-        """Add to the top of the Controls tab; for subclasses, nothing by default."""
+        """Add panels to the top of the Controls tab. For subclasses; the default adds none."""
 
     def sync_viewer_to_env(self) -> None:
-        # Commands' own panels write into their terms; nothing else goes this way.
+        # Command panels write into their terms; the page has no other input.
         pass
 
     def sync_env_to_viewer(self) -> None:
@@ -200,7 +198,7 @@ class ViserPlayViewer(BaseViewer):
         self._follow_env_switch()
         if self._update_reasons and now >= self._next_scene:
             self._next_scene = now + self.scene_period
-            # Requests from here on may come too late for this drawing, and cause another.
+            # Clear before drawing: later requests may miss this update and must cause another.
             self._update_reasons.clear()
             env, scene = self.env.unwrapped, self.scene
             if self._debug_overlays is not None:
@@ -234,7 +232,7 @@ class ViserPlayViewer(BaseViewer):
         if action is ViewerAction.FETCH_CHECKPOINT:
             self._load_checkpoint(str(payload))
             return True
-        # What a command's panel sends to start from the state that it shows.
+        # Command panels send gui_reset to start from the state that they show.
         if isinstance(payload, dict) and payload.get("type") == "gui_reset":
             self._gui_reset(all_envs=bool(payload.get("all_envs", True)))
             return True
@@ -286,7 +284,7 @@ class ViserPlayViewer(BaseViewer):
             folder.remove()
 
     def _follow_env_switch(self) -> None:
-        """Start plots and drawings over if the page selected another environment."""
+        """Restart plots and drawings if the page selected another environment."""
         env_idx = self.scene.env_idx
         if self._shown_env == env_idx:
             return
@@ -297,14 +295,14 @@ class ViserPlayViewer(BaseViewer):
         self._update_reasons.add(UpdateReason.ENV_SWITCH)
 
     def _load_checkpoint(self, name: str) -> None:
-        """Play on with another policy; one that cannot be loaded leaves the present one alone."""
+        """Switch to the policy of a checkpoint. If loading fails, keep the current policy."""
         panel = self._checkpoint_panel
         if self._checkpoint_manager is None or panel is None:
             return
         try:
             policy = self._checkpoint_manager.load_checkpoint(name)
         except Exception as error:
-            log.exception("Cannot load the checkpoint %s.", name)
+            log.exception("Cannot load checkpoint %s.", name)
             panel.show_error(f"Cannot load {name}: {error}")
             return
         self.policy = policy
@@ -312,7 +310,7 @@ class ViserPlayViewer(BaseViewer):
         panel.show_loaded(name)
 
     def _gui_reset(self, all_envs: bool) -> None:
-        """Reset the selected or all environments into the state a command's panel asks for."""
+        """Reset the selected or all environments to the state of a command panel."""
         env = self.env.unwrapped
         ids = torch.arange(env.num_envs) if all_envs else torch.tensor([self.scene.env_idx])
         ids = ids.to(env.device)
@@ -321,18 +319,19 @@ class ViserPlayViewer(BaseViewer):
             if env.command_manager.apply_gui_reset(ids):
                 env.sim.forward(ids)
                 env.sim.sense()
-                # What the reset observed is of the state before.
+                # `reset` observed the state before the panel set its own.
                 env.observation_manager.reset(ids)
                 env.obs_buf = env.observation_manager.compute(update_history=True, env_ids=ids)
-            forget(self.policy, torch.zeros(env.num_envs, device=env.device).index_fill_(0, ids, 1))
+            dones = torch.zeros(env.num_envs, device=env.device).index_fill_(0, ids, 1)
+            reset_policy(self.policy, dones)
         self.after_reset()
 
 
 class SimulationControls:
-    """The Info and Simulation parts of the Controls tab."""
+    """Info and Simulation folders of the Controls tab."""
 
     def __init__(self, server: viser.ViserServer, request_action: Callable[..., None]) -> None:
-        """Add the controls to the current place in the page.
+        """Add the controls to the current GUI container.
 
         Args:
             server: The page's server.
@@ -361,20 +360,20 @@ class SimulationControls:
             request_action(_SPEED_ACTIONS[event.target.value])
 
     def show_paused(self, paused: bool) -> None:
-        """Let the buttons say what they now do."""
+        """Update the labels of the buttons."""
         self._pause.label = "Play" if paused else "Pause"
         self._pause.icon = viser.Icon.PLAYER_PLAY if paused else viser.Icon.PLAYER_PAUSE
         self._step.disabled = not paused
 
     def show_status(self, status: ViewerStatus) -> None:
-        """Show the status where it differs from what is shown."""
+        """Update the displayed status if it changed."""
         content = status_html(status)
         if content != self._shown:
             self._shown = self._status.content = content
 
 
 def status_html(status: ViewerStatus) -> str:
-    """The status as a small table."""
+    """Return the status as an HTML table."""
     state = "Paused" if status.paused else "Running"
     if status.capped and not status.paused:
         state += ' <span style="color:#e03131">CAPPED</span>'
@@ -393,7 +392,7 @@ def status_html(status: ViewerStatus) -> str:
 
 
 class CheckpointPanel:
-    """List, Sync and Use Latest. What goes wrong is shown here and ends nothing."""
+    """Checkpoint list with Sync and Use Latest. Errors are shown here, not raised."""
 
     def __init__(
         self,
@@ -401,17 +400,17 @@ class CheckpointPanel:
         manager: CheckpointManager,
         request_load: Callable[[str], None],
     ):
-        """Add the panel to the current place in the page and list what there is.
+        """Add the panel to the current GUI container and list the available checkpoints.
 
         Args:
             server: The page's server.
-            manager: Lists and loads checkpoints.
-            request_load: Asks the main thread to load a checkpoint by name.
+            manager: Checkpoints to list and load.
+            request_load: Requests the main thread to load a checkpoint by name.
         """
         self._manager = manager
         self._request_load = request_load
         self._labels: dict[str, str] = {}
-        # Setting the list's value calls its callback, as a person's choice does.
+        # Suppresses the list's callback, because setting the value invokes it.
         self._silent = threading.local()
         gui = server.gui
         self._about = gui.add_markdown("")
@@ -419,14 +418,14 @@ class CheckpointPanel:
         self._message = gui.add_html("")
         latest = gui.add_button("Use Latest", icon=viser.Icon.PLAYER_TRACK_NEXT)
         sync = gui.add_button("Sync", icon=viser.Icon.REFRESH, hint="Look for new checkpoints.")
-        self._choice.on_update(self._chosen)
+        self._choice.on_update(self._on_choice)
         latest.on_click(lambda _: self.load_latest())
         sync.on_click(lambda _: self.refresh())
         self.refresh()
         self.select(manager.current_name)
 
     def refresh(self) -> None:
-        """List the source again, keeping the choice where it still exists."""
+        """Refresh the list and keep the selection if it still exists."""
         try:
             checkpoints = self._manager.fetch_available()
         except Exception as error:
@@ -442,32 +441,32 @@ class CheckpointPanel:
                 status = f" ({self._manager.run_status})"
             self._about.content = f"**Run:** {name}{status}"
         chosen = self._labels.get(self._choice.value)
-        # The newest first: that is the one people look for.
+        # Newest first: users usually want the latest checkpoint.
         self._labels = {
             f"{name} ({age})" if age else name: name for name, age in reversed(checkpoints)
         }
-        self._quietly("options", list(self._labels) or [_NONE_FOUND])
+        self._set_silently("options", list(self._labels) or [_NONE_FOUND])
         self.select(chosen or self._manager.current_name)
         self._show(f"{len(checkpoints)} found.")
 
     def select(self, name: str) -> None:
-        """Show `name` as the chosen one, without loading it."""
+        """Select `name` without loading it."""
         for label, candidate in self._labels.items():
             if candidate == name:
-                self._quietly("value", label)
+                self._set_silently("value", label)
 
     def show_loaded(self, name: str) -> None:
-        """Say that `name` is in use."""
+        """Select `name` and report that it is loaded."""
         self._manager.current_name = name
         self.select(name)
         self._show(f"Loaded {name}.")
 
     def show_error(self, message: str) -> None:
-        """Say what went wrong."""
+        """Show an error message."""
         self._show(message, color="#e03131")
 
     def load_latest(self) -> None:
-        """List the source again and load the newest checkpoint."""
+        """Refresh the list and load the newest checkpoint."""
         self.refresh()
         if self._labels:
             self._request_load(next(iter(self._labels.values())))
@@ -478,14 +477,14 @@ class CheckpointPanel:
             f"{html.escape(message)}</div>"
         )
 
-    def _quietly(self, attribute: str, value: Any) -> None:
+    def _set_silently(self, attribute: str, value: Any) -> None:
         self._silent.on = True
         try:
             setattr(self._choice, attribute, value)
         finally:
             self._silent.on = False
 
-    def _chosen(self, _: Any) -> None:
+    def _on_choice(self, _: Any) -> None:
         name = self._labels.get(self._choice.value)
         if name is not None and not getattr(self._silent, "on", False):
             self._request_load(name)
@@ -494,10 +493,10 @@ class CheckpointPanel:
 def local_checkpoints(
     folder: Path, load_policy: Callable[[Path], PolicyProtocol], current: str = ""
 ) -> CheckpointManager:
-    """Return a manager of the checkpoints (`*.pt`) in `folder`; `current` is the one in use."""
+    """Return a manager of the checkpoints (`*.pt`) in `folder`; `current` is the loaded one."""
 
     def fetch_available() -> list[tuple[str, str]]:
-        # The replay beside a checkpoint has no policy.
+        # replay_*.pt files contain a replay buffer, not a policy.
         files = [path for path in folder.glob("*.pt") if not path.name.startswith("replay_")]
         files.sort(key=lambda path: checkpoint_number(path.name))
         now = time.time()

@@ -1,4 +1,4 @@
-"""Debug drawing in the browser: primitives of one kind are sent as one batch."""
+"""Debug visualizer for the browser, with one batch per kind of primitive."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _MAX_GHOST_GEOM_GROUP = 2
 
 
 class ViserDebugVisualizer(DebugVisualizer):
-    """Collects what terms draw in a frame; `send` shows it in the browser.
+    """Debug visualizer that collects the items of a frame; `send` shows them in the browser.
 
-    Each item keeps its own opacity, arrows included.
+    Opacity is per item, for arrows too.
     """
 
     def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
@@ -51,7 +51,7 @@ class ViserDebugVisualizer(DebugVisualizer):
         self._arrows = _Arrows()
 
     def clear_debug_all(self) -> None:
-        """Remove everything drawn, from the page too."""
+        """Remove everything drawn, including items on the page."""
         self.clear()
         for handle in self._debug_handles.values():
             handle.remove()
@@ -130,7 +130,7 @@ class ViserDebugVisualizer(DebugVisualizer):
             }
             for geom_id, key in shown.items():
                 self._meshes[key] = merge_geoms(model, [geom_id])
-            # The model is kept too, so that its id cannot be reused by another model.
+            # Keep a reference to the model, so that another model cannot reuse its id.
             self._ghosts[id(model)] = (model, mujoco.MjData(model), shown)
         _, data, shown = self._ghosts[id(model)]
         mocap = (None if pose is None else to_numpy(pose) for pose in (mocap_pos, mocap_quat))
@@ -161,7 +161,7 @@ class ViserDebugVisualizer(DebugVisualizer):
         super().add_frame(position, rotation, scale, label, axis_radius, alpha, axis_colors)
 
     def send(self, offset: np.ndarray) -> None:
-        """Show this frame's items, moved by `offset` (3,), and hide what was not drawn again."""
+        """Show the items of this frame, translated by `offset` (3,), and hide items not redrawn."""
         arrows, self._arrows = self._arrows, _Arrows()
         if arrows.starts:
             shafts, heads = (self._batches.get(key, _Batch()) for key in ("shaft", "head"))
@@ -212,7 +212,7 @@ class ViserDebugVisualizer(DebugVisualizer):
 
 @dataclass
 class _Batch:
-    """Items of one mesh: position, rotation, size, colour and opacity of each."""
+    """Items of one mesh: position, rotation, scale, color and opacity per item."""
 
     positions: list[np.ndarray] = field(default_factory=list)
     wxyzs: list[np.ndarray] = field(default_factory=list)
@@ -226,7 +226,7 @@ class _Batch:
         self.colors.append(color)
 
     def extend(self, positions, wxyzs, scales, colors: list[Color]) -> None:
-        """Add a row of each array (n, ...) as an item."""
+        """Add n items, with one row of each array (n, ...) per item."""
         self.positions.extend(positions)
         self.wxyzs.extend(wxyzs)
         self.scales.extend(scales)
@@ -235,7 +235,7 @@ class _Batch:
 
 @dataclass
 class _Arrows:
-    """Arrows of a frame. They are many, so that their directions are computed all at once."""
+    """Arrows of a frame. Directions are computed in one batch, because frames have many arrows."""
 
     starts: list[np.ndarray] = field(default_factory=list)
     ends: list[np.ndarray] = field(default_factory=list)
@@ -243,7 +243,7 @@ class _Arrows:
     colors: list[Color] = field(default_factory=list)
 
     def add_to(self, shafts: _Batch, heads: _Batch) -> None:
-        """Add what the arrows that have a direction consist of."""
+        """Add the shafts and heads of the arrows that have a direction."""
         starts = np.array(self.starts, dtype=float).reshape(-1, 3)
         vectors = np.array(self.ends, dtype=float).reshape(-1, 3) - starts
         lengths = np.linalg.norm(vectors, axis=1)
@@ -271,13 +271,13 @@ def _wxyz(mat: Array) -> np.ndarray:
 
 
 def rotations_of_z(axes: np.ndarray) -> np.ndarray:
-    """Rotations (n, 4), w first, that turn z onto unit vectors (n, 3)."""
-    # Half way between no turn and twice the turn: 1 + z.a, and z x a.
+    """Return the quaternions that rotate z onto unit vectors (n, 3), w first, (n, 4)."""
+    # Shortest-arc quaternion, before normalization: (1 + z·a, z × a).
     wxyzs = np.zeros((len(axes), 4))
     wxyzs[:, 0] = 1.0 + axes[:, 2]
     wxyzs[:, 1], wxyzs[:, 2] = -axes[:, 1], axes[:, 0]
     lengths = np.linalg.norm(wxyzs, axis=1)
-    # Straight down: half a turn about x.
+    # Antiparallel (a = -z): rotate by π about x.
     opposite = lengths < 1e-8
     wxyzs[opposite], lengths[opposite] = (0.0, 1.0, 0.0, 0.0), 1.0
     return wxyzs / lengths[:, None]

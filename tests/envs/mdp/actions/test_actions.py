@@ -90,7 +90,7 @@ def test_relative_positions_follow_the_joint(world: Any) -> None:
     world.sim.data.qpos[:, 7:] = 1.0
     term.apply_actions()
     torch.testing.assert_close(data.joint_pos_target[0], torch.tensor([1.05, 0.98, 1.0]))
-    with pytest.raises(ValueError, match="takes no offset, got 0.5"):
+    with pytest.raises(ValueError, match="offset: .*got 0.5"):
         act.RelativeJointPositionActionCfg(**JOINTS, offset=0.5)
 
 
@@ -144,11 +144,11 @@ def test_the_caller_may_reuse_its_action_tensor(world: Any) -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("scale", (1.0, 2.0), "scale must be a number or a dict"),
-        ("offset", "1", "offset must be a number or a dict"),
+        ("scale", (1.0, 2.0), "scale: .*number.*dict.*tuple"),
+        ("offset", "1", "offset: .*number.*dict.*'1'"),
         ("scale", {"elbow": 1.0}, "elbow"),
         ("clip", {"hip": (1.0, -1.0)}, "low <= high"),
-        ("clip", (0.0, 1.0), "clip must be a dict"),
+        ("clip", (0.0, 1.0), "clip: .*dict.*tuple"),
         ("actuator_names", ("elbow",), "elbow"),
     ],
 )

@@ -403,7 +403,7 @@ def test_a_joint_at_its_limit_stops_and_the_others_make_up_for_it_as_in_mink(arm
         [mink_dq(ik, arm, k, SeparateErrors, limited=True) for k in range(NUM_ENVS)]
     )
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-3)
-    # What clamping alone would do is not that.
+    # Clamping alone gives another result.
     assert (free.clamp(found.min(), found.max()) - expected).abs().max() > 1e-2
 
 
@@ -449,7 +449,7 @@ def test_the_limit_weight_pulls_back_what_is_outside(arm: Any) -> None:
     act(ik := term(arm, joint_limit_weight=50.0, max_dq=9.0), [0.0] * 6)
     found = ik.compute_dq()
     torch.testing.assert_close(found[:, 0], -q[:, 0], atol=1e-3, rtol=0.0)
-    # The others hold the hand where it is as well as they can.
+    # The other joints keep the hand in place as well as possible.
     assert found[:, 1:].abs().max() > 0.01
 
 
@@ -524,7 +524,7 @@ def test_an_unreachable_target_is_approached_in_the_simulation(
     assert (residual(ik, arm) < start - 0.05).all()
 
 
-# What it is for.
+# Use cases.
 
 
 @pytest.mark.parametrize(
@@ -562,14 +562,14 @@ def test_the_posture_decides_what_the_position_leaves_open(arm: Any) -> None:
     assert elbows[1] > -0.2
 
 
-# What is refused.
+# Errors.
 
 
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
         ("frame_type", "camera", "frame_type.*'camera'"),
-        ("frame_name", "tip_.*", r"matches 2 sites of entity 'robot': \['tip_1', 'tip_2'\]"),
+        ("frame_name", "tip_.*", r"site of entity 'robot', got 2: \['tip_1', 'tip_2'\]"),
         ("frame_name", "elbow", "elbow"),
         ("actuator_names", ("finger",), "finger"),
         ("damping", -0.1, "damping.*-0.1"),
@@ -584,7 +584,7 @@ def test_bad_configs_are_refused(arm: Any, field: str, value: Any, message: str)
 
 
 def test_a_frame_that_nothing_pulls_is_refused(arm: Any) -> None:
-    with pytest.raises(ValueError, match="are both 0"):
+    with pytest.raises(ValueError, match="position_weight, orientation_weight.*got 0"):
         term(arm, position_weight=0.0, orientation_weight=0.0)
 
 
@@ -625,7 +625,7 @@ def test_a_subclass_may_say_where_the_frame_is(arm: Any) -> None:
     torch.testing.assert_close(
         tool._desired_pos - plain._desired_pos, torch.tensor([[0.0, 0.0, 0.1]]).expand(NUM_ENVS, 3)
     )
-    # Where the frame is asked to be elsewhere, the error is that of the tool's point.
+    # For a displaced target, the error is that of the tool's point.
     plain._desired_pos.copy_(tool._desired_pos)
     assert not tool.compute_dq().abs().gt(1e-3).any()
     assert plain.compute_dq().abs().gt(1e-3).any()

@@ -124,13 +124,13 @@ def test_dc_motor_gains_are_randomized_in_volts(
 @pytest.mark.parametrize(
     ("fields", "named"),
     [
-        ({"mode": DcMotorInputMode.VOLTAGE}, r"\['hip'\] are driven by voltage"),
+        ({"mode": DcMotorInputMode.VOLTAGE}, r"\['hip'\].*voltage mode"),
         (
             {
                 "mode": DcMotorInputMode.VELOCITY, "stiffness": 2.0, "voltage_limit": 24.0,
                 "slew_rate": 5.0,
             },
-            r"\['hip'\] have a slew_rate",
+            r"\['hip'\].*slew_rate",
         ),
     ],
 )  # fmt: skip
@@ -247,7 +247,7 @@ def test_gains_and_effort_limits_of_every_kind_act_on_the_joint(
 
 def test_only_scale_and_abs_are_known(make_world: Any) -> None:
     world = make_world(actuators=(POSITION,))
-    with pytest.raises(ValueError, match="pd_gains knows the operations 'scale' and 'abs'"):
+    with pytest.raises(ValueError, match="pd_gains operation: .*'scale' or 'abs', got 'add'"):
         world.apply(dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0), operation="add")
 
 
@@ -308,7 +308,5 @@ def test_effort_limits_of_xml_muscles_scale_their_force(make_world: Any) -> None
 
 def test_xml_motors_without_any_limit_are_refused_by_name(make_world: Any) -> None:
     world = make_world(with_actuator('<motor joint="slider"/>'), actuators=XML_SLIDER)
-    with pytest.raises(
-        TypeError, match=r"effort_limits: .*\['slider'\].*forcerange or a ctrlrange"
-    ):
+    with pytest.raises(TypeError, match=r"effort_limits: .*\['slider'\].*forcerange or ctrlrange"):
         world.apply(dr.effort_limits, effort_limit_range=(0.5, 0.5))

@@ -111,7 +111,7 @@ def test_points_move_by_the_affine_map(make_world: Any, shift: float, stretch: f
     expected[:, 1] += shift
     now = inertials(world)
     torch.testing.assert_close(now.com, expected.expand(4, 4, 3), rtol=1e-4, atol=1e-6)
-    # The second moment of mass along x, about the centre of mass, is stretched twice.
+    # The second moment of mass along x, about the center of mass, is stretched twice.
     before, after = tensor_about_com(defaults(world)), tensor_about_com(now)
 
     def second_moment(inertia: torch.Tensor) -> torch.Tensor:

@@ -20,7 +20,7 @@ TABLE = {f.row.name: f.row for f in vars(dr).values() if hasattr(f, "row")}
 FIELD_TERMS = sorted(name for name, row in TABLE.items() if not row.rotation)
 ROTATION_TERMS = sorted(name for name, row in TABLE.items() if row.rotation)
 ENGINES = ("native", "warp")
-# Geoms of which geom_size can change the size.
+# Geoms with a size that geom_size supports.
 PRIMITIVES = ("box", "sphere", "capsule", "cylinder", "ellipsoid")
 LAWS = settings(
     max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -196,15 +196,15 @@ def test_name_patterns_replace_the_selection(make_world: Any) -> None:
 
 def test_bad_axes_and_ranges_are_named(make_world: Any) -> None:
     world = make_world()
-    with pytest.raises(ValueError, match=r"geom_friction has no axes \[3\]"):
+    with pytest.raises(ValueError, match=r"geom_friction axes.*\[3\]"):
         world.apply(dr.geom_friction, ranges=(0.0, 1.0), axes=[3])
-    with pytest.raises(ValueError, match=r"no entry for the axes \[1\]"):
+    with pytest.raises(ValueError, match=r"ranges: .*\[1\]"):
         world.apply(dr.geom_friction, ranges={0: (0.0, 1.0)}, axes=[0, 1])
-    with pytest.raises(ValueError, match=r"must be a pair of numbers.*0\.5"):
+    with pytest.raises(ValueError, match=r"pair of numbers.*0\.5"):
         world.apply(dr.geom_friction, ranges=0.5)
     with pytest.raises(ValueError, match="Unknown operation 'multiply'.*abs.*add.*scale"):
         world.apply(dr.geom_friction, ranges=(0.0, 1.0), operation="multiply")
-    with pytest.raises(ValueError, match=r"joint_damping has no axes \[1\]"):
+    with pytest.raises(ValueError, match=r"joint_damping axes.*\[1\]"):
         world.apply(dr.joint_damping, ranges=(0.0, 1.0), axes=[1])
 
 
@@ -264,7 +264,7 @@ def test_a_shifted_centre_of_mass_changes_the_motion(make_world: Any) -> None:
 
 
 def test_frames_that_the_compiler_merged_can_be_moved_apart(make_world: Any) -> None:
-    # The thigh's capsule is at the origin of its body, and so is the body's centre of mass.
+    # The thigh's capsule is at the origin of its body, and so is the body's center of mass.
     world = make_world(num_envs=2)
     ids = torch.tensor([1])
     thigh = SceneEntityCfg("robot", geom_names=("capsule",))
@@ -303,7 +303,7 @@ def test_a_randomized_robot_moves_like_one_built_that_way(make_world: Any) -> No
         torch.testing.assert_close(
             getattr(world.sim.model, field)[2], built.sim.get_default_field(field), msg=field
         )
-    # The other environments are the robot as it was.
+    # The robot is unchanged in the other environments.
     plain = make_world(chain(1.0, 0.0, 0.1, 0.01))
     plain.sim.data.qpos[:] = torch.tensor([0.5, -0.7])
     plain.sim.data.qvel[:] = torch.tensor([1.0, -2.0])

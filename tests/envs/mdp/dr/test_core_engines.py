@@ -1,4 +1,4 @@
-"""What is randomized acts, and acts the same on both engines."""
+"""Randomized values take effect, equally on both engines."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def test_joint_limits_refresh_the_limits_of_the_entity(make_world: Any) -> None:
     torch.testing.assert_close(data.joint_pos_limits[1, 0], torch.tensor([-0.5, 0.1]))
     # The soft limits shrink by the configured factor, 0.9, about the middle.
     torch.testing.assert_close(data.soft_joint_pos_limits[1, 0], torch.tensor([-0.47, 0.07]))
-    # A joint without limits stays without; other joints and environments stay as they were.
+    # A joint without limits keeps infinite limits; other joints and environments are unchanged.
     assert torch.isinf(data.joint_pos_limits[1, 2]).all()
     assert torch.equal(data.soft_joint_pos_limits[1, 1:], before[1, 1:])
     assert torch.equal(data.soft_joint_pos_limits[0], before[0])

@@ -25,5 +25,5 @@ def test_light_directions_have_length_one(make_world: Any, engine: str) -> None:
 
 
 def test_a_zero_light_direction_is_refused(make_world: Any) -> None:
-    with pytest.raises(ValueError, match="light_dir: a zero vector"):
+    with pytest.raises(ValueError, match="light_dir: .*zero vector"):
         make_world().apply(dr.light_dir, ranges=(0.0, 0.0))

@@ -36,12 +36,12 @@ def test_equal_log_uniform_bounds_are_a_constant(value: float) -> None:
 
 @pytest.mark.parametrize("bounds", [(0.0, 1.0), (-1.0, 1.0)])
 def test_log_uniform_refuses_bounds_at_or_below_zero(bounds: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="log_uniform needs bounds above 0"):
+    with pytest.raises(ValueError, match="log_uniform bounds: expected bounds > 0"):
         draw(resolve_distribution("log_uniform"), bounds, (3,), "cpu")
 
 
 def test_gaussian_refuses_a_negative_deviation() -> None:
-    with pytest.raises(ValueError, match="must not be negative"):
+    with pytest.raises(ValueError, match=r"gaussian bounds: .*\(0\.0, -1\.0\)"):
         draw(resolve_distribution("gaussian"), (0.0, -1.0), (3,), "cpu")
 
 
@@ -58,5 +58,5 @@ def test_unknown_names_list_the_valid_ones_and_instances_pass() -> None:
 
 def test_a_distribution_of_the_wrong_shape_is_refused() -> None:
     scalar = Distribution("scalar", lambda lower, upper, shape, device: lower)
-    with pytest.raises(ValueError, match="'scalar' returned shape"):
+    with pytest.raises(ValueError, match=r"'scalar': .*shape \(2, 2\), got \(\)"):
         draw(scalar, (0.0, 1.0), (2, 2), "cpu")

@@ -1,1 +1,1 @@
-"""The I2RT YAM, an arm of six joints with a gripper."""
+"""I2RT YAM: arm with six joints and a gripper."""

@@ -1,15 +1,15 @@
-"""The I2RT YAM: its motors, gains, pose and collision setups.
+"""I2RT YAM: motors, gains, keyframe and collision setups.
 
-Each joint of the arm, and the left finger, is a position actuator, that is a spring and a damper
-towards the commanded angle. The right finger has none: the gripper's one motor moves both fingers,
-which the model ties by an equality. The gains follow from the inertia I that there is to move:
+Each joint of the arm, and the left finger, has a position actuator: a spring and damper toward the
+position target. The right finger has no actuator: the gripper's single motor moves both fingers,
+coupled in the model by an equality constraint. The gains follow from the effective inertia I:
 
     stiffness = I w^2,  damping = 2 z I w,
 
-with the natural frequency w (`NATURAL_FREQ`, for the fingers `NATURAL_FREQ_GRIPPER`) and the
-damping ratio z (`DAMPING_RATIO`). Unlike a walking robot's, which is that of the motor alone, it is
-the inertia of all that the joint carries: an arm moves slowly, and its motors are light. Torques are
-in N m, angles in rad, lengths in m, forces in N.
+with natural frequency w (`NATURAL_FREQ`, for the fingers `NATURAL_FREQ_GRIPPER`) and damping ratio z
+(`DAMPING_RATIO`). For walking robots, I is the reflected inertia of the motor only; here I includes
+all links moved by the joint, because the arm moves slowly and its motors are light. Units: N m, rad,
+m, N.
 """
 
 from __future__ import annotations
@@ -27,40 +27,40 @@ from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.utils.actuator import ElectricActuator, reflect_rotary_to_linear
 from mjlab.utils.spec_config import CollisionCfg
 
-# The model.
+# Model.
 
 YAM_XML = Path(__file__).parent / "xmls" / "yam.xml"
 
 
 def get_spec() -> mujoco.MjSpec:
-    """Return a new spec of the robot, without actuators: the config adds them."""
+    """Return a new spec of the robot without actuators; the config adds actuators."""
     return mujoco.MjSpec.from_file(str(YAM_XML))
 
 
-# Motors. Their makers state the inertia behind the gear.
+# Motors. The manufacturer specifies the reflected inertia, after the gear.
 
 ARMATURE_DM_4340 = 0.032
-"""Inertia of the motors of joints 1 to 3, kg m^2."""
+"""Reflected inertia of the motors of joints 1 to 3 (kg m^2)."""
 ARMATURE_DM_4310 = 0.0018
-"""Inertia of the motors of joints 4 to 6 and of the gripper, kg m^2."""
+"""Reflected inertia of the motors of joints 4 to 6 and of the gripper (kg m^2)."""
 
 DM_4340 = ElectricActuator(
     reflected_inertia=ARMATURE_DM_4340, velocity_limit=10.0, effort_limit=28.0
 )
-"""The motor of joints 1 to 3."""
+"""Motor of joints 1 to 3."""
 DM_4310 = ElectricActuator(
     reflected_inertia=ARMATURE_DM_4310, velocity_limit=30.0, effort_limit=10.0
 )
-"""The motor of joints 4 to 6, and of the gripper before its crank."""
+"""Motor of joints 4 to 6, and of the gripper before its crank."""
 
-# The gripper: a crank turns the motor's angle into the travel of the fingers.
+# Gripper: a crank converts the motor angle to finger travel.
 
 GRIPPER_LINEAR_STROKE_CRANK = 0.071
-"""How far the crank moves the fingers apart, m."""
+"""Stroke of the fingers (m)."""
 GRIPPER_MOTOR_STROKE_CRANK = 2.7
-"""How far the motor turns for that, rad."""
+"""Motor angle of the full stroke (rad)."""
 GRIPPER_TRANSMISSION_RATIO_CRANK = GRIPPER_LINEAR_STROKE_CRANK / GRIPPER_MOTOR_STROKE_CRANK
-"""Travel for a turn of the motor, m/rad."""
+"""Transmission ratio: finger travel per motor angle (m/rad)."""
 (
     ARMATURE_DM_4310_LINEAR_CRANK,
     VELOCITY_LIMIT_DM_4310_LINEAR_CRANK,
@@ -71,16 +71,16 @@ GRIPPER_TRANSMISSION_RATIO_CRANK = GRIPPER_LINEAR_STROKE_CRANK / GRIPPER_MOTOR_S
     DM_4310.effort_limit,
     GRIPPER_TRANSMISSION_RATIO_CRANK,
 )
-"""The motor as the fingers see it: kg, m/s and N."""
+"""Motor properties at the fingers (kg, m/s, N)."""
 EFFORT_LIMIT_DM_4310_LINEAR_CRANK_SAFE = EFFORT_LIMIT_DM_4310_LINEAR_CRANK * 0.1
-"""The force that the gripper may use, N: a tenth of what the motor could do."""
+"""Force limit of the gripper (N): a tenth of the motor's maximum."""
 
 # Gains.
 
 NATURAL_FREQ = 2 * 2.0 * 3.1415926535
-"""Natural frequency of the arm's joints, 2 Hz in rad/s. (Policies are trained with pi as here.)"""
+"""Natural frequency of the arm, 2 Hz (rad/s). Trained policies rely on this rounding of pi."""
 NATURAL_FREQ_GRIPPER = 1 * 2.0 * 3.1415926535
-"""Natural frequency of the fingers, 1 Hz in rad/s."""
+"""Natural frequency of the fingers, 1 Hz (rad/s)."""
 
 EFFECTIVE_INERTIAS = {
     "joint1": 0.123153,
@@ -91,10 +91,10 @@ EFFECTIVE_INERTIAS = {
     "joint6": 0.002868,
     "left_finger": 2.781624,
 }
-"""What each actuator moves: the diagonal of the mass matrix in the pose to start from, with that of
-the motors, in kg m^2 (the finger: kg)."""
+"""Effective inertia by joint: diagonal of the mass matrix at the home keyframe, including the motors'
+reflected inertia (kg m^2; finger: kg)."""
 STIFFNESS_GRIPPER, DAMPING_GRIPPER = gains(EFFECTIVE_INERTIAS["left_finger"], NATURAL_FREQ_GRIPPER)
-"""Gains of the fingers, N/m and N s/m."""
+"""Gains of the fingers (N/m, N s/m)."""
 
 
 def _joint_actuator(joint: str, motor: ElectricActuator) -> BuiltinPositionActuatorCfg:
@@ -112,7 +112,7 @@ ARM_ACTUATORS = (
     *(_joint_actuator(f"joint{number}", DM_4340) for number in (1, 2, 3)),
     *(_joint_actuator(f"joint{number}", DM_4310) for number in (4, 5, 6)),
 )
-"""Actuators of the arm, one for each joint."""
+"""Actuators of the arm, one per joint."""
 ACTUATOR_DM_4310_LINEAR_CRANK = BuiltinPositionActuatorCfg(
     target_names_expr=("left_finger",),
     stiffness=STIFFNESS_GRIPPER,
@@ -120,16 +120,16 @@ ACTUATOR_DM_4310_LINEAR_CRANK = BuiltinPositionActuatorCfg(
     effort_limit=EFFORT_LIMIT_DM_4310_LINEAR_CRANK_SAFE,
     armature=ARMATURE_DM_4310_LINEAR_CRANK,
 )
-"""Actuator of the gripper, at the left finger."""
+"""Actuator of the gripper, on the left finger."""
 ARTICULATION = EntityArticulationInfoCfg(
     actuators=(*ARM_ACTUATORS, ACTUATOR_DM_4310_LINEAR_CRANK), soft_joint_pos_limit_factor=0.9
 )
 """All actuators."""
 
 YAM_ACTION_SCALE = action_scale((*ARM_ACTUATORS, ACTUATOR_DM_4310_LINEAR_CRANK))
-"""Scale of joint position actions by joint, rad per unit of action (the finger: m)."""
+"""Scale of joint position actions by joint (rad per unit action; finger: m)."""
 
-# The pose to start from.
+# Home keyframe.
 
 HOME_KEYFRAME = EntityCfg.InitialStateCfg(
     pos=(0.0, 0.0, 0.01),
@@ -142,8 +142,8 @@ HOME_KEYFRAME = EntityCfg.InitialStateCfg(
         "right_finger": -0.0375 / 2,
     },
 )
-"""Forearm level, gripper half open, 21 cm above the ground and pointing at it. The foot of the arm
-stands on the ground."""
+"""Home keyframe: level forearm, gripper half open, 21 cm above the ground and pointing down. The
+base stands on the ground."""
 
 # Collision setups.
 
@@ -157,7 +157,7 @@ def _collision(contype: int | dict[str, int]) -> CollisionCfg:
         geom_names_expr=(_ALL_REGEX,),
         contype=contype,
         conaffinity=copy.copy(contype),
-        # Fingertips hold what they touch: their friction counts, also against spinning and rolling.
+        # Fingertips grasp objects: friction with priority, including torsional and rolling friction.
         condim={_FINGERTIPS_REGEX: 6, _ALL_REGEX: 3},
         priority={_FINGERTIPS_REGEX: 1, ".*": 0},
         friction={_FINGERTIPS_REGEX: (1, 5e-3, 5e-4), _ALL_REGEX: (0.6,)},
@@ -166,17 +166,17 @@ def _collision(contype: int | dict[str, int]) -> CollisionCfg:
 
 
 FULL_COLLISION = _collision(1)
-"""Everything collides, the arm with itself too."""
+"""All geoms collide, self-collisions included."""
 GRIPPER_ONLY_COLLISION = _collision({_GRIPPER_REGEX: 1, _ALL_REGEX: 0})
-"""Only the gripper collides."""
+"""Only gripper geoms collide."""
 
-# The robot.
+# Entity config.
 
 
 def get_yam_robot_cfg() -> EntityCfg:
-    """Return a new config of the robot, at its home pose, whose gripper alone collides.
+    """Return a new config of the robot at its home keyframe, with gripper-only collision.
 
-    It shares nothing with the constants of this module: what a task changes in it stays there.
+    The config shares no objects with this module's constants, so tasks may modify it.
     """
     return EntityCfg(
         init_state=copy.deepcopy(HOME_KEYFRAME),

@@ -1,1 +1,1 @@
-"""The Unitree G1, a humanoid with 29 joints."""
+"""Unitree G1: humanoid with 29 joints."""

@@ -1,14 +1,14 @@
-"""The Unitree G1: its motors, gains, poses and collision setups.
+"""Unitree G1: motors, gains, keyframes and collision setups.
 
-Each joint is a position actuator, that is a spring and a damper towards the commanded angle. The
-gains follow from the inertia I that the motor has at the joint (that of its rotor and of its two
-planetary stages), as if the joint carried nothing else:
+Each joint has a position actuator: a spring and damper toward the position target. The gains follow
+from the reflected inertia I of the motor (rotor and two planetary stages), neglecting the inertia of
+the links:
 
     stiffness = I w^2,  damping = 2 z I w,
 
-with the natural frequency w (`NATURAL_FREQ`) and the damping ratio z (`DAMPING_RATIO`). Four kinds
-of motor move the 29 joints; they are called after their size, "7520-14" being the 7520 whose gears
-give about 14:1. Torques are in N m, angles in rad, lengths in m, inertias in kg m^2.
+with natural frequency w (`NATURAL_FREQ`) and damping ratio z (`DAMPING_RATIO`). Four motor types
+drive the 29 joints. Motors are named after their size; "7520-14" is the 7520 with a gear ratio of
+about 14:1. Units: N m, rad, m, kg m^2.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.utils.actuator import ElectricActuator, reflected_inertia_from_two_stage_planetary
 from mjlab.utils.spec_config import CollisionCfg
 
-# The model.
+# Model.
 
 G1_XML = Path(__file__).parent / "xmls" / "g1.xml"
 
 
 def get_spec() -> mujoco.MjSpec:
-    """Return a new spec of the robot, without actuators: the config adds them."""
+    """Return a new spec of the robot without actuators; the config adds actuators."""
     return mujoco.MjSpec.from_file(str(G1_XML))
 
 
-# Motors: the inertias of rotor, first and second stage, and the ratios of the stages. A stage whose
-# planets run between a sun of s teeth and a ring of r teeth has the ratio 1 + r/s.
+# Motors: inertias of rotor, first and second stage, and gear ratios of the stages. A planetary stage
+# with s sun teeth and r ring teeth has ratio 1 + r/s.
 
 ROTOR_INERTIAS_5020 = (0.139e-4, 0.017e-4, 0.169e-4)
 GEARS_5020 = (1, 1 + (46 / 18), 1 + (56 / 16))
@@ -58,20 +58,20 @@ ARMATURE_4010 = reflected_inertia_from_two_stage_planetary(ROTOR_INERTIAS_4010, 
 ACTUATOR_5020 = ElectricActuator(
     reflected_inertia=ARMATURE_5020, velocity_limit=37.0, effort_limit=25.0
 )
-"""Moves the shoulders, the elbow and the roll of the wrist; two of them move the ankle, and two
-the pitch and roll of the waist."""
+"""Motor of shoulders, elbow and wrist roll. Ankle, and waist pitch and roll, have two motors
+each."""
 ACTUATOR_7520_14 = ElectricActuator(
     reflected_inertia=ARMATURE_7520_14, velocity_limit=32.0, effort_limit=88.0
 )
-"""Moves the pitch and yaw of the hip and the yaw of the waist."""
+"""Motor of hip pitch and yaw, and waist yaw."""
 ACTUATOR_7520_22 = ElectricActuator(
     reflected_inertia=ARMATURE_7520_22, velocity_limit=20.0, effort_limit=139.0
 )
-"""Moves the roll of the hip and the knee."""
+"""Motor of hip roll and knee."""
 ACTUATOR_4010 = ElectricActuator(
     reflected_inertia=ARMATURE_4010, velocity_limit=22.0, effort_limit=5.0
 )
-"""Moves the pitch and yaw of the wrist."""
+"""Motor of wrist pitch and yaw."""
 
 # Gains.
 
@@ -96,10 +96,10 @@ G1_ACTUATOR_7520_14 = position_actuator(
 G1_ACTUATOR_7520_22 = position_actuator(ACTUATOR_7520_22, (".*_hip_roll_joint", ".*_knee_joint"))
 G1_ACTUATOR_4010 = position_actuator(ACTUATOR_4010, (".*_wrist_pitch_joint", ".*_wrist_yaw_joint"))
 
-# Waist and ankle are four-bar linkages: two 5020 side by side move pitch when they turn together
-# and roll when they turn against each other. The model has a serial chain instead. At the nominal
-# pose each of its two joints sees both motors, hence twice the inertia, gains and torque; away from
-# it the true figures depend on the angles.
+# Waist and ankle are four-bar linkages: two parallel 5020 motors move pitch when turning in the same
+# direction and roll when turning in opposite directions. The model uses a serial chain instead. At
+# the nominal pose, both motors act on each of its two joints, hence twice the inertia, gains and
+# torque; away from it, the true values depend on the angles.
 G1_ACTUATOR_WAIST = position_actuator(
     ACTUATOR_5020, ("waist_pitch_joint", "waist_roll_joint"), motors=2
 )
@@ -119,7 +119,7 @@ G1_ARTICULATION = EntityArticulationInfoCfg(actuators=_ACTUATORS, soft_joint_pos
 """All actuators."""
 
 G1_ACTION_SCALE = action_scale(_ACTUATORS)
-"""Scale of joint position actions by joint pattern, rad per unit of action."""
+"""Scale of joint position actions by joint pattern (rad per unit action)."""
 
 # Keyframes.
 
@@ -136,7 +136,7 @@ HOME_KEYFRAME = EntityCfg.InitialStateCfg(
     },
     joint_vel={".*": 0.0},
 )
-"""Standing nearly upright, the arms hanging."""
+"""Home keyframe: nearly upright, arms hanging."""
 KNEES_BENT_KEYFRAME = EntityCfg.InitialStateCfg(
     pos=(0, 0, 0.76),
     joint_pos={
@@ -151,7 +151,7 @@ KNEES_BENT_KEYFRAME = EntityCfg.InitialStateCfg(
     },
     joint_vel={".*": 0.0},
 )
-"""Standing with bent knees, ready to walk."""
+"""Keyframe with bent knees, for walking."""
 
 # Collision setups.
 
@@ -165,7 +165,7 @@ FULL_COLLISION = CollisionCfg(
     priority={_FOOT_REGEX: 1, ".*": 0},
     friction={_FOOT_REGEX: (0.6,)},
 )
-"""Everything collides, self-collisions included. Only feet have friction."""
+"""All geoms collide, self-collisions included. Only feet have friction."""
 FULL_COLLISION_WITHOUT_SELF = CollisionCfg(
     geom_names_expr=(".*_collision",),
     contype=0,
@@ -174,7 +174,7 @@ FULL_COLLISION_WITHOUT_SELF = CollisionCfg(
     priority={_FOOT_REGEX: 1, ".*": 0},
     friction={_FOOT_REGEX: (0.6,)},
 )
-"""Everything collides, but only with other things."""
+"""All geoms collide, without self-collisions."""
 FEET_ONLY_COLLISION = CollisionCfg(
     geom_names_expr=(_FOOT_REGEX,),
     contype=0,
@@ -183,15 +183,15 @@ FEET_ONLY_COLLISION = CollisionCfg(
     priority=1,
     friction=(0.6,),
 )
-"""Only feet collide, and only with other things."""
+"""Only feet collide, without self-collisions."""
 
-# The robot.
+# Entity config.
 
 
 def get_g1_robot_cfg() -> EntityCfg:
-    """Return a new config of the robot, its knees bent, with full collisions.
+    """Return a new config of the robot with bent knees and full collision.
 
-    It shares nothing with the constants of this module: what a task changes in it stays there.
+    The config shares no objects with this module's constants, so tasks may modify it.
     """
     return EntityCfg(
         init_state=copy.deepcopy(KNEES_BENT_KEYFRAME),

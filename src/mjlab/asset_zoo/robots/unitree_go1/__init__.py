@@ -1,1 +1,1 @@
-"""The Unitree Go1, a quadruped with twelve joints."""
+"""Unitree Go1: quadruped with twelve joints."""

@@ -1,13 +1,12 @@
-"""The Unitree Go1: its motors, gains, poses and collision setups.
+"""Unitree Go1: motors, gains, keyframe and collision setups.
 
-Each joint is a position actuator, that is a spring and a damper towards the commanded angle. The
-gains follow from the inertia I that the motor has at the joint (that of its rotor, times the square
-of the gear ratio), as if the joint carried nothing else:
+Each joint has a position actuator: a spring and damper toward the position target. The gains follow
+from the reflected inertia I of the motor (rotor inertia times squared gear ratio), neglecting the
+inertia of the links:
 
     stiffness = I w^2,  damping = 2 z I w,
 
-with the natural frequency w (`NATURAL_FREQ`) and the damping ratio z (`DAMPING_RATIO`). Torques are
-in N m, angles in rad, lengths in m.
+with natural frequency w (`NATURAL_FREQ`) and damping ratio z (`DAMPING_RATIO`). Units: N m, rad, m.
 """
 
 from __future__ import annotations
@@ -25,44 +24,44 @@ from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.utils.actuator import ElectricActuator, reflected_inertia
 from mjlab.utils.spec_config import CollisionCfg
 
-# The model.
+# Model.
 
 GO1_XML = Path(__file__).parent / "xmls" / "go1.xml"
 
 
 def get_spec() -> mujoco.MjSpec:
-    """Return a new spec of the robot, without actuators: the config adds them."""
+    """Return a new spec of the robot without actuators; the config adds actuators."""
     return mujoco.MjSpec.from_file(str(GO1_XML))
 
 
-# Motors. Every joint has the same one; at the knee, a drive of 1.5 comes after its gear.
+# Motors. All joints have the same motor; the knee has an additional 1.5:1 stage.
 
 ROTOR_INERTIA = 0.000111842
-"""Inertia of the rotor before the gear, kg m^2."""
+"""Rotor inertia, before the gear (kg m^2)."""
 HIP_GEAR_RATIO = 6
-"""Gear of the hip and thigh joints."""
+"""Gear ratio of the hip and thigh joints."""
 KNEE_GEAR_RATIO = HIP_GEAR_RATIO * 1.5
-"""Gear of the calf joints."""
+"""Gear ratio of the calf joints."""
 
 HIP_ACTUATOR = ElectricActuator(
     reflected_inertia=reflected_inertia(ROTOR_INERTIA, HIP_GEAR_RATIO),
     velocity_limit=30.1,
     effort_limit=23.7,
 )
-"""The motor as hip and thigh joints see it."""
+"""Motor properties at hip and thigh joints."""
 KNEE_ACTUATOR = ElectricActuator(
     reflected_inertia=reflected_inertia(ROTOR_INERTIA, KNEE_GEAR_RATIO),
     velocity_limit=20.06,
     effort_limit=35.55,
 )
-"""The motor as calf joints see it."""
+"""Motor properties at calf joints."""
 
 # Gains.
 
 STIFFNESS_HIP, DAMPING_HIP = gains(HIP_ACTUATOR.reflected_inertia)
-"""Gains of the hip and thigh joints, N m/rad and N m s/rad."""
+"""Gains of the hip and thigh joints (N m/rad, N m s/rad)."""
 STIFFNESS_KNEE, DAMPING_KNEE = gains(KNEE_ACTUATOR.reflected_inertia)
-"""Gains of the calf joints, N m/rad and N m s/rad."""
+"""Gains of the calf joints (N m/rad, N m s/rad)."""
 
 GO1_HIP_ACTUATOR_CFG = position_actuator(HIP_ACTUATOR, (".*_hip_joint", ".*_thigh_joint"))
 """Actuators of the hip and thigh joints."""
@@ -73,9 +72,9 @@ GO1_ARTICULATION = EntityArticulationInfoCfg(actuators=_ACTUATORS, soft_joint_po
 """All actuators."""
 
 GO1_ACTION_SCALE = action_scale(_ACTUATORS)
-"""Scale of joint position actions by joint pattern, rad per unit of action."""
+"""Scale of joint position actions by joint pattern (rad per unit action)."""
 
-# The home keyframe.
+# Home keyframe.
 
 INIT_STATE = EntityCfg.InitialStateCfg(
     pos=(0.0, 0.0, 0.278),
@@ -87,8 +86,8 @@ INIT_STATE = EntityCfg.InitialStateCfg(
     },
     joint_vel={".*": 0.0},
 )
-"""Standing with bent knees. The feet are 1.6 cm below the ground: resets of the velocity tasks lift
-the robot by 1 to 5 cm, and under its weight the legs give way."""
+"""Home keyframe: bent knees. The feet are 1.6 cm below the ground, because resets of the velocity
+tasks raise the robot by 1 to 5 cm, and the legs yield under its weight."""
 
 # Collision setups.
 
@@ -103,8 +102,8 @@ FULL_COLLISION = CollisionCfg(
     friction={_FOOT_REGEX: (1, 5e-3, 5e-4)},
     solref=(0.01, 1),
 )
-"""Everything collides, the robot with itself too. Contacts that no foot is part of have no friction,
-unless the other thing brings it."""
+"""All geoms collide, self-collisions included. Contacts without a foot are frictionless (condim 1),
+unless the other geom has a larger condim."""
 FEET_ONLY_COLLISION = CollisionCfg(
     geom_names_expr=(_FOOT_REGEX,),
     contype=0,
@@ -114,15 +113,15 @@ FEET_ONLY_COLLISION = CollisionCfg(
     friction=(0.6,),
     solimp=(0.9, 0.95, 0.023),
 )
-"""Only feet collide, and only with other things."""
+"""Only feet collide, without self-collisions."""
 
-# The robot.
+# Entity config.
 
 
 def get_go1_robot_cfg() -> EntityCfg:
-    """Return a new config of the robot, standing, with full collisions.
+    """Return a new config of the robot, standing, with full collision.
 
-    It shares nothing with the constants of this module: what a task changes in it stays there.
+    The config shares no objects with this module's constants, so tasks may modify it.
     """
     return EntityCfg(
         init_state=copy.deepcopy(INIT_STATE),

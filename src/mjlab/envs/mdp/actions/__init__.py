@@ -1,4 +1,4 @@
-"""Action terms: how the policy's output becomes targets of an entity's actuators."""
+"""Action terms: convert the policy's output to actuator targets of an entity."""
 
 from __future__ import annotations
 

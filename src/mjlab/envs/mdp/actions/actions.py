@@ -1,4 +1,4 @@
-"""Action terms in actuator space: one component of the action for each target."""
+"""Action terms in actuator space: one action component per target."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class BaseActionCfg(ActionTermCfg):
-    """Targets are `action * scale + offset`, then clipped."""
+    """Base configuration of actuator-space actions: target = clip(action * scale + offset)."""
 
     transmission_type: TransmissionType = TransmissionType.JOINT
-    """What the actuators drive: joints, tendons or sites. Subclasses fix it."""
+    """Transmission of the actuators: joint, tendon or site. Fixed by subclasses."""
 
     actuator_names: tuple[str, ...] | list[str]
-    """Patterns of the driven joints (tendons, sites); each must match a whole name."""
+    """Patterns of the actuated joints (tendons, sites), matched in full."""
 
     scale: float | dict[str, float] = 1.0
-    """Factor of the action: one number, or pattern of target names to number (others 1)."""
+    """Factor of the action: one number, or target name pattern to number (others 1)."""
 
     offset: float | dict[str, float] = 0.0
-    """Added after scaling: one number, or pattern of target names to number (others 0)."""
+    """Offset added after scaling: one number, or target name pattern to number (others 0)."""
 
     preserve_order: bool = False
-    """True orders the action components by pattern, as given; False by the entity's own order."""
+    """Order the action components by pattern instead of the entity's order."""
 
 
 class BaseAction(ActionTerm):
-    """Base of terms whose action has one component for each target.
+    """Base class of action terms with one component per target.
 
-    Raises `ValueError` if a pattern (of targets, scale, offset or clip) matches nothing, or two
-    match one name; and if scale or offset are neither a number nor a dict.
+    Raises `ValueError` if a pattern (of targets, scale, offset or clip) matches nothing, if two
+    patterns match one name, or if scale or offset are neither a number nor a dict.
     """
 
     cfg: BaseActionCfg
 
-    # What follows from the config is no run-time state: a resumed run may have another config.
-    # The entity saves its own.
+    # Derived from the config; not checkpointed, because a resumed run may change the config. The
+    # entity saves its state itself.
     _transient = {
         "_entity",
         "_target_ids",
@@ -61,7 +61,7 @@ class BaseAction(ActionTerm):
         super().__init__(cfg, env)
         ids, self._target_names = self._find_targets()
         self._target_ids = torch.tensor(ids, dtype=torch.long, device=self.device)
-        # The same targets as a slice where they are contiguous, which reads without a copy.
+        # Slice if the targets are contiguous: reads without a copy.
         self._columns = as_columns(ids, self.device)
         self._raw_actions = torch.zeros(
             self.num_envs, len(ids), dtype=torch.float32, device=self.device
@@ -78,27 +78,27 @@ class BaseAction(ActionTerm):
 
     @property
     def raw_action(self) -> torch.Tensor:
-        """(N, action_dim) last action as the policy gave it; zero after a reset."""
+        """Last unprocessed action, (N, action_dim). Zero after a reset."""
         return self._raw_actions
 
     @property
     def scale(self) -> torch.Tensor | float:
-        """Factor of the action: a number, or (N, action_dim)."""
+        """Factor of the action, a number or (N, action_dim)."""
         return self._scale
 
     @property
     def offset(self) -> torch.Tensor | float:
-        """Added after scaling: a number, or (N, action_dim)."""
+        """Offset added after scaling, a number or (N, action_dim)."""
         return self._offset
 
     @property
     def target_ids(self) -> torch.Tensor:
-        """Ids of the targets inside the entity, in the order of the action's components."""
+        """Ids of the targets within the entity, in the order of the action components."""
         return self._target_ids
 
     @property
     def target_names(self) -> list[str]:
-        """Names of the targets, in the order of the action's components."""
+        """Names of the targets, in the order of the action components."""
         return self._target_names
 
     def process_actions(self, actions: torch.Tensor) -> None:
@@ -111,7 +111,7 @@ class BaseAction(ActionTerm):
             torch.clamp(processed, min=self._clip[..., 0], max=self._clip[..., 1], out=processed)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Zero the raw action of environments (None means all)."""
+        """Zero the raw action of `env_ids` (None: all)."""
         self._raw_actions[slice(None) if env_ids is None else env_ids] = 0.0
 
     def _find_targets(self) -> tuple[list[int], list[str]]:
@@ -127,13 +127,13 @@ class BaseAction(ActionTerm):
         return [ids[position] for position in positions], joints
 
     def _by_target(
-        self, what: str, value: float | dict[str, float], default: float
+        self, name: str, value: float | dict[str, float], default: float
     ) -> torch.Tensor | float:
         if isinstance(value, (int, float)):
             return float(value)
         if not isinstance(value, dict):
             raise ValueError(
-                f"{type(self.cfg).__name__}.{what} must be a number or a dict of name pattern to "
+                f"{type(self.cfg).__name__}.{name}: expected a number or a dict of name pattern to "
                 f"number, got {type(value).__name__}: {value!r}."
             )
         per_target = torch.full(
@@ -144,12 +144,12 @@ class BaseAction(ActionTerm):
         return per_target.repeat(self.num_envs, 1)
 
     def _resolve_clip(self) -> torch.Tensor | None:
-        """Return (N, action_dim, 2) bounds, infinite where none are given."""
+        """Return the bounds of all targets, (N, action_dim, 2), infinite for unclipped targets."""
         if self.cfg.clip is None:
             return None
         if not isinstance(self.cfg.clip, dict):
             raise ValueError(
-                f"{type(self.cfg).__name__}.clip must be a dict of name pattern to (low, high), "
+                f"{type(self.cfg).__name__}.clip: expected a dict of name pattern to (low, high), "
                 f"got {type(self.cfg.clip).__name__}: {self.cfg.clip!r}."
             )
         bounds = torch.tensor([-torch.inf, torch.inf], dtype=torch.float32, device=self.device)
@@ -158,7 +158,7 @@ class BaseAction(ActionTerm):
         for i, name, pair in zip(ids, names, values, strict=True):
             if len(pair) != 2 or not pair[0] <= pair[1]:
                 raise ValueError(
-                    f"clip of target {name!r} must be (low, high) with low <= high: {pair!r}."
+                    f"clip of target {name!r}: expected (low, high) with low <= high, got {pair!r}."
                 )
             bounds[i] = torch.tensor(pair, dtype=torch.float32, device=self.device)
         return bounds.repeat(self.num_envs, 1, 1)
@@ -166,10 +166,10 @@ class BaseAction(ActionTerm):
 
 @dataclass(kw_only=True)
 class JointPositionActionCfg(BaseActionCfg):
-    """Joint position targets."""
+    """Joint position target configuration."""
 
     use_default_offset: bool = True
-    """Take the default joint positions as offset; `offset` is then ignored."""
+    """Use the default joint positions as offset; `offset` is then ignored."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.JOINT
@@ -179,10 +179,10 @@ class JointPositionActionCfg(BaseActionCfg):
 
 
 class JointPositionAction(BaseAction):
-    """Commands joint positions (rad or m), as the joints' encoders report them.
+    """Commands joint positions (rad or m) as measured by the encoders.
 
-    The target is lowered by the encoder bias, so that a robot commanded to the positions it
-    observes (`joint_pos_rel` with `biased=True`) stays where it is.
+    The encoder bias is subtracted from the target, so that a robot commanded to its observed
+    positions (`joint_pos_rel` with `biased=True`) does not move.
     """
 
     def __init__(self, cfg: JointPositionActionCfg, env: ManagerBasedRlEnv) -> None:
@@ -200,13 +200,13 @@ class JointPositionAction(BaseAction):
 
 @dataclass(kw_only=True)
 class RelativeJointPositionActionCfg(BaseActionCfg):
-    """Joint position targets relative to the current positions; `offset` must stay 0."""
+    """Relative joint position target configuration. `offset` must be 0."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.JOINT
         if self.offset != 0.0:
             raise ValueError(
-                f"RelativeJointPositionActionCfg takes no offset, got {self.offset!r}: the target "
+                f"RelativeJointPositionActionCfg.offset: expected 0, got {self.offset!r}; the target "
                 "is the current position plus the scaled action."
             )
 
@@ -217,7 +217,7 @@ class RelativeJointPositionActionCfg(BaseActionCfg):
 class RelativeJointPositionAction(BaseAction):
     """Commands joint position increments (rad or m); `clip` bounds the increment.
 
-    The current position is read again at every physics substep.
+    The current position is read at every physics substep.
     """
 
     def apply_actions(self) -> None:
@@ -227,10 +227,10 @@ class RelativeJointPositionAction(BaseAction):
 
 @dataclass(kw_only=True)
 class JointVelocityActionCfg(BaseActionCfg):
-    """Joint velocity targets."""
+    """Joint velocity target configuration."""
 
     use_default_offset: bool = True
-    """Take the default joint velocities as offset; `offset` is then ignored."""
+    """Use the default joint velocities as offset; `offset` is then ignored."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.JOINT
@@ -254,7 +254,7 @@ class JointVelocityAction(BaseAction):
 
 @dataclass(kw_only=True)
 class JointEffortActionCfg(BaseActionCfg):
-    """Joint effort targets."""
+    """Joint effort target configuration."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.JOINT
@@ -264,7 +264,7 @@ class JointEffortActionCfg(BaseActionCfg):
 
 
 class JointEffortAction(BaseAction):
-    """Commands joint efforts (what the actuator's control means: N m or N before its gear)."""
+    """Commands joint efforts in units of the actuator's control (N m or N, before its gear)."""
 
     @constant_within_step
     def apply_actions(self) -> None:
@@ -273,7 +273,7 @@ class JointEffortAction(BaseAction):
 
 @dataclass(kw_only=True)
 class TendonLengthActionCfg(BaseActionCfg):
-    """Tendon length targets."""
+    """Tendon length target configuration."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.TENDON
@@ -292,7 +292,7 @@ class TendonLengthAction(BaseAction):
 
 @dataclass(kw_only=True)
 class TendonVelocityActionCfg(BaseActionCfg):
-    """Tendon velocity targets."""
+    """Tendon velocity target configuration."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.TENDON
@@ -311,7 +311,7 @@ class TendonVelocityAction(BaseAction):
 
 @dataclass(kw_only=True)
 class TendonEffortActionCfg(BaseActionCfg):
-    """Tendon effort targets."""
+    """Tendon effort target configuration."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.TENDON
@@ -330,7 +330,7 @@ class TendonEffortAction(BaseAction):
 
 @dataclass(kw_only=True)
 class SiteEffortActionCfg(BaseActionCfg):
-    """Site effort targets."""
+    """Site effort target configuration."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.SITE
@@ -340,7 +340,7 @@ class SiteEffortActionCfg(BaseActionCfg):
 
 
 class SiteEffortAction(BaseAction):
-    """Commands efforts at sites, along the first axis of the actuator's gear (N or N m)."""
+    """Commands efforts at sites (N or N m), along the first axis of the actuator's gear."""
 
     @constant_within_step
     def apply_actions(self) -> None:

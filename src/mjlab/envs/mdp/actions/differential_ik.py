@@ -1,4 +1,4 @@
-"""An action that moves a frame of the robot: inverse kinematics turns it into joint targets."""
+"""Task-space action: differential inverse kinematics converts frame poses to joint targets."""
 
 from __future__ import annotations
 
@@ -22,69 +22,69 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 FrameType = Literal["body", "site", "geom"]
 
-# Least damping: below it a singular arm would have no solution.
+# Minimum damping: with less, a singular arm has no solution.
 _MIN_DAMPING = 1.0e-6
 
-# A quaternion shorter than this names no orientation.
+# Minimum norm of a quaternion that defines an orientation.
 _MIN_QUAT_NORM = 1.0e-6
 
-# No target is further away than this (m, rad); larger numbers would overflow.
-_FARTHEST = 1.0e6
+# Maximum magnitude of targets (m, rad); larger numbers would overflow.
+_MAX_TARGET = 1.0e6
 _WEIGHTS = ("position_weight", "orientation_weight", "joint_limit_weight", "posture_weight")
 
 
 @accepts_older_fields
 @dataclass(kw_only=True)
 class DifferentialIKActionCfg(ActionTermCfg):
-    """Pose targets of one frame, followed by damped least squares; `clip` has no effect.
+    """Pose target of one frame, tracked by damped least squares. `clip` has no effect.
 
-    The action has 3 components without orientation (`orientation_weight` 0), else 6 relative ones
-    (shift, rotation vector) or 7 absolute ones (position, quaternion w x y z), in world axes.
+    Action dimension: 3 without orientation (`orientation_weight` 0); else 6 in relative mode
+    (translation, rotation vector) or 7 in absolute mode (position, quaternion w x y z). World axes.
 
-    Joint targets start from where the joints are, so that drives which are soft sag under the
-    arm's weight; `gravcomp` of its bodies compensates that, as many arms' own controllers do.
+    Joint targets start from the current joint positions, so that soft position servos sag under
+    the arm's weight; compensate with `gravcomp` of the bodies, as many arm controllers do.
     """
 
     actuator_names: tuple[str, ...] | list[str]
-    """Patterns of the actuated joints that may move; each must match a whole name."""
+    """Patterns of the actuated joints that may move, matched in full."""
 
     frame_type: FrameType = "body"
-    """What the frame is: a body, a site or a geom of the entity."""
+    """Element type of the frame: `body`, `site` or `geom` of the entity."""
 
     frame_name: str
-    """Pattern of the frame's name; it must match exactly one."""
+    """Pattern of the frame's name. Must match exactly one element."""
 
     use_relative_mode: bool = True
-    """Whether actions move the target from the frame's present pose, instead of being the pose."""
+    """Interpret actions as displacements from the current frame pose instead of absolute poses."""
 
     delta_pos_scale: float = 1.0
-    """Metres for an action of 1, in relative mode."""
+    """Translation per unit action in relative mode (m)."""
 
     delta_ori_scale: float = 1.0
-    """Radians for an action of 1, in relative mode."""
+    """Rotation per unit action in relative mode (rad)."""
 
     damping: float = 0.05
-    """Damping of the joints' motion. Larger is calmer near singular poses, and slower."""
+    """Damping of joint motion. Larger values are smoother near singularities, and slower."""
 
     max_dq: float = 0.5
-    """Largest change of a joint target from its joint's position (rad or m)."""
+    """Maximum distance of a joint target from the joint position (rad or m)."""
 
     position_weight: float = 1.0
-    """Weight of the position error (per metre)."""
+    """Weight of the position error (1/m)."""
 
     orientation_weight: float = 1.0
-    """Weight of the orientation error (per radian). 0 leaves the orientation free."""
+    """Weight of the orientation error (1/rad). 0 leaves the orientation free."""
 
     joint_limit_weight: float = 0.0
-    """Weight of bringing joints that are outside their soft limits back."""
+    """Weight of returning joints to their soft limits."""
 
     posture_weight: float = 0.0
-    """Weight of the posture, which decides what the pose leaves open. It should be far below the
-    other weights, since it also pulls the frame off its target."""
+    """Weight of the posture, which resolves redundancy. Choose it far below the other weights,
+    since it also pulls the frame off its target."""
 
     posture_target: dict[str, float] | None = None
-    """The posture: joint positions by pattern (matching the start of a name), where it is not the
-    default one."""
+    """Posture: joint name pattern, matching the start of a name, to joint position (rad or m).
+    Other joints: default positions."""
 
     def build(self, env: ManagerBasedRlEnv) -> DifferentialIKAction:
         return DifferentialIKAction(self, env)
@@ -92,19 +92,19 @@ class DifferentialIKActionCfg(ActionTermCfg):
 
 @offers_older_attributes
 class DifferentialIKAction(ActionTerm):
-    """Commands the pose of a frame; joint position targets follow it at every physics substep.
+    """Commands the pose of a frame; joint position targets are updated every physics substep.
 
-    See `compute_dq` for the formula. Targets never leave the soft joint limits, whether the pose
-    can be reached or not. Poses are in the world frame, so tasks whose environments stand apart add
-    their origins to absolute positions.
+    See `compute_dq` for the formula. Targets never leave the soft joint limits, even if the pose is
+    unreachable. Poses are in the world frame: tasks with separate environment origins add them to
+    absolute positions.
 
-    Raises `ValueError` if a pattern of joints matches nothing, the frame's pattern not exactly one
-    element, or a number of the config is not one that makes sense.
+    Raises `ValueError` if a joint pattern matches nothing, if the frame pattern does not match
+    exactly one element, or for an invalid number in the config.
     """
 
     cfg: DifferentialIKActionCfg
 
-    # What follows from the config and views of the simulation are no run-time state.
+    # Values derived from the config and views of the simulation are not checkpointed.
     _transient = {
         "_columns",
         "_dofs",
@@ -128,8 +128,8 @@ class DifferentialIKAction(ActionTerm):
         self._dofs = as_columns(dofs, self.device)
         self._find_frame()
         self._posture = self._entity.data.default_joint_pos[:, self._columns].clone()
-        given = resolve_expr(cfg.posture_target or {}, tuple(self._joint_names), None)
-        for column, value in enumerate(given):
+        positions = resolve_expr(cfg.posture_target or {}, tuple(self._joint_names), None)
+        for column, value in enumerate(positions):
             if value is not None:
                 self._posture[:, column] = float(value)
         self._raw_actions = torch.zeros(
@@ -145,32 +145,32 @@ class DifferentialIKAction(ActionTerm):
 
     @property
     def action_dim(self) -> int:
-        """3 without orientation, 6 for a relative pose, 7 for an absolute one."""
+        """Action dimension: 3 without orientation, 6 for relative poses, 7 for absolute poses."""
         if self.cfg.orientation_weight == 0.0:
             return 3
         return 6 if self.cfg.use_relative_mode else 7
 
     @property
     def raw_action(self) -> torch.Tensor:
-        """(N, action_dim) last action as the policy gave it; zero after a reset."""
+        """Last unprocessed action, (N, action_dim). Zero after a reset."""
         return self._raw_actions
 
     def process_actions(self, actions: torch.Tensor) -> None:
-        """Set the pose to reach, from the frame's present one; actions are (N, action_dim)."""
+        """Set the target pose from `actions`, (N, action_dim), and the current frame pose."""
         self._raw_actions.copy_(actions)
         cfg, (position, quat) = self.cfg, self._get_frame_pose()
         if cfg.use_relative_mode:
-            delta = (self._raw_actions * self._scale).clamp_(-_FARTHEST, _FARTHEST)
+            delta = (self._raw_actions * self._scale).clamp_(-_MAX_TARGET, _MAX_TARGET)
             position = position + delta[:, :3]
             if self.action_dim == 6:
                 quat = quat_box_plus(quat, delta[:, 3:])
         else:
-            position = self._raw_actions[:, :3].clamp(-_FARTHEST, _FARTHEST)
+            position = self._raw_actions[:, :3].clamp(-_MAX_TARGET, _MAX_TARGET)
             if self.action_dim == 7:
-                given = self._raw_actions[:, 3:]
-                is_given = torch.linalg.vector_norm(given, dim=1, keepdim=True) > _MIN_QUAT_NORM
-                # A policy that outputs zeros asks for no orientation: the present one is kept.
-                quat = torch.where(is_given, normalize(given), quat)
+                target = self._raw_actions[:, 3:]
+                is_valid = torch.linalg.vector_norm(target, dim=1, keepdim=True) > _MIN_QUAT_NORM
+                # A zero quaternion defines no orientation: keep the current one.
+                quat = torch.where(is_valid, normalize(target), quat)
         self._desired_pos.copy_(position)
         self._desired_quat.copy_(quat)
 
@@ -180,21 +180,21 @@ class DifferentialIKAction(ActionTerm):
         self._entity.set_joint_position_target(q + self.compute_dq(), joint_ids=self._columns)
 
     def compute_dq(self) -> torch.Tensor:
-        """Return how far each joint should move, (N, number of joints), without applying it.
+        """Return the joint displacements, (N, number of joints), without applying them.
 
         With the pose errors e_p = p* - p and e_R = log(Q* Q^-1), the Jacobians J_p and J_R of the
-        frame, and how far joints are outside their soft limits, r = min(u - q, 0) + max(l - q, 0),
+        frame, and the soft limit violations r = min(u - q, 0) + max(l - q, 0),
 
             dq = argmin  w_p^2 |J_p dq - e_p|^2 + w_o^2 |J_R dq - e_R|^2
                        + w_l^2 |[r != 0] (dq - r)|^2 + w_q^2 |dq - (q_posture - q)|^2
                        + damping^2 |dq|^2,
 
-        clamped to +-max_dq. Joints that this would take past a soft limit stop there, and the
-        others do the best they can with that; a joint that is outside comes back, by at most
-        `max_dq` at a time.
+        clamped to +-max_dq. Joints that would pass a soft limit stop there, and the problem is
+        solved again for the other joints; a joint outside its limits returns by at most `max_dq`
+        per substep.
 
         Pose and Jacobian belong to the state before the last substep (at the first substep of a
-        step to the present one), q is current.
+        step, to the current state); q is current.
         """
         data, max_dq = self._entity.data, self.cfg.max_dq
         q = data.joint_pos[:, self._columns]
@@ -205,13 +205,13 @@ class DifferentialIKAction(ActionTerm):
         low, high = low.clamp_(-max_dq, max_dq), high.clamp_(-max_dq, max_dq)
         bounded = torch.clamp(dq, low, high)
         blocked = bounded != dq
-        # On a GPU looking would take longer than solving again.
+        # On a GPU, reading the mask takes longer than solving again.
         if not dq.is_cuda and not blocked.any():
             return dq
         known = torch.where(blocked, bounded, 0.0)
         dq = damped_least_squares(
             jacobian.masked_fill(blocked.unsqueeze(1), 0.0),
-            # No matrix product, which a GPU would compute in TF32.
+            # Not a matrix product: a GPU would compute it in TF32.
             error - (jacobian * known.unsqueeze(1)).sum(-1),
             stiffness,
             pull,
@@ -219,7 +219,7 @@ class DifferentialIKAction(ActionTerm):
         return torch.where(blocked, bounded, torch.clamp(dq, low, high))
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Zero the raw action of environments (None means all) and forget their targets."""
+        """Zero the raw action and clear the target pose of `env_ids` (None: all)."""
         index = slice(None) if env_ids is None else env_ids
         self._raw_actions[index] = 0.0
         self._desired_pos[index] = 0.0
@@ -229,7 +229,10 @@ class DifferentialIKAction(ActionTerm):
     def _least_squares(
         self, q: torch.Tensor, low: torch.Tensor, high: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the arguments of `damped_least_squares`; `low` and `high` are the way to limits."""
+        """Return the arguments of `damped_least_squares`.
+
+        `low` and `high` are the distances from q to the soft limits.
+        """
         cfg = self.cfg
         position, quat = self._get_frame_pose()
         errors = compute_pose_error(position, quat, self._desired_pos, self._desired_quat)
@@ -245,9 +248,9 @@ class DifferentialIKAction(ActionTerm):
         return jacobian, error, stiffness, limit * outside + posture * (self._posture - q)
 
     def _get_frame_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return position (N, 3) and quaternion (N, 4) of the frame in the world.
+        """Return position, (N, 3), and quaternion, (N, 4), of the frame in the world.
 
-        Subclasses override it to control a custom frame; the point moves with the body.
+        Override to control a custom frame; the point must move with the body.
         """
         if self.cfg.frame_type == "body":
             return self._frame_pos, self._frame_rotation
@@ -259,8 +262,8 @@ class DifferentialIKAction(ActionTerm):
         ids, names = find[cfg.frame_type](cfg.frame_name)
         if len(ids) != 1:
             raise ValueError(
-                f"frame_name {cfg.frame_name!r} matches {len(ids)} {cfg.frame_type}s of entity "
-                f"{cfg.entity_name!r}: {names}. It has to match exactly one."
+                f"frame_name {cfg.frame_name!r}: expected to match exactly one {cfg.frame_type} of "
+                f"entity {cfg.entity_name!r}, got {len(ids)}: {names}."
             )
         kinds = {"body": "body_ids", "site": "site_ids", "geom": "geom_ids"}
         frame = int(getattr(entity.indexing, kinds[cfg.frame_type])[ids[0]])
@@ -280,14 +283,14 @@ class DifferentialIKAction(ActionTerm):
 def damped_least_squares(
     jacobian: torch.Tensor, error: torch.Tensor, stiffness: torch.Tensor, pull: torch.Tensor
 ) -> torch.Tensor:
-    """Return x = (J'J + D)^-1 (J'e + b), with D a diagonal of positive numbers.
+    """Return x = (J'J + D)^-1 (J'e + b), with D diagonal and positive.
 
-    It is computed as x = D^-1 (b + J'y) with (J D^-1 J' + I) y = e - J D^-1 b (the matrix inversion
-    lemma). That system has the size of the task, not of the arm, its eigenvalues are at least 1,
-    and for an arm that can move freely its condition does not depend on the damping, while that of
-    J'J + D grows with its inverse square: in single precision that fails from a damping of about
-    1e-3 downward. Singular poses still make it ill-conditioned, so it is solved in double
-    precision, which costs no more time here.
+    Computed by the matrix inversion lemma: x = D^-1 (b + J'y) with
+    (J D^-1 J' + I) y = e - J D^-1 b. This system has the size of the task, not of the arm, and
+    eigenvalues >= 1. For an arm that can move freely its condition number does not depend on the
+    damping, whereas that of J'J + D grows with the inverse square of the damping: single precision
+    fails below a damping of about 1e-3. Singular poses still make the system ill-conditioned, so it
+    is solved in double precision, at no extra time.
 
     Args:
         jacobian: J, (N, m, n). error: e, (N, m). stiffness: D, (N, n). pull: b, (N, n).
@@ -299,7 +302,7 @@ def damped_least_squares(
     scaled = j.mT / d
     system = j @ scaled
     system.diagonal(dim1=-2, dim2=-1).add_(1.0)
-    # Without a check of the outcome, which would wait for a GPU: the matrix is positive definite.
+    # The matrix is positive definite; `solve` would check the result and synchronize with the GPU.
     multiplier, _ = torch.linalg.solve_ex(system, e - j @ (b / d))
     return (b / d + scaled @ multiplier).squeeze(-1).to(jacobian.dtype)
 
@@ -313,8 +316,8 @@ def _check_cfg(cfg: DifferentialIKActionCfg) -> None:
     check_positive("max_dq", cfg.max_dq)
     if cfg.position_weight == 0.0 and cfg.orientation_weight == 0.0:
         raise ValueError(
-            "position_weight and orientation_weight are both 0, so that the frame is free to be "
-            "anywhere. Give at least one of them a positive weight."
+            "position_weight, orientation_weight: expected at least one weight > 0, got 0 for both; "
+            "the frame would be unconstrained."
         )
 
 

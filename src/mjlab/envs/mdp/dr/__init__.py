@@ -1,7 +1,7 @@
-"""Domain randomization: event terms that vary the physical model between environments.
+"""Domain randomization: event terms that vary model fields between environments.
 
-Use them as the function of an `EventTermCfg`; the model fields they write are then expanded to one
-copy per environment, and derived constants are recomputed.
+Use these functions in an `EventTermCfg`: the model fields they write are expanded to per-environment
+copies, and derived constants are recomputed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = ["Distribution", "Operation"]
 for _home in (actuator, body, camera, geom, joint, light, material, pair, site, tendon):
     __all__ += _home.__all__
 
-# Operations and distributions as objects. `__all__` is without them: `abs` is also a builtin.
+# Operations and distributions as objects, not in `__all__`: `abs` is also a builtin.
 abs, add, scale = _types.ABS, _types.ADD, _types.SCALE
 uniform, log_uniform, gaussian = _types.UNIFORM, _types.LOG_UNIFORM, _types.GAUSSIAN
 

@@ -1,7 +1,7 @@
-"""Randomization of one model field: select, draw, write; and the factories of public functions.
+"""Randomization of one model field: select, sample, write; and factories of public functions.
 
-Each public function of `mjlab.envs.mdp.dr` stands in the file of its object (`geom`, `joint`, ...), most
-of them as one row: `geom_friction = field_term(__name__, "geom_friction", GEOM, ...)`.
+Each public function of `mjlab.envs.mdp.dr` is defined in the module of its object type (`geom`, `joint`,
+...), usually as one row: `geom_friction = field_term(__name__, "geom_friction", GEOM, ...)`.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 ROBOT = SceneEntityCfg("robot")
-"""Default selection of the functions: everything of the entity called "robot"."""
+"""Default selection: all elements of the entity called "robot"."""
 
 
 @dataclass(frozen=True)
 class ObjectKind:
-    """A kind of MuJoCo object: where its ids are in configs, entities and the model."""
+    """MuJoCo object type: location of its ids in configs, entities and the model."""
 
     name: str
-    """What error messages call it."""
+    """Name in error messages."""
     cfg_ids: str
-    """Attribute of `SceneEntityCfg` with the ids inside the entity."""
+    """Attribute of `SceneEntityCfg` with the ids within the entity."""
     entity_names: str
     """Attribute of `Entity` with the names, in the order of those ids."""
     global_ids: str
-    """Attribute of `EntityIndexing` with the ids in the model, in that order too."""
+    """Attribute of `EntityIndexing` with the ids in the model, in the same order."""
     addresses: tuple[str, Callable[[int], int]] | None = None
     """For values stored by address: the `MjModel` field with the first address of a joint, and the
     number of addresses by joint type."""
@@ -85,11 +85,11 @@ def field_term(
     """Return a public function that randomizes a model field.
 
     Args:
-        module: Module that publishes the function: its home in configs and pickles.
+        module: Module of the function in configs and pickles.
         name: Name of the function.
         kind: Objects that own the field.
         summary: First paragraph of the docstring, with units.
-        field: Field of `MjModel`. None: called like the function.
+        field: Field of `MjModel`. None: `name`.
         options: Other fields of `FieldRow`.
     """
     row = FieldRow(name, field or name, kind, **options)
@@ -134,7 +134,7 @@ def rotation_term(
 
 
 def writes(row: FieldRow) -> Callable[[F], F]:
-    """Declare, as a decorator, that a function randomizes the field of `row`, its attribute `row`."""
+    """Decorate a function that randomizes the field of `row`; sets its attribute `row`."""
 
     def declare(function: F) -> F:
         setattr(function, "row", row)  # noqa: B010
@@ -181,40 +181,40 @@ class RotationTerm(Protocol):
 _FIELD_ARGS = """
 
 Args:
-    env_ids: Environments to change; None means all.
+    env_ids: Environments to change. None: all.
     ranges: Pair of numbers (tuple or list) for all target axes; or a dict of axis to pair; or a
-        dict of name pattern to either, where each pattern must match object names of the entity
-        in full and replaces the selection of `asset_cfg`.
+        dict of name pattern to either. Patterns are matched in full against object names of the
+        entity and replace the selection of `asset_cfg`.
     asset_cfg: Entity and objects.
     distribution: "uniform" (lower, upper), "log_uniform" (lower, upper), "gaussian" (mean,
         standard deviation), or a `Distribution`.
     operation: "abs" sets the sample, `=U(a, b)`; "scale" multiplies the compile-time default by it,
         `*U(a, b)`; "add" adds it to the default, `+U(a, b)`; or an `Operation`.
     axes: Axes of the field to change. Default: the keys of `ranges`, else {axes}.
-    shared_random: Draw one value per environment and axis for all objects.
+    shared_random: Sample one value per environment and axis for all objects.
 
 Raises:
-    ValueError: unknown name, pattern without match, bad range, or axis the field does not have.
+    ValueError: unknown name, pattern without match, invalid range, or invalid axis.
 """
 _ROTATION_ARGS = """
 
-Roll, pitch and yaw (rad) turn about the fixed x, y and z axes of the frame in which the
-orientation is given, starting from the default: repeating does not accumulate.
+Roll, pitch and yaw (rad) are rotations about the fixed x, y and z axes of the orientation's
+reference frame, applied to the default: repetitions do not accumulate.
 
 Args:
-    env_ids: Environments to change; None means all.
-    roll_range, pitch_range, yaw_range: Pairs of numbers (rad), drawn per environment and object.
+    env_ids: Environments to change. None: all.
+    roll_range, pitch_range, yaw_range: Pairs of numbers (rad), sampled per environment and object.
     distribution: "uniform", "log_uniform", "gaussian", or a `Distribution`.
     asset_cfg: Entity and objects.
 
 Raises:
-    ValueError: unknown distribution or bad range.
+    ValueError: unknown distribution or invalid range.
 """
 
 
 @dataclass(frozen=True)
 class FieldRow:
-    """Model field, and how a public function randomizes it."""
+    """Model field and options of the public function that randomizes it."""
 
     name: str
     """Name of the public function."""
@@ -223,32 +223,32 @@ class FieldRow:
     kind: ObjectKind
     """Objects that own the field."""
     default_axes: tuple[int, ...] | None = None
-    """Axes of the last dimension changed when the caller names none; None means all of them."""
+    """Default axes of the last dimension to change. None: all."""
     operation: str = "abs"
     """Default operation."""
     recompute: RecomputeLevel = RecomputeLevel.none
     """Constants that depend on the field."""
     rotation: bool = False
-    """Whether the field is a quaternion, perturbed by roll, pitch and yaw."""
+    """Treat the field as a quaternion, perturbed by roll, pitch and yaw."""
     unit: bool = False
-    """Whether the field is a direction: kept at length 1, with untargeted axes at their defaults,
-    because their current values already depend on the axes drawn last time."""
+    """Treat the field as a direction of length 1. Untargeted axes start from their defaults,
+    because their current values depend on the previous samples."""
     also_writes: tuple[str, ...] = ()
-    """Further fields that `after` writes."""
+    """Additional fields written by `after`."""
     before: Callable[[Selection], None] | None = None
-    """Called before anything is written; refuses what cannot be randomized."""
+    """Check called before the write; raises if a selected object is not supported."""
     after: Callable[[Selection], None] | None = None
-    """Called after the write, to bring what depends on the field up to date."""
+    """Callback after the write that updates dependent fields."""
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """All model fields the function writes."""
+        """All model fields written by the function."""
         return (self.field, *self.also_writes)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Rows (environments) and columns (places in a model field) to write."""
+    """Rows (environments) and columns (indices into a model field) to write."""
 
     env: ManagerBasedRlEnv
     entity: Entity
@@ -256,10 +256,10 @@ class Selection:
     rows: torch.Tensor
     """Environment ids, int64 (R,)."""
     local_ids: torch.Tensor
-    """Ids of the objects inside the entity, int64 (K,)."""
+    """Ids of the objects within the entity, int64 (K,)."""
     columns: torch.Tensor
-    """Indices into the second dimension of the model field, int64 (C,). C = K, except where a
-    joint has several addresses."""
+    """Indices into the second dimension of the model field, int64 (C,). C = K, except for joints
+    with several addresses."""
 
     @property
     def index(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -268,7 +268,7 @@ class Selection:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(R, C)."""
+        """Shape of the block, (R, C)."""
         return len(self.rows), len(self.columns)
 
     @property
@@ -281,7 +281,7 @@ class Selection:
 # Write.
 
 Targets = list[tuple[Selection, tuple[int, ...]]]
-"""What was written: selections, each with its axes (empty for a field without axes)."""
+"""Written selections, each with its axes (empty for a field without axes)."""
 
 
 def randomize(
@@ -295,10 +295,10 @@ def randomize(
     axes: list[int] | tuple[int, ...] | None = None,
     shared_random: bool = False,
 ) -> Targets:
-    """Randomize a field as its row says, and return what was written.
+    """Randomize the field of `row` and return the written selections.
 
-    Only the given environments and the selected objects change, and of those only the target
-    axes. Raises `ValueError` for unknown names, bad ranges and axes the field does not have.
+    Only target axes of the selected objects in `env_ids` change. Raises `ValueError` for unknown
+    names, invalid ranges and invalid axes.
     """
     dist, op = resolve_distribution(distribution), resolve_operation(operation)
     shape = model_field(env, row.field).shape
@@ -320,7 +320,7 @@ def randomize(
 def targets_of(
     env: ManagerBasedRlEnv, ranges: Any, asset_cfg: SceneEntityCfg, kind: ObjectKind
 ) -> list[Selection]:
-    """Return what `randomize` would write with these `ranges`, in all environments."""
+    """Return the selections `randomize` would write with these `ranges`, in all environments."""
     return [select(env, None, asset_cfg, kind, pattern) for pattern, _ in _by_pattern(ranges)]
 
 
@@ -334,7 +334,7 @@ def rotate(
 ) -> None:
     """Set a quaternion field to `Rz(yaw) Ry(pitch) Rx(roll) * default`.
 
-    Roll, pitch and yaw (rad) are drawn per environment and object; they turn about the fixed
+    Roll, pitch and yaw (rad) are sampled per environment and object, and rotate about the fixed
     axes of the parent frame. Starting from the default, repetitions do not accumulate.
     """
     dist = resolve_distribution(distribution)
@@ -346,10 +346,10 @@ def rotate(
     delta = quat_from_euler_xyz(*angles)
     field = model_field(env, row.field)
     new = quat_mul(delta, default_values(selection, row.field))
-    field[selection.index] = keep_absent(selection, new, field)
+    field[selection.index] = preserve_absent_geoms(selection, new, field)
 
 
-# Selection and values, also for functions that are not rows.
+# Selection and values, shared with functions that are not rows.
 
 
 def select(
@@ -362,16 +362,16 @@ def select(
     """Resolve ids to a `Selection`.
 
     Args:
-        env_ids: Environments; None means all.
+        env_ids: Environments. None: all.
         asset_cfg: Entity and, without a pattern, its selected objects.
-        pattern: Regular expression that object names of the entity must match in full; it
-            replaces the selection of `asset_cfg`.
+        pattern: Regular expression, matched in full against object names of the entity. Replaces
+            the selection of `asset_cfg`.
 
     Raises `ValueError` if a pattern matches nothing.
     """
     entity: Entity = env.scene[asset_cfg.name]
     all_ids: torch.Tensor = getattr(entity.data.indexing, kind.global_ids)
-    # Names are looked up for patterns only: randomization may run at nearly every step.
+    # Names are looked up only for patterns: randomization may run nearly every step.
     if pattern is None:
         chosen = as_columns(getattr(asset_cfg, kind.cfg_ids), env.device)
         local_ids = torch.arange(len(all_ids), device=env.device)[chosen]
@@ -380,26 +380,26 @@ def select(
         matches = [i for i, name in enumerate(names) if re.fullmatch(pattern, name)]
         if not matches:
             raise ValueError(
-                f"ranges: the pattern {pattern!r} matches no {kind.name} of entity "
+                f"ranges: pattern {pattern!r} matches no {kind.name} of entity "
                 f"{asset_cfg.name!r}. Available: {list(names)}."
             )
         local_ids = torch.tensor(matches, dtype=torch.long, device=env.device)
-    places = all_ids[local_ids].long()
+    columns = all_ids[local_ids].long()
     if kind.addresses is not None:
         model, (start, width) = env.sim.mj_model, kind.addresses
         starts, types = getattr(model, start), model.jnt_type
-        addresses = [starts[j] + k for j in places.tolist() for k in range(width(types[j]))]
-        places = torch.tensor(addresses, dtype=torch.long, device=env.device)
+        addresses = [starts[j] + k for j in columns.tolist() for k in range(width(types[j]))]
+        columns = torch.tensor(addresses, dtype=torch.long, device=env.device)
     return Selection(
-        env, entity, kind, as_ids(env_ids, env.num_envs, env.device), local_ids, places
+        env, entity, kind, as_ids(env_ids, env.num_envs, env.device), local_ids, columns
     )
 
 
 def model_field(env: ManagerBasedRlEnv, field: str) -> torch.Tensor:
     """Return a model field, (N, objects, ...).
 
-    Writing one that the environments share raises `RuntimeError`: the event term has to declare
-    it with `requires_model_fields`.
+    Writing a field shared by all environments raises `RuntimeError`: the event term must declare it
+    with `requires_model_fields`.
     """
     return getattr(env.sim.model, field)
 
@@ -408,18 +408,20 @@ def default_values(selection: Selection, field: str) -> torch.Tensor:
     """Return a new tensor with the compile-time values of the selected block, (R, C, ...)."""
     default = selection.env.sim.get_default_field(field)
     current = getattr(selection.env.sim.model, field)
-    # Fields that differ by mesh variant have defaults of their own for each environment.
+    # Fields that differ between mesh variants have per-environment defaults.
     if default.ndim == current.ndim:
         return default[selection.index]
     block = default[selection.columns]
     return block.expand(len(selection.rows), *block.shape).clone()
 
 
-def keep_absent(selection: Selection, new: torch.Tensor, field: torch.Tensor) -> torch.Tensor:
-    """Return `new` (R, C, ...), with the present values for geoms that are not there.
+def preserve_absent_geoms(
+    selection: Selection, new: torch.Tensor, field: torch.Tensor
+) -> torch.Tensor:
+    """Return `new`, (R, C, ...), with the current values of absent geoms.
 
-    Where an entity has variants, an environment may lack geoms of the model. What keeps them out
-    of contacts and pictures stands in their fields.
+    With entity variants, an environment may lack geoms of the model. Field values of absent geoms
+    exclude them from contacts and images.
     """
     absent = selection.env.sim.absent_geoms if selection.kind is GEOM else None
     if absent is None:
@@ -429,15 +431,15 @@ def keep_absent(selection: Selection, new: torch.Tensor, field: torch.Tensor) ->
 
 
 def choose_ids(targets: Selection, choices: Selection, shared_random: bool) -> torch.Tensor:
-    """Return model ids drawn from `choices`, int32, for each environment and target (R, C).
+    """Sample model ids from `choices` for each environment and target, int32 (R, C).
 
-    Raises `ValueError` if there is nothing to choose from.
+    Raises `ValueError` if `choices` is empty.
     """
     kind, count = choices.kind.name, len(choices.columns)
     if count == 0:
         raise ValueError(
-            f"No {kind} to choose from: the selection of entity is empty. "
-            f"Set {kind}_names in the SceneEntityCfg to {kind}s that the entity has."
+            f"SceneEntityCfg {kind}_names: expected at least one {kind} of the entity to choose from, "
+            "got an empty selection."
         )
     rows, columns = targets.shape
     shape = (rows, 1 if shared_random else columns)
@@ -446,7 +448,7 @@ def choose_ids(targets: Selection, choices: Selection, shared_random: bool) -> t
 
 
 def _published(term: Any, module: str, row: FieldRow, docstring: str) -> Any:
-    """Give a made function the name, home and docstring it would have if written by hand."""
+    """Set name, module and docstring of a generated function, as if written by hand."""
     term.__name__ = term.__qualname__ = row.name
     term.__module__ = module
     term.__doc__ = docstring
@@ -454,21 +456,23 @@ def _published(term: Any, module: str, row: FieldRow, docstring: str) -> Any:
 
 
 def _by_pattern(ranges: Any) -> Iterator[tuple[str | None, Any]]:
-    """Yield (pattern of object names, ranges for them); None stands for the config's selection."""
+    """Yield (object name pattern, ranges). Pattern None: the selection of the config."""
     if not (isinstance(ranges, dict) and any(isinstance(key, str) for key in ranges)):
         yield None, ranges
         return
     if not all(isinstance(key, str) for key in ranges):
-        raise ValueError(f"ranges mixes name patterns and axes as keys: {ranges!r}. Nest the axes.")
+        raise ValueError(
+            f"ranges: expected name patterns or axes as keys, got both in {ranges!r}; nest the axes."
+        )
     yield from ranges.items()
 
 
 def _bounds_by_axis(
     row: FieldRow, ranges: Any, axes: list[int] | tuple[int, ...] | None, size: int
 ) -> dict[int, tuple[float, float]]:
-    """Return the bounds of each target axis, in the order in which they are drawn.
+    """Return the bounds of each target axis, in sampling order.
 
-    A field with one number an object counts as having the single axis 0.
+    A field with one number per object has the single axis 0.
     """
     if axes is not None:
         targets = list(axes)
@@ -476,14 +480,16 @@ def _bounds_by_axis(
         targets = list(ranges)
     else:
         targets = list(range(size) if row.default_axes is None else row.default_axes)
-    wrong = [axis for axis in targets if axis not in range(size)]
-    if wrong:
-        raise ValueError(f"{row.name} has no axes {wrong}; the valid axes are {[*range(size)]}.")
+    invalid = [axis for axis in targets if axis not in range(size)]
+    if invalid:
+        raise ValueError(f"{row.name} axes: expected axes in {[*range(size)]}, got {invalid}.")
     if not isinstance(ranges, dict):
         return dict.fromkeys(targets, read_bounds(ranges, f"{row.name}: ranges"))
     missing = [axis for axis in targets if axis not in ranges]
     if missing:
-        raise ValueError(f"{row.name}: ranges has no entry for the axes {missing}: {ranges!r}.")
+        raise ValueError(
+            f"{row.name}: ranges: expected entries for axes {missing}, got {ranges!r}."
+        )
     return {axis: read_bounds(ranges[axis], f"{row.name}: ranges[{axis}]") for axis in targets}
 
 
@@ -495,12 +501,12 @@ def _write(
     op: Operation,
     shared_random: bool,
 ) -> None:
-    """Draw a sample for each axis and write `op.combine(base, samples)`."""
+    """Sample each axis and write `op.combine(base, samples)`."""
     field = model_field(selection.env, row.field)
     from_default = op.uses_defaults or (row.unit and op is ABS)
     base = default_values(selection, row.field) if from_default else field[selection.index]
     rnd = op.initialize(base)
-    # The samples go into `rnd`; an operation may hand back the base itself as neutral element.
+    # `rnd` is written below, but an operation may return the base itself as neutral element.
     rnd = rnd.clone() if rnd is base else rnd
     rows, columns = selection.shape
     shape = (rows, 1 if shared_random else columns)
@@ -511,13 +517,13 @@ def _write(
             rnd[..., axis] = sample
         else:
             rnd = sample
-    new = keep_absent(selection, op.combine(base, rnd), field)
+    new = preserve_absent_geoms(selection, op.combine(base, rnd), field)
     if row.unit:
         norms = new.norm(dim=-1, keepdim=True)
         if bool((norms < 1e-6).any()):
             raise ValueError(
-                f"{row.name}: a zero vector was drawn, which is no direction. "
-                "Choose ranges that exclude the origin."
+                f"{row.name}: expected a nonzero direction, sampled a zero vector; choose ranges "
+                "that exclude the origin."
             )
         field[selection.index] = new / norms
     elif has_axes:

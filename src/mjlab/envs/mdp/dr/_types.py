@@ -1,6 +1,6 @@
-"""How a model field is randomized: what is drawn (`Distribution`) and how it is used (`Operation`).
+"""Distributions of samples, and operations that combine samples with field values.
 
-Both are open: an instance of your own passes wherever a name is accepted.
+Custom instances are accepted wherever a name is.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ Ranges = Bounds | dict[int, Bounds] | dict[str, "Bounds | dict[int, Bounds]"]
 
 @dataclass(frozen=True)
 class Distribution:
-    """A named random distribution with two parameters."""
+    """Named random distribution with two parameters."""
 
     name: str
-    """Name by which terms refer to it."""
+    """Name used in term configs."""
     sample: Callable[[torch.Tensor, torch.Tensor, tuple[int, ...], str], torch.Tensor]
-    """Called as `sample(lower, upper, shape, device)` with 0-d tensors; returns `shape`."""
+    """Sampler `sample(lower, upper, shape, device)`; bounds are 0-d tensors; returns `shape`."""
     check: Callable[[float, float], None] | None = None
-    """Called with the plain bounds before sampling; raises `ValueError` if they make no sense."""
+    """Check of the bounds before sampling; raises `ValueError` if they are invalid."""
 
 
 @dataclass(frozen=True)
 class Operation:
-    """How samples turn into new values: `new = combine(base, rnd)`.
+    """Named operation that computes new values: `new = combine(base, rnd)`.
 
     `rnd` is `initialize(base)` with the target axes overwritten by samples.
     """
 
     name: str
-    """Name by which terms refer to it."""
+    """Name used in term configs."""
     initialize: Callable[[torch.Tensor], torch.Tensor]
-    """Returns the neutral element for the base values, of the same shape."""
+    """Function from base values to their neutral element, of the same shape."""
     combine: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-    """Returns the new values from base values and samples."""
+    """Function from base values and samples to new values."""
     uses_defaults: bool
-    """Whether the base is the compile-time default (repeating never accumulates) or the current
-    value."""
+    """Use the compile-time default as base, so that repetitions do not accumulate. False: the
+    current value."""
 
 
 def _uniform(
@@ -58,9 +58,9 @@ def _log_uniform(
     lower: torch.Tensor, upper: torch.Tensor, shape: tuple[int, ...], device: str
 ) -> torch.Tensor:
     low, high = torch.log(lower), torch.log(upper)
-    drawn = torch.exp(torch.rand(shape, dtype=torch.float32, device=device) * (high - low) + low)
-    # Equal bounds are a constant, also at or below zero, where the logarithm does not exist.
-    return torch.where(lower == upper, lower.expand(shape), drawn)
+    samples = torch.exp(torch.rand(shape, dtype=torch.float32, device=device) * (high - low) + low)
+    # Equal bounds are a constant, even for bounds <= 0 without a logarithm.
+    return torch.where(lower == upper, lower.expand(shape), samples)
 
 
 def _gaussian(
@@ -72,16 +72,16 @@ def _gaussian(
 def _check_log_bounds(lower: float, upper: float) -> None:
     if lower != upper and min(lower, upper) <= 0.0:
         raise ValueError(
-            f"log_uniform needs bounds above 0 (or equal bounds, which are a constant), "
-            f"got ({lower}, {upper}). Use 'uniform' for ranges that touch 0."
+            f"log_uniform bounds: expected bounds > 0, or equal bounds for a constant, got "
+            f"({lower}, {upper}); use 'uniform' for ranges that include 0."
         )
 
 
 def _check_deviation(mean: float, deviation: float) -> None:
     if deviation < 0.0:
         raise ValueError(
-            f"gaussian takes (mean, standard deviation); the deviation must not be negative, "
-            f"got ({mean}, {deviation})."
+            f"gaussian bounds: expected (mean, standard deviation) with deviation >= 0, got "
+            f"({mean}, {deviation})."
         )
 
 
@@ -101,7 +101,7 @@ T = TypeVar("T")
 
 
 def resolve_distribution(dist: Distribution | str) -> Distribution:
-    """Return the distribution of that name; an instance passes through.
+    """Return the distribution called `dist`; an instance is returned unchanged.
 
     Raises `ValueError` for an unknown name.
     """
@@ -109,36 +109,36 @@ def resolve_distribution(dist: Distribution | str) -> Distribution:
 
 
 def resolve_operation(op: Operation | str) -> Operation:
-    """Return the operation of that name; an instance passes through.
+    """Return the operation called `op`; an instance is returned unchanged.
 
     Raises `ValueError` for an unknown name.
     """
     return _resolve(op, Operation, OPERATIONS)
 
 
-def _resolve(given: T | str, kind: type[T], known: dict[str, T]) -> T:
-    if isinstance(given, kind):
-        return given
-    if not isinstance(given, str) or given not in known:
+def _resolve(value: T | str, kind: type[T], known: dict[str, T]) -> T:
+    if isinstance(value, kind):
+        return value
+    if not isinstance(value, str) or value not in known:
         raise ValueError(
-            f"Unknown {kind.__name__.lower()} {given!r}. Choose one of {sorted(known)}, "
-            f"or pass a {kind.__name__} of your own."
+            f"Unknown {kind.__name__.lower()} {value!r}. Available: {sorted(known)}, or a custom "
+            f"{kind.__name__}."
         )
-    return known[given]
+    return known[value]
 
 
-def read_bounds(given: Any, what: str) -> tuple[float, float]:
+def read_bounds(value: Any, name: str) -> tuple[float, float]:
     """Return two floats from a pair in a tuple or list.
 
-    Raises `ValueError` naming `what` for anything else.
+    Raises `ValueError` naming `name` for other values.
     """
-    if isinstance(given, (tuple, list)) and len(given) == 2:
-        lower, upper = given
+    if isinstance(value, (tuple, list)) and len(value) == 2:
+        lower, upper = value
         if all(isinstance(bound, (int, float)) for bound in (lower, upper)):
             return float(lower), float(upper)
     raise ValueError(
-        f"{what} must be a pair of numbers, such as (0.8, 1.2), got {given!r} "
-        f"of type {type(given).__name__}."
+        f"{name}: expected a pair of numbers, such as (0.8, 1.2), got {value!r} of type "
+        f"{type(value).__name__}."
     )
 
 
@@ -147,16 +147,16 @@ def draw(
 ) -> torch.Tensor:
     """Sample a tensor of `shape`.
 
-    Raises `ValueError` if the distribution does not accept the bounds, or returns another shape.
+    Raises `ValueError` if the distribution rejects the bounds or returns the wrong shape.
     """
     if distribution.check is not None:
         distribution.check(*bounds)
-    # Filled on the device: copies from the host would wait for it.
+    # Filled on the device: copies from the host would synchronize.
     lower, upper = (torch.full((), b, dtype=torch.float32, device=device) for b in bounds)
     sample = distribution.sample(lower, upper, shape, device)
     if sample.shape != torch.Size(shape):
         raise ValueError(
-            f"The distribution {distribution.name!r} returned shape {tuple(sample.shape)}; "
-            f"it must return the shape it is asked for, {shape}."
+            f"Distribution {distribution.name!r}: expected samples of shape {shape}, got "
+            f"{tuple(sample.shape)}."
         )
     return sample

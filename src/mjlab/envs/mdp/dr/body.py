@@ -38,8 +38,8 @@ __all__ = [
 def warn_mass_without_inertia(selection: Selection) -> None:
     """Warn that a body whose mass changes keeps its inertia."""
     warnings.warn(
-        "dr.body_mass changes masses and leaves inertias as they are. "
-        "Use dr.pseudo_inertia with alpha_range to scale both consistently.",
+        "dr.body_mass changes mass but not inertia (physically inconsistent); use "
+        "dr.pseudo_inertia with alpha_range to scale both.",
         UserWarning,
         stacklevel=4,
     )
@@ -49,7 +49,7 @@ body_mass = field_term(
     __name__,
     "body_mass",
     BODY,
-    "Randomize body masses (kg). The inertia stays; `pseudo_inertia` scales both.",
+    "Randomize body masses (kg). The inertia is unchanged; `pseudo_inertia` scales both.",
     operation="scale",
     recompute=RecomputeLevel.set_const,
     before=warn_mass_without_inertia,
@@ -58,7 +58,7 @@ body_com_offset = body_ipos = field_term(
     __name__,
     "body_com_offset",
     BODY,
-    "Randomize centres of mass: offsets x, y, z (m) in the body frame.",
+    "Randomize centers of mass: offsets x, y, z (m) in the body frame.",
     field="body_ipos",
     operation="add",
     recompute=RecomputeLevel.set_const,
@@ -79,7 +79,7 @@ body_quat = rotation_term(
     recompute=RecomputeLevel.set_const_0,
 )
 
-# Mass, centre of mass and inertia together.
+# Joint randomization of mass, center of mass and inertia.
 
 _FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
 _PARAMETERS = ("alpha", "d1", "d2", "d3", "s12", "s13", "s23", "t1", "t2", "t3")
@@ -89,13 +89,13 @@ class Inertial(NamedTuple):
     """Inertial parameters of bodies, with leading dimensions (...), as MuJoCo stores them."""
 
     mass: torch.Tensor
-    """(...) kg."""
+    """Mass (kg), (...)."""
     com: torch.Tensor
-    """(..., 3) m, body frame."""
+    """Center of mass (m) in the body frame, (..., 3)."""
     inertia: torch.Tensor
-    """(..., 3) kg m^2, principal moments."""
+    """Principal moments of inertia (kg m^2), (..., 3)."""
     quat: torch.Tensor
-    """(..., 4) orientation of the principal axes in the body frame."""
+    """Orientation of the principal axes in the body frame, (..., 4)."""
 
 
 @requires_model_fields(*_FIELDS, recompute=RecomputeLevel.set_const)
@@ -117,7 +117,7 @@ def pseudo_inertia(
     distribution: Distribution | str = "uniform",
     asset_cfg: SceneEntityCfg = ROBOT,
 ) -> None:
-    """Randomize mass, centre of mass and inertia so that a real body could have them.
+    """Randomize mass, center of mass and inertia with physical consistency.
 
     Every point of the default body moves by `x -> A x + t` in the body frame, and its density
     scales, so that mass is multiplied by `e^(2 alpha)`:
@@ -125,23 +125,23 @@ def pseudo_inertia(
         A = [[e^d1, s12, s13], [0, e^d2, s23], [0, 0, e^d3]],   J' = e^(2 alpha) U J U^T,
         U = [[A, t], [0, 1]],   J = pseudo-inertia matrix (4 x 4) of the default body.
 
-    The default is the start every time, so repeating does not accumulate. The principal moments
-    come out in ascending order. The ten parameters are drawn independently for each environment
-    and body, in the order alpha, d1..d3, s12, s13, s23, t1..t3.
+    Starts from the default, so repetitions do not accumulate. Principal moments are in ascending
+    order. The ten parameters are sampled independently per environment and body, in the order
+    alpha, d1..d3, s12, s13, s23, t1..t3.
 
     Args:
-        env_ids: Environments to change; None means all.
+        env_ids: Environments to change. None: all.
         alpha_range: Half the logarithm of the mass factor.
         d1_range, d2_range, d3_range: Logarithms of the stretch along x, y, z.
-        d_range: Replaces the three single ranges.
+        d_range: Replacement of the three ranges above.
         s12_range, s13_range, s23_range: Shears.
-        t1_range, t2_range, t3_range: Shift of the centre of mass (m) in the body frame.
-        t_range: Replaces the three single ranges.
+        t1_range, t2_range, t3_range: Shift of the center of mass (m) in the body frame.
+        t_range: Replacement of the three ranges above.
         distribution: "uniform", "log_uniform", "gaussian", or a `Distribution`.
         asset_cfg: Entity and bodies.
 
     Raises:
-        ValueError: a selected body has no mass or an unphysical inertia (by name), or a bad range.
+        ValueError: a selected body (named) has no mass or an unphysical inertia, or invalid range.
     """
     dist = resolve_distribution(distribution)
     d_ranges = (d1_range, d2_range, d3_range) if d_range is None else (d_range,) * 3
@@ -150,8 +150,8 @@ def pseudo_inertia(
     bodies = select(env, env_ids, asset_cfg, BODY)
     default = _default_pseudo_inertia(bodies)
     parameters = []
-    for name, given in zip(_PARAMETERS, ranges, strict=True):
-        bounds = read_bounds(given, f"pseudo_inertia: {name}_range")
+    for name, value in zip(_PARAMETERS, ranges, strict=True):
+        bounds = read_bounds(value, f"pseudo_inertia: {name}_range")
         parameters.append(draw(dist, bounds, bodies.shape, env.device).double())
     transform = _transform(parameters)
     perturbed = transform @ default @ transform.transpose(-1, -2)
@@ -163,23 +163,23 @@ def pseudo_inertia(
 def _default_pseudo_inertia(bodies: Selection) -> torch.Tensor:
     values = Inertial(*(default_values(bodies, field).double() for field in _FIELDS))
     # J is positive definite iff the mass and the second moments of mass along the principal axes
-    # are positive. The margin is the rounding of the float32 values: a flat body has none.
+    # are positive. The margin covers float32 rounding: a flat body has a zero second moment.
     trace = values.inertia.sum(dim=-1, keepdim=True)
     second_moments = 0.5 * trace - values.inertia
     unphysical = (second_moments <= 2e-7 * trace).any(dim=-1) | (values.mass <= 0.0)
     bad = unphysical.any(dim=0).tolist()
-    refused = [name for name, is_bad in zip(bodies.names, bad, strict=True) if is_bad]
-    if refused:
+    invalid = [name for name, is_bad in zip(bodies.names, bad, strict=True) if is_bad]
+    if invalid:
         raise ValueError(
-            f"pseudo_inertia: the bodies {refused} have no mass, or an inertia that no real body "
-            "has (their pseudo-inertia matrix is not positive definite). Leave them out of "
-            "body_names, or give them a mass and an inertia in the model."
+            f"pseudo_inertia: bodies {invalid} have no mass or an unphysical inertia (pseudo-inertia "
+            "matrix not positive definite); exclude them from body_names, or set mass and inertia "
+            "in the model."
         )
     return pseudo_inertia_matrix(values)
 
 
 def _transform(parameters: list[torch.Tensor]) -> torch.Tensor:
-    """Return `e^alpha U` for parameters of shape (...), as (..., 4, 4)."""
+    """Return `e^alpha U`, (..., 4, 4), for parameters of shape (...)."""
     alpha, d1, d2, d3, s12, s13, s23, t1, t2, t3 = parameters
     zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)
     rows = (
@@ -195,8 +195,8 @@ def _transform(parameters: list[torch.Tensor]) -> torch.Tensor:
 def pseudo_inertia_matrix(body: Inertial) -> torch.Tensor:
     """Return J = [[Sigma, m c], [m c^T, m]], (..., 4, 4).
 
-    Sigma = tr(I_o) / 2 * 1 - I_o is the second moment of mass about the body frame's origin, and
-    I_o the inertia about that origin.
+    Sigma = tr(I_o) / 2 * 1 - I_o is the second moment of mass about the origin of the body frame,
+    and I_o the inertia about that origin.
     """
     rotation = matrix_from_quat(body.quat)
     about_com = rotation @ torch.diag_embed(body.inertia) @ rotation.transpose(-1, -2)
@@ -210,7 +210,7 @@ def pseudo_inertia_matrix(body: Inertial) -> torch.Tensor:
 
 
 def inertial_from_pseudo_inertia(matrix: torch.Tensor) -> Inertial:
-    """Return the inertial parameters of (..., 4, 4) pseudo-inertia matrices.
+    """Return the inertial parameters of pseudo-inertia matrices, (..., 4, 4).
 
     Principal moments are ascending; the axes are right-handed.
     """
@@ -221,7 +221,7 @@ def inertial_from_pseudo_inertia(matrix: torch.Tensor) -> Inertial:
     about_com = about_origin - mass[..., None, None] * _steiner(com)
     inertia, axes = torch.linalg.eigh(0.5 * (about_com + about_com.transpose(-1, -2)))
     sign = torch.where(torch.linalg.det(axes) < 0.0, -1.0, 1.0).to(axes.dtype)
-    # Eigenvectors have no sign: turning the third makes them a rotation where they are none.
+    # The sign of eigenvectors is arbitrary: flip the third to get a rotation (determinant 1).
     axes = torch.cat((axes[..., :2], axes[..., 2:] * sign[..., None, None]), dim=-1)
     return Inertial(mass, com, inertia, quat_from_matrix(axes))
 

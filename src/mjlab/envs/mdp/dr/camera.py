@@ -26,7 +26,7 @@ cam_pos = field_term(
     __name__,
     "cam_pos",
     CAMERA,
-    "Randomize camera positions x, y, z (m) in the body frame. Moves cameras of mode fixed only.",
+    "Randomize camera positions x, y, z (m) in the body frame. Affects only cameras of mode fixed.",
 )
 cam_quat = rotation_term(
     __name__, "cam_quat", CAMERA, "Perturb camera orientations in the body frame."
@@ -36,21 +36,21 @@ cam_quat = rotation_term(
 def _check_cam_fovy(
     env: ManagerBasedRlEnv, ranges: Ranges, asset_cfg: SceneEntityCfg = ROBOT, **_: Any
 ) -> None:
-    """Raise `ValueError` if a selected camera has a sensor, because of which fovy is not read."""
+    """Raise `ValueError` if a selected camera has a sensor size: MuJoCo then ignores fovy."""
     model = env.sim.mj_model
     for selection in targets_of(env, ranges, asset_cfg, CAMERA):
-        # Parallel rays have no focal length: there fovy is the height of the image.
-        refused = [
+        # Orthographic cameras have no focal length: fovy is the height of the image.
+        ignored = [
             name
             for name, camera in zip(selection.names, selection.columns.tolist(), strict=True)
             if model.cam_sensorsize[camera, 1] > 0.0
             and model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
         ]
-        if refused:
+        if ignored:
             raise ValueError(
-                f"cam_fovy: these cameras have a focal length and a sensor size, so that their "
-                f"field of view is not read: {refused}. Use dr.cam_intrinsic for them, or select "
-                "others (camera_names of the SceneEntityCfg)."
+                f"cam_fovy: expected cameras without focal and sensorsize, got {ignored}, whose "
+                "fovy MuJoCo ignores; use dr.cam_intrinsic, or select other cameras (camera_names "
+                "of the SceneEntityCfg)."
             )
 
 
@@ -59,7 +59,7 @@ cam_fovy = checked_when_built(_check_cam_fovy)(
         __name__,
         "cam_fovy",
         CAMERA,
-        "Randomize vertical fields of view (degrees). Cameras with a focal length and a sensor "
-        "size do not read it, and are refused when the term is built: see `cam_intrinsic`.",
+        "Randomize vertical fields of view (degrees). Raises when the term is built for cameras "
+        "with focal length and sensor size, because MuJoCo ignores their fovy; use `cam_intrinsic`.",
     )
 )

@@ -13,8 +13,8 @@ from mjlab.envs.mdp.dr._core import (
     ROBOT,
     choose_ids,
     field_term,
-    keep_absent,
     model_field,
+    preserve_absent_geoms,
     rotation_term,
     select,
 )
@@ -31,12 +31,12 @@ geom_friction = field_term(
     __name__,
     "geom_friction",
     GEOM,
-    "Randomize geom friction: axis 0 slides, 1 spins (needs condim >= 4), 2 rolls (condim 6). "
+    "Randomize geom friction: axis 0 sliding, 1 torsional (needs condim >= 4), 2 rolling (condim 6). "
     "A contact uses the larger value of its two geoms unless their priorities differ.",
     default_axes=(0,),
 )
 
-# Spatial tendons run around geoms.
+# Spatial tendons wrap around geoms.
 geom_pos = field_term(
     __name__,
     "geom_pos",
@@ -55,7 +55,7 @@ geom_rgba = field_term(
     __name__,
     "geom_rgba",
     GEOM,
-    "Randomize geom colours r, g, b, a in [0, 1]; seen only on geoms without material.",
+    "Randomize geom colors r, g, b, a in [0, 1]. Visible only on geoms without material.",
 )
 
 
@@ -66,10 +66,10 @@ def geom_matid(
     asset_cfg: SceneEntityCfg = ROBOT,
     shared_random: bool = False,
 ) -> None:
-    """Give each selected geom one of the selected materials, uniformly at random.
+    """Assign each selected geom one of the selected materials, uniformly at random.
 
     Args:
-        env_ids: Environments to change; None means all.
+        env_ids: Environments to change. None: all.
         asset_cfg: Entity, geoms (`geom_names`) and materials to choose from (`material_names`).
         shared_random: Choose one material per environment for all geoms.
 
@@ -80,7 +80,7 @@ def geom_matid(
     materials = select(env, env_ids, asset_cfg, MATERIAL)
     field = model_field(env, "geom_matid")
     chosen = choose_ids(geoms, materials, shared_random)
-    field[geoms.index] = keep_absent(geoms, chosen, field)
+    field[geoms.index] = preserve_absent_geoms(geoms, chosen, field)
 
 
 # Sizes.
@@ -94,23 +94,23 @@ _PRIMITIVES = {
 }
 
 
-def require_primitive_geoms(selection: Selection) -> None:
-    """Raise `ValueError` if a selected geom has no size that could be randomized."""
+def check_primitive_geoms(selection: Selection) -> None:
+    """Raise `ValueError` if a selected geom is not a primitive."""
     types = selection.env.sim.mj_model.geom_type
-    refused = {
+    invalid = {
         name: mujoco.mjtGeom(int(types[geom])).name.removeprefix("mjGEOM_").lower()
         for name, geom in zip(selection.names, selection.columns.tolist(), strict=True)
         if int(types[geom]) not in _PRIMITIVES
     }
-    if refused:
+    if invalid:
         raise ValueError(
-            f"geom_size: these geoms are no primitives: {refused}. Select only geoms of type "
-            f"{', '.join(_PRIMITIVES.values())} (geom_names of the SceneEntityCfg)."
+            f"geom_size: expected geoms of type {', '.join(_PRIMITIVES.values())}, got {invalid}; "
+            "select others with geom_names of the SceneEntityCfg."
         )
 
 
 def refresh_geom_bounds(selection: Selection) -> None:
-    """Recompute bounding sphere radius and box of the selected geoms from their sizes."""
+    """Recompute bounding sphere radii and boxes of the selected geoms from their sizes."""
     env = selection.env
     sizes, radii = model_field(env, "geom_size"), model_field(env, "geom_rbound")
     boxes = model_field(env, "geom_aabb")
@@ -120,14 +120,14 @@ def refresh_geom_bounds(selection: Selection) -> None:
         index = selection.rows[:, None], selection.columns[types == kind][None, :]
         radius, half = _bounds(kind, sizes[index])
         new_radii[:, types == kind] = radius
-        # The box is (centre, half sizes); the centre of a primitive does not move.
+        # The box is (center, half sizes); the center of a primitive does not move.
         new_boxes[:, types == kind, 1] = half
-    radii[selection.index] = keep_absent(selection, new_radii, radii)
-    boxes[selection.index] = keep_absent(selection, new_boxes, boxes)
+    radii[selection.index] = preserve_absent_geoms(selection, new_radii, radii)
+    boxes[selection.index] = preserve_absent_geoms(selection, new_boxes, boxes)
 
 
 def _bounds(kind: int, size: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the bounding radius (...) and half sizes (..., 3) of primitives of one type."""
+    """Return bounding radii, (...), and half sizes, (..., 3), of primitives of one type."""
     a, b, c = size.unbind(-1)
     shape = _PRIMITIVES[kind]
     if shape == "sphere":
@@ -144,11 +144,11 @@ geom_size = field_term(
     __name__,
     "geom_size",
     GEOM,
-    "Randomize sizes of primitive geoms (m) and refresh their bounding volumes. Mass and "
-    "inertia stay. Planes, height fields, meshes and SDFs are refused.",
+    "Randomize sizes of primitive geoms (m) and recompute their bounding volumes. Mass and "
+    "inertia are unchanged. Planes, height fields, meshes and SDFs are not supported.",
     operation="scale",
     also_writes=("geom_rbound", "geom_aabb"),
     recompute=RecomputeLevel.set_const_0,
-    before=require_primitive_geoms,
+    before=check_primitive_geoms,
     after=refresh_geom_bounds,
 )

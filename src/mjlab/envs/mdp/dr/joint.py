@@ -1,6 +1,6 @@
 """Randomization of joints and their degrees of freedom.
 
-A quantity that MuJoCo calls otherwise (`dof_damping`, `jnt_range`, `qpos0`) has that name too.
+Quantities are also available under their MuJoCo names (`dof_damping`, `jnt_range`, `qpos0`).
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ joint_stiffness = jnt_stiffness = field_term(
 
 
 def refresh_entity_limits(selection: Selection) -> None:
-    """Carry changed joint ranges over to the entity's hard and soft limits.
+    """Update the entity's hard and soft limits from the model's joint ranges.
 
-    Joints that the model does not limit keep their infinite limits.
+    Joints without limits in the model keep infinite limits.
     """
     env, entity = selection.env, selection.entity
     limited = torch.as_tensor(env.sim.mj_model.jnt_limited, device=env.device).bool()
@@ -88,16 +88,16 @@ joint_limits = jnt_range = field_term(
     __name__,
     "joint_limits",
     JOINT,
-    "Randomize joint limits (rad or m), and with them the entity's hard and soft limits. "
-    "Axis 0 is the lower end, 1 the upper; one pair for both draws them independently, so "
-    "give {0: ..., 1: ...} where the intervals overlap.",
+    "Randomize joint limits (rad or m) and the entity's hard and soft limits. Axis 0 is the "
+    "lower limit, 1 the upper. One pair for both axes samples them independently, so use "
+    "{0: ..., 1: ...} if the limits could cross.",
     field="jnt_range",
     after=refresh_entity_limits,
 )
 
 
 def normalize_ball_joints(selection: Selection) -> None:
-    """Bring the reference quaternions of selected ball joints back to length 1."""
+    """Normalize the reference quaternions of selected ball joints."""
     env, model = selection.env, selection.env.sim.mj_model
     qpos0 = model_field(env, "qpos0")
     joints = selection.entity.data.indexing.joint_ids[selection.local_ids].tolist()
@@ -114,7 +114,7 @@ joint_default_pos = qpos0 = field_term(
     "joint_default_pos",
     QPOS,
     "Shift the kinematic zero of joints (rad or m): the joint angle is qpos - qpos0. Default "
-    "joint positions and reset targets of the entity stay.",
+    "joint positions and reset targets of the entity are unchanged.",
     field="qpos0",
     operation="add",
     recompute=RecomputeLevel.set_const_0,
@@ -128,13 +128,14 @@ def encoder_bias(
     bias_range: tuple[float, float],
     asset_cfg: SceneEntityCfg = ROBOT,
 ) -> None:
-    """Draw joint encoder biases (rad or m), uniform, per environment and joint.
+    """Sample joint encoder biases (rad or m), uniform, per environment and joint.
 
-    Sensed positions are q + bias, and position targets are lowered by the bias, so sensed and
-    commanded frames agree. A bias replaces the previous one and survives resets.
+    Measured positions are q + bias, and the bias is subtracted from position targets, so that
+    measured and commanded positions agree. A bias replaces the previous one and persists across
+    resets.
 
     Args:
-        env_ids: Environments to change; None means all.
+        env_ids: Environments to change. None: all.
         bias_range: Lower and upper bound.
         asset_cfg: Entity and joints.
     """

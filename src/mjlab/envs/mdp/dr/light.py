@@ -15,7 +15,7 @@ __all__ = [
     "light_specular",
 ]
 
-light_ambient = field_term(__name__, "light_ambient", LIGHT, "Randomize ambient colours r, g, b.")
+light_ambient = field_term(__name__, "light_ambient", LIGHT, "Randomize ambient colors r, g, b.")
 light_attenuation = field_term(
     __name__,
     "light_attenuation",
@@ -23,19 +23,17 @@ light_attenuation = field_term(
     "Randomize attenuation: constant, linear and quadratic coefficient.",
 )
 light_cutoff = field_term(__name__, "light_cutoff", LIGHT, "Randomize spotlight cutoffs (degrees).")
-light_diffuse = field_term(__name__, "light_diffuse", LIGHT, "Randomize diffuse colours r, g, b.")
+light_diffuse = field_term(__name__, "light_diffuse", LIGHT, "Randomize diffuse colors r, g, b.")
 light_dir = field_term(
     __name__,
     "light_dir",
     LIGHT,
-    "Randomize light directions x, y, z (body frame), which are then brought to length 1. "
-    "Axes that are not targeted start from the default direction.",
+    "Randomize light directions x, y, z (body frame), normalized to length 1. Axes without "
+    "ranges start from the default direction.",
     unit=True,
 )
 light_exponent = field_term(__name__, "light_exponent", LIGHT, "Randomize spotlight exponents.")
 light_pos = field_term(
     __name__, "light_pos", LIGHT, "Randomize light positions x, y, z (m), body frame."
 )
-light_specular = field_term(
-    __name__, "light_specular", LIGHT, "Randomize specular colours r, g, b."
-)
+light_specular = field_term(__name__, "light_specular", LIGHT, "Randomize specular colors r, g, b.")

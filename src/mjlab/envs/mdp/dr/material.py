@@ -36,7 +36,7 @@ mat_rgba = field_term(
     __name__,
     "mat_rgba",
     MATERIAL,
-    "Randomize material colours r, g, b, a in [0, 1]; a texture is multiplied by it.",
+    "Randomize material colors r, g, b, a in [0, 1]. Textures are multiplied by the color.",
 )
 mat_shininess = field_term(__name__, "mat_shininess", MATERIAL, "Randomize shininess in [0, 1].")
 mat_specular = field_term(__name__, "mat_specular", MATERIAL, "Randomize specularity in [0, 1].")
@@ -51,17 +51,17 @@ def mat_texid(
     role: int = 1,
     shared_random: bool = False,
 ) -> None:
-    """Give each selected material one of the selected textures, uniformly at random.
+    """Assign each selected material one of the selected textures, uniformly at random.
 
     Args:
-        env_ids: Environments to change; None means all.
+        env_ids: Environments to change. None: all.
         asset_cfg: Entity, materials (`material_names`) and textures to choose from
             (`texture_names`).
         role: Texture slot to write, an `mjtTextureRole`; 1 is RGB.
         shared_random: Choose one texture per environment for all materials.
 
     Raises:
-        ValueError: no texture is selected, or there is no such role.
+        ValueError: no texture is selected, or invalid role.
     """
     materials = select(env, env_ids, asset_cfg, MATERIAL)
     textures = select(env, env_ids, asset_cfg, TEXTURE)

@@ -32,12 +32,11 @@ def pair_friction(
 ) -> None:
     """Randomize friction of contact pairs: tangent 1, tangent 2, spin, roll 1, roll 2.
 
-    Arguments are those of the other functions (see `dr.geom_friction`), with axes 0 to 4 and
-    axis 0 by default.
+    Arguments as in `dr.geom_friction`, with axes 0 to 4; default axis 0.
 
     Args:
-        isotropic: Make friction equal in both directions: tangent 2 follows tangent 1, and
-            roll 2 follows roll 1 if a roll axis was randomized.
+        isotropic: Use equal friction in both directions: copy tangent 1 to tangent 2, and roll 1 to
+            roll 2 if a roll axis was randomized.
     """
     written = randomize(
         _ROW, env, env_ids, ranges, asset_cfg, distribution, operation, axes, shared_random

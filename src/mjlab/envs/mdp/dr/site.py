@@ -7,7 +7,7 @@ from mjlab.managers.event_manager import RecomputeLevel
 
 __all__ = ["site_pos", "site_quat"]
 
-# Spatial tendons run through sites, and actuators act at them.
+# Spatial tendons pass through sites, and actuators act at sites.
 site_pos = field_term(
     __name__,
     "site_pos",

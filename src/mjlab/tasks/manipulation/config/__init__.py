@@ -1,1 +1,1 @@
-"""The robots that the manipulation tasks come with, one package each."""
+"""Robots of the manipulation tasks, one package each."""

@@ -1,4 +1,4 @@
-"""The terms of the manipulation tasks, together with the library of `mjlab.envs.mdp`."""
+"""Terms of the manipulation tasks and of `mjlab.envs.mdp`."""
 
 from mjlab.compat import older_exports, older_names
 from mjlab.envs.mdp import *  # noqa: F403

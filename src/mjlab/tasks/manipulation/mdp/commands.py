@@ -1,4 +1,4 @@
-"""The commands of the manipulation tasks: goals for one object, or for one of several."""
+"""Commands of the manipulation tasks: goals for a single object, or for one of several."""
 
 from __future__ import annotations
 
@@ -36,14 +36,13 @@ __all__ = [
 ]
 
 FIXED_GOAL = (0.4, 0.0, 0.3)
-"""The goal of difficulty `fixed`, in metres from the environment's origin."""
+"""Goal of difficulty `fixed`, relative to the environment's origin (m)."""
 _GOAL_RADIUS = 0.03
 _GOAL_COLOR: Color = (1.0, 0.5, 0.0, 0.3)
 _DIFFICULTIES = ("fixed", "dynamic")
 logger = logging.getLogger(__name__)
 _MAX_TRIES = 200
-# Discs that are put down at random one after the other leave no room for another one once they
-# cover 55 % of the ground. Well below that there is room at the first few tries.
+# Random sequential packing of disks jams at 55 % coverage. Well below that, a few tries suffice.
 _CROWDED = 0.35
 _NO_GEOM = -999
 _MARK_HEIGHT = 0.04
@@ -53,53 +52,53 @@ _MARK_COLOR: Color = (1.0, 0.0, 0.0, 1.0)
 
 @dataclass(kw_only=True)
 class GoalCommandCfg(CommandTermCfg):
-    """A goal for an object, drawn anew from time to time."""
+    """Configuration of a goal for an object, resampled periodically."""
 
     @dataclass
     class TargetPositionRangeCfg:
-        """Where goals are, in metres from the environment's origin."""
+        """Ranges of goals relative to the environment's origin (m)."""
 
         x: tuple[float, float] = (0.3, 0.5)
-        """Forward."""
+        """Range along x, forward (m)."""
         y: tuple[float, float] = (-0.2, 0.2)
-        """To the left."""
+        """Range along y, to the left (m)."""
         z: tuple[float, float] = (0.2, 0.4)
-        """Up."""
+        """Range along z, up (m)."""
 
     success_threshold: float = 0.05
-    """The object is at its goal when its origin is closer to it than this, in metres."""
+    """Distance from object origin to goal below which the object counts as at its goal (m)."""
     difficulty: Literal["fixed", "dynamic"] = "fixed"
-    """`fixed`: the goal is always at (0.4, 0, 0.3). `dynamic`: it is uniform within
+    """Goal sampling. `fixed`: always (0.4, 0, 0.3). `dynamic`: uniform within
     `target_position_range`."""
     target_position_range: TargetPositionRangeCfg = field(default_factory=TargetPositionRangeCfg)
-    """Where goals are drawn from."""
+    """Sampling ranges of dynamic goals."""
 
 
 class GoalCommand(CommandTerm):
-    """Base of commands that say where an object is to be brought.
+    """Base class of commands with a goal position for an object.
 
-    A subclass defines `wanted_object_pos()` and `_place_objects(env_ids)`, and may draw more with
+    Subclasses define `object_pos()` and `_place_objects(env_ids)`, and may sample more in
     `_draw_command(env_ids)`.
 
-    When the time of a goal is over within an episode, a new one is drawn and the objects are put
-    elsewhere. Derived quantities of these environments, and of no others, are then computed once
-    more, so that observations see objects where they are.
+    When the goal is resampled within an episode, the objects are placed at new poses. `sim.forward`
+    then recomputes the derived quantities of these environments only, so that observations are of
+    the new poses.
 
-    Metrics, of the end of the last step: `position_error` (m), `at_goal` (whether that is below
-    the threshold), `goal_success` (whether it has been at any step since this goal was drawn) and
-    `episode_success` (likewise, since the episode began).
+    Metrics at the end of the last step: `position_error` (m), `at_goal` (1 if the error is below
+    the threshold), `goal_success` (1 if at the goal in any step since the goal was sampled) and
+    `episode_success` (1 if at a goal in any step since the episode began).
 
     Attributes:
-        target_pos: (N, 3) the goal, in the world (m).
-        goal_age: (N,) seconds since the goal was drawn.
-        last_goal_met: (N,) bool, whether the object was at the goal before this one when its time
-            was over; False in an episode's first goal.
+        target_pos: (N, 3) goal, world frame (m).
+        goal_age: (N,) time since the goal was sampled (s).
+        last_goal_met: (N,) bool, True if the object was at the previous goal when that was
+            replaced; False for the first goal of an episode.
     """
 
-    # Where objects were moved, and the page's panel.
+    # Rebuilt or set within a call; not checkpointed.
     _transient = {"_moved", "_panel"}
 
-    # A GoalCommandCfg; subclasses have configs of their own.
+    # GoalCommandCfg or a subclass of it.
     cfg: Any
 
     def __init__(self, cfg: GoalCommandCfg, env: ManagerBasedRlEnv) -> None:
@@ -120,35 +119,35 @@ class GoalCommand(CommandTerm):
 
     @property
     def command(self) -> torch.Tensor:
-        """The goal, (N, 3), in the world (m)."""
+        """Goal, world frame (m), (N, 3)."""
         return self.target_pos
 
     @property
     def episode_success(self) -> torch.Tensor:
-        """1 where the object has been at a goal in this episode, else 0, (N,)."""
+        """1 if the object has been at a goal in this episode, else 0, (N,)."""
         return self.metrics["episode_success"]
 
-    def wanted_object_pos(self) -> torch.Tensor:
-        """Return where the object is that is to be brought, (N, 3), in the world (m)."""
+    def object_pos(self) -> torch.Tensor:
+        """Return the position of the target object, world frame (m), (N, 3)."""
         raise NotImplementedError
 
     def compute_success(self) -> torch.Tensor:
-        """Return where the object was at its goal at the end of the last step, (N,) bool."""
+        """Return True if the object was at its goal at the end of the last step, (N,) bool."""
         return self.metrics["position_error"] < self.cfg.success_threshold
 
     def goal_is_met(self) -> torch.Tensor:
-        """Return whether the object was brought to its goal in the time that there was, (N,) bool.
+        """Return True if the object reached its goal in the time available, (N,) bool.
 
-        A goal that is younger than the shortest time a goal has is not judged, because nobody could
-        have met it yet: there it is the goal before that counts, at the moment when its time was
-        over. The first goal of an episode is always judged.
+        A goal younger than the minimum resampling time is not scored, because it may be unreachable
+        so early; the previous goal then counts, at the moment it was replaced. The first goal of an
+        episode is always scored.
         """
         has_time = self.goal_age >= self.cfg.resampling_time_range[0]
-        is_judged = has_time | (self.command_counter <= 1)
-        return torch.where(is_judged, self.compute_success(), self.last_goal_met)
+        is_scored = has_time | (self.command_counter <= 1)
+        return torch.where(is_scored, self.compute_success(), self.last_goal_met)
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
-        """Measure, advance time, and redraw goals whose time is over; see `CommandTerm.compute`."""
+        """Update metrics, advance time and resample expired goals; see `CommandTerm.compute`."""
         self._moved = None
         self.goal_age[slice(None) if env_ids is None else env_ids] += dt
         super().compute(dt, env_ids)
@@ -157,7 +156,7 @@ class GoalCommand(CommandTerm):
         if self._panel is not None:
             held = self._panel.write_to(self.target_pos, self._env.scene.env_origins)
             if held is not None:
-                # What a person holds is not taken away.
+                # Do not resample a goal that the user holds.
                 self.time_left[held] = self.cfg.resampling_time_range[1]
 
     def create_gui(
@@ -168,12 +167,12 @@ class GoalCommand(CommandTerm):
         on_change: Callable[[], None] | None = None,
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
-        """Add a handle at the goal of the environment in view, by which a person drags it."""
+        """Add a handle to drag the goal of the displayed environment."""
         self._panel = GoalPanel(
             name, server, self.cfg.target_position_range, get_env_idx, on_change
         )
 
-    # Drawing goals.
+    # Resampling.
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         metrics = self.metrics
@@ -190,17 +189,17 @@ class GoalCommand(CommandTerm):
         self._place_objects(env_ids)
 
     def _draw_command(self, env_ids: torch.Tensor) -> None:
-        """Draw what comes before the goal; nothing unless overridden."""
+        """Sample subclass quantities before the goal. Default: nothing."""
 
     def _place_objects(self, env_ids: torch.Tensor) -> None:
-        """Put the objects of these environments to where they start, with `_place`."""
+        """Place the objects of `env_ids` at their start poses, with `_place`."""
         raise NotImplementedError
 
     def _place(
         self, entity: Entity, positions: torch.Tensor, yaws: torch.Tensor, env_ids: torch.Tensor
     ) -> None:
-        """Put an object at rest at positions (n, 3) from the environments' origins, turned by `yaws`
-        (n,) about the vertical."""
+        """Place an object at rest at `positions` (n, 3), relative to the environments' origins,
+        with rotations `yaws` (n,) about z."""
         pose = positions.new_zeros(len(env_ids), 7)
         pose[:, :3] = positions + self._env.scene.env_origins[env_ids]
         pose[:, 3] = torch.cos(yaws / 2.0)
@@ -209,15 +208,15 @@ class GoalCommand(CommandTerm):
         entity.write_root_link_velocity_to_sim(torch.zeros_like(pose[:, :6]), env_ids=env_ids)
         self._moved = env_ids
 
-    # Metrics and drawing.
+    # Metrics and visualization.
 
     def _is_measured(self, env_ids: torch.Tensor) -> torch.Tensor:
-        # Before its first goal there was nothing to measure.
+        # Metrics are undefined before the first goal.
         return self.command_counter[env_ids] > 0
 
     def _update_metrics(self) -> None:
         metrics = self.metrics
-        error = torch.linalg.vector_norm(self.target_pos - self.wanted_object_pos(), dim=1)
+        error = torch.linalg.vector_norm(self.target_pos - self.object_pos(), dim=1)
         metrics["position_error"].copy_(error)
         metrics["at_goal"].copy_(error < self.cfg.success_threshold)
         for name in ("goal_success", "episode_success"):
@@ -235,52 +234,52 @@ class GoalCommand(CommandTerm):
 
 @dataclass(kw_only=True)
 class LiftingCommandCfg(GoalCommandCfg):
-    """A goal for one object, which is put somewhere else with every new goal."""
+    """Configuration of a goal for a single object, placed at a new pose with every new goal."""
 
     @dataclass
     class ObjectPoseRangeCfg:
-        """Where the object is put, from the environment's origin."""
+        """Ranges of the object pose relative to the environment's origin."""
 
         x: tuple[float, float] = (0.3, 0.35)
-        """Forward, in metres."""
+        """Range along x, forward (m)."""
         y: tuple[float, float] = (-0.1, 0.1)
-        """To the left, in metres."""
+        """Range along y, to the left (m)."""
         z: tuple[float, float] = (0.02, 0.05)
-        """Up, in metres. The object falls from there."""
+        """Range along z, up (m). The object falls from there."""
         yaw: tuple[float, float] = (-math.pi, math.pi)
-        """Turn about the vertical, in rad."""
+        """Range of rotations about z (rad)."""
 
     @dataclass
     class VizCfg:
-        """How the command is drawn."""
+        """Visualization of the command."""
 
         target_color: tuple[float, float, float, float] = (1.0, 0.5, 0.0, 0.3)
-        """Red, green, blue and opacity of the goal."""
+        """Color and opacity of the goal (RGBA)."""
 
     entity_name: str
-    """The object, which has a free joint."""
+    """Name of the object, an entity with a free joint."""
     object_pose_range: ObjectPoseRangeCfg | None = field(default_factory=ObjectPoseRangeCfg)
-    """Where the object is put. None: it stays where it is, or where reset events put it."""
+    """Ranges of the object pose. None: keep the current pose, or the pose set by reset events."""
     viz: VizCfg = field(default_factory=VizCfg)
-    """Drawing."""
+    """Visualization settings."""
 
     def build(self, env: ManagerBasedRlEnv) -> LiftingCommand:
-        """Return the term; raises `ValueError` for ranges or an object that make no sense."""
+        """Build the term; raises `ValueError` for invalid ranges or an invalid object."""
         return LiftingCommand(self, env)
 
 
 class LiftingCommand(GoalCommand):
-    """A goal (x, y, z) in the world for one object; see `GoalCommand`.
+    """Goal (x, y, z) in the world frame for a single object; see `GoalCommand`.
 
-    One more metric is `object_height`: the object's z in the world (m).
+    Additional metric: `object_height`, the object's z in the world (m).
     """
 
     cfg: LiftingCommandCfg
 
     def __init__(self, cfg: LiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        moved = cfg.object_pose_range is not None
-        self.object: Entity = require_object(env, cfg.entity_name, "entity_name", moved)
+        is_moved = cfg.object_pose_range is not None
+        self.object: Entity = require_object(env, cfg.entity_name, "entity_name", is_moved)
         if cfg.object_pose_range is not None:
             check_pose_range(cfg.object_pose_range)
         self.metrics = {
@@ -288,7 +287,7 @@ class LiftingCommand(GoalCommand):
             **self.metrics,
         }
 
-    def wanted_object_pos(self) -> torch.Tensor:
+    def object_pos(self) -> torch.Tensor:
         return self.object.data.root_link_pos_w
 
     def _place_objects(self, env_ids: torch.Tensor) -> None:
@@ -302,7 +301,7 @@ class LiftingCommand(GoalCommand):
 
     def _update_metrics(self) -> None:
         super()._update_metrics()
-        self.metrics["object_height"].copy_(self.wanted_object_pos()[:, 2])
+        self.metrics["object_height"].copy_(self.object_pos()[:, 2])
 
     @property
     def _goal_color(self) -> Color:
@@ -311,38 +310,38 @@ class LiftingCommand(GoalCommand):
 
 @dataclass(kw_only=True)
 class MultiCubeLiftingCommandCfg(GoalCommandCfg):
-    """A goal for one of several objects, all of which are put elsewhere with every new goal."""
+    """Configuration of a goal for one of several objects. Every new goal places all objects."""
 
     @dataclass
     class ObjectPoseRangeCfg:
-        """Where the objects are put, from the environment's origin."""
+        """Ranges of the object poses relative to the environment's origin."""
 
         x: tuple[float, float] = (0.25, 0.40)
-        """Forward, in metres."""
+        """Range along x, forward (m)."""
         y: tuple[float, float] = (-0.15, 0.15)
-        """To the left, in metres."""
+        """Range along y, to the left (m)."""
         z: tuple[float, float] = (0.02, 0.05)
-        """Up, in metres. The objects fall from there."""
+        """Range along z, up (m). The objects fall from there."""
         yaw: tuple[float, float] = (-math.pi, math.pi)
-        """Turn about the vertical, in rad."""
+        """Range of rotations about z (rad)."""
 
     entity_names: tuple[str, ...] = ()
-    """The objects, each with a free joint."""
+    """Names of the objects, entities with a free joint."""
     object_pose_range: ObjectPoseRangeCfg = field(default_factory=ObjectPoseRangeCfg)
-    """Where the objects are put."""
+    """Ranges of the object poses."""
 
     def build(self, env: ManagerBasedRlEnv) -> MultiCubeLiftingCommand:
-        """Return the term; raises `ValueError` for ranges or objects that make no sense."""
+        """Build the term; raises `ValueError` for invalid ranges or objects."""
         return MultiCubeLiftingCommand(self, env)
 
 
 class MultiCubeLiftingCommand(GoalCommand):
-    """A goal (x, y, z) in the world for one object out of several; see `GoalCommand`.
+    """Goal (x, y, z) in the world frame for one of several objects; see `GoalCommand`.
 
-    Objects are put so far apart that they do not touch, whatever their yaw.
+    Objects are placed far enough apart not to touch at any yaw.
 
     Attributes:
-        target_selection: (N,) int64, the wanted object: an index into `entity_names`.
+        target_selection: (N,) int64, index of the target object in `entity_names`.
     """
 
     _transient = {"_geom_ids", "_apart"}
@@ -353,13 +352,13 @@ class MultiCubeLiftingCommand(GoalCommand):
         super().__init__(cfg, env)
         check_pose_range(cfg.object_pose_range)
         if not cfg.entity_names:
-            raise ValueError("entity_names is empty; name the objects, of which one is wanted.")
+            raise ValueError("entity_names: expected at least one object, got ().")
         self.objects: list[Entity] = [
             require_object(env, name, "entity_names", is_moved=True) for name in cfg.entity_names
         ]
         self.target_selection = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         ids = [torch.as_tensor(one.indexing.geom_ids).long().cpu() for one in self.objects]
-        # (K, G) scene ids of each object's geoms.
+        # Scene ids of the geoms of each object, (K, G).
         self._geom_ids = torch.nn.utils.rnn.pad_sequence(
             ids, batch_first=True, padding_value=_NO_GEOM
         ).to(self.device)
@@ -369,17 +368,17 @@ class MultiCubeLiftingCommand(GoalCommand):
 
     @property
     def target_geom_ids(self) -> torch.Tensor:
-        """Scene ids of the wanted object's geoms, (N, G) int64, filled up with -999."""
+        """Scene ids of the target object's geoms, padded with -999, (N, G) int64."""
         return self._geom_ids[self.target_selection]
 
-    def wanted_object_pos(self) -> torch.Tensor:
+    def object_pos(self) -> torch.Tensor:
         return self.target_object_pos()
 
     def target_object_pos(self) -> torch.Tensor:
-        """Return where the wanted object is now, (N, 3), in the world (m)."""
+        """Return the position of the target object, world frame (m), (N, 3)."""
         positions = torch.stack([entity.data.root_link_pos_w for entity in self.objects])
-        wanted = self.target_selection.view(1, -1, 1).expand(1, -1, 3)
-        return positions.gather(0, wanted).squeeze(0)
+        index = self.target_selection.view(1, -1, 1).expand(1, -1, 3)
+        return positions.gather(0, index).squeeze(0)
 
     def _draw_command(self, env_ids: torch.Tensor) -> None:
         self.target_selection[env_ids] = torch.randint(
@@ -400,31 +399,31 @@ class MultiCubeLiftingCommand(GoalCommand):
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
         super()._debug_vis_impl(visualizer)
-        wanted = self.target_object_pos()
+        target = self.target_object_pos()
         for index in visualizer.get_env_indices(self.num_envs):
-            mark = wanted[index].cpu().numpy() + (0.0, 0.0, _MARK_HEIGHT)
+            mark = target[index].cpu().numpy() + (0.0, 0.0, _MARK_HEIGHT)
             visualizer.add_sphere(mark, _MARK_RADIUS, _MARK_COLOR)
 
 
 def check_pose_range(within: Any) -> None:
-    """Raise `ValueError` for a range of poses that makes no sense."""
+    """Raise `ValueError` for an invalid range in `within`."""
     for name in ("x", "y", "z", "yaw"):
         check_range(f"object_pose_range.{name}", getattr(within, name))
 
 
-def require_object(env: ManagerBasedRlEnv, name: str, label: str, is_moved: bool) -> Entity:
-    """Return an entity of the scene; raises `ValueError` if there is none, or it cannot move."""
-    check_exists(f"entity in {label}", name, env.scene.entities)
+def require_object(env: ManagerBasedRlEnv, name: str, field: str, is_moved: bool) -> Entity:
+    """Return the entity `name`; raises `ValueError` if unknown, or fixed and `is_moved`."""
+    check_exists(f"entity in {field}", name, env.scene.entities)
     entity: Entity = env.scene.entities[name]
     if is_moved and entity.is_fixed_base:
         raise ValueError(
-            f"{label}: {name!r} has a fixed base, so that it cannot be lifted. Give its root body a "
+            f"{field} {name!r}: expected a floating base, got a fixed base; give its root body a "
             "free joint."
         )
     return entity
 
 
-# Placing several objects so that none is in another.
+# Placement of several objects without overlap.
 
 
 def keep_apart(
@@ -433,14 +432,14 @@ def keep_apart(
     x: tuple[float, float],
     y: tuple[float, float],
 ) -> None:
-    """Draw x and y anew, in place, of objects that are too close to one before them.
+    """Resample, in place, x and y of objects too close to an earlier object.
 
-    What is far enough apart keeps its place, so that as few numbers are drawn as can be. Where 200
-    tries find no room, the last one stays.
+    Objects that are far enough apart keep their positions, to draw as few random numbers as
+    possible. If 200 tries fail, the last sample is kept.
 
     Args:
         positions: (n, K, 3) positions of K objects.
-        apart: (n, K, K) or (K, K) least horizontal distances, in metres.
+        apart: (n, K, K) or (K, K) minimum horizontal distances (m).
         x: Range of new x.
         y: Range of new y.
     """
@@ -458,7 +457,7 @@ def keep_apart(
 
 
 def _too_close(positions: torch.Tensor, index: int, apart: torch.Tensor) -> torch.Tensor:
-    """Return whether an object is too close to one of those before it, (n,) bool."""
+    """Return True if object `index` is too close to an earlier object, (n,) bool."""
     offsets = positions[:, :index, :2] - positions[:, index : index + 1, :2]
     distances = torch.linalg.vector_norm(offsets, dim=-1)
     return (distances < apart[:, index, :index]).any(dim=1)
@@ -467,19 +466,19 @@ def _too_close(positions: torch.Tensor, index: int, apart: torch.Tensor) -> torc
 def distance_apart(
     sim: Simulation, geom_ids: torch.Tensor, within: Any, names: Sequence[str]
 ) -> torch.Tensor:
-    """Return how far apart the origins of objects have to be not to touch, (N, K, K) in metres.
+    """Return the minimum distances of object origins that prevent contact (m), (N, K, K).
 
-    That is the sum of the radii of the spheres about their origins that hold them: for two equal
-    cubes, the diagonal of one. Variants of objects have radii of their own. Warns if the range
-    `within` is too small for all of them in any environment.
+    The distance is the sum of the radii of bounding spheres about the origins: for two equal
+    cubes, the diagonal of one. Radii are per environment, for variants. Logs a warning if the range
+    `within` is too small for all objects in any environment.
 
     Args:
-        sim: The simulation of the scene.
-        geom_ids: (K, G) scene ids of each object's geoms; negative ones are no geom.
-        within: Ranges `x` and `y` that the objects are placed in.
-        names: The objects' names.
+        sim: Simulation of the scene.
+        geom_ids: (K, G) scene ids of each object's geoms; negative ids are padding.
+        within: Placement ranges, attributes `x` and `y`.
+        names: Names of the objects.
     """
-    # As these objects have one body, a geom's position is that from the origin.
+    # The objects have one body each, so geom_pos is relative to the object's origin.
     reach = sim.model.geom_pos.norm(dim=-1) + sim.model.geom_rbound
     if sim.absent_geoms is not None:
         reach = reach.masked_fill(sim.absent_geoms, 0.0)
@@ -491,15 +490,15 @@ def distance_apart(
     covered = sum(math.pi * radius**2 for radius in largest)
     if len(largest) > 1 and covered > _CROWDED * sides[0] * sides[1]:
         logger.warning(
-            "object_pose_range is small for the %d objects %s: some may be put into one another, "
-            "and are then thrown apart. Widen x or y, or take fewer or smaller objects.",
+            "object_pose_range is small for the %d objects %s: objects may start in penetration "
+            "and be thrown apart. Widen x or y, or use fewer or smaller objects.",
             len(largest),
             list(names),
         )
     return radii.unsqueeze(1) + radii.unsqueeze(2)
 
 
-# How far an arm reaches.
+# Reach of an arm.
 
 
 def check_reach(
@@ -507,30 +506,29 @@ def check_reach(
 ) -> None:
     """Raise `ValueError` if goals or objects of a command are certainly out of an arm's reach.
 
-    An object is at its goal within `success_threshold` of it, which is added to the reach.
+    `success_threshold` is added to the reach, because objects count as at their goal within it.
     """
     found = reach(env.sim.mj_model, f"{entity_name}/{site}")
     if found is None:
         return
     center, longest = found
     goals, starts = cfg.target_position_range, getattr(cfg, "object_pose_range", None)
-    narrow = "Narrow {} to what the arm can reach."
+    narrow = "narrow {}"
     places: list[tuple[str, list[tuple[float, ...]], str]]
     places = [("goals", _corners(goals), narrow.format("target_position_range"))]
     if cfg.difficulty == "fixed":
-        nearer = "Put the arm nearer, or choose the difficulty 'dynamic', whose goals have a range."
+        nearer = "move the arm nearer, or use difficulty 'dynamic', whose goals have a range"
         places = [("goals", [FIXED_GOAL], nearer)]
     if starts is not None:
         places.append(("objects", _corners(starts), narrow.format("object_pose_range")))
-    for label, points, remedy in places:
+    for kind, points, remedy in places:
         farthest = max(points, key=lambda point: math.dist(point, center))
         distance = math.dist(farthest, center)
         if distance > longest + cfg.success_threshold:
             raise ValueError(
-                f"The command {command_name!r} puts {label} as far away as {farthest} (metres from "
-                f"the environment's origin). That is {distance:.2f} m from the first joint of entity "
-                f"{entity_name!r}, whose site {site!r} gets {longest:.2f} m from it at most. "
-                f"{remedy}"
+                f"Command {command_name!r} {kind}: expected at most {longest:.2f} m from the first "
+                f"joint of entity {entity_name!r}, the reach of site {site!r}, got {distance:.2f} m "
+                f"at {farthest} (m, relative to the environment's origin); {remedy}."
             )
 
 
@@ -539,13 +537,12 @@ def _corners(within: Any) -> list[tuple[float, ...]]:
 
 
 def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:
-    """Return the place from which a site reaches, (3,), and how far it gets at most, in metres.
+    """Return the center (3,) and the maximum reach of a site (m); None: unlimited.
 
-    The place is the joint nearest to the base, where the model puts it. No configuration of the
-    joints gets the site further from there than the sum of the distances from joint to joint; what
-    joints slide comes on top. Limits of joints may well keep it closer.
-
-    None: the arm can go anywhere, since its base floats, or a joint slides without limit.
+    The center is the joint nearest to the base, in the model's initial configuration. The reach is
+    an upper bound: the sum of the distances from joint to joint plus the travel of slide joints.
+    Joint limits may reduce it. The reach is unlimited with a floating base or an unlimited slide
+    joint.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -560,12 +557,12 @@ def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:
             if kind == mujoco.mjtJoint.mjJNT_SLIDE:
                 if not model.jnt_limited[joint]:
                     return None
-                # A range is of the joint's position, which is not 0 where the model puts it.
+                # jnt_range bounds qpos; its initial value may be nonzero.
                 start = model.qpos0[model.jnt_qposadr[joint]]
                 length += float(np.abs(model.jnt_range[joint] - start).max())
                 continue
             anchor = data.xanchor[joint].copy()
-            # What lies between the site and the last joint is turned as a whole; so is all else.
+            # Links between joints are rigid, so the joint-to-joint distance is an upper bound.
             length += float(np.linalg.norm(point - anchor))
             point, is_jointed = anchor, True
         body = int(model.body_parentid[body])

@@ -1,4 +1,4 @@
-"""Curriculum terms of the manipulation tasks, all of which are in `mjlab.envs.mdp` today."""
+"""Curriculum terms of the manipulation tasks, now in `mjlab.envs.mdp`."""
 
 from mjlab.compat import older_names
 

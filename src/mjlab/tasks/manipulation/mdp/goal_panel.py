@@ -1,4 +1,4 @@
-"""A handle in the browser viewer by which a person drags the goal."""
+"""Browser viewer panel to drag the goal."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ if TYPE_CHECKING:
 
 _AXES = ("x", "y", "z")
 _SLIDER_STEP = 0.01
-# How much further than the range of goals the sliders go, in metres.
+# Slider range beyond the range of goals (m).
 _BEYOND = 0.1
 _HANDLE_SIZE = 0.12
-# Nobody sees that a handle is so far from its goal, in metres.
+# Invisible distance of the handle from its goal (m).
 _NO_DISTANCE = 1e-5
-# mjviser shifts the scene to keep what the camera follows in the middle. What does not move by
-# itself hangs below this frame, in world coordinates.
+# mjviser shifts the scene to center the tracked body. Children of this frame stay in world
+# coordinates.
 _WORLD = "/fixed_bodies"
 
 
 class GoalPanel:
-    """A handle at the goal of the environment in view, and a slider for each coordinate.
+    """Handle at the goal of the displayed environment, and a slider per coordinate.
 
-    The handle follows the command until a person drags it or moves a slider. From then on the goal
-    is where the person has put it, in whichever environment is in view, until `Hold goal` is
-    switched off. Coordinates are those from the environment's origin.
+    The handle follows the command until the user drags it or moves a slider. From then on the goal
+    of the displayed environment is held at the handle, until `Hold goal` is switched off.
+    Coordinates are relative to the environment's origin.
     """
 
     def __init__(
@@ -40,18 +40,18 @@ class GoalPanel:
         get_env_idx: Callable[[], int],
         on_change: Callable[[], None] | None = None,
     ) -> None:
-        """Add the panel to the current place in the page, and the handle to its scene.
+        """Add the panel to the current GUI container, and the handle to the scene.
 
         Args:
             name: Title of the panel.
-            server: The page's server.
-            ranges: What goals are drawn from, by coordinate: `x`, `y` and `z`.
-            get_env_idx: Returns the environment in view.
+            server: Viser server.
+            ranges: Ranges of goals, attributes `x`, `y` and `z`.
+            get_env_idx: Returns the index of the displayed environment.
             on_change: Called after every change.
         """
         self._get_env_idx = get_env_idx
         self._on_change = on_change
-        # The page's callbacks come in other threads.
+        # Viser calls callbacks in other threads.
         self._lock = threading.Lock()
         self._origin = np.zeros(3)
         self._shown: np.ndarray | None = None
@@ -59,8 +59,8 @@ class GoalPanel:
             self._held = server.gui.add_checkbox(
                 "Hold goal",
                 False,
-                hint="Keep the goal of the environment in view at the handle. Dragging the handle "
-                "in the scene, or moving a slider, switches this on.",
+                hint="Keep the goal of the displayed environment at the handle. Dragging the "
+                "handle or moving a slider switches this on.",
             )
             self._sliders = [self._add_slider(server, axis, ranges) for axis in _AXES]
         self._handle = server.scene.add_transform_controls(
@@ -78,13 +78,13 @@ class GoalPanel:
         return slider
 
     def write_to(self, goals: torch.Tensor, origins: torch.Tensor) -> int | None:
-        """Put the goal of the environment in view at the handle if it is held, else the reverse.
+        """Move the displayed environment's goal to the handle if held, else the handle to the goal.
 
         Args:
-            goals: (N, 3) goals in the world, of which one row may be overwritten.
-            origins: (N, 3) origins of the environments.
+            goals: (N, 3) goals in the world; the row of a held goal is overwritten.
+            origins: (N, 3) environment origins.
 
-        Returns the environment whose goal is held, if any.
+        Returns the index of the environment whose goal is held, or None.
         """
         index = self._get_env_idx()
         if not 0 <= index < len(goals):
@@ -100,7 +100,7 @@ class GoalPanel:
             return index
 
     def _show(self, goal: np.ndarray) -> None:
-        """Put handle and sliders at a goal in the world, unless they are there."""
+        """Move handle and sliders to a goal in the world if it changed."""
         if self._shown is not None and np.allclose(goal, self._shown, atol=_NO_DISTANCE):
             return
         self._shown = goal
@@ -117,13 +117,13 @@ class GoalPanel:
             return
         with self._lock:
             self._held.value = True
-            # Not sent back to whoever drags it, unless it has gone further than the sliders.
+            # The next `_show` then skips the dragged handle, unless the sliders clipped the goal.
             self._shown = np.asarray(self._handle.position, dtype=float)
             self._set_sliders(self._shown - self._origin)
         self._changed(event)
 
     def _moved(self, event: Any) -> None:
-        # Sliders are also moved to follow the command, and that is no person.
+        # Slider updates from the command have no client.
         if event.client is None:
             return
         if not self._held.value:

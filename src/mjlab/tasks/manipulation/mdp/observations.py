@@ -1,8 +1,7 @@
-"""Observation terms of the manipulation tasks, about hand, object and goal.
+"""Observation terms of the manipulation tasks: hand, object, goal and images.
 
-The end effector is the selected site of `asset_cfg`; the root is the entity's root link. Positions
-of objects are those of their root links. Images have channels first, as networks take them:
-(N, C, height, width).
+The end effector is the selected site of `asset_cfg`; the root is the entity's root link. Object
+positions are positions of their root links. Images have channels first: (N, C, height, width).
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ __all__ = [
 ]
 
 DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
-"""The entity whose site terms take for the hand unless they are told."""
+"""Default entity of the end-effector site."""
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 
 
@@ -88,7 +87,7 @@ def object_to_goal_distance(
     """Vector from the object to its goal in the frame of the root (m), (N, 3).
 
     Raises:
-        TypeError: the command is no `LiftingCommand`.
+        TypeError: the command is not a `LiftingCommand`.
     """
     asset: Entity = env.scene[asset_cfg.name]
     target: Entity = env.scene[object_name]
@@ -114,7 +113,7 @@ def target_position(
     """Vector from the end effector to the goal in the frame of the end effector (m), (N, 3).
 
     Raises:
-        TypeError: the command is no `LiftingCommand` or `MultiCubeLiftingCommand`.
+        TypeError: the command is not a `LiftingCommand` or `MultiCubeLiftingCommand`.
     """
     offset = goal_command(env, command_name).target_pos - site_pos(env, asset_cfg)
     return quat_apply_inverse(site_quat(env, asset_cfg), offset)
@@ -130,7 +129,7 @@ def _check_ee_velocity(
 def ee_velocity(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Linear velocity of the end effector in its own frame (m/s), (N, 3)."""
+    """Linear velocity of the end effector in the end-effector frame (m/s), (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
     sites = as_columns(asset_cfg.site_ids, env.device)
     velocity = asset.data.site_lin_vel_w[:, sites].squeeze(1)
@@ -144,13 +143,14 @@ def _check_camera(env: ManagerBasedRlEnv, sensor_name: str, data_type: str, **_:
     cfg = require_sensor(env, sensor_name, CameraSensor).cfg
     if data_type not in cfg.data_types:
         raise ValueError(
-            f"The camera {sensor_name!r} has data_types={tuple(cfg.data_types)}; add {data_type!r}."
+            f"Camera {sensor_name!r} data_types: expected {data_type!r} among them, got "
+            f"{tuple(cfg.data_types)}; add it."
         )
 
 
 @checked_when_built(partial(_check_camera, data_type="rgb"))
 def camera_rgb(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Red, green and blue in [0, 1], (N, 3, height, width)."""
+    """RGB image in [0, 1], (N, 3, height, width)."""
     return env.scene[sensor_name].data.rgb.permute(0, 3, 1, 2).float().div_(255.0)
 
 
@@ -164,8 +164,8 @@ def _check_depth(
     _check_camera(env, sensor_name, "depth")
     if not 0.0 <= min_depth < cutoff_distance:
         raise ValueError(
-            f"min_depth is {min_depth} and cutoff_distance is {cutoff_distance}; the first must not "
-            "be negative, and has to be smaller than the second."
+            "min_depth and cutoff_distance: expected 0 <= min_depth < cutoff_distance, got "
+            f"{min_depth} and {cutoff_distance}."
         )
 
 
@@ -173,21 +173,20 @@ def _check_depth(
 def camera_depth(
     env: ManagerBasedRlEnv, sensor_name: str, cutoff_distance: float, min_depth: float = 0.01
 ) -> torch.Tensor:
-    """Depth as a share of `cutoff_distance`, in [0, 1], (N, 1, height, width).
+    """Depth as a fraction of `cutoff_distance`, in [0, 1], (N, 1, height, width).
 
-    Depth is the distance along the optical axis. What is closer than `min_depth` (m) counts as if
-    it were there, and what is further than `cutoff_distance` (m) as if it were at that. So does the
-    background, for which the camera reports a depth of 0.
+    Depth is the distance along the optical axis, clamped to [`min_depth`, `cutoff_distance`] (m).
+    Background pixels, reported by the camera as depth 0, are 1.
     """
     depth = env.scene[sensor_name].data.depth.permute(0, 3, 1, 2)
-    share = depth.clamp(min_depth, cutoff_distance).div_(cutoff_distance)
-    # Written so that NaN, too, is background.
-    return torch.where(depth > 0.0, share, 1.0)
+    fraction = depth.clamp(min_depth, cutoff_distance).div_(cutoff_distance)
+    # depth > 0 is False for NaN, which thus counts as background.
+    return torch.where(depth > 0.0, fraction, 1.0)
 
 
 @checked_when_built(partial(_check_camera, data_type="segmentation"))
 def camera_segmentation(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Id and type of the object at each pixel, (N, 2, height, width) int32; -1, -1: background."""
+    """Object id and type of each pixel, (N, 2, height, width) int32; background: (-1, -1)."""
     return env.scene[sensor_name].data.segmentation.permute(0, 3, 1, 2)
 
 
@@ -201,32 +200,32 @@ def _check_mask(env: ManagerBasedRlEnv, sensor_name: str, command_name: str, **_
 def camera_target_cube_mask(
     env: ManagerBasedRlEnv, sensor_name: str, command_name: str
 ) -> torch.Tensor:
-    """1 where the wanted object is seen, else 0, (N, 1, height, width).
+    """Mask of the target object: 1 at its pixels, else 0, (N, 1, height, width).
 
     Raises:
-        TypeError: the command is no `MultiCubeLiftingCommand`.
+        TypeError: the command is not a `MultiCubeLiftingCommand`.
     """
-    wanted = multi_cube_command(env, command_name).target_geom_ids
+    target = multi_cube_command(env, command_name).target_geom_ids
     ids, types = env.scene[sensor_name].data.segmentation.unbind(dim=-1)
-    is_wanted = (ids.unsqueeze(-1) == wanted[:, None, None, :]).any(dim=-1)
-    return (is_wanted & (types == _GEOM)).float().unsqueeze(1)
+    is_target = (ids.unsqueeze(-1) == target[:, None, None, :]).any(dim=-1)
+    return (is_target & (types == _GEOM)).float().unsqueeze(1)
 
 
-# Look-ups and checks that several terms share.
+# Shared lookups and checks.
 
 
 def lifting_command(env: ManagerBasedRlEnv, name: str) -> LiftingCommand:
-    """Return the command for one object; raises `TypeError` if it is of another kind."""
+    """Return the command; raises `TypeError` unless it is a `LiftingCommand`."""
     return _command(env, name, LiftingCommand)
 
 
 def multi_cube_command(env: ManagerBasedRlEnv, name: str) -> MultiCubeLiftingCommand:
-    """Return the command for one object of several; raises `TypeError` if it is of another kind."""
+    """Return the command; raises `TypeError` unless it is a `MultiCubeLiftingCommand`."""
     return _command(env, name, MultiCubeLiftingCommand)
 
 
 def goal_command(env: ManagerBasedRlEnv, name: str) -> LiftingCommand | MultiCubeLiftingCommand:
-    """Return a command with a goal; raises `TypeError` if it has none."""
+    """Return the command; raises `TypeError` unless it is one of the two lifting commands."""
     return _command(env, name, (LiftingCommand, MultiCubeLiftingCommand))
 
 
@@ -234,21 +233,21 @@ def _command(env: ManagerBasedRlEnv, name: str, kind: Any) -> Any:
     command = env.command_manager.get_term(name)
     if not isinstance(command, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        wanted = " or a ".join(cls.__name__ for cls in kinds)
+        expected = " or ".join(cls.__name__ for cls in kinds)
         raise WrongTypeError(
-            f"The command {name!r} is a {type(command).__name__}; a {wanted} is needed."
+            f"Command {name!r}: expected {expected}, got {type(command).__name__}."
         )
     return command
 
 
 def site_pos(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
-    """Return the position of the one selected site in the world, (N, 3)."""
+    """Return the world position of the selected site, (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device)].squeeze(1)
 
 
 def site_quat(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
-    """Return the orientation of the one selected site in the world, (N, 4)."""
+    """Return the world orientation of the selected site, (N, 4)."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.site_quat_w[:, as_columns(asset_cfg.site_ids, env.device)].squeeze(1)
 
@@ -260,7 +259,7 @@ def check_single(
     asset_cfg: SceneEntityCfg | None = None,
     **params: Any,
 ) -> None:
-    """Check a term about one object and its goal, and whether the arm of `asset_cfg` reaches it."""
+    """Check a single-object term, and that the arm of `asset_cfg` reaches object and goal."""
     require_command(env, command_name)
     command = lifting_command(env, command_name)
     check_entity(env, object_name, "object_name")
@@ -272,7 +271,7 @@ def check_single(
 def check_single_with_hand(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG, **params: Any
 ) -> None:
-    """Check a term about a hand, one object and its goal."""
+    """Check a single-object term that reads the end effector."""
     check_single(env, asset_cfg=asset_cfg, **params)
 
 
@@ -282,7 +281,7 @@ def check_multi(
     asset_cfg: SceneEntityCfg | None = None,
     **params: Any,
 ) -> None:
-    """Check a term about one object of several, likewise."""
+    """Check a multi-object term, and that the arm of `asset_cfg` reaches objects and goal."""
     require_command(env, command_name)
     command = multi_cube_command(env, command_name)
     check_stds(**params)
@@ -293,32 +292,32 @@ def check_multi(
 def check_multi_with_hand(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG, **params: Any
 ) -> None:
-    """Check a term about a hand, one object of several and its goal."""
+    """Check a multi-object term that reads the end effector."""
     check_multi(env, asset_cfg=asset_cfg, **params)
 
 
-def check_entity(env: ManagerBasedRlEnv, name: str, label: str) -> None:
-    """Raise `ValueError` unless the scene has an entity of that name."""
-    check_exists(f"entity in {label}", name, env.scene.entities)
+def check_entity(env: ManagerBasedRlEnv, name: str, field: str) -> None:
+    """Raise `ValueError` unless the scene has an entity called `name`."""
+    check_exists(f"entity in {field}", name, env.scene.entities)
 
 
 def check_site(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> str:
-    """Return the name of the one selected site; raises `ValueError` if it is not one."""
+    """Return the name of the selected site; raises `ValueError` unless exactly one is selected."""
     check_entity(env, asset_cfg.name, "asset_cfg.name")
     names = env.scene.entities[asset_cfg.name].site_names
     ids = asset_cfg.site_ids
     selected = list(names[ids]) if isinstance(ids, slice) else [names[index] for index in ids]
     if len(selected) != 1:
         raise ValueError(
-            f"asset_cfg selects {len(selected)} sites of entity {asset_cfg.name!r}; the term needs "
-            "one, such as the site between the fingers. Give it as site_names; there are "
+            f"asset_cfg: expected one site of entity {asset_cfg.name!r}, got {len(selected)}; set "
+            "site_names, e.g. to the site between the fingers. Available: "
             f"{list(names)}."
         )
     return selected[0]
 
 
 def check_stds(**params: Any) -> None:
-    """Raise `ValueError` unless all parameters called `std` or `..._std` are positive."""
+    """Raise `ValueError` unless all parameters named `std` or `..._std` are positive."""
     for name, value in params.items():
         if name.endswith("std"):
             check_positive(name, value)

@@ -1,7 +1,7 @@
-"""Reward terms of the manipulation tasks. Each returns (N,), before its weight.
+"""Reward terms of the manipulation tasks, (N,), unweighted.
 
-The end effector is the selected site of `asset_cfg`. Positions are those of before the last physics
-substep, of hand and object alike.
+The end effector is the selected site of `asset_cfg`. Positions of hand and object are both from
+before the last physics substep.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ def staged_position_reward(
     bringing_std: float,
     asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """Reward reaching the object, and then bringing it to its goal.
+    """Reward reaching the object, then bringing it to its goal.
 
-    `exp(-e^2 / reaching_std^2) (1 + exp(-g^2 / bringing_std^2))`, where e is the distance from the
-    end effector to the object and g that from the object to the goal, in metres.
+    `exp(-e^2 / reaching_std^2) (1 + exp(-g^2 / bringing_std^2))`, where e is the distance from
+    the end effector to the object (m) and g the distance from the object to the goal (m).
     """
     target: Entity = env.scene[object_name]
     goal = lifting_command(env, command_name).target_pos
@@ -64,7 +64,7 @@ def staged_position_reward(
 def bring_object_reward(
     env: ManagerBasedRlEnv, command_name: str, object_name: str, std: float
 ) -> torch.Tensor:
-    """Reward an object at its goal: `exp(-g^2 / std^2)`, with g the distance between them (m)."""
+    """Reward an object at its goal: `exp(-g^2 / std^2)`, g: distance from object to goal (m)."""
     target: Entity = env.scene[object_name]
     goal = lifting_command(env, command_name).target_pos
     return _closeness(target.data.root_link_pos_w, goal, std)
@@ -78,18 +78,18 @@ def multi_cube_staged_position_reward(
     bringing_std: float,
     asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """Reward reaching the wanted object and bringing it to its goal; see `staged_position_reward`."""
+    """Reward reaching the target object and its goal; see `staged_position_reward`."""
     command = multi_cube_command(env, command_name)
     hand = site_pos(env, asset_cfg)
-    wanted = command.target_object_pos()
-    return _staged(hand, wanted, command.target_pos, reaching_std, bringing_std)
+    target = command.target_object_pos()
+    return _staged(hand, target, command.target_pos, reaching_std, bringing_std)
 
 
 @checked_when_built(check_multi)
 def multi_cube_bring_object_reward(
     env: ManagerBasedRlEnv, command_name: str, std: float
 ) -> torch.Tensor:
-    """Reward the wanted object at its goal; see `bring_object_reward`."""
+    """Reward the target object at its goal; see `bring_object_reward`."""
     command = multi_cube_command(env, command_name)
     return _closeness(command.target_object_pos(), command.target_pos, std)
 
@@ -104,8 +104,7 @@ def joint_velocity_hinge_penalty(
 ) -> torch.Tensor:
     """Penalize joints faster than `max_vel`: the sum of `max(|v| - max_vel, 0)^2`.
 
-    Velocities are in rad/s, or in m/s where joints slide. The value is positive, so that the weight
-    has to be negative.
+    Velocities are in rad/s, in m/s for slide joints. The value is positive; use a negative weight.
     """
     asset: Entity = env.scene[asset_cfg.name]
     speed = asset.data.joint_vel[:, as_columns(asset_cfg.joint_ids, env.device)].abs()

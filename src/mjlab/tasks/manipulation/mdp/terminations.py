@@ -1,4 +1,4 @@
-"""Termination terms of the manipulation tasks. Each returns bool (N,)."""
+"""Termination terms of the manipulation tasks, (N,) bool."""
 
 from mjlab.compat import older_names
 from mjlab.envs.mdp.terminations import illegal_contact

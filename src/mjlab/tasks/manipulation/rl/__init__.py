@@ -1,4 +1,4 @@
-"""Training of the manipulation tasks."""
+"""Runner of the manipulation tasks."""
 
 from mjlab.tasks.manipulation.rl.runner import (
     ManipulationOnPolicyRunner as ManipulationOnPolicyRunner,

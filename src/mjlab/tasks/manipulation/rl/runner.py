@@ -1,7 +1,7 @@
-"""The runner of the manipulation tasks."""
+"""On-policy runner of the manipulation tasks."""
 
 from mjlab.rl.runner import ExportingOnPolicyRunner
 
 
 class ManipulationOnPolicyRunner(ExportingOnPolicyRunner):
-    """Trains as `MjlabOnPolicyRunner` does, and exports the policy whenever it saves."""
+    """`MjlabOnPolicyRunner` that exports the policy with every checkpoint."""

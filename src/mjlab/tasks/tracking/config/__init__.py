@@ -1,1 +1,1 @@
-"""The robots that imitate motions."""
+"""Robots of the motion tracking tasks, one package each."""

@@ -1,4 +1,4 @@
-"""The terms of motion tracking, together with the library of `mjlab.envs.mdp`."""
+"""Terms of motion tracking and of `mjlab.envs.mdp`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
 
 _older_name = older_names(__name__)
 
-# A name of 1.6 at this path, which is loaded when it is asked for.
+# Name that mjlab 1.6 has at this path; imported on first use.
 _LAZY = {"DebugVisualizer": "mjlab.viewer.debug_visualizer"}
 
 

@@ -1,4 +1,4 @@
-"""The motion command: where the robot should be now, starting it there, drawing and logging that."""
+"""Motion command: reference playback, episode starts, tracking metrics and visualization."""
 
 from __future__ import annotations
 
@@ -61,15 +61,15 @@ __all__ = [
 
 _MODES = ("adaptive", "uniform", "start")
 _DRAWINGS = ("ghost", "frames")
-# Lengths of the axes, in metres: of bodies and of the anchor.
+# Axis lengths of bodies and of the anchor (m).
 _REFERENCE_LENGTHS = (0.08, 0.1)
 _ROBOT_LENGTHS = (0.12, 0.15)
 _PASTEL = ((1.0, 0.6, 0.6), (0.6, 1.0, 0.6), (0.6, 0.6, 1.0))
 _AXIS_RADIUS = 0.008
-# A group of geoms that no viewer shows of a ghost.
+# Geom group hidden in ghosts by all viewers.
 _HIDDEN_GROUP = 3
 _SAMPLING_METRICS = ("sampling_entropy", "sampling_top1_prob", "sampling_top1_bin")
-# What terms read of a command, whose class may be a package's own.
+# Attributes read by the terms; commands may be of a custom class.
 _READ = (
     "anchor_pos_w",
     "anchor_quat_w",
@@ -84,87 +84,86 @@ _READ = (
 
 @dataclass(kw_only=True)
 class MotionCommandCfg(CommandTermCfg):
-    """Motions to imitate."""
+    """Motion command configuration."""
 
     @dataclass
     class VizCfg:
-        """How the reference is drawn."""
+        """Visualization of the reference."""
 
         mode: Literal["ghost", "frames"] = "ghost"
-        """`ghost` draws a see-through robot, `frames` the axes of each tracked body, of the
+        """Drawing mode. `ghost`: a transparent robot. `frames`: axes of the tracked bodies of the
         reference (short) and of the robot (long)."""
         ghost_color: tuple[float, float, float, float] = (0.5, 0.7, 0.5, 0.5)
-        """Red, green, blue and opacity of the ghost."""
+        """Color and opacity of the ghost (RGBA)."""
         ghost_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        """From the place of the reference to that of the ghost, in metres: zero is over the robot,
-        (0, 1, 0) beside it."""
+        """Offset of the ghost from the reference (m). Zero: overlaid on the robot; (0, 1, 0):
+        beside it."""
 
     motion_file: str
-    """The motions: files, folders, or names of motions that ship with the package, separated by
-    commas."""
+    """Motions: files, folders, or names of bundled motions, separated by commas."""
     anchor_body_name: str
-    """Body by which robot and reference are aligned; one of `body_names`."""
+    """Body that aligns robot and reference; one of `body_names`."""
     body_names: tuple[str, ...]
     """Bodies to track; the first is the floating base."""
     entity_name: str
-    """The robot."""
+    """Name of the robot entity."""
     pose_range: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Perturbation of the root's pose at a start: ranges of `x`, `y`, `z` (m), `roll`, `pitch` and
-    `yaw` (rad, world axes); 0 where there is none."""
+    """Perturbation of the root pose at a start: ranges of `x`, `y`, `z` (m), `roll`, `pitch` and
+    `yaw` (rad, world axes). Missing keys: 0."""
     velocity_range: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Perturbation of the root's velocity, likewise (m/s, rad/s)."""
+    """Perturbation of the root velocity at a start, same keys (m/s, rad/s)."""
     joint_position_range: tuple[float, float] = (-0.52, 0.52)
-    """Perturbation of each joint's position at a start (rad)."""
+    """Perturbation of joint positions at a start (rad)."""
     adaptive_kernel_size: int = 1
-    """Bins ahead of a start, its own included, whose failures make it more likely."""
+    """Kernel size in bins, ahead of and including a bin, whose failures raise its probability."""
     adaptive_lambda: float = 0.8
-    """Weight of failures one bin further ahead."""
+    """Decay of the kernel per bin ahead."""
     adaptive_uniform_ratio: float = 0.1
-    """Weight of starts anywhere, against failures."""
+    """Weight of uniform sampling relative to failures."""
     adaptive_alpha: float = 0.001
-    """Share of the running mean of failures that one step replaces."""
+    """Update rate per step of the running mean of failures."""
     sampling_mode: Literal["adaptive", "uniform", "start"] = "adaptive"
-    """Where episodes start: `adaptive` more often where they fail, `uniform` anywhere, `start` at
-    the first frame, of one motion after the other."""
+    """Start frame sampling. `adaptive`: more often before failures. `uniform`: any frame. `start`:
+    the first frame of each motion in turn."""
     viz: VizCfg = field(default_factory=VizCfg)
-    """Drawing."""
+    """Visualization settings."""
     advance_after_teleport: bool = True
-    """Whether the reference is a frame ahead of the robot after the end of a motion, as it is after
-    a reset; False is what mjlab 1.6 does. A motion is played to its end only where no termination
-    (`motion_ended`) ends the episode there."""
+    """Keep the reference one frame ahead of the robot after resampling at the end of a motion, as
+    after a reset. False: behavior of mjlab 1.6. Without effect if a termination (`motion_ended`)
+    ends the episode there."""
 
     def build(self, env: ManagerBasedRlEnv) -> MotionCommand:
-        """Return the term; raises `ValueError` for motions or settings that do not fit the robot."""
+        """Build the term; raises `ValueError` if motions or settings do not match the robot."""
         return MotionCommand(self, env)
 
 
 class MotionCommand(MotionReader, CommandTerm):
-    """Plays motions as the reference, one frame a step, and starts the robot on them.
+    """Motion command: plays reference motions, one frame per step, and places robots on them.
 
-    In a step, rewards and terminations compare the robot with frame t, which the policy saw. Then
-    environments that are done are reset: the robot is put, perturbed, onto a frame k. The update of
-    the command measures errors, advances t by one everywhere (the robot is at k then, and the
-    reference at k + 1), and refreshes the relative poses. Where the motion is over, the robot is put
-    onto another frame at once, in the middle of its episode, unless a termination such as
-    `motion_ended` has ended that.
+    In a step, rewards and terminations compare the robot with frame t, the frame observed by the
+    policy. Done environments are then reset: the robot is placed, perturbed, on a frame k. The
+    command update measures errors, advances t by one in all environments (the robot is then at k,
+    the reference at k + 1), and updates the relative poses. At the end of a motion the robot is
+    placed on a newly sampled frame in the middle of its episode, unless a termination such as
+    `motion_ended` ends the episode first.
 
-    The relative poses (`relative_poses`) are refreshed once a step and then kept, so that rewards
-    go by the robot's anchor of one step before.
+    Relative poses (`relative_poses`) are updated once per step, so rewards use the robot anchor of
+    the previous step.
 
     Attributes:
-        motion: The motions; see `MotionLibrary`.
-        motion_files: Where they were read from.
-        motion_ids: (N,) int64, the motion of each environment.
-        time_steps: (N,) int64, its frame t within that motion.
+        motion: Motions; see `MotionLibrary`.
+        motion_files: Paths of the motion files.
+        motion_ids: (N,) int64, motion of each environment.
+        time_steps: (N,) int64, frame t within the motion.
         body_pos_relative_w: (N, K, 3) relative positions; `body_quat_relative_w` (N, K, 4).
-        sampler: The statistics of failures; None unless sampling is adaptive.
-        start_perturbation: How much of the config's perturbation starts get, from 0 to 1.
-        drawing: How the reference is drawn.
+        sampler: Failure statistics; None unless sampling is adaptive.
+        start_perturbation: Scale of the configured start perturbation, from 0 to 1.
+        drawing: Visualization of the reference.
     """
 
     cfg: MotionCommandCfg
 
-    # What the config and the files say, and what lasts no longer than a call.
+    # Derived from the config and the files, or used within a call; not checkpointed.
     _transient = {
         "scene", "robot", "body_names", "body_indexes", "anchor_index", "anchor_body", "motion_files",
         "_num_bins", "_moved", "_started",
@@ -205,15 +204,15 @@ class MotionCommand(MotionReader, CommandTerm):
         self._num_bins = sampler.num_bins
         self.sampler = sampler if cfg.sampling_mode == "adaptive" else None
         self.start_perturbation = 1.0
-        # Number of starts of each environment, so that it plays one motion after the other.
+        # Number of starts of each environment, to play the motions in turn.
         self._num_starts = torch.zeros_like(self.time_steps)
-        # The step in which a failure was last counted, so that none is counted twice.
+        # Step of the last counted failure of each environment, to count each failure once.
         self._counted_at = torch.full_like(self.time_steps, -1)
         self._moved: list[torch.Tensor] = []
         self._started: list[torch.Tensor] = []
         self._over = Lookup()
-        # Frames are of motions with these lengths: by their shapes, the state of a run on other
-        # motions is refused, whose frames may not exist here.
+        # Lengths of the motions, encoded as shapes: loading the state of a run on motions of other
+        # lengths then raises, since its frames may not exist here.
         lengths = self.motion.lengths.tolist()
         self._extent = [
             torch.empty(count, 0, dtype=torch.float32) for count in (len(lengths), *lengths)
@@ -223,78 +222,78 @@ class MotionCommand(MotionReader, CommandTerm):
 
     @property
     def command(self) -> torch.Tensor:
-        """Positions and velocities of all joints in the reference, (N, 2 nj)."""
+        """Joint positions and velocities of the reference, (N, 2 nj)."""
         return torch.cat((self.joint_pos, self.joint_vel), dim=1)
 
     @property
     def motion_anchor_body_index(self) -> int:
-        """Index of the anchor within `body_names`."""
+        """Index of the anchor in `body_names`."""
         return self.anchor_index
 
     @property
     def robot_anchor_body_index(self) -> int:
-        """Index of the anchor within the robot's bodies."""
+        """Index of the anchor in the robot's bodies."""
         return self.anchor_body
 
     @property
     def bin_count(self) -> int:
-        """Number of bins, of about a second each, that all motions are cut into."""
+        """Number of bins of about 1 s, over all motions."""
         return self._num_bins
 
     @property
     def bin_failed_count(self) -> torch.Tensor:
-        """Running mean of the failures in each bin, (bin_count,). Zeros unless sampling is adaptive."""
+        """Running mean of failures per bin, (bin_count,). Zeros unless sampling is adaptive."""
         if self.sampler is None:
             return torch.zeros(self._num_bins, dtype=torch.float32, device=self.device)
         return self.sampler.failed
 
     @property
     def frame_indexes(self) -> torch.Tensor:
-        """(N,) int64, the frame of each environment, counted over all motions."""
-        return self._counted_over_all(self.time_steps)
+        """(N,) int64, frame of each environment, indexed over all motions."""
+        return self._global_frames(self.time_steps)
 
     @property
     def matching_frame(self) -> MotionFrame:
-        """The reference at the time of the robot's state, with relative poses of now.
+        """Reference at the time of the robot's state, with current relative poses.
 
-        Between steps the command itself is a frame ahead of the robot: it is what comes next.
+        Between steps the command itself is one frame ahead of the robot.
         """
-        return MotionFrame(self, self._counted_over_all((self.time_steps - 1).clamp_(min=0)))
+        return MotionFrame(self, self._global_frames((self.time_steps - 1).clamp_(min=0)))
 
-    def _counted_over_all(self, frames: torch.Tensor) -> torch.Tensor:
+    def _global_frames(self, frames: torch.Tensor) -> torch.Tensor:
         if len(self.motion) == 1:
             return frames
         return frames + self.motion.starts.index_select(0, self.motion_ids)
 
     def update_relative_body_poses(self) -> None:
-        """Refresh the relative poses from the reference and the robot as they are now."""
+        """Update the relative poses from the current reference and robot state."""
         pos, quat = self.relative_poses()
         self.body_pos_relative_w.copy_(pos)
         self.body_quat_relative_w.copy_(quat)
 
-    # Starting.
+    # Starts.
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
-        """Start these environments on a frame; return the metrics of the episodes that ended.
+        """Start `env_ids` on a sampled frame; return the metrics of the episodes that ended.
 
-        Writes the robot's state; what derives from it is stale until `sim.forward()`.
+        Writes the robot state; derived quantities are stale until `sim.forward()`.
         """
         ids = as_ids(env_ids, self.num_envs, self.device)
         log = super().reset(ids)
-        # The environment runs forward after its resets.
+        # The environment calls forward after resets.
         self._moved.clear()
         self._started.append(ids)
         return log
 
     def reset_to_frame(self, env_ids: torch.Tensor, frame: int) -> None:
-        """Put robots exactly onto a frame of their motions, and the reference with them.
+        """Set robot and reference to a frame of their motion, without perturbation.
 
-        Joints are clipped to their soft limits. What derives from the robot's state, and the
-        relative poses, are stale until `sim.forward()` and `update_relative_body_poses()`.
+        Joint positions are clipped to their soft limits. Quantities derived from the robot state,
+        and the relative poses, are stale until `sim.forward()` and `update_relative_body_poses()`.
 
         Args:
             env_ids: (n,) int64.
-            frame: Counted within the motion of each environment; beyond the end is the last.
+            frame: Frame within the motion of each environment, clamped to the last frame.
         """
         last = self.motion.lengths[self.motion_ids[env_ids]] - 1
         self.time_steps[env_ids] = torch.full_like(last, max(frame, 0)).minimum(last)
@@ -307,14 +306,14 @@ class MotionCommand(MotionReader, CommandTerm):
         self._moved.append(env_ids)
 
     def take_turns_from(self, episode: int) -> None:
-        """Let environment i play motion (`episode` + i) modulo their number next, in mode `start`.
+        """Play motion (`episode` + i) % M next in environment i, of M motions, in mode `start`.
 
-        How often environments were started before depends on how often their robots fell.
+        Needed because the number of previous starts depends on how often the robots fell.
         """
         self._num_starts.fill_(episode)
 
     def _draw(self, env_ids: torch.Tensor) -> Drawn:
-        """Return a motion and a frame for each environment."""
+        """Sample a motion and a frame for each of `env_ids`."""
         if self.cfg.sampling_mode == "start":
             motions = (env_ids + self._num_starts[env_ids]) % len(self.motion)
             self._num_starts[env_ids] += 1
@@ -323,7 +322,7 @@ class MotionCommand(MotionReader, CommandTerm):
             self._write_sampling_metrics(1.0, 1.0 / self._num_bins, 0.5)
             return draw_uniform(self.motion, len(env_ids))
         probabilities = self.sampler.probabilities()
-        self._write_sampling_metrics(*self.sampler.figures(probabilities))
+        self._write_sampling_metrics(*self.sampler.statistics(probabilities))
         return self.sampler.draw(self.motion, len(env_ids), probabilities)
 
     def _write_sampling_metrics(self, *values: Any) -> None:
@@ -331,7 +330,7 @@ class MotionCommand(MotionReader, CommandTerm):
             self.metrics[name][:] = value
 
     def _write_start(self, env_ids: torch.Tensor, perturbed: bool) -> None:
-        """Write the robot's state on its frame, and forget its targets, delays and histories."""
+        """Write the robot state of the current frame; reset targets, delays and histories."""
         robot, cfg = self.robot, self.cfg
         at = self.frame_indexes[env_ids]
         root_state, joint_pos = perturbed_start(
@@ -351,9 +350,9 @@ class MotionCommand(MotionReader, CommandTerm):
         robot.seed_position_targets(env_ids)
 
     def _count_failures(self, env_ids: torch.Tensor) -> None:
-        """Count the environments that failed in this step, at the frame where they did.
+        """Count the failures of this step at the frames where they occurred, each once.
 
-        The flags of a step stand until the next one, and environments may be reset again meanwhile.
+        Termination flags stay set until the next step, and environments may be reset again before.
         """
         terminations: Any = getattr(self._env, "termination_manager", None)
         if self.sampler is None or terminations is None:
@@ -365,23 +364,23 @@ class MotionCommand(MotionReader, CommandTerm):
         if not is_empty(ids):
             self.sampler.count_failures(self.motion, self.motion_ids[ids], self.time_steps[ids])
 
-    # The update of every step.
+    # Step update.
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
-        """Measure errors, advance the reference by a frame, and refresh what depends on it.
+        """Update metrics, advance the reference by one frame, and update the relative poses.
 
-        The arguments are those of `CommandTerm.compute`. With `env_ids` None, which is once a step,
-        the failures of the step are taken into the statistics.
+        The arguments are those of `CommandTerm.compute`. With `env_ids` None (once per step), the
+        failures of the step are added to the statistics.
         """
         super().compute(dt, env_ids)
         if self.sampler is not None and env_ids is None:
             self.sampler.end_step()
         if self._panel is not None:
-            # Also where the reference is not drawn.
+            # Needed even if the reference is not drawn.
             self._panel.update()
 
     def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
-        """Plan the look-ups of `compute(dt)`; see `CommandTerm.plan_lookups`."""
+        """Plan the lookups of `compute(dt)`; see `CommandTerm.plan_lookups`."""
         is_over = self._is_over(self.time_steps + 1)
         over = self._over.plan(is_over, self.time_steps, self.motion_ids)
         return [*super().plan_lookups(dt), over]
@@ -391,7 +390,7 @@ class MotionCommand(MotionReader, CommandTerm):
 
     def _update_metrics(self) -> None:
         if self._started:
-            # Their relative poses are still those of before the reset.
+            # Relative poses of restarted environments are still from before the reset.
             ids = torch.cat(self._started)
             pos, quat = self.relative_poses(ids)
             self.body_pos_relative_w[ids], self.body_quat_relative_w[ids] = pos, quat
@@ -409,7 +408,7 @@ class MotionCommand(MotionReader, CommandTerm):
             if self.cfg.advance_after_teleport:
                 self.time_steps[over] += 1
         if self._moved:
-            # These robots were put elsewhere after the step's own forward.
+            # The robots were moved after the step's forward pass.
             self._env.sim.forward(torch.cat(self._moved).unique())
             self._moved.clear()
         self.update_relative_body_poses()
@@ -429,7 +428,7 @@ class MotionCommand(MotionReader, CommandTerm):
         on_change: Callable[[], None] | None = None,
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
-        """Add the frame slider, the button that starts there, and the errors of the bodies."""
+        """Add a frame slider, a button to start there, and a table of body errors."""
 
         def set_frame(env: int, motion: int, frame: int) -> None:
             self.motion_ids[env], self.time_steps[env] = motion, frame
@@ -451,14 +450,14 @@ class MotionCommand(MotionReader, CommandTerm):
         )
 
     def on_viewer_pause(self, paused: bool) -> None:
-        """Let the frame slider move the reference while the viewer is paused."""
+        """Enable the frame slider while the viewer is paused."""
         if self._panel is not None:
             self._panel.set_paused(paused)
 
     def apply_gui_reset(self, env_ids: torch.Tensor) -> bool:
-        """Put these environments exactly onto the frame that the panel asks for, if it does.
+        """Reset `env_ids` to the frame selected in the panel; return False if none is selected.
 
-        As after every reset, the reference is a frame ahead then.
+        As after every reset, the reference is then one frame ahead of the robot.
         """
         chosen = None if self._panel is None else self._panel.take_start()
         if chosen is None:
@@ -472,12 +471,12 @@ class MotionCommand(MotionReader, CommandTerm):
         return True
 
 
-# Terms that read a motion command.
+# Helpers for terms that read a motion command.
 
 
 def motion_command(env: ManagerBasedRlEnv, command_name: str) -> MotionCommand:
-    """Return the motion command of that name."""
-    # That it exists, and what it is, was checked when the term was built.
+    """Return the motion command called `command_name`."""
+    # Existence and type are checked when the term is built.
     manager: Any = env.command_manager
     return manager.get_term(command_name)
 
@@ -493,21 +492,21 @@ def check_motion_term(
     """Check a term that reads a motion command.
 
     Raises:
-        ValueError: there is no such command, a body is none of those it tracks, none is left, or
-            `std` or `threshold` is not positive.
-        TypeError: the command lacks what a `MotionCommand` has.
+        ValueError: unknown command, a body that the command does not track, empty `body_names`, or
+            `std` or `threshold` not positive.
+        TypeError: the command lacks attributes of `MotionCommand`.
     """
     require_command(env, command_name)
     command: Any = motion_command(env, command_name)
     missing: list[str] = []
     if not isinstance(command, MotionCommand):
-        # Listed rather than read: before the first reset, a property may have nothing to return.
+        # dir() instead of getattr: properties may fail before the first reset.
         missing = sorted(set(_READ) - set(dir(command)))
         missing += [] if hasattr(command.cfg, "body_names") else ["cfg.body_names"]
     if missing:
         raise WrongTypeError(
-            f"Command {command_name!r}: expected a MotionCommand or a term with its attributes, got "
-            f"a {type(command).__name__} without {', '.join(missing)}."
+            f"Command {command_name!r}: expected a MotionCommand or a term with its attributes, "
+            f"got a {type(command).__name__} without {', '.join(missing)}."
         )
     body_columns(command, body_names)
     for name, value in (("std", std), ("threshold", threshold)):
@@ -516,10 +515,10 @@ def check_motion_term(
 
 
 def body_columns(command: MotionReader, body_names: tuple[str, ...] | None) -> slice | torch.Tensor:
-    """Return which of the tracked bodies are meant, in the command's order; None means all.
+    """Return the columns of `body_names` (None: all) among the tracked bodies, in their order.
 
     Raises:
-        ValueError: a name is none of the tracked bodies, or there is none.
+        ValueError: a body is not tracked, or `body_names` is empty.
     """
     if body_names is None:
         return slice(None)
@@ -532,23 +531,24 @@ def body_columns(command: MotionReader, body_names: tuple[str, ...] | None) -> s
 def _columns_of(body_names: tuple[str, ...], tracked: tuple[str, ...], device: str) -> torch.Tensor:
     unknown = [name for name in body_names if name not in tracked]
     if unknown or not body_names:
-        what = f"{unknown}, which are not tracked" if unknown else "no body"
-        raise ValueError(f"body_names names {what}. The command tracks {list(tracked)}.")
+        raise ValueError(
+            f"body_names: expected tracked bodies, got {unknown or ()}. Available: {list(tracked)}."
+        )
     columns = [i for i, name in enumerate(tracked) if name in body_names]
     return torch.tensor(columns, device=device)
 
 
-# Building: checks of the config and the robot.
+# Checks of config and robot.
 
 
 def check_command_cfg(cfg: MotionCommandCfg) -> None:
-    """Raise `ValueError` for names, ranges or numbers of the config that make no sense."""
+    """Raise `ValueError` for invalid names, ranges or numbers in the config."""
     if len(set(cfg.body_names)) != len(cfg.body_names):
-        raise ValueError(f"body_names names a body twice: {list(cfg.body_names)}.")
+        raise ValueError(f"body_names: expected distinct bodies, got {list(cfg.body_names)}.")
     if cfg.anchor_body_name not in cfg.body_names:
         raise ValueError(
-            f"anchor_body_name is {cfg.anchor_body_name!r}; it has to be one of body_names, "
-            f"which are {list(cfg.body_names)}."
+            f"anchor_body_name: expected one of body_names, {list(cfg.body_names)}, got "
+            f"{cfg.anchor_body_name!r}."
         )
     check_one_of("sampling_mode", cfg.sampling_mode, _MODES)
     check_one_of("viz.mode", cfg.viz.mode, _DRAWINGS)
@@ -558,57 +558,57 @@ def check_command_cfg(cfg: MotionCommandCfg) -> None:
             check_range(f"{name}[{axis!r}]", bounds)
     check_range("joint_position_range", cfg.joint_position_range)
     check_count("adaptive_kernel_size", cfg.adaptive_kernel_size)
-    # Without it nothing could be drawn before the first failure.
+    # Zero would make all start probabilities 0 before the first failure.
     check_positive("adaptive_uniform_ratio", cfg.adaptive_uniform_ratio)
     for name in ("adaptive_lambda", "adaptive_alpha"):
         if not 0.0 < getattr(cfg, name) <= 1.0:
-            raise ValueError(f"{name} is {getattr(cfg, name)}; it is above 0 and at most 1.")
+            raise ValueError(f"{name}: expected a number in (0, 1], got {getattr(cfg, name)}.")
 
 
 def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
-    """Return the robot that the config names.
+    """Return the entity `cfg.entity_name`.
 
     Raises:
-        ValueError: there is no such entity, it has a fixed base, it lacks a tracked body, or the
-            first tracked body is not its floating base.
+        ValueError: unknown entity, fixed base, a tracked body not found, or the first tracked body
+            is not the floating base.
     """
     check_exists("entity in entity_name", cfg.entity_name, env.scene.entities)
     robot: Entity = env.scene[cfg.entity_name]
     if robot.is_fixed_base:
         raise ValueError(
-            f"Entity {cfg.entity_name!r} has a fixed base, and cannot be put onto a motion. Give "
-            "its root body a free joint."
+            f"Entity {cfg.entity_name!r}: expected a floating base, got a fixed base; give its "
+            "root body a free joint."
         )
     missing = [name for name in cfg.body_names if name not in robot.body_names]
     if missing:
         raise ValueError(
-            f"body_names names {missing}, which entity {cfg.entity_name!r} lacks. Its bodies: "
+            f"body_names: expected bodies of entity {cfg.entity_name!r}, got {missing}. Available: "
             f"{list(robot.body_names)}."
         )
     root = robot.body_names[0]
     if cfg.body_names[0] != root:
         raise ValueError(
-            f"The first of body_names is {cfg.body_names[0]!r}; it has to be the floating base "
-            f"{root!r}, because starts of episodes take its pose."
+            f"body_names: expected the floating base {root!r} first, got {cfg.body_names[0]!r}. "
+            "Episodes start from its pose."
         )
     return robot
 
 
-# Drawing.
+# Visualization.
 
 
 class MotionDrawing:
-    """Draws the reference of a motion command."""
+    """Visualization of the reference of a motion command."""
 
     def __init__(self, command: MotionCommand) -> None:
-        """Take the command whose reference is drawn, with the settings in its config."""
+        """Store the command; settings are read from its config."""
         self._command = command
         self._ghost: mujoco.MjModel | None = None
         self.offset = np.array(command.cfg.viz.ghost_offset, dtype=float)
-        """From the reference to where it is drawn, (3,), in metres; may be changed."""
+        """Drawing offset from the reference (m), (3,); may be changed."""
 
     def draw(self, visualizer: DebugVisualizer) -> None:
-        """Draw into `visualizer`, for the environments that it shows."""
+        """Draw the reference of the environments that `visualizer` displays."""
         indices = list(visualizer.get_env_indices(self._command.num_envs))
         if not indices:
             return
@@ -656,11 +656,11 @@ class MotionDrawing:
 
 
 def ghost_model(robot: Any, color: tuple[float, float, float, float]) -> mujoco.MjModel:
-    """Return a model of the robot in one colour, without its collision shapes if it has others.
+    """Return a single-color model of the robot; collision geoms are hidden if it has visual geoms.
 
-    It is of the robot alone, so that nothing else in the scene gets a ghost.
+    The model contains the robot alone, so that nothing else in the scene has a ghost.
     """
-    # Built anew, because the robot's own spec has become part of the scene's.
+    # Rebuild from the config, because the robot's spec is attached to the scene's spec.
     model = robot.cfg.build().compile()
     collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     model.geom_matid[:] = -1
@@ -670,20 +670,19 @@ def ghost_model(robot: Any, color: tuple[float, float, float, float]) -> mujoco.
     return model
 
 
-# Errors that are logged in every episode.
+# Tracking metrics.
 
 
 def tracking_metrics(motion: MotionReader) -> dict[str, torch.Tensor]:
-    """Return errors by name, (N,) each.
+    """Return tracking errors by name, (N,) each.
 
-    Those of positions and velocities are Euclidean norms (m, m/s, rad/s), those of orientations
-    angles (rad), those of bodies means over the tracked bodies, and those of joints the norm over
-    all joints (rad, rad/s). Poses of bodies are compared with the relative ones; velocities are in
-    world axes.
+    Position and velocity errors are Euclidean norms (m, m/s, rad/s), orientation errors angles
+    (rad), body errors means over the tracked bodies, and joint errors norms over all joints (rad,
+    rad/s). Body poses are compared with the relative poses; velocities are in world axes.
     """
     anchor = motion.anchor_index
     pos, quat = motion.robot_body_pos_w, motion.robot_body_quat_w
-    # (3, N, K): of positions and both velocities.
+    # Position, linear and angular velocity errors, (3, N, K).
     norms = _norm(
         torch.stack(
             (
@@ -711,7 +710,7 @@ def tracking_metrics(motion: MotionReader) -> dict[str, torch.Tensor]:
 
 def _norm(vectors: torch.Tensor) -> torch.Tensor:
     """Return Euclidean norms of (..., 3) vectors."""
-    # By components: a reduction over three numbers takes a CPU twice as long.
+    # By components: a reduction over three numbers takes twice as long on a CPU.
     x, y, z = vectors.unbind(-1)
     return (x * x).addcmul_(y, y).addcmul_(z, z).sqrt_()
 

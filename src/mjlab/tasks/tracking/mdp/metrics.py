@@ -1,12 +1,12 @@
-"""How far robot and reference are apart, as evaluations report it.
+"""Tracking errors reported by evaluations.
 
-Each function takes a motion command, or one of its frames (`MotionCommand.matching_frame`), and
-returns a value for each environment.
+Functions take a motion command, or one of its frames (`MotionCommand.matching_frame`), and return
+one value per environment, (N,).
 
-In evaluations every environment plays one motion once, from its first frame. Errors are those of the states in
-which the policy acts, the perturbed start among them: each is compared with the frame of its own
-time, and relative poses are those of the same time too. So no state after a reset is ever compared
-with the frame before it.
+In evaluations every environment plays one motion once, from its first frame. Errors are measured in
+all states the policy acts in, including the perturbed start: each state is compared with the frame
+of the same time, with relative poses of the same time. No state after a reset is ever compared with
+the frame before it.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ _LONGER_THAN_MOTIONS_S = 3600.0
 
 
 def compute_mpkpe(command: MotionReader) -> torch.Tensor:
-    """Return the mean distance of the tracked bodies to the reference in the world, (N,), in m."""
+    """Return the mean distance of the tracked bodies to the reference in the world (m), (N,)."""
     return _distance(command.body_pos_w, command.robot_body_pos_w).mean(dim=1)
 
 
 def compute_root_relative_mpkpe(command: MotionReader) -> torch.Tensor:
-    """Return the mean distance of the tracked bodies to the relative reference, (N,), in m."""
+    """Return the mean distance of the tracked bodies to the relative reference (m), (N,)."""
     return _distance(command.body_pos_relative_w, command.robot_body_pos_w).mean(dim=1)
 
 
 def compute_joint_velocity_error(command: MotionReader) -> torch.Tensor:
-    """Return the root mean square over joints of the velocity error, (N,), in rad/s."""
+    """Return the root mean square of the joint velocity errors (rad/s), (N,)."""
     return (command.joint_vel - command.robot_joint_vel).square().mean(dim=1).sqrt()
 
 
 def compute_ee_position_error(
     command: MotionReader, ee_body_names: tuple[str, ...]
 ) -> torch.Tensor:
-    """Return the mean distance of some bodies to the relative reference, (N,), in m.
+    """Return the mean distance of the named bodies to the relative reference (m), (N,).
 
-    No bodies have no error. Raises `ValueError` for a body that is not tracked.
+    0 for an empty `ee_body_names`. Raises `ValueError` for a body that is not tracked.
     """
     if not ee_body_names:
         return torch.zeros(
@@ -71,9 +71,9 @@ def compute_ee_position_error(
 def compute_ee_orientation_error(
     command: MotionReader, ee_body_names: tuple[str, ...]
 ) -> torch.Tensor:
-    """Return the mean angle of some bodies to the relative reference, (N,), in rad.
+    """Return the mean angle of the named bodies to the relative reference (rad), (N,).
 
-    No bodies have no error. Raises `ValueError` for a body that is not tracked.
+    0 for an empty `ee_body_names`. Raises `ValueError` for a body that is not tracked.
     """
     if not ee_body_names:
         return torch.zeros(
@@ -88,7 +88,7 @@ def _distance(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
     return torch.linalg.vector_norm(one - other, dim=-1)
 
 
-# What evaluations measure, and the environments that they measure it in.
+# Evaluation metrics, and the config of evaluation environments.
 
 
 def mpkpe(env: Any) -> torch.Tensor:
@@ -97,12 +97,12 @@ def mpkpe(env: Any) -> torch.Tensor:
 
 
 def r_mpkpe(env: Any) -> torch.Tensor:
-    """Return the same with the reference carried to the robot's place and heading (m), (N,)."""
+    """Return the mean distance of the tracked bodies to the relative reference (m), (N,)."""
     return compute_root_relative_mpkpe(_frame(env))
 
 
 def joint_vel_error(env: Any) -> torch.Tensor:
-    """Return the root mean square over joints of the velocity error (rad/s), (N,)."""
+    """Return the root mean square of the joint velocity errors (rad/s), (N,)."""
     return compute_joint_velocity_error(_frame(env))
 
 
@@ -134,14 +134,14 @@ TRACKING_ERRORS = {
     "ee_pos_error": ee_pos_error,
     "ee_ori_error": ee_ori_error,
 }
-"""The errors by the name under which evaluations report them."""
+"""Evaluation metrics by name."""
 
 
 def play_motions_once(cfg: Any) -> None:
-    """Edit an environment's config so that each episode is one motion, from its start to its end.
+    """Edit an environment config so that each episode is one motion from start to end.
 
-    Nothing pushes. Noise, randomization and the perturbation of the start stay as they are. A motion
-    of more than an hour is cut.
+    Pushes are removed. Noise, randomization and start perturbations are unchanged. Motions longer
+    than one hour are truncated.
     """
     motion = cfg.commands[_COMMAND]
     assert isinstance(motion, MotionCommandCfg)
@@ -150,5 +150,5 @@ def play_motions_once(cfg: Any) -> None:
     cfg.terminations[_END] = TerminationTermCfg(
         func=motion_ended, time_out=True, params={"command_name": _COMMAND}
     )
-    # The motion is to end the episode, and not the clock. Which motion it will be is not known yet.
+    # The end of the motion ends the episode, not the time limit. The motion is not yet known here.
     cfg.episode_length_s = max(cfg.episode_length_s, _LONGER_THAN_MOTIONS_S)

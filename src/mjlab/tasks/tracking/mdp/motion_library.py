@@ -1,4 +1,4 @@
-"""Motions as tensors on the device, and frames of them beside the robot, which errors are computed from."""
+"""Motions as device tensors, and readers of reference frames and robot state."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _PER_JOINT = ("joint_pos", "joint_vel")
 
 
 class MotionLoader:
-    """A motion of T frames, of which the bodies `body_indexes` (K of them) are kept.
+    """Motion of T frames, reduced to K bodies `body_indexes`.
 
     Attributes:
-        fps: Frames per second, or None where the file does not say.
-        joint_pos: (T, nj); likewise `joint_vel`.
-        body_pos_w: (T, K, 3) without origins of environments; likewise `body_lin_vel_w` and
-            `body_ang_vel_w`, and `body_quat_w` (T, K, 4).
+        fps: Frames per second; None if not in the file.
+        joint_pos, joint_vel: (T, nj).
+        body_pos_w, body_lin_vel_w, body_ang_vel_w: (T, K, 3), without environment origins.
+        body_quat_w: (T, K, 4).
         time_step_total: T.
     """
 
@@ -51,19 +51,18 @@ class MotionLoader:
 
         Args:
             motion_file: The `.npz` file.
-            body_indexes: Bodies to keep, (K,) int64, counted in the robot.
-            device: Where the tensors lie.
+            body_indexes: Robot body indices to keep, (K,) int64.
+            device: Device of the tensors.
 
         Raises:
-            MotionFileError: the file is no motion, or has fewer bodies.
+            MotionFileError: not a motion file, or fewer bodies.
         """
         motion = read_motion(motion_file)
         bodies = motion.body_pos_w.shape[1]
         unknown = [i for i in body_indexes.tolist() if not 0 <= i < bodies]
         if unknown:
             raise MotionFileError(
-                f"The motion {motion_file} has {bodies} bodies, and not those of the indexes "
-                f"{unknown}."
+                f"Motion {motion_file}: expected body indices in [0, {bodies - 1}], got {unknown}."
             )
         self._take(motion, body_indexes, device)
 
@@ -71,7 +70,7 @@ class MotionLoader:
     def from_motion(
         cls, motion: Motion, body_indexes: torch.Tensor, device: str = "cpu"
     ) -> MotionLoader:
-        """Return the loader of a motion that was read before; the arguments are as above."""
+        """Return the loader of a motion read earlier; other arguments as in `__init__`."""
         loader = cls.__new__(cls)
         loader._take(motion, body_indexes, device)
         return loader
@@ -80,21 +79,21 @@ class MotionLoader:
         self.fps = motion.fps
         for name in _PER_JOINT:
             setattr(self, name, torch.from_numpy(getattr(motion, name)).to(device))
-        chosen = body_indexes.cpu().numpy()
+        columns = body_indexes.cpu().numpy()
         for name in _PER_BODY:
-            kept = getattr(motion, name)[:, chosen]
-            setattr(self, name, torch.from_numpy(kept).to(device))
+            values = getattr(motion, name)[:, columns]
+            setattr(self, name, torch.from_numpy(values).to(device))
         self.time_step_total = motion.num_frames
 
 
 class MotionLibrary:
-    """Several motions, one after the other in the same tensors; one motion is as `MotionLoader`.
+    """M motions, concatenated along the frame axis.
 
     Attributes:
-        names: Name of each of the M motions.
-        starts: (M,) int64, index of the first frame of each.
-        lengths: (M,) int64, frames of each.
-        time_step_total: Frames of all of them.
+        names: Names of the motions.
+        starts: (M,) int64, index of the first frame of each motion.
+        lengths: (M,) int64, number of frames of each motion.
+        time_step_total: Total number of frames.
 
     The tensors are those of `MotionLoader`, over all frames.
     """
@@ -107,7 +106,7 @@ class MotionLibrary:
     body_ang_vel_w: torch.Tensor
 
     def __init__(self, motions: Sequence[MotionLoader], names: Sequence[str]) -> None:
-        """Put motions of the same robot together."""
+        """Concatenate motions of the same robot."""
         for name in (*_PER_JOINT, *_PER_BODY):
             setattr(self, name, torch.cat([getattr(motion, name) for motion in motions]))
         device = self.joint_pos.device
@@ -123,11 +122,10 @@ class MotionLibrary:
 def read_library(
     motion_file: str, robot: Entity, body_indexes: torch.Tensor, step_dt: float, device: str
 ) -> tuple[tuple[Path, ...], MotionLibrary]:
-    """Return the files that `motion_file` names, and their motions.
+    """Return the files selected by `motion_file`, and their motions.
 
     Raises:
-        MotionFileError: a file does not exist, is no motion, or is none of this robot; the
-            message says what is wrong.
+        MotionFileError: a file is not found, is not a motion, or does not match the robot.
     """
     files = tuple(find_motions(motion_file))
     loaders = []
@@ -139,7 +137,7 @@ def read_library(
 
 
 class MotionReader:
-    """Reads a frame of the reference for each environment, and the robot as it is now.
+    """Reader of one reference frame per environment, and of the current robot state.
 
     N environments, K tracked bodies, nj joints. World frame, quaternions (w, x, y, z), SI units.
     """
@@ -147,25 +145,25 @@ class MotionReader:
     motion: MotionLibrary
     robot: Entity
     body_indexes: torch.Tensor
-    """(K,) int64, the tracked bodies, counted in the robot."""
+    """(K,) int64, tracked bodies as indices in the robot."""
     anchor_index: int
-    """Which of the tracked bodies is the anchor."""
+    """Index of the anchor in the tracked bodies."""
     anchor_body: int
-    """The anchor, counted in the robot."""
+    """Index of the anchor in the robot's bodies."""
     body_names: tuple[str, ...]
     """Names of the tracked bodies."""
     scene: Scene
     body_pos_relative_w: torch.Tensor
-    """(N, K, 3) relative positions, as of the last refresh; see `relative_poses`."""
+    """(N, K, 3) relative positions, as of the last update; see `relative_poses`."""
     body_quat_relative_w: torch.Tensor
-    """(N, K, 4) relative orientations, likewise."""
+    """(N, K, 4) relative orientations, as of the last update."""
 
     @property
     def frame_indexes(self) -> torch.Tensor:
-        """(N,) int64, the frame of each environment, counted over all motions."""
+        """(N,) int64, frame of each environment, indexed over all motions."""
         raise NotImplementedError
 
-    # The reference.
+    # Reference.
 
     @property
     def joint_pos(self) -> torch.Tensor:
@@ -219,7 +217,7 @@ class MotionReader:
         """(N, 3) angular velocity of the anchor in the reference."""
         return self.motion.body_ang_vel_w[:, self.anchor_index].index_select(0, self.frame_indexes)
 
-    # The robot.
+    # Robot.
 
     @property
     def robot_joint_pos(self) -> torch.Tensor:
@@ -274,15 +272,15 @@ class MotionReader:
     def relative_poses(
         self, env_ids: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the reference carried to the robot's x, y and heading, at its own height.
+        """Return the reference moved to the robot's x, y and heading, at the reference height.
 
-        With anchors (p, q) of the reference and (p', q') of the robot, both as they are now, and D
-        the turn about z by the yaw of q' q^-1:
+        With current anchors (p, q) of the reference and (p', q') of the robot, and D the rotation
+        about z by the yaw of q' q^-1:
 
             q_rel = D q_body,   p_rel = (p'_x, p'_y, p_z) + D (p_body - p).
 
         Args:
-            env_ids: (n,) int64, the environments that are meant; None means all.
+            env_ids: (n,) int64. None: all environments.
 
         Returns:
             Positions (n, K, 3) and orientations (n, K, 4).
@@ -293,13 +291,13 @@ class MotionReader:
             frames, origins, robot_pos, robot_quat = (
                 part[env_ids] for part in (frames, origins, robot_pos, robot_quat)
             )
-        # Along x and y the origins of environments cancel out.
+        # Environment origins cancel out along x and y.
         pos = self.motion.body_pos_w.index_select(0, frames)
         body_quat = self.motion.body_quat_w.index_select(0, frames)
         anchor_pos, anchor_quat = pos[:, self.anchor_index], body_quat[:, self.anchor_index]
         turn = yaw_quat(quat_mul(robot_quat, quat_inv(anchor_quat)))
         w, z = turn[:, :1], turn[:, 3:]
-        # Written out, because a turn about z takes half of what any other takes.
+        # Written out: a rotation about z takes half the time of a general rotation.
         cos, sin = w * w - z * z, 2.0 * w * z
         x, y, height = pos.unbind(-1)
         dx, dy = x - anchor_pos[:, :1], y - anchor_pos[:, 1:2]
@@ -316,13 +314,13 @@ class MotionReader:
 
 
 class MotionFrame(MotionReader):
-    """Other frames than the command's beside the robot as it is now.
+    """Reader of frames other than the command's, with the current robot state.
 
-    Its relative poses are those of now, where the command keeps those of its last update.
+    Relative poses are current; those of the command are from its last update.
     """
 
     def __init__(self, reader: MotionReader, frame_indexes: torch.Tensor) -> None:
-        """Take the frames (N,), counted over all motions, of what `reader` reads."""
+        """Read the frames (N,), indexed over all motions, of the motions and robot of `reader`."""
         self.motion, self.robot, self.scene = reader.motion, reader.robot, reader.scene
         self.body_indexes, self.body_names = reader.body_indexes, reader.body_names
         self.anchor_index, self.anchor_body = reader.anchor_index, reader.anchor_body
@@ -331,5 +329,5 @@ class MotionFrame(MotionReader):
 
     @property
     def frame_indexes(self) -> torch.Tensor:
-        """(N,) int64, the frames, counted over all motions."""
+        """(N,) int64, frames, indexed over all motions."""
         return self._frame_indexes

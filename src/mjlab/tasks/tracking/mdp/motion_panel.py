@@ -1,4 +1,4 @@
-"""The panel of a motion command in the browser: choosing a frame, and the errors of the bodies."""
+"""Browser panel of a motion command: frame selection and body errors."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _MAX_OFFSET = 2.0
 
 
 class MotionPanel:
-    """Moves the reference of the environment in view, and starts robots on a frame.
+    """Panel to move the reference of the displayed environment, and to start robots on a frame.
 
-    While the viewer plays, the slider follows the reference; while it is paused, the reference
-    follows the slider. Callbacks come in other threads: they only take down what is asked for, and
-    `update` and `take_start`, which the viewer calls between steps, do it.
+    While the viewer runs, the slider follows the reference; while it is paused, the reference
+    follows the slider. Callbacks run in other threads: they only store requests. The viewer calls
+    `update` and `take_start` between steps to execute them.
     """
 
     def __init__(
@@ -44,30 +44,30 @@ class MotionPanel:
         on_change: Callable[[], None] | None = None,
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
-        """Add the panel to the current place in the page.
+        """Add the panel to the current GUI container.
 
         Args:
             name: Title of the panel.
-            server: The page's server.
-            motion: Motions to choose from.
+            server: Viser server.
+            motion: Motions to select from.
             num_envs: Number of environments.
-            ghost_offset: (3,) from the reference to where it is drawn (m); the slider edits it.
-            get_env_idx: Returns the environment in view.
+            ghost_offset: (3,) drawing offset from the reference (m); the slider edits it.
+            get_env_idx: Returns the index of the displayed environment.
             get_frame: Returns motion and frame of an environment.
             set_frame: Moves the reference of an environment to a motion and a frame.
-            get_matching: Returns the reference at the time of the robot's state, beside the robot.
-            get_current: Returns the reference as it is, beside the robot.
-            on_change: Called after every change, so that the scene is drawn anew.
-            request_action: Queues an action of the viewer; without it, there is no button.
+            get_matching: Returns a reader of robot and reference at the time of the robot's state.
+            get_current: Returns a reader of robot and current reference.
+            on_change: Called after every change, to redraw the scene.
+            request_action: Queues a viewer action. None: no start button.
         """
         self._library, self._num_envs = motion, num_envs
         self._get_env_idx, self._get_frame, self._set_frame = get_env_idx, get_frame, set_frame
         self._get_matching, self._get_current = get_matching, get_current
         self._on_change, self._request_action = on_change, request_action
         self._paused = False
-        self._wanted: tuple[int, int] | None = None
+        self._requested: tuple[int, int] | None = None
         self._start: tuple[int, int] | None = None
-        # Whether the reference was moved by hand, and so is not a frame ahead of the robot.
+        # True if the user moved the reference, which then is not one frame ahead of the robot.
         self._was_moved = False
         self._next_table = 0.0
         gui, names = server.gui, list(motion.names)
@@ -84,8 +84,8 @@ class MotionPanel:
             )
             with gui.add_folder("Errors", expand_by_default=False):
                 self._table = gui.add_markdown("")
-        self._frame.on_update(self._chosen)
-        self._motion.on_update(self._chosen)
+        self._frame.on_update(self._on_select)
+        self._motion.on_update(self._on_select)
         button.on_click(self._start_here)
 
         @beside.on_update
@@ -94,27 +94,27 @@ class MotionPanel:
             self._redraw()
 
     def set_paused(self, paused: bool) -> None:
-        """Hear that the viewer was paused or continued."""
+        """Store the pause state; enable frame and motion selection while paused."""
         self._paused = paused
         self._frame.disabled = self._motion.disabled = not paused
 
     def take_start(self) -> tuple[int, int] | None:
-        """Return the motion and the frame that the button asked for, once; else None."""
+        """Return and clear the start requested by the button: motion and frame, or None."""
         start, self._start = self._start, None
         if start is not None:
-            # The robot follows to where the reference was moved, and what was chosen is done.
-            self._wanted, self._was_moved = None, False
+            # The robot moves to the reference, which completes the pending request.
+            self._requested, self._was_moved = None, False
             self._next_table = 0.0
         return start
 
     def update(self) -> None:
-        """Move the reference where the slider is, or the slider where the reference is."""
+        """Move the reference to the slider while paused, else the slider to the reference."""
         index = self._get_env_idx()
         if not 0 <= index < self._num_envs:
             return
-        wanted, self._wanted = self._wanted, None
-        if wanted is not None and self._paused:
-            self._set_frame(index, *wanted)
+        requested, self._requested = self._requested, None
+        if requested is not None and self._paused:
+            self._set_frame(index, *requested)
             self._was_moved = True
         elif not self._paused:
             self._was_moved = False
@@ -127,12 +127,12 @@ class MotionPanel:
         if self._motion.value != self._library.names[motion]:
             self._motion.value = self._library.names[motion]
         now = time.perf_counter()
-        if now >= self._next_table or wanted is not None:
+        if now >= self._next_table or requested is not None:
             self._next_table = now + _TABLE_PERIOD_S
             self._table.content = self._errors_of(index)
 
     def _errors_of(self, index: int) -> str:
-        """Return a table of the errors of each tracked body of an environment."""
+        """Return a Markdown table of the errors of each tracked body of an environment."""
         frame = self._get_current() if self._was_moved else self._get_matching()
         pos = frame.robot_body_pos_w[index]
         distance = torch.linalg.vector_norm(frame.body_pos_relative_w[index] - pos, dim=-1)
@@ -150,13 +150,13 @@ class MotionPanel:
         ]
         return "\n".join(lines)
 
-    def _chosen(self, event: Any) -> None:
-        # What the panel itself sets has no client.
+    def _on_select(self, event: Any) -> None:
+        # Updates by the panel itself have no client.
         if event.client is None or not self._paused:
             return
         motion = self._library.names.index(self._motion.value)
         last = int(self._library.lengths[motion]) - 1
-        self._wanted = motion, min(int(self._frame.value), last)
+        self._requested = motion, min(int(self._frame.value), last)
         self._redraw()
 
     def _start_here(self, _event: Any) -> None:

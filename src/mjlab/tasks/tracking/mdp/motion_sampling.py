@@ -1,4 +1,4 @@
-"""Starts of episodes: which frame of which motion, and the perturbed state of the robot there."""
+"""Episode starts: sampling of motion and frame, and perturbation of the robot state."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary
 
 Drawn = tuple[torch.Tensor, torch.Tensor]
-"""Motions (n,) and frames within them (n,), int64."""
+"""Sampled motions (n,) and frames within them (n,), int64."""
 
 _TINY = 1e-12
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-"""What a range of poses or velocities may name."""
+"""Keys of pose and velocity ranges."""
 
 
 def draw_uniform(motion: MotionLibrary, count: int) -> Drawn:
-    """Draw frames uniformly over all motions.
+    """Sample frames uniformly over all motions.
 
-    The last frame of a motion is none of them, because nothing follows it.
+    The last frame of a motion is excluded, because it has no successor.
     """
     device = motion.starts.device
     usable = motion.lengths - 1
@@ -39,17 +39,17 @@ def draw_uniform(motion: MotionLibrary, count: int) -> Drawn:
 
 @stateful
 class HardSegmentSampler:
-    """Draws frames more often where episodes failed: adaptive sampling.
+    """Adaptive sampling: frames before failures are sampled more often.
 
-    Each motion is cut into bins of about a second, N in all. `failed` (F) is a running mean of the
-    failures in each bin. With the kernel k_i ~ decay^i, i < kernel_size, which looks ahead within
-    the motion, because what fails later was begun before,
+    Each motion is divided into bins of about 1 s, N in total. `failed` (F) is a running mean of the
+    failures per bin. The kernel k_i ~ decay^i, i < kernel_size, looks ahead within the motion,
+    because the cause of a failure precedes it:
 
         p_b ~ sum_i k_i s_(b+i),   s_b = F_b + uniform_ratio / N.
 
     Attributes:
-        failed: (N,) running mean F of the failures of a step; run-time state.
-        current_failed: (N,) failures C of the running step.
+        failed: (N,) running mean F of the failures per step; run-time state.
+        current_failed: (N,) failures C of the current step.
         num_bins: N.
     """
 
@@ -65,19 +65,19 @@ class HardSegmentSampler:
         alpha: float,
         device: str,
     ) -> None:
-        """Prepare a sampler that has seen no failure.
+        """Build a sampler without recorded failures.
 
         Args:
-            lengths: Frames of each motion.
-            step_dt: Seconds from one frame to the next.
-            kernel_size: How many bins ahead failures count, the bin itself included.
-            decay: Weight of a failure one bin further ahead.
-            uniform_ratio: Weight that bins have without failures, in all.
-            alpha: Share of the running mean that one step replaces.
-            device: Where the tensors lie.
+            lengths: Number of frames of each motion.
+            step_dt: Time between frames (s).
+            kernel_size: Number of bins in the kernel, starting with the bin itself.
+            decay: Decay of the kernel per bin ahead.
+            uniform_ratio: Total weight of bins without failures.
+            alpha: Update rate of the running mean per step.
+            device: Device of the tensors.
         """
         self._uniform_ratio, self._alpha = uniform_ratio, alpha
-        # The small number keeps 3.0 seconds at 3, whatever the division makes of it.
+        # 1e-9 absorbs rounding, so that 3.0 s is not rounded down to 2.
         bins = [math.floor(length * step_dt + 1e-9) + 1 for length in lengths]
         self.num_bins = sum(bins)
         self._motion_bins = torch.tensor(bins, device=device)
@@ -101,20 +101,20 @@ class HardSegmentSampler:
         return smoothed / smoothed.sum()
 
     def draw(self, motion: MotionLibrary, count: int, probabilities: torch.Tensor) -> Drawn:
-        """Draw a bin by its probability, and a frame uniformly within it."""
+        """Sample a bin by its probability, and a frame uniformly within it."""
         bins = torch.multinomial(probabilities, count, replacement=True)
         within = torch.rand(count, dtype=torch.float32, device=bins.device)
         motions = self._bin_motions[bins]
         place = (bins - self._first_bins[motions] + within) / self._motion_bins[motions]
         last = motion.lengths[motions] - 1
         frames = (place * last).long()
-        # Rounding may reach the last frame, which nothing follows.
+        # Exclude the last frame, reachable by rounding: it has no successor.
         return motions, torch.minimum(frames, last - 1)
 
     def count_failures(
         self, motion: MotionLibrary, motions: torch.Tensor, frames: torch.Tensor
     ) -> None:
-        """Take down the failures of this step: frames (n,) of motions (n,). Replaces earlier ones."""
+        """Record the failures of this step, replacing earlier ones: frames (n,), motions (n,)."""
         bins = self._motion_bins[motions]
         local = torch.div(frames * bins, motion.lengths[motions], rounding_mode="floor")
         local = torch.minimum(local.clamp(min=0), bins - 1)
@@ -122,19 +122,19 @@ class HardSegmentSampler:
         self.current_failed.copy_(counts)
 
     def end_step(self) -> None:
-        """Take the failures of this step up into the running mean."""
+        """Add the failures of this step to the running mean."""
         self.failed.lerp_(self.current_failed, self._alpha)
         self.current_failed.zero_()
 
-    def figures(
+    def statistics(
         self, probabilities: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the normalized entropy of p, its largest value, and where that is, in [0, 1)."""
-        top, where = probabilities.max(dim=0)
+        """Return normalized entropy, maximum, and position of the maximum in [0, 1) of p."""
+        top, index = probabilities.max(dim=0)
         if self.num_bins == 1:
             return torch.ones_like(top), top, torch.zeros_like(top)
         entropy = -(probabilities * (probabilities + _TINY).log()).sum() / math.log(self.num_bins)
-        return entropy, top, where / self.num_bins
+        return entropy, top, index / self.num_bins
 
 
 def perturbed_start(
@@ -146,14 +146,15 @@ def perturbed_start(
     joint_position_range: tuple[float, float],
     scale: float = 1.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return states on frames (n,), with uniform perturbations.
+    """Return robot states on frames (n,), with uniform perturbations.
 
-    Positions and velocities are added to, p + (x, y, z) and v + (x, y, z), w + (roll, pitch, yaw);
-    orientations are turned in world axes, q_euler(roll, pitch, yaw) q. Numbers are drawn in the
-    order pose, velocity, joints, and multiplied by `scale`. The root is the first of the tracked bodies.
+    Perturbations are added to positions and velocities, p + (x, y, z), v + (x, y, z) and w + (roll,
+    pitch, yaw); orientations are rotated in world axes, q_euler(roll, pitch, yaw) q. Samples are
+    taken in the order pose, velocity, joints, and multiplied by `scale`. The root is the first
+    tracked body.
 
     Returns:
-        Root states (n, 13), without origins of environments, and joint positions (n, nj).
+        Root states (n, 13), without environment origins, and joint positions (n, nj).
     """
     count, device = len(frames), str(frames.device)
     pos, quat, lin_vel, ang_vel = (
@@ -163,9 +164,9 @@ def perturbed_start(
         )
     )  # fmt: skip
     joint_pos = motion.joint_pos[frames]
-    pose = scale * _drawn(pose_range, count, device)
+    pose = scale * _sample_axes(pose_range, count, device)
     turn = quat_from_euler_xyz(*pose[:, 3:].unbind(1))
-    velocity = scale * _drawn(velocity_range, count, device)
+    velocity = scale * _sample_axes(velocity_range, count, device)
     joints = scale * sample_uniform(*joint_position_range, tuple(joint_pos.shape), device)
     root_state = torch.cat(
         (
@@ -179,7 +180,9 @@ def perturbed_start(
     return root_state, joint_pos + joints
 
 
-def _drawn(ranges: Mapping[str, tuple[float, float]], count: int, device: str) -> torch.Tensor:
+def _sample_axes(
+    ranges: Mapping[str, tuple[float, float]], count: int, device: str
+) -> torch.Tensor:
     bounds = zip(*(ranges.get(axis, (0.0, 0.0)) for axis in AXES), strict=True)
     low, high = (constant_tensor(side, device) for side in bounds)
     return sample_uniform(low, high, (count, len(AXES)), device)

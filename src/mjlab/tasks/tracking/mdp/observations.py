@@ -1,4 +1,4 @@
-"""Observation terms of motion tracking. The frame of a body is seen from the robot's anchor."""
+"""Observation terms of motion tracking, in the frame of the robot's anchor body."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ __all__ = [
 
 @checked_when_built(check_motion_term)
 def motion_anchor_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """Position of the reference's anchor in the frame of the robot's, (N, 3), in m."""
+    """Position of the reference anchor in the frame of the robot anchor (m), (N, 3)."""
     command = motion_command(env, command_name)
-    away = command.anchor_pos_w - command.robot_anchor_pos_w
-    return quat_apply_inverse(command.robot_anchor_quat_w, away)
+    offset = command.anchor_pos_w - command.robot_anchor_pos_w
+    return quat_apply_inverse(command.robot_anchor_quat_w, offset)
 
 
 @checked_when_built(check_motion_term)
 def motion_anchor_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """Orientation of the reference's anchor in the frame of the robot's, (N, 6).
+    """Orientation of the reference anchor in the frame of the robot anchor, (N, 6).
 
     The first two columns of the rotation matrix, row by row.
     """
@@ -43,11 +43,11 @@ def motion_anchor_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tens
 
 @checked_when_built(check_motion_term)
 def robot_body_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """Positions of the robot's tracked bodies in the frame of its anchor, (N, 3 K), in m."""
+    """Positions of the robot's tracked bodies in the frame of its anchor (m), (N, 3 K)."""
     command = motion_command(env, command_name)
     pos = command.robot_body_pos_w
-    away = pos - command.robot_anchor_pos_w[:, None]
-    return quat_apply_inverse(command.robot_anchor_quat_w[:, None], away).flatten(1)
+    offset = pos - command.robot_anchor_pos_w[:, None]
+    return quat_apply_inverse(command.robot_anchor_quat_w[:, None], offset).flatten(1)
 
 
 @checked_when_built(check_motion_term)
@@ -64,8 +64,8 @@ def robot_body_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
 
 
 def _two_columns(quat: torch.Tensor) -> torch.Tensor:
-    """Return the first two columns of rotation matrices of unit quaternions, row by row, (..., 6)."""
-    # Components apart from each other, for which a CPU needs half of the time.
+    """Return two columns of the rotation matrices of unit quaternions, row by row, (..., 6)."""
+    # Contiguous components halve the time on a CPU.
     w, x, y, z = quat.movedim(-1, 0).contiguous()
     xy, wz, xz, wy, yz, wx = x * y, w * z, x * z, w * y, y * z, w * x
     yy, xx, zz = y * y, x * x, z * z

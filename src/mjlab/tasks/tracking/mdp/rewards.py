@@ -1,6 +1,6 @@
-"""Reward terms of motion tracking, each exp(-E / std^2) with an error E that is 0 on the reference.
+"""Reward terms of motion tracking, exp(-E / std^2), (N,). The error E is 0 on the reference.
 
-Terms about bodies take the mean over all tracked bodies, or over those in `body_names`.
+Body terms average over all tracked bodies, or over `body_names`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def motion_global_anchor_orientation_error_exp(
 def motion_relative_body_position_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:
-    """Reward positions of bodies: E is the mean squared distance to the relative ones (m^2)."""
+    """Reward body positions: E is the mean squared distance to the relative positions (m^2)."""
     command = motion_command(env, command_name)
     away = command.body_pos_relative_w - command.robot_body_pos_w
     return _rewarded(away, body_columns(command, body_names), std)
@@ -64,7 +64,7 @@ def motion_relative_body_position_error_exp(
 def motion_relative_body_orientation_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:
-    """Reward orientations of bodies: E is the mean squared angle to the relative ones (rad^2)."""
+    """Reward body orientations: E is the mean squared angle to the relative ones (rad^2)."""
     command = motion_command(env, command_name)
     angle = quat_error_magnitude(command.body_quat_relative_w, command.robot_body_quat_w)
     return _rewarded(angle.unsqueeze(-1), body_columns(command, body_names), std)
@@ -74,7 +74,7 @@ def motion_relative_body_orientation_error_exp(
 def motion_global_body_linear_velocity_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:
-    """Reward velocities of bodies, in world axes: E is the mean squared error (m^2/s^2)."""
+    """Reward linear body velocities in world axes: E is the mean squared error (m^2/s^2)."""
     command = motion_command(env, command_name)
     error = command.body_lin_vel_w - command.robot_body_lin_vel_w
     return _rewarded(error, body_columns(command, body_names), std)
@@ -84,16 +84,16 @@ def motion_global_body_linear_velocity_error_exp(
 def motion_global_body_angular_velocity_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:
-    """Reward angular velocities of bodies, in world axes: E is the mean squared error (rad^2/s^2)."""
+    """Reward angular body velocities in world axes: E is the mean squared error (rad^2/s^2)."""
     command = motion_command(env, command_name)
     error = command.body_ang_vel_w - command.robot_body_ang_vel_w
     return _rewarded(error, body_columns(command, body_names), std)
 
 
 def _rewarded(errors: torch.Tensor, columns: slice | torch.Tensor, std: float) -> torch.Tensor:
-    """Return exp(-E / std^2), E the mean over the chosen bodies of |error|^2; `errors` (N, K, D)."""
+    """Return exp(-E / std^2), E: mean of |error|^2 over the selected bodies; `errors` (N, K, D)."""
     chosen = errors[:, columns]
-    # One sum over bodies and components: a sum over three components alone takes four times as long.
+    # Sum over bodies and components at once: a sum over three components takes four times as long.
     squares = chosen.square().flatten(1).sum(dim=1)
     return torch.exp(squares / -(chosen.shape[1] * std**2))
 

@@ -1,4 +1,4 @@
-"""Termination terms of motion tracking. Each returns bool (N,); limits themselves are no failure."""
+"""Termination terms of motion tracking, (N,) bool. Thresholds are strict (`>`)."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ BodyNames = tuple[str, ...] | None
 
 @checked_when_built(check_motion_term)
 def bad_anchor_pos(env: ManagerBasedRlEnv, command_name: str, threshold: float) -> torch.Tensor:
-    """The robot's anchor is further from the reference's than `threshold` (m)."""
+    """Terminate if the distance of robot anchor and reference anchor exceeds `threshold` (m)."""
     command = motion_command(env, command_name)
-    away = command.anchor_pos_w - command.robot_anchor_pos_w
-    return torch.linalg.vector_norm(away, dim=1) > threshold
+    offset = command.anchor_pos_w - command.robot_anchor_pos_w
+    return torch.linalg.vector_norm(offset, dim=1) > threshold
 
 
 @checked_when_built(check_motion_term)
 def bad_anchor_pos_z_only(
     env: ManagerBasedRlEnv, command_name: str, threshold: float
 ) -> torch.Tensor:
-    """The robot's anchor is higher or lower than the reference's by more than `threshold` (m)."""
+    """Terminate if robot and reference anchor heights differ by over `threshold` (m)."""
     command = motion_command(env, command_name)
     return (command.anchor_pos_w[:, 2] - command.robot_anchor_pos_w[:, 2]).abs() > threshold
 
@@ -48,16 +48,16 @@ def bad_anchor_pos_z_only(
 def bad_anchor_ori(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg, command_name: str, threshold: float
 ) -> torch.Tensor:
-    """The anchors differ in |g_z - g'_z| by more than `threshold`, whatever their headings.
+    """Terminate if |g_z - g'_z| > `threshold`, independent of heading.
 
-    g and g' are the unit vectors down in the frames of the two anchors.
+    g and g' are gravity directions (unit vectors) in the frames of reference and robot anchor.
     """
     command = motion_command(env, command_name)
     return (_down(command.anchor_quat_w) - _down(command.robot_anchor_quat_w)).abs() > threshold
 
 
 def _down(quat: torch.Tensor) -> torch.Tensor:
-    """Return z of the unit vector down in frames of orientation (N, 4): 2 (x^2 + y^2) - 1."""
+    """Return z of the gravity direction in frames of orientation (N, 4): 2 (x^2 + y^2) - 1."""
     x, y = quat[:, 1], quat[:, 2]
     return 2.0 * (x * x + y * y) - 1.0
 
@@ -66,30 +66,36 @@ def _down(quat: torch.Tensor) -> torch.Tensor:
 def bad_motion_body_pos(
     env: ManagerBasedRlEnv, command_name: str, threshold: float, body_names: BodyNames = None
 ) -> torch.Tensor:
-    """Any body (of `body_names`, or tracked) is further from its relative place than `threshold`."""
+    """Terminate if a body of `body_names` (None: all) is over `threshold` (m) off its reference.
+
+    The reference is the relative position.
+    """
     command = motion_command(env, command_name)
     columns = body_columns(command, body_names)
-    away = command.body_pos_relative_w[:, columns] - command.robot_body_pos_w[:, columns]
-    return (torch.linalg.vector_norm(away, dim=-1) > threshold).any(dim=1)
+    offset = command.body_pos_relative_w[:, columns] - command.robot_body_pos_w[:, columns]
+    return (torch.linalg.vector_norm(offset, dim=-1) > threshold).any(dim=1)
 
 
 @checked_when_built(check_motion_term)
 def bad_motion_body_pos_z_only(
     env: ManagerBasedRlEnv, command_name: str, threshold: float, body_names: BodyNames = None
 ) -> torch.Tensor:
-    """Any body (of `body_names`, or tracked) is above or below its place by more than `threshold`."""
+    """Terminate if a body of `body_names` (None: all) is over `threshold` (m) off its height.
+
+    The height is that of the relative position.
+    """
     command = motion_command(env, command_name)
     columns = body_columns(command, body_names)
-    away = command.body_pos_relative_w[:, columns, 2] - command.robot_body_pos_w[:, columns, 2]
-    return (away.abs() > threshold).any(dim=1)
+    offset = command.body_pos_relative_w[:, columns, 2] - command.robot_body_pos_w[:, columns, 2]
+    return (offset.abs() > threshold).any(dim=1)
 
 
 @checked_when_built(check_motion_term)
 def motion_ended(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """The motion has no further frame. A time-out: nothing the robot did ended it.
+    """End the episode at the last frame of the motion. Use as a time-out: the robot did not fail.
 
-    Without such a term the command puts the robot onto another frame in the middle of the episode,
-    as mjlab 1.6 does, and the values that are learned span the jump.
+    Without this term the command moves the robot to a new frame in the middle of the episode, as in
+    mjlab 1.6, and value estimates bootstrap across the jump.
     """
     command = motion_command(env, command_name)
     return command.time_steps >= command.motion.lengths[command.motion_ids] - 1

@@ -1,4 +1,4 @@
-"""Training of motion tracking."""
+"""Runner of the motion tracking tasks."""
 
 from mjlab.tasks.tracking.rl.runner import (
     MotionTrackingOnPolicyRunner as MotionTrackingOnPolicyRunner,

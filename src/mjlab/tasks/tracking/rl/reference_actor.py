@@ -1,4 +1,4 @@
-"""An actor that follows the reference before it has learned anything."""
+"""Actor initialized as a position controller on the reference motion."""
 
 from __future__ import annotations
 
@@ -11,61 +11,62 @@ from torch import nn
 from mjlab.envs import mdp
 from mjlab.tasks.tracking.mdp.commands import MotionCommand
 
-_NEARLY_NOTHING = 0.01
+_OUTPUT_SCALE = 0.01
 
 
 class ReferenceActor(MLPModel):
-    """rsl_rl's `MLPModel`, whose output is added to the action that asks for the reference's pose.
+    """rsl_rl's `MLPModel` plus the action that targets the reference pose.
 
-    So a policy begins as a position controller on the reference, and learns what that lacks, which is
-    to keep its balance. It reads the same observations and gives the same actions as the plain model,
-    and is exported like it. The runner of motion tracking says which action asks for which joint.
+    The policy starts as a position controller on the reference and learns a residual, mainly to
+    balance. Observations, actions and exports are those of the plain model. The motion tracking
+    runner assigns actions to joints with `follow`.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Take the arguments of rsl_rl's `MLPModel`.
+        """Build the model; the arguments are those of rsl_rl's `MLPModel`.
 
         Raises:
-            ValueError: the distribution takes more from the network than one number for each action.
+            ValueError: the distribution needs more than one network output per action.
         """
         super().__init__(*args, **kwargs)
-        wanted = self.distribution
-        if wanted is not None and wanted.input_dim != wanted.output_dim:
+        distribution = self.distribution
+        if distribution is not None and distribution.input_dim != distribution.output_dim:
             raise ValueError(
-                f"ReferenceActor cannot have the distribution {type(wanted).__name__}, which takes "
-                f"{wanted.input_dim} numbers from the network for {wanted.output_dim} actions. Use "
-                "'GaussianDistribution', which takes the mean alone, or class_name='MLPModel'."
+                "ReferenceActor distribution: expected one network output per action, got "
+                f"{type(distribution).__name__} with {distribution.input_dim} outputs for "
+                f"{distribution.output_dim} actions; use 'GaussianDistribution' (mean only) or "
+                "class_name='MLPModel'."
             )
         self.mlp: nn.Module = _WithReference(self.mlp, self.obs_normalizer, self.obs_dim)
 
     @property
     def with_reference(self) -> _WithReference:
-        """The network and what is added to its output; it stands where `MLPModel` has the network."""
+        """Network with reference term, stored as `mlp`."""
         network: Any = self.mlp
         return network
 
     def follow(self, env: Any, command: MotionCommand) -> None:
-        """Take from `env` which action asks for which joint of `command`.
+        """Set the reference term from the actions of `env` and the joints of `command`.
 
         Raises:
-            ValueError: the actor does not observe the command as it is, or the actions are not one
-                term of joint positions.
+            ValueError: the actor does not observe the unscaled command, or the actions are not a
+                single `JointPositionAction`.
         """
-        begin = _place_of_command(env, self.obs_groups, command)
+        begin = _command_offset(env, self.obs_groups, command)
         names = command.robot.joint_names
         manager = env.action_manager
         terms = [manager.get_term(name) for name in manager.active_terms]
         if len(terms) != 1 or not isinstance(terms[0], mdp.JointPositionAction):
             raise ValueError(
-                "ReferenceActor needs one action term, of joint positions; there are "
-                f"{[type(term).__name__ for term in terms]}. Use class_name='MLPModel'."
+                "ReferenceActor actions: expected one JointPositionAction, got "
+                f"{[type(term).__name__ for term in terms]}; use class_name='MLPModel'."
             )
         term = terms[0]
         weight, bias = self.with_reference.weight, self.with_reference.bias
         device, indices = weight.device, [names.index(name) for name in term.target_names]
         columns = begin + torch.tensor(indices, device=device)
         rows = torch.arange(len(indices), device=device)
-        # Both may be single numbers, and the networks may be on another device than the term.
+        # Scale and offset may be scalars, and on a different device than the networks.
         shape = (env.num_envs, len(indices))
         scale = torch.as_tensor(term.scale, device=device).expand(shape)[0]
         offset = torch.as_tensor(term.offset, device=device).expand(shape)[0]
@@ -75,7 +76,7 @@ class ReferenceActor(MLPModel):
 
 
 class _WithReference(nn.Module):
-    """What a network makes of normalized observations, and a linear function of the plain ones."""
+    """Sum of a network of normalized observations and a linear map of unnormalized observations."""
 
     weight: torch.Tensor
     bias: torch.Tensor
@@ -83,27 +84,27 @@ class _WithReference(nn.Module):
 
     def __init__(self, mlp: Any, normalizer: nn.Module, num_observations: int) -> None:
         super().__init__()
-        # The normalizer is the model's. It is listed here too, so that a copy of this module alone,
-        # which is what is exported, has it and moves it to other devices.
+        # The model's normalizer is also registered here, because exports copy this module alone and
+        # move it to other devices.
         self.mlp, self.normalizer = mlp, normalizer
         last = [layer for layer in mlp if isinstance(layer, nn.Linear)][-1]
         with torch.no_grad():
-            last.weight.mul_(_NEARLY_NOTHING)
+            last.weight.mul_(_OUTPUT_SCALE)
             last.bias.zero_()
         self.register_buffer("weight", torch.zeros(last.out_features, num_observations))
         self.register_buffer("bias", torch.zeros(last.out_features))
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
         """Map normalized observations (N, observations) to actions (N, actions)."""
-        plain = latent
+        raw = latent
         if not isinstance(self.normalizer, nn.Identity):
-            plain = latent * (self.normalizer._std + self.normalizer.eps) + self.normalizer._mean
-        return self.mlp(latent) + nn.functional.linear(plain, self.weight, self.bias)
+            raw = latent * (self.normalizer._std + self.normalizer.eps) + self.normalizer._mean
+        return self.mlp(latent) + nn.functional.linear(raw, self.weight, self.bias)
 
 
-def _place_of_command(env: Any, groups: list[str], command: MotionCommand) -> int:
-    """Return where in the actor's observations the reference's joint positions begin."""
-    manager, place = env.observation_manager, 0
+def _command_offset(env: Any, groups: list[str], command: MotionCommand) -> int:
+    """Return the index of the first reference joint position in the actor's observations."""
+    manager, offset = env.observation_manager, 0
     for group in groups:
         shapes = manager.group_obs_term_dim[group]
         for name, shape in zip(manager.active_terms[group], shapes, strict=True):
@@ -111,10 +112,10 @@ def _place_of_command(env: Any, groups: list[str], command: MotionCommand) -> in
             if cfg.func is mdp.generated_commands and shape == command.command.shape[1:]:
                 found = env.command_manager.get_term(cfg.params["command_name"])
                 if found is command and cfg.scale is None and cfg.clip is None:
-                    return place
-            place += shape[0]
+                    return offset
+            offset += shape[0]
     raise ValueError(
-        "ReferenceActor needs the motion command among the actor's observations, as "
-        "`generated_commands` without scale, clip and history; these are "
-        f"{[manager.active_terms[group] for group in groups]}. Add it, or use class_name='MLPModel'."
+        "ReferenceActor observations: expected the motion command as `generated_commands` without "
+        f"scale, clip and history, got {[manager.active_terms[group] for group in groups]}; add it, "
+        "or use class_name='MLPModel'."
     )

@@ -1,4 +1,4 @@
-"""The runner of motion tracking, and the exported policy together with the reference that it follows."""
+"""Motion tracking runner, and export of the policy with its reference motions."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ REFERENCE = (
     "body_lin_vel_w",
     "body_ang_vel_w",
 )
-"""Tensors of a motion that the exported policy returns, with a row for each frame."""
+"""Motion tensors returned by the exported policy, one row per frame."""
 logger = logging.getLogger(__name__)
 _FAILURES = "motion_failures"
 
 
 class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
-    """Trains as `MjlabOnPolicyRunner` does, exports the policy with the reference whenever it saves,
-    and keeps the motions in the run's folder.
+    """`MjlabOnPolicyRunner` that exports the policy with the reference at every checkpoint and
+    copies the motions into the run folder.
 
-    The command is a `MotionCommand`, or any term named `motion`. Of a class that is not ours, the
-    motions are those of `motion` and `cfg.motion_file`; without them the policy is exported alone.
+    The command is a `MotionCommand`, or any term named `motion`. For custom classes, the motions
+    are read from `motion` and `cfg.motion_file`; without these, the policy is exported alone.
 
-    Checkpoints hold the statistics of failures, so that a run that resumes, with however many
-    environments, still knows where the robot fails.
+    Checkpoints contain the failure statistics, so that adaptive sampling continues after a resume
+    with any number of environments.
     """
 
     def __init__(
@@ -52,19 +52,18 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         device: str = "cpu",
         registry_name: str | None = None,
     ) -> None:
-        """Build networks and algorithm.
+        """Build the networks and the algorithm.
 
         Args:
-            env: The environments.
-            train_cfg: A `RslRlOnPolicyRunnerCfg` as a dict; it is edited here and by rsl_rl.
-            log_dir: Folder of the run. None: nothing is written.
+            env: Vectorized environment.
+            train_cfg: `RslRlOnPolicyRunnerCfg` as a dict; modified in place here and by rsl_rl.
+            log_dir: Run folder. None: write nothing.
             device: Device of the networks.
-            registry_name: Weights & Biases artifact that the motion comes from; a run that logs
-                there is marked as using it.
+            registry_name: Weights & Biases artifact of the motion; runs logged there record its
+                use.
 
         Raises:
-            ValueError: the environments have no motion command, or none that a `ReferenceActor` can
-                follow.
+            ValueError: no motion command found, or `ReferenceActor` cannot follow it.
         """
         super().__init__(env, train_cfg, log_dir, device)
         self.motion_command: Any = _motion_command(self.env.unwrapped)
@@ -77,12 +76,12 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
     def save(self, path: str, infos=None) -> None:
         """Write a checkpoint, and the policy as `<folder>/<folder's name>.onnx` beside it.
 
-        At the first time the motions are copied into the folder. What fails after the checkpoint is
-        logged, and training goes on.
+        The first call also copies the motions into the folder. Errors after the checkpoint is
+        written are logged and do not stop training.
 
         Args:
-            path: Where to write the checkpoint.
-            infos: Further plain data, which `load` returns.
+            path: Path of the checkpoint.
+            infos: Additional plain data, returned by `load`.
 
         Raises:
             CheckpointError: the checkpoint could not be written.
@@ -95,9 +94,9 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             return
         folder = Path(path).resolve().parent
         try:
-            self._keep_motions(folder)
+            self._save_motions(folder)
         except Exception as error:
-            logger.warning("The motions were not recorded in %s: %s", folder, error)
+            logger.warning("Motions not recorded in %s: %s", folder, error)
 
     def load(
         self,
@@ -106,7 +105,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         strict: bool = True,
         map_location: str | None = None,
     ) -> dict:
-        """Load a checkpoint, and with all of it the statistics of failures, if they fit.
+        """Load a checkpoint; a full load also restores failure statistics of matching size.
 
         Arguments, result and errors are those of `MjlabOnPolicyRunner.load`.
         """
@@ -117,26 +116,26 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
                 sampler.failed.copy_(failed)
             else:
                 logger.warning(
-                    "The statistics of failures start anew: they are of %d segments, and the "
-                    "motions have %d.", len(failed), sampler.num_bins,
+                    "Failure statistics reset: the checkpoint has %d segments, the motions have %d.",
+                    len(failed), sampler.num_bins,
                 )  # fmt: skip
         return infos
 
     def export_policy_to_onnx(
         self, path: str, filename: str = "policy.onnx", verbose: bool = False
     ) -> None:
-        """Write the policy and the reference to `path`/`filename`: see `PolicyWithReference`."""
+        """Write the policy and the reference to `path`/`filename`; see `PolicyWithReference`."""
         motion: Any = getattr(self.motion_command, "motion", None)
         missing = [name for name in (*REFERENCE, "time_step_total") if not hasattr(motion, name)]
         if missing:
-            logger.info("The policy is exported without the motion, which has no %s.", missing)
+            logger.info("Policy exported without the motion: attributes %s are missing.", missing)
             super().export_policy_to_onnx(path, filename, verbose)
             return
         policy = self.alg.get_policy().as_onnx(verbose=verbose)
         export_to_onnx(PolicyWithReference(policy, motion), Path(path) / filename, verbose)
 
     def onnx_metadata(self) -> dict[str, Any]:
-        """Return the metadata of the base with what the reference is of."""
+        """Return the base metadata plus anchor, tracked bodies and motions of the reference."""
         command, metadata = self.motion_command, super().onnx_metadata()
         if hasattr(command.cfg, "anchor_body_name"):
             metadata["anchor_body_name"] = command.cfg.anchor_body_name
@@ -155,7 +154,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         sampler = getattr(self.motion_command, "sampler", None)
         return sampler if isinstance(sampler, HardSegmentSampler) else None
 
-    def _keep_motions(self, folder: Path) -> None:
+    def _save_motions(self, folder: Path) -> None:
         command = self.motion_command
         if isinstance(command, MotionCommand):
             files = command.motion_files
@@ -163,7 +162,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             path = Path(getattr(command.cfg, "motion_file", ""))
             files = (path,) if path.is_file() else ()
         new = record_motions(files, folder, self._registry_name) if files else []
-        # Whoever has a live run at Weights & Biases has imported wandb.
+        # An active Weights & Biases run implies that wandb is imported.
         wandb: Any = sys.modules.get("wandb")
         if self.cfg.get("logger") != "wandb" or getattr(wandb, "run", None) is None:
             return
@@ -181,14 +180,14 @@ def _motion_command(env: Any) -> Any:
     found = [term for term in terms.values() if isinstance(term, MotionCommand)]
     if not found and "motion" not in terms:
         raise ValueError(
-            "MotionTrackingOnPolicyRunner needs a MotionCommand, or a command named 'motion'; the "
-            f"commands are {list(terms)}."
+            "MotionTrackingOnPolicyRunner commands: expected a MotionCommand or a command named "
+            f"'motion', got {list(terms)}."
         )
     return found[0] if found else terms["motion"]
 
 
 class PolicyWithReference(torch.nn.Module):
-    """What is exported: (obs, time_step) -> actions and the reference at that time step.
+    """Exported module: (obs, time_step) -> actions and the reference at that time step.
 
     | input | shape | | output | shape |
     | --- | --- | --- | --- | --- |
@@ -197,23 +196,22 @@ class PolicyWithReference(torch.nn.Module):
     | | | | `body_pos_w`, `body_lin_vel_w`, `body_ang_vel_w` | (N, K, 3) |
     | | | | `body_quat_w` | (N, K, 4) |
 
-    The time step is a number of frames, truncated to an integer and kept within the reference; it
-    counts over all motions, one after the other. Bodies are the tracked ones, without origins of
-    environments.
+    The time step is a frame index over all motions in sequence, truncated to an integer and clamped
+    to the last frame. Bodies are the tracked ones; positions do not include environment origins.
     """
 
     def __init__(self, policy: Any, motion: MotionLibrary) -> None:
-        """Take what rsl_rl's `as_onnx` returns, and the motions, which are copied.
+        """Wrap the module returned by rsl_rl's `as_onnx`, with copies of the motion tensors.
 
         Raises:
-            ValueError: the policy has other inputs than observations.
+            ValueError: the policy has inputs other than `obs`.
         """
         super().__init__()
         self.policy = policy
         if list(policy.input_names) != ["obs"]:
             raise ValueError(
-                f"A policy with the inputs {list(policy.input_names)} cannot be exported with the "
-                "reference; one that reads observations only can."
+                "PolicyWithReference policy: expected the single input 'obs', got "
+                f"{list(policy.input_names)}."
             )
         for name in REFERENCE:
             self.register_buffer(name, getattr(motion, name).detach().cpu().clone())
@@ -221,19 +219,19 @@ class PolicyWithReference(torch.nn.Module):
 
     @property
     def input_names(self) -> list[str]:
-        """Names of the inputs."""
+        """Names of the ONNX inputs."""
         return ["obs", "time_step"]
 
     @property
     def output_names(self) -> list[str]:
-        """Names of the outputs."""
+        """Names of the ONNX outputs."""
         return ["actions", *REFERENCE]
 
     def get_dummy_inputs(self) -> tuple[torch.Tensor, ...]:
-        """Return inputs of the right shapes."""
+        """Return example inputs for tracing."""
         return (*self.policy.get_dummy_inputs(), torch.zeros(1, 1))
 
     def forward(self, obs: torch.Tensor, time_step: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the outputs."""
+        """Return the actions and the reference frame."""
         frame = time_step.long().squeeze(-1).clamp(0, self.last_frame)
         return (self.policy(obs), *(getattr(self, name)[frame] for name in REFERENCE))

@@ -1,1 +1,1 @@
-"""Command lines of motion tracking, at the paths of mjlab 1.6."""
+"""Motion tracking commands at the module paths of mjlab 1.6."""

@@ -1,6 +1,6 @@
-"""Score a policy that tracks motions: `python -m mjlab.tasks.tracking.scripts.evaluate TASK [flags]`.
+"""Evaluate a tracking policy: `python -m mjlab.tasks.tracking.scripts.evaluate TASK [flags]`.
 
-It is `evaluate TASK` with the flags and the figures of mjlab 1.6.
+Equivalent to `evaluate TASK`, with the flags and metrics of mjlab 1.6.
 """
 
 from __future__ import annotations
@@ -21,52 +21,54 @@ _NAME = "python -m mjlab.tasks.tracking.scripts.evaluate"
 _COMMAND = Command(
     _NAME,
     "Policies",
-    "Score a policy that tracks motions.",
+    "Evaluate a motion tracking policy.",
     "mjlab.tasks.tracking.scripts.evaluate:command",
     "TASK",
-    "Let each environment play a motion once, and print the share of episodes that no termination "
-    "ended,\nand the mean errors.",
+    "Play one motion per environment, and print the fraction of episodes without termination,\n"
+    "and the mean errors.",
     (
         f"{_NAME} Mjlab-Tracking-Flat-Unitree-G1 --wandb-run-path org/project/run",
-        f"{_NAME} Mjlab-Tracking-Flat-Unitree-G1 --num-envs 200 --output-file figures.json",
+        f"{_NAME} Mjlab-Tracking-Flat-Unitree-G1 --num-envs 200 --output-file metrics.json",
     ),
 )
 
 
 @dataclass
 class EvaluateTrackingConfig(EvaluateConfig):
-    """Flags of the tracking tasks' own `evaluate`."""
+    """Flags of `evaluate` for tracking tasks."""
 
     num_envs: int = 1024
-    """Environments, each of which plays one episode."""
+    """Number of environments. Each plays one episode."""
     output_file: str | None = None
-    """Where the figures go, as JSON; None writes none."""
+    """JSON file for the metrics. None: do not write."""
 
 
 def run_evaluate_tracking(task: str, cfg: EvaluateTrackingConfig) -> dict[str, float]:
-    """Score a policy of `task`, print the figures, and return the means of mjlab 1.6.
+    """Evaluate a policy of `task`, print the metrics, and return the means of mjlab 1.6.
 
-    The file has these means, and for each its 95 % interval as `<name>_interval`; of one episode,
-    errors have none.
+    The file contains these means and their 95 % intervals as `<name>_interval`. Intervals of errors
+    are None for a single episode.
 
     Raises:
-        ValueError: the task does not track motions.
-        UserError: `num_episodes` is given, which is always `num_envs` here.
+        ValueError: not a tracking task.
+        UserError: `num_episodes` is set; the number of episodes is always `num_envs`.
     """
     if "Tracking" not in task:
-        raise ValueError(f"{task!r} does not track motions; `evaluate {task}` scores its policies.")
+        raise ValueError(
+            f"TASK: expected a motion tracking task, got {task!r}; use `evaluate {task}`."
+        )
     if cfg.num_episodes != EvaluateConfig.num_episodes:
         raise UserError(
-            f"--num-episodes is {cfg.num_episodes}, but here each environment plays one episode; "
-            f"give --num-envs {cfg.num_episodes} instead."
+            f"--num-episodes: expected no value, because each environment plays one episode, got "
+            f"{cfg.num_episodes}; use --num-envs {cfg.num_episodes}."
         )
     cfg = copy.copy(cfg)
     cfg.num_episodes = cfg.num_envs
-    figures = run_evaluate(task, cfg)
-    means: dict[str, float] = {"success_rate": figures["success_rate"]}
-    intervals: dict[str, Any] = {"success_rate_interval": list(figures["success_interval"])}
+    metrics = run_evaluate(task, cfg)
+    means: dict[str, float] = {"success_rate": metrics["success_rate"]}
+    intervals: dict[str, Any] = {"success_rate_interval": list(metrics["success_interval"])}
     for name in TRACKING_ERRORS:
-        metric = figures["metrics"][name]
+        metric = metrics["metrics"][name]
         means[name] = metric["mean"]
         interval = metric["interval"]
         intervals[f"{name}_interval"] = None if interval is None else list(interval)

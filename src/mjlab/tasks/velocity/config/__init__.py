@@ -1,1 +1,1 @@
-"""The robots that the velocity task comes with, one package each."""
+"""Robots of the velocity task, one package each."""

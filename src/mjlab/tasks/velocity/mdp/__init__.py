@@ -1,4 +1,4 @@
-"""The terms of the velocity task, together with the library of `mjlab.envs.mdp`."""
+"""MDP terms of the velocity task, and all terms of `mjlab.envs.mdp`."""
 
 from mjlab.compat import older_exports, older_names
 from mjlab.envs.mdp import *  # noqa: F403

@@ -1,4 +1,4 @@
-"""Curriculum terms of the velocity task: harder terrain and faster commands as training goes on."""
+"""Curriculum terms of the velocity task: terrain levels and command ranges."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ __getattr__ = older_names(__name__)
 
 
 class VelocityStage(TypedDict, total=False):
-    """Command ranges from a number of environment steps on; those not given stay as they are."""
+    """Command ranges that take effect at an environment step. Omitted ranges are unchanged."""
 
     step: int
     """First `common_step_counter` of the stage; required."""
     lin_vel_x: tuple[float, float] | None
-    """Forward velocity, in m/s."""
+    """Forward velocity (m/s)."""
     lin_vel_y: tuple[float, float] | None
-    """Velocity to the left, in m/s."""
+    """Velocity to the left (m/s)."""
     ang_vel_z: tuple[float, float] | None
-    """Yaw rate, in rad/s."""
+    """Yaw rate (rad/s)."""
 
 
 def _check_levels(
@@ -49,8 +49,8 @@ def _check_levels(
     term = env.command_manager.get_term(command_name)
     if use_elapsed_time and not isinstance(term, UniformVelocityCommand):
         raise ValueError(
-            f"use_elapsed_time needs a UniformVelocityCommand, which knows the time, and "
-            f"{command_name!r} is a {type(term).__name__}. Set it to False."
+            f"use_elapsed_time: expected {command_name!r} to be a UniformVelocityCommand, got "
+            f"{type(term).__name__}; use False."
         )
 
 
@@ -62,23 +62,23 @@ def terrain_levels_vel(
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
     use_elapsed_time: bool = False,
 ) -> dict[str, torch.Tensor]:
-    """Move environments to harder terrain where the robot walked far, and to easier where it did not.
+    """Raise the terrain level of robots that walked far, and lower it for robots that did not.
 
-    Up a level if the robot is further from its origin than half a cell; else down a level if it
-    came less than half as far as its command asked for in a whole episode. Environments that have
-    not made a step stay where they are, so that nothing moves at the first reset.
+    Up one level if the distance from the origin exceeds half a cell. Otherwise down one level if the
+    distance is less than half of commanded speed times episode length. Environments without a step
+    keep their level, so the first reset changes nothing.
 
     Args:
         env: The environment.
-        env_ids: Environments that are about to reset.
-        command_name: The velocity command; its value now stands for that of the whole episode.
+        env_ids: Environments about to reset.
+        command_name: Velocity command; its current value represents the whole episode.
         asset_cfg: The robot.
-        use_elapsed_time: Ask for the distance of the time that the robot had, not of a whole
-            episode. Otherwise a robot is sent down when its episode was cut short, although it
-            walked well: episodes also end early at the start of training, which spreads them.
+        use_elapsed_time: Use the time since the reset instead of the full episode length. Otherwise
+            robots whose episodes were truncated early are sent down although they walked well.
+            Training truncates first episodes early, because it randomizes their initial lengths.
 
-    Returns, to be logged: mean and largest level, and the mean level of each kind of terrain where
-    each has its own column.
+    Returns, for logging: mean and maximum level, and the mean level per sub-terrain if each
+    sub-terrain has one column.
     """
     terrain: Any = env.scene.terrain
     if terrain is None or terrain.terrain_origins is None:
@@ -91,10 +91,10 @@ def terrain_levels_vel(
     if use_elapsed_time:
         term: Any = env.command_manager.get_term(command_name)
         duration = term.elapsed_s[env_ids]
-    asked = torch.linalg.vector_norm(command[:, :2], dim=1) * duration * 0.5
+    required = torch.linalg.vector_norm(command[:, :2], dim=1) * duration * 0.5
     move_up = distance > terrain.cfg.terrain_generator.size[0] / 2.0
-    move_down = (distance < asked) & ~move_up
-    # At the first reset robots are wherever the model puts them.
+    move_down = (distance < required) & ~move_up
+    # Before the first reset, robots are at their model pose.
     has_moved = env.episode_length_buf[env_ids] > (0 if env.common_step_counter > 0 else torch.inf)
     terrain.update_env_origins(env_ids, move_up & has_moved, move_down & has_moved)
     return _levels_to_log(terrain)
@@ -106,15 +106,15 @@ def _levels_to_log(terrain: Any) -> dict[str, torch.Tensor]:
     numbers = [levels.mean().view(1), levels.max().view(1)]
     has_own_columns = terrain.terrain_origins.shape[1] == len(names)
     if has_own_columns:
-        # In one matrix, so that it comes from the device in one go.
+        # One matrix, so that one transfer from the device suffices.
         is_of = terrain.terrain_types == torch.arange(len(names), device=levels.device).unsqueeze(1)
         count = is_of.sum(dim=1)
         mean = torch.where(is_of, levels, 0.0).sum(dim=1) / count
         numbers.append(mean)
-    mean, largest, *of_kinds = torch.cat(numbers).cpu()
+    mean, largest, *level_means = torch.cat(numbers).cpu()
     logged = {"mean": mean, "max": largest}
-    # A kind without environments has no mean.
-    pairs = zip(names, of_kinds, strict=True) if has_own_columns else ()
+    # Sub-terrains without environments have no mean.
+    pairs = zip(names, level_means, strict=True) if has_own_columns else ()
     return logged | {name: level for name, level in pairs if not level.isnan()}
 
 
@@ -124,11 +124,11 @@ def _check_stages(
     require_command(env, command_name)
     for stage in velocity_stages:
         if "step" not in stage:
-            raise ValueError(f"velocity_stages: the stage {dict(stage)} has no 'step'.")
+            raise ValueError(f"velocity_stages: expected a stage with 'step', got {dict(stage)}.")
         for key, bounds in stage.items():
             if key != "step" and key not in RANGES:
                 raise ValueError(
-                    f"velocity_stages: the stage of step {stage['step']} has {key!r}; "
+                    f"velocity_stages: unknown range {key!r} in the stage of step {stage['step']}; "
                     f"{suggest(key, RANGES)}"
                 )
             if key != "step" and bounds is not None:
@@ -144,17 +144,17 @@ def commands_vel(
 ) -> dict[str, torch.Tensor]:
     """Set the ranges of a velocity command to those of the stages that have begun.
 
-    Stages are applied in order, so that later ones win; what none of them gives stays as it is.
-    Commands already given stay too. The ranges are those of the term, not of the config that the
-    environment was made from, and are saved with a checkpoint.
+    Stages are applied in order; later stages override earlier ones, and omitted ranges are unchanged.
+    Current commands are unchanged. The ranges belong to the term, not to the environment config, and
+    are checkpointed.
 
     Args:
         env: The environment.
-        env_ids: Not used; curricula are called when environments reset.
-        command_name: The velocity command.
+        env_ids: Unused.
+        command_name: Velocity command.
         velocity_stages: Dicts with `step` and ranges, see `VelocityStage`.
 
-    Returns, to be logged, the bounds in use.
+    Returns, for logging, the bounds in use.
     """
     ranges: Any = env.command_manager.get_term_cfg(command_name).ranges  # ty: ignore
     for stage in velocity_stages:

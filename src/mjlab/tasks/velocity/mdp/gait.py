@@ -1,7 +1,7 @@
-"""Gait clock: a command that tells when each foot swings, and reward terms for gaits.
+"""Gait clock, a command that times the swing of each foot, and reward terms for gaits.
 
-A policy that knows the time learns to step sooner than one that has to find a rhythm. The clock is a
-command, so that observations and rewards read one phase, and a checkpoint keeps it.
+Policies that observe a clock learn to step sooner than policies that must find a rhythm. The clock is a
+command, so observations and rewards share one phase, and the phase is checkpointed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
-# Longer than any episode: the phase goes on until the next reset.
+# Longer than any episode: the phase is resampled at resets only.
 _ONLY_AT_RESETS = (1e9, 1e9)
 
 
@@ -51,20 +51,20 @@ class GaitClockCommandCfg(CommandTermCfg):
     """Gait clock configuration. Observe it with `generated_commands`."""
 
     resampling_time_range: tuple[float, float] = _ONLY_AT_RESETS
-    """Shortest and longest time until the phase is redrawn (s); every reset draws one."""
+    """Range of the time until the phase is resampled (s). Every reset resamples the phase."""
     frequency: float = 1.5
-    """Strides per second (Hz)."""
+    """Stride frequency f (Hz)."""
     velocity_command_name: str | None = "twist"
-    """Velocity command that asks to stand. None: the clock always runs."""
+    """Velocity command that stops the clock. None: the clock always runs."""
     standing_threshold: float = 0.1
-    """Commanded motion `|c_xy| + |c_z|` below which the clock stands."""
+    """Threshold of the commanded motion `|c_xy| + |c_z|`; the clock stops below."""
     starts: tuple[float, ...] | None = None
-    """Offsets o to draw from (strides), such as (0, 0.5): both feet on the ground. None: any."""
+    """Offsets o to sample from (strides), such as (0, 0.5): both feet on the ground. None: any in [0, 1)."""
     fade_s: float = 0.0
-    """Time in which the amplitude grows from 0 to 1 after resets and standing, and falls again (s)."""
+    """Ramp time of the amplitude from 0 to 1 after resets and standing, and back to 0 (s)."""
 
     def build(self, env: ManagerBasedRlEnv) -> GaitClockCommand:
-        """Return the term.
+        """Build the term.
 
         Raises:
             ValueError: frequency is not positive, fade_s is negative or infinite, starts has no offset
@@ -78,12 +78,12 @@ class GaitClockCommand(CommandTerm):
 
         phi = 2 pi (f t + o)
 
-    with t the time since the reset (s), and o in [0, 1) drawn at each reset. The amplitude A is 1, and
-    0 where the velocity command asks to stand, with the phase going on unseen; with `fade_s` it begins
-    at 0 and goes to either linearly.
+    with t the time since the reset (s), and o in [0, 1) sampled at each reset. The amplitude A is 1, or
+    0 for standing commands; the phase advances in both cases. With `fade_s`, A starts at 0 and changes
+    linearly.
 
     Attributes:
-        cycles: (N,) phase in strides, `f t + o` modulo 1.
+        cycles: Phase `f t + o` modulo 1 (strides), (N,).
     """
 
     cfg: GaitClockCommandCfg
@@ -98,37 +98,37 @@ class GaitClockCommand(CommandTerm):
             raise ValueError(
                 f"starts: expected offsets from 0 to below 1 (strides), got {starts!r}; use None for any."
             )
-        # The manager of commands is still being built, so the config says which there are.
+        # Names are read from the config, because the command manager is still being built.
         name, names = cfg.velocity_command_name, list(env.cfg.commands)
         if name is not None and env.cfg.commands.get(name) is None:
             raise ValueError(
                 f"velocity_command_name: unknown command {name!r}; {suggest(name, names)} Use None "
-                "for a clock that always runs."
+                "if the clock should always run."
             )
         self.cycles = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._faded = torch.zeros_like(self.cycles)
 
     @property
     def command(self) -> torch.Tensor:
-        """The clock (A sin phi, A cos phi), (N, 2)."""
+        """Clock (A sin phi, A cos phi), (N, 2)."""
         phase = self.phase
         clock = torch.stack((torch.sin(phase), torch.cos(phase)), dim=1)
         return clock.mul_(self.amplitude.unsqueeze(1))
 
     @property
     def amplitude(self) -> torch.Tensor:
-        """The amplitude A, (N,)."""
+        """Amplitude A, (N,)."""
         return self._faded if self.cfg.fade_s > 0.0 else (~self.is_standing).float()
 
     @property
     def phase(self) -> torch.Tensor:
-        """The phase phi, (N,), in [0, 2 pi)."""
+        """Phase phi in [0, 2 pi) (rad), (N,)."""
         return self.cycles * (2.0 * math.pi)
 
     @property
     def is_standing(self) -> torch.Tensor:
-        """True where the velocity command asks to stand, (N,)."""
-        # Read when asked for, so that the order of the commands does not matter.
+        """True for standing commands, (N,) bool."""
+        # Computed on access, so that the order of the commands does not matter.
         if self.cfg.velocity_command_name is None:
             return torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         return command_speed(self._env, self.cfg.velocity_command_name) < (
@@ -136,11 +136,11 @@ class GaitClockCommand(CommandTerm):
         )
 
     def swing(self, offsets: tuple[float, ...]) -> torch.Tensor:
-        """Return how far each foot is in the air, `A max(0, sin(phi + 2 pi o_i))^2`, (N, feet)."""
+        """Return the swing phase variable of each foot, `A max(0, sin(phi + 2 pi o_i))^2`, (N, feet)."""
         return swing_at(self.cycles, offsets).mul_(self.amplitude.unsqueeze(1))
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
-        """Advance the phase by `dt` seconds; the arguments are those of `CommandTerm.compute`."""
+        """Advance the phase by `dt` seconds. Arguments are those of `CommandTerm.compute`."""
         index = slice(None) if env_ids is None else env_ids
         self.cycles[index] = torch.remainder(self.cycles[index] + self.cfg.frequency * dt, 1.0)
         if self.cfg.fade_s > 0.0:
@@ -149,7 +149,7 @@ class GaitClockCommand(CommandTerm):
         super().compute(dt, env_ids)
 
     def export_metadata(self, name: str) -> dict[str, list | str | float]:
-        """Return the clock, under the keys of `mjlab.rl.exporter_utils`."""
+        """Return the clock parameters under the keys of `mjlab.rl.exporter_utils`."""
         cfg = self.cfg
         follows = cfg.velocity_command_name is not None
         return {
@@ -172,22 +172,22 @@ class GaitClockCommand(CommandTerm):
 
 
 def swing_at(cycles: torch.Tensor, offsets: tuple[float, ...]) -> torch.Tensor:
-    """Return `max(0, sin(2 pi (c + o_i)))^2` for phases c in strides, (N,), as (N, feet)."""
+    """Return `max(0, sin(2 pi (c + o_i)))^2` of phases c (strides), (N,), as (N, feet)."""
     phases = cycles.unsqueeze(1) + constant_tensor(tuple(offsets), cycles.device)
     return torch.sin(phases * (2.0 * math.pi)).clamp_(min=0.0).square_()
 
 
 def require_gait_clock(env: ManagerBasedRlEnv, command_name: str) -> GaitClockCommand:
-    """Return a gait clock.
+    """Return the gait clock `command_name`.
 
     Raises:
-        ValueError: there is no such command, or it is none.
+        ValueError: unknown command, or not a gait clock.
     """
     require_command(env, command_name)
     term = env.command_manager.get_term(command_name)
     if not isinstance(term, GaitClockCommand):
         raise ValueError(
-            f"command_name: expected a GaitClockCommand, got {command_name!r}, a "
+            f"command_name: expected a GaitClockCommand, got {command_name!r} of type "
             f"{type(term).__name__}; use the name of a GaitClockCommandCfg."
         )
     return term
@@ -205,8 +205,8 @@ def _check_height_by_phase(
     feet = [name for name, _ in height_columns(env, height_sensor_name)]
     if len(offsets) != len(feet):
         raise ValueError(
-            f"offsets: expected one number for each foot of {height_sensor_name!r}, {feet}, got "
-            f"{offsets}; use (0, 0.5) for two feet, and (0, 0.5, 0.5, 0) for the trot of four."
+            f"offsets: expected one number per foot of {height_sensor_name!r}, {feet}, got {offsets}; "
+            "use (0, 0.5) for two feet, (0, 0.5, 0.5, 0) for a trot of four."
         )
     check_positive("variance", variance)
 
@@ -221,24 +221,24 @@ def feet_height_by_phase(
     offsets: tuple[float, ...] = (0.0, 0.5),
     rest_height: float = 0.0,
 ) -> torch.Tensor:
-    """Reward feet that swing as high as the gait clock says, and stand while it says so:
+    """Reward foot heights that follow the gait clock:
 
         exp(-sum_i (h_i - h*_i)^2 / variance),    h*_i = swing_height A max(0, sin(phi + 2 pi o_i))^2
 
     with h_i the height of foot i above `rest_height`, phi the phase and A the amplitude of the clock.
-    Feet swing in one half of the cycle and stand in the other; while the clock stands, all do. Heights
-    and phase are those that the policy saw.
+    Feet swing in one half of the cycle and stand in the other; all feet stand while the clock is
+    stopped. Heights and phase are those that the policy observed.
 
     Args:
         env: The environment.
-        height_sensor_name: Height sensor with one frame for each foot.
-        command_name: The gait clock.
-        swing_height: Height of the middle of a swing (m).
-        variance: Sum of squared errors at which the reward is 1/e (m^2).
-        offsets: Offset o_i of each foot (fractions of a cycle), in the order of the sensor's
-            frames. For a trot of four, diagonal feet have the same.
-        rest_height: Reading of the sensor for a foot that stands (m): 0 for the G1, whose sites are
-            in the soles, and 0.0225 for the Go1, whose sites are in the middle of the feet.
+        height_sensor_name: Height sensor with one frame per foot.
+        command_name: Gait clock.
+        swing_height: Peak height of a swing (m).
+        variance: Sum of squared errors that reduces the reward to 1/e (m^2).
+        offsets: Offset o_i of each foot (fraction of a cycle), in the order of the sensor's frames.
+            For a trot of four, diagonal feet have equal offsets.
+        rest_height: Sensor reading of a standing foot (m): 0 for the G1, whose sites are in the
+            soles, and 0.0225 for the Go1, whose sites are at the foot centers.
     """
     clock: Any = env.command_manager.get_term(command_name)
     target = clock.swing(offsets).mul_(swing_height)
@@ -247,24 +247,24 @@ def feet_height_by_phase(
 
 
 class weighted_joint_deviation:
-    """Squared distance of joints from the default positions q0: `sum_j w_j (q_j - q0_j)^2`.
+    """Weighted squared joint deviation from the default positions q0: `sum_j w_j (q_j - q0_j)^2`.
 
     Params:
-        weights: Dict of joint name pattern to weight w, at least 0. Read once; every selected joint
-            must match one pattern, and every pattern a joint.
-        asset_cfg: Entity and joints; all joints where none are selected.
+        weights: Dict of joint name pattern to weight w >= 0, read once. Every selected joint must match
+            exactly one pattern, and every pattern a joint.
+        asset_cfg: Entity and joints; all joints by default.
 
-    Raises, when built: `ValueError` for weights that do not fit the joints, or are negative.
+    Raises, when built: `ValueError` for weights that do not match the joints or are negative.
     """
 
-    # Follows from the config, so it is no run-time state.
+    # Derived from the config; not checkpointed.
     _transient = {"_weights"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         weights: dict[str, float] = cfg.params["weights"]
         asset_cfg: SceneEntityCfg = cfg.params.get("asset_cfg", _DEFAULT_ASSET_CFG)
         asset: Entity = env.scene[asset_cfg.name]
-        # The names are in the order of the joint ids, whichever order the config asks for.
+        # Resolved names are in the order of the joint ids.
         joints = list(asset_cfg.joint_names or asset.joint_names)
         values = values_of_joints(joints, "weights", weights, least=0.0)
         self._weights = torch.tensor(values, dtype=torch.float32, device=env.device)
@@ -283,11 +283,11 @@ class weighted_joint_deviation:
 
 
 class feet_tilt:
-    """Tilt of feet from how they stand in the default pose: `sum_i sin(angle_i)^2`.
+    """Tilt of feet relative to the default pose: `sum_i sin(angle_i)^2`.
 
-    The angle of foot i is that between "up" and the direction fixed to the foot that points up in
-    the default pose with an upright root. For a level sole, the sum is that of the squared x and y
-    components of gravity's direction in the foot's frame.
+    The angle of foot i is that between world z and the foot-fixed axis that points up in the default
+    pose with an upright root. For feet with frames aligned to the sole, each summand is the squared
+    horizontal component of projected gravity in the foot frame.
 
     Params:
         asset_cfg: Entity, and the feet as `site_names` or `body_names`.
@@ -295,7 +295,7 @@ class feet_tilt:
     Raises, when built: `ValueError` unless either sites or bodies are selected.
     """
 
-    # Follows from the model, so it is no run-time state.
+    # Derived from the model; not checkpointed.
     _transient = {"_up", "_rest"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
@@ -316,12 +316,12 @@ class feet_tilt:
         else:
             quat = data.body_link_quat_w[:, as_columns(asset_cfg.body_ids, env.device)]
         up = quat_apply_inverse(quat, self._up.expand(*quat.shape[:-1], 3))
-        # The length of a cross product, because 1 - cos^2 of a small angle is rounded away.
+        # Norm of the cross product, because 1 - cos^2 cancels at small angles.
         return torch.linalg.cross(up, self._rest.expand_as(up)).square_().sum(dim=(1, 2))
 
 
 def _up_at_rest(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
-    """Return "up" in the frame of each foot, (feet, 3), in the default pose with an upright root."""
+    """Return world z in each foot frame, in the default pose with an upright root, (feet, 3)."""
     model = env.sim.mj_model
     data = mujoco.MjData(model)
     asset: Entity = env.scene[asset_cfg.name]
@@ -338,7 +338,7 @@ def _up_at_rest(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tens
 
 
 def height_over_feet(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
-    """Return the height of the root above the lowest of the feet (m), (N,); feet as `site_names`."""
+    """Return the height of the root above the lowest foot (m), (N,). Feet are `site_names`."""
     data = env.scene[asset_cfg.name].data
     feet = data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device), 2]
     return data.root_link_pos_w[:, 2] - feet.amin(dim=1)
@@ -347,9 +347,9 @@ def height_over_feet(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch
 def root_height_l2(
     env: ManagerBasedRlEnv, target_height: float, asset_cfg: SceneEntityCfg
 ) -> torch.Tensor:
-    """Squared distance of `height_over_feet` from `target_height` (m^2).
+    """Squared error of `height_over_feet` from `target_height` (m^2).
 
-    A robot that sinks falls seconds later, which is longer than a small discount factor looks ahead.
+    Robots that sink fall seconds later, beyond the horizon of a small discount factor.
     """
     return (height_over_feet(env, asset_cfg) - target_height).square_()
 
@@ -357,18 +357,18 @@ def root_height_l2(
 def root_near_feet(
     env: ManagerBasedRlEnv, minimum_height: float, asset_cfg: SceneEntityCfg
 ) -> torch.Tensor:
-    """`height_over_feet` is less than `minimum_height` (m)."""
+    """`height_over_feet` below `minimum_height` (m)."""
     return height_over_feet(env, asset_cfg) < minimum_height
 
 
 def feet_apart_l2(
     env: ManagerBasedRlEnv, distance: float, asset_cfg: SceneEntityCfg
 ) -> torch.Tensor:
-    """Squared amount (m^2) by which the lateral distance of two feet is below `distance` (m).
+    """Squared shortfall of the lateral foot distance below `distance` (m^2).
 
-    A robot whose feet come closer trips over them. The distance is that of the left foot to the left of
-    the right one, along y of the root's frame. Feet are `site_names`, the left one first: in the model,
-    or with `preserve_order`.
+    Penalizes feet that come close enough to trip the robot. The distance is the y offset from the right
+    to the left foot in the root frame (m). Feet are `site_names`, the left one first, in model order or
+    with `preserve_order`.
     """
     data = env.scene[asset_cfg.name].data
     feet = data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device)]

@@ -1,4 +1,4 @@
-"""Observation terms of the velocity task, about feet. They are for critics: robots do not know it."""
+"""Foot observation terms of the velocity task. Privileged: for critics, not available on robots."""
 
 from __future__ import annotations
 
@@ -25,97 +25,94 @@ __all__ = [
 
 
 def check_found_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that asks whether there is contact."""
+    """Raise unless `sensor_name` is a contact sensor with the field `found`."""
     require_fields(require_sensor(env, sensor_name, ContactSensor), "found")
 
 
 def check_force_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that reads forces of contacts."""
+    """Raise unless `sensor_name` is a contact sensor with the field `force`."""
     require_fields(require_sensor(env, sensor_name, ContactSensor), "force")
 
 
 def check_air_time_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that reads air times, or landings of feet."""
+    """Raise unless `sensor_name` is a contact sensor that tracks air time."""
     if not require_sensor(env, sensor_name, ContactSensor).cfg.track_air_time:
         raise ValueError(
-            f"The contact sensor {sensor_name!r} does not track air time. Set track_air_time=True "
-            "in its config."
+            f"Contact sensor {sensor_name!r} track_air_time: expected True, got False; the term uses air times."
         )
 
 
 def check_height_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that reads one height for each foot."""
+    """Raise unless `sensor_name` is a height sensor with one height per frame."""
     if require_sensor(env, sensor_name, TerrainHeightSensor).cfg.reduction == "none":
         raise ValueError(
-            f"The height sensor {sensor_name!r} has reduction='none', one height for each ray. "
-            "One for each foot is needed: 'min', 'max' or 'mean'."
+            f"Height sensor {sensor_name!r} reduction: expected 'min', 'max' or 'mean', one height per "
+            "frame, got reduction='none', one height per ray."
         )
 
 
 @accepts_older_params
 @checked_when_built(check_height_sensor)
 def foot_height(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Height of each foot above the ground (m), (N, feet), from a height sensor."""
+    """Height of each foot above the terrain (m), (N, feet)."""
     return env.scene[sensor_name].data.heights
 
 
 @checked_when_built(check_air_time_sensor)
 def foot_air_time(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Time that each foot has been in the air (s), (N, feet); 0 on the ground."""
+    """Time since lift-off of each foot (s), (N, feet); 0 in contact."""
     return env.scene[sensor_name].data.current_air_time
 
 
 @checked_when_built(check_found_sensor)
 def foot_contact(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """1 for each foot that touches the ground, else 0, (N, feet)."""
+    """1 for each foot in contact, else 0, (N, feet)."""
     return (env.scene[sensor_name].data.found > 0).float()
 
 
 @checked_when_built(check_force_sensor)
 def foot_contact_forces(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Contact forces as `sign(f) ln(1 + |f|)`, (N, 3 feet): x, y, z of the first foot, and so on.
+    """Contact forces `sign(f) ln(1 + |f|)`, f in N: x, y, z of the first foot, and so on, (N, 3 feet).
 
-    The logarithm brings standing (some 30 N a foot) and landing (some 1000 N) to one scale.
+    The logarithm reduces the range from standing (about 30 N per foot) to landing (about 1000 N).
     """
     force = env.scene[sensor_name].data.force.flatten(start_dim=1)
     return torch.copysign(torch.log1p(force.abs()), force)
 
 
-# Checks of further terms, for when they are built.
+# Checks of reward terms and metrics.
 
 
 def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that reads one contact for each foot."""
+    """Raise unless `sensor_name` is a contact sensor with `found` and one slot per foot."""
     sensor = require_sensor(env, sensor_name, ContactSensor)
     if sensor.cfg.num_slots != 1:
         raise ValueError(
-            f"The contact sensor {sensor_name!r} has {sensor.cfg.num_slots} slots for each foot, "
-            "and the term needs one. Set num_slots=1, with reduce='netforce' for the sum of all "
-            "contacts of a foot."
+            f"Contact sensor {sensor_name!r} num_slots: expected 1 slot per foot, got "
+            f"{sensor.cfg.num_slots}; use reduce='netforce' for the sum of all contacts of a foot."
         )
     require_fields(sensor, "found")
 
 
 def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check a term that reads a MuJoCo sensor of three numbers."""
+    """Raise unless `sensor_name` is a MuJoCo sensor with three values."""
     sensor = require_sensor(env, sensor_name, BuiltinSensor)
     size = sensor.data.shape[-1]
     if size != 3:
         raise ValueError(
-            f"The sensor {sensor_name!r} has {size} values; one of 3 is needed, such as a "
-            "subtreeangmom sensor."
+            f"Sensor {sensor_name!r}: expected 3 values, got {size}; use e.g. a subtreeangmom sensor."
         )
 
 
-# Feet: columns of different sources that are multiplied with each other.
+# Foot columns of sensors and site selections.
 
 
-# What a source is called in messages, and name and body of each of its columns.
+# Name of a source for messages, and (name, body id) of each column.
 Source = tuple[str, list[tuple[str, int]]]
 
 
 def contact_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str, int]]:
-    """Return name and body of each column of a contact sensor."""
+    """Return name and body id of each column of a contact sensor."""
     sensor = require_sensor(env, sensor_name, ContactSensor)
     primary = sensor.cfg.primary
     kind = "geom" if primary.mode == "geom" else "body"
@@ -123,7 +120,7 @@ def contact_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str,
 
 
 def height_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str, int]]:
-    """Return name and body of each column of a height sensor: its frames, in order."""
+    """Return name and body id of each column of a height sensor, in the order of its frames."""
     check_height_sensor(env, sensor_name)
     frame = require_sensor(env, sensor_name, TerrainHeightSensor).cfg.frame
     frames = frame if isinstance(frame, tuple) else (frame,)
@@ -131,24 +128,22 @@ def height_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str, 
 
 
 def site_columns(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> list[tuple[str, int]]:
-    """Return name and body of each selected site."""
+    """Return name and body id of each selected site."""
     entity = env.scene.entities[asset_cfg.name]
     names = entity.site_names if asset_cfg.site_names is None else asset_cfg.site_names
     if not names:
         raise ValueError(
-            f"asset_cfg selects no site of entity {asset_cfg.name!r}; give the sites of the feet "
-            "as site_names."
+            f"asset_cfg.site_names: expected the foot sites of entity {asset_cfg.name!r}, got none."
         )
     return [_element(env, "site", name, asset_cfg.name) for name in names]
 
 
-def check_same_feet(env: ManagerBasedRlEnv, one: Source, other: Source) -> None:
+def check_same_feet(env: ManagerBasedRlEnv, source: Source, other: Source) -> None:
     """Raise `ValueError` unless the columns of two sources belong to the same feet, in order.
 
-    Two columns belong together if they are on the same body, or one is on a part of the other's
-    body.
+    Two columns match if they are on the same body, or one is on a descendant of the other's body.
     """
-    (label, columns), (other_label, other_columns) = one, other
+    (name, columns), (other_name, other_columns) = source, other
     model = env.sim.mj_model
     fits = len(columns) == len(other_columns) and all(
         _is_within(model, a, b) or _is_within(model, b, a)
@@ -156,15 +151,14 @@ def check_same_feet(env: ManagerBasedRlEnv, one: Source, other: Source) -> None:
     )
     if not fits:
         raise ValueError(
-            f"{label} has the columns {[name for name, _ in columns]} and {other_label} has "
-            f"{[name for name, _ in other_columns]}; they are multiplied with each other, so they "
-            "have to be the same feet in the same order. Contacts and sites follow the order of "
-            "the model, heights the order of the sensor's frames."
+            f"Columns of {name} and {other_name}: expected the same feet in the same order, got "
+            f"{[column for column, _ in columns]} and {[column for column, _ in other_columns]}. Contacts "
+            "and sites are in model order, heights in the order of the sensor's frames."
         )
 
 
 def _element(env: ManagerBasedRlEnv, kind: str, name: str, entity: str | None) -> tuple[str, int]:
-    """Return the name of an element, and the id of the body it is on."""
+    """Return the name of an element and the id of its body."""
     model = env.sim.mj_model
     full = name if entity is None or name.startswith(f"{entity}/") else f"{entity}/{name}"
     if kind in ("body", "xbody"):
@@ -174,7 +168,7 @@ def _element(env: ManagerBasedRlEnv, kind: str, name: str, entity: str | None) -
 
 
 def _is_within(model: mujoco.MjModel, body: int, tree: int) -> bool:
-    """Return whether `body` is `tree` or below it."""
+    """Return True if `body` is `tree` or a descendant of `tree`."""
     while body > 0 and body != tree:
         body = int(model.body_parentid[body])
     return body == tree

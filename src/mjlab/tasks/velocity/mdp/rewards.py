@@ -1,11 +1,10 @@
-"""Reward terms of the velocity task, without weight. Each returns (N,).
+"""Reward terms of the velocity task, unweighted, (N,).
 
-Derived quantities (velocities of links, orientations, contacts) are one physics substep old here,
-and what rays see is one environment step old; `ManagerBasedRlEnv.step` says why. A command is the
-one that the policy saw.
+Derived quantities (link velocities, orientations, contacts) are one physics substep old, and ray hits
+one environment step old; see `ManagerBasedRlEnv.step`. Commands are those that the policy observed.
 
-Terms about feet multiply columns of different sources (contacts, heights, sites) with each other, so that
-all of them have to list the feet in one order. That is checked when the terms are built.
+Foot terms combine columns of different sources (contacts, heights, sites), so all sources must list the
+feet in the same order. The terms check the order when they are built.
 """
 
 from __future__ import annotations
@@ -73,11 +72,11 @@ def track_linear_velocity(
     command_name: str,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """Reward following the commanded horizontal velocity, without vertical velocity:
+    """Reward tracking of the commanded horizontal velocity, and zero vertical velocity:
 
         exp(-(|c_xy - v_xy|^2 + v_z^2) / std^2)
 
-    with v the velocity of the root link in its own frame (m/s).
+    with v the root link velocity in its own frame (m/s).
     """
     asset: Entity = env.scene[asset_cfg.name]
     command = velocity_command(env, command_name)
@@ -93,12 +92,12 @@ def track_angular_velocity(
     command_name: str,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """Reward following the commanded yaw rate, without roll and pitch:
+    """Reward tracking of the commanded yaw rate, and zero roll and pitch rate:
 
         exp(-((c_z - w_z)^2 + w_x^2 + w_y^2) / std^2)
 
-    with w the angular velocity of the root link in its own frame (rad/s). In environments that
-    keep a heading, c_z is the yaw rate that heading control asks for.
+    with w the root link angular velocity in its own frame (rad/s). For heading commands, c_z is the
+    output of heading control.
     """
     asset: Entity = env.scene[asset_cfg.name]
     command = velocity_command(env, command_name)
@@ -108,20 +107,19 @@ def track_angular_velocity(
 
 
 class upright:
-    """Reward a body that stands upright, or perpendicular to the ground.
+    """Reward a body that is upright, or perpendicular to the terrain.
 
-    It is `exp(-(n_x^2 + n_y^2) / std^2)`, where n is the unit vector down, or, with terrain
-    sensors, the normal of the ground that they see, in the frame of the body. At a tilt t the
-    exponent is `-sin(t)^2 / std^2`.
+    The reward is `exp(-(n_x^2 + n_y^2) / std^2)`, with n the direction of gravity or, with terrain
+    sensors, the terrain normal, in the body frame. At tilt angle θ the exponent is `-sin(θ)^2 / std^2`.
 
     Params:
-        std: Sine of the tilt at which the reward is 1/e; positive.
-        asset_cfg: Entity and one body; the root link where no body is selected.
-        terrain_sensor_names: Ray sensors that see the ground. Their hits are those of the last
-            environment step.
+        std: Sine of the tilt that reduces the reward to 1/e; positive.
+        asset_cfg: Entity and one body; the root link by default.
+        terrain_sensor_names: Ray sensors of the terrain normal. Hits are those of the last environment
+            step.
 
-    Raises, when built: `ValueError` for several bodies or a sensor that does not exist, `TypeError`
-    for one that casts no rays.
+    Raises, when built: `ValueError` for several bodies or an unknown sensor, `TypeError` for a sensor
+    other than a ray sensor.
     """
 
     _transient = {"_normal"}
@@ -133,7 +131,7 @@ class upright:
         self._body = single_body(env, self._asset_cfg)
         check_terrain_sensors(env, cfg.params.get("terrain_sensor_names") or ())
         self._up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float32, device=env.device)
-        # What the last reward was compared with, for drawing.
+        # Reference direction of the last reward, for drawing.
         self._normal = self._up.repeat(env.num_envs, 1)
 
     def __call__(
@@ -146,8 +144,8 @@ class upright:
         """Return the reward."""
         quat = self._quat()
         if terrain_sensor_names:
-            # Into the term's own memory: a rollout under `inference_mode` would otherwise leave a
-            # tensor that `reset` may not write afterwards.
+            # Copied in place: assignment in a rollout under `inference_mode` would leave an inference
+            # tensor, and `reset` could not write it afterwards.
             self._normal.copy_(terrain_normal_from_sensors(env, terrain_sensor_names))
             tilt = quat_apply_inverse(quat, self._normal)[:, :2].square().sum(dim=1)
         else:
@@ -155,21 +153,21 @@ class upright:
         return torch.exp(tilt / -(std**2))
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Forget the ground that these environments stood on."""
+        """Reset the drawn normal of `env_ids` to world z."""
         self._normal[slice(None) if env_ids is None else env_ids] = self._up[0]
 
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Draw the direction to be upright to (green), and that of the body (blue)."""
+        """Draw the reference direction (green) and the body z axis (blue)."""
         data = self._env.scene[self._asset_cfg.name].data
         for index in visualizer.get_env_indices(self._env.num_envs):
             start = data.root_link_pos_w[index]
             if self._body is not None:
                 start = data.body_link_pos_w[index, self._body]
-            own = quat_apply(self._quat()[index : index + 1], self._up)[0]
+            body_z = quat_apply(self._quat()[index : index + 1], self._up)[0]
             base = start.cpu().numpy()
             for direction, color in (
                 (self._normal[index], (0.2, 0.8, 0.2, 0.8)),
-                (own, (0.2, 0.4, 1.0, 0.8)),
+                (body_z, (0.2, 0.4, 1.0, 0.8)),
             ):
                 visualizer.add_arrow(base, base + 0.3 * direction.cpu().numpy(), color)
 
@@ -190,10 +188,10 @@ def _check_body(
 def body_angular_velocity_penalty(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Squared roll and pitch rate of a body, in world axes (rad^2/s^2).
+    """Squared x and y angular velocity of a body in the world frame (rad^2/s^2). Default: the root link.
 
     Raises:
-        ValueError: several bodies are selected. Without a selection it is the root.
+        ValueError: several bodies are selected.
     """
     asset: Entity = env.scene[asset_cfg.name]
     body = single_body(env, asset_cfg)
@@ -206,7 +204,7 @@ def body_angular_velocity_penalty(
 
 @checked_when_built(check_builtin_sensor)
 def angular_momentum_penalty(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
-    """Squared norm of the angular momentum that a MuJoCo sensor measures (kg^2 m^4/s^2)."""
+    """Squared norm of the angular momentum from a MuJoCo sensor (kg^2 m^4/s^2)."""
     squared = env.scene[sensor_name].data.square().sum(dim=1)
     log_metric(env, "angular_momentum_mean", masked_mean(squared.sqrt(), squared >= 0.0))
     return squared
@@ -215,25 +213,24 @@ def angular_momentum_penalty(env: ManagerBasedRlEnv, sensor_name: str) -> torch.
 class variable_posture:
     """`exp(-mean_j ((q_j - q0_j) / std_j)^2)` with standard deviations that depend on the command.
 
-    q0 are the default joint positions. With the commanded motion `s = |c_xy| + |c_z|` the standard
-    deviations are those of standing (s < walking_threshold), walking, or running
-    (s >= running_threshold).
+    q0 are the default joint positions. The commanded motion `s = |c_xy| + |c_z|` selects the standard
+    deviations: standing (s < walking_threshold), walking, or running (s >= running_threshold).
 
     Params:
-        std_standing: Dict of joint name pattern to standard deviation (rad or m). Read once; every
-            selected joint must match one pattern, and every pattern a joint.
-        std_walking: The same for walking.
-        std_running: The same for running.
+        std_standing: Dict of joint name pattern to standard deviation (rad or m), read once. Every
+            selected joint must match exactly one pattern, and every pattern a joint.
+        std_walking: Standard deviations for walking.
+        std_running: Standard deviations for running.
         asset_cfg: Entity and joints; `joint_names` must be set.
-        command_name: The velocity command.
-        walking_threshold: Least commanded motion that counts as walking.
-        running_threshold: Least commanded motion that counts as running.
+        command_name: Velocity command.
+        walking_threshold: Minimum commanded motion of walking.
+        running_threshold: Minimum commanded motion of running.
 
-    Raises, when built: `ValueError` for a table that does not fit the joints, standard deviations
-    that are not positive, thresholds in the wrong order, or no such command.
+    Raises, when built: `ValueError` for tables that do not match the joints, standard deviations <= 0,
+    walking_threshold > running_threshold, or an unknown command.
     """
 
-    # Follows from the config, so it is no run-time state.
+    # Derived from the config; not checkpointed.
     _transient = {"_weights"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
@@ -242,23 +239,22 @@ class variable_posture:
         thresholds = params.get("walking_threshold", 0.5), params.get("running_threshold", 1.5)
         if thresholds[0] > thresholds[1]:
             raise ValueError(
-                f"walking_threshold is {thresholds[0]} and running_threshold is {thresholds[1]}; "
-                "running cannot start at less motion than walking."
+                f"walking_threshold: expected at most running_threshold {thresholds[1]}, got "
+                f"{thresholds[0]}."
             )
         asset_cfg: SceneEntityCfg = params["asset_cfg"]
         if asset_cfg.joint_names is None:
             raise ValueError(
-                "asset_cfg.joint_names must be set, since standard deviations are given by joint "
-                "name. Use ('.*',) for all joints."
+                "asset_cfg.joint_names: expected joint names, got None; use ('.*',) for all joints."
             )
-        # The names are in the order of the joint ids, whichever order the config asks for.
+        # Resolved names are in the order of the joint ids.
         joints = list(asset_cfg.joint_names)
         tables = [f"std_{gait}" for gait in ("standing", "walking", "running")]
         stds = torch.tensor(
             [values_of_joints(joints, name, params[name], above=0.0) for name in tables],
             dtype=torch.float32,
         )
-        # (3, joints): what squared errors are weighted with, which makes their sum a mean.
+        # Weights of squared errors, (3, joints); 1 / len(joints) makes the sum a mean.
         self._weights = (1.0 / (stds.square() * len(joints))).to(env.device)
 
     def __call__(
@@ -281,7 +277,7 @@ class variable_posture:
         return torch.exp(-(error.square_() * self._weights[gait]).sum(dim=1))
 
 
-# Feet: how long and how high they swing, how they land, whether they slip.
+# Feet: air time, clearance, swing height, slip, landing.
 
 
 def _check_air_time(
@@ -296,8 +292,7 @@ def _check_air_time(
     require_command(env, command_name)
     if threshold_min >= threshold_max:
         raise ValueError(
-            f"threshold_min is {threshold_min} and threshold_max is {threshold_max}; no air time "
-            "is between them."
+            f"threshold_min: expected less than threshold_max {threshold_max}, got {threshold_min}."
         )
 
 
@@ -310,15 +305,15 @@ def feet_air_time(
     command_name: str | None = None,
     command_threshold: float = 0.5,
 ) -> torch.Tensor:
-    """Number of feet that have been in the air for between `threshold_min` and `threshold_max` (s).
+    """Number of feet with an air time between `threshold_min` and `threshold_max` (s).
 
     Args:
         env: The environment.
         sensor_name: Contact sensor of the feet, with `track_air_time`.
-        threshold_min: Air times up to this do not count.
-        threshold_max: Air times from this on do not count.
-        command_name: Velocity command without which there is no reward; None: always.
-        command_threshold: Commanded motion above which there is a reward.
+        threshold_min: Lower bound of the air time, exclusive (s).
+        threshold_max: Upper bound of the air time, exclusive (s).
+        command_name: Velocity command that enables the reward. None: always enabled.
+        command_threshold: Commanded motion that must be exceeded to enable the reward.
     """
     air_time = env.scene[sensor_name].data.current_air_time
     log_metric(env, "air_time_mean", masked_mean(air_time, air_time > 0.0))
@@ -334,8 +329,8 @@ def _check_clearance(
     **_: Any,
 ) -> None:
     require_command(env, command_name)
-    heights = f"The height sensor {height_sensor_name!r}", height_columns(env, height_sensor_name)
-    check_same_feet(env, heights, ("the selection of sites", site_columns(env, asset_cfg)))
+    heights = f"height sensor {height_sensor_name!r}", height_columns(env, height_sensor_name)
+    check_same_feet(env, heights, ("asset_cfg.site_names", site_columns(env, asset_cfg)))
 
 
 @accepts_older_params
@@ -348,51 +343,50 @@ def feet_clearance(
     command_threshold: float = 0.01,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """Distance of moving feet from the height at which they should move (m^2/s):
+    """Height error of moving feet, weighted by horizontal speed (m^2/s):
 
         sum over feet of |height - target_height| * |v_xy|
 
-    A foot that stands does not move, so that its height costs nothing.
+    Standing feet have zero speed and no cost.
 
     Args:
         env: The environment.
-        target_height: Height above the ground at which feet should swing, in metres.
-        height_sensor_name: Height sensor with one frame for each foot.
-        command_name: Velocity command without which there is no cost; None: always.
-        command_threshold: Commanded motion above which there is a cost.
+        target_height: Target height of swinging feet above the terrain (m).
+        height_sensor_name: Height sensor with one frame per foot.
+        command_name: Velocity command that enables the cost. None: always enabled.
+        command_threshold: Commanded motion that must be exceeded to enable the cost.
         asset_cfg: Entity, and the sites of the feet in the order of the sensor's frames.
     """
-    miss = env.scene[height_sensor_name].data.heights - target_height
-    return clearance_cost(env, miss, command_name, command_threshold, asset_cfg)
+    error = env.scene[height_sensor_name].data.heights - target_height
+    return clearance_cost(env, error, command_name, command_threshold, asset_cfg)
 
 
 def clearance_cost(
     env: ManagerBasedRlEnv,
-    miss: torch.Tensor,
+    error: torch.Tensor,
     command_name: str | None,
     command_threshold: float,
     asset_cfg: SceneEntityCfg,
 ) -> torch.Tensor:
-    """Return the cost of feet that miss their height by `miss` (m), (N, feet), while they move."""
-    cost = (miss.abs() * _site_speed(env, asset_cfg)).sum(dim=1)
+    """Return the cost, (N,), of height errors (m), (N, feet), weighted by horizontal speed."""
+    cost = (error.abs() * _site_speed(env, asset_cfg)).sum(dim=1)
     return if_commanded(cost, env, command_name, command_threshold)
 
 
 @accepts_older_params
 class feet_swing_height:
-    """Cost of landing after a swing that was too low or too high: `(peak / target - 1)^2`.
+    """Error of the swing height at landing: sum of `(peak / target - 1)^2` over feet that land in this step.
 
-    The peak is the greatest height (m) of the foot since it left the ground, and the cost is that
-    of the feet that land in this step, where motion is commanded.
+    The peak is the maximum height (m) of the foot since lift-off. The cost is 0 for standing commands.
 
     Params:
         sensor_name: Contact sensor of the feet, with `track_air_time`.
-        height_sensor_name: Height sensor with one frame for each foot, in the same order.
-        target_height: Height that a swing should reach, in metres.
-        command_name: The velocity command.
-        command_threshold: Commanded motion above which there is a cost.
+        height_sensor_name: Height sensor with one frame per foot, in the same order.
+        target_height: Target peak height of a swing (m).
+        command_name: Velocity command.
+        command_threshold: Commanded motion that must be exceeded to enable the cost.
 
-    Raises, when built: `ValueError` for sensors that do not exist, or list other feet.
+    Raises, when built: `ValueError` for unknown sensors, or sensors of different feet.
     """
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
@@ -403,7 +397,7 @@ class feet_swing_height:
         check_feet_sensor(env, contact)
         check_positive("target_height", params["target_height"])
         feet = contact_columns(env, contact)
-        contacts = f"The contact sensor {contact!r}", feet
+        contacts = f"contact sensor {contact!r}", feet
         self._check_feet(env, contacts, self._height_columns(env, params))
         self.peak_heights = torch.zeros(
             env.num_envs, len(feet), dtype=torch.float32, device=env.device
@@ -418,7 +412,7 @@ class feet_swing_height:
         command_name: str,
         command_threshold: float,
     ) -> torch.Tensor:
-        """Update the peak heights, and return the cost of landings in this step, (N,)."""
+        """Update the peak heights; return the cost of landings in this step, (N,)."""
         heights = env.scene[height_sensor_name].data.heights
         cost = self.landing_cost(env, sensor_name, heights, target_height)
         return if_commanded(cost, env, command_name, command_threshold)
@@ -426,7 +420,7 @@ class feet_swing_height:
     def landing_cost(
         self, env: ManagerBasedRlEnv, sensor_name: str, heights: torch.Tensor, target_height: float
     ) -> torch.Tensor:
-        """Update the peaks with `heights` (m), (N, feet); return the cost of landings, (N,)."""
+        """Update the peaks with `heights` (m), (N, feet); return the cost of landings in this step, (N,)."""
         sensor = env.scene[sensor_name]
         peaks = self.peak_heights
         is_swinging = sensor.data.found == 0
@@ -434,8 +428,8 @@ class feet_swing_height:
         torch.where(is_swinging, higher, peaks, out=peaks)
         has_landed = sensor.compute_first_contact(dt=env.step_dt)
         log_metric(env, "peak_height_mean", masked_mean(peaks, has_landed))
-        miss = (peaks / target_height - 1.0).square_()
-        cost = torch.where(has_landed, miss, 0.0).sum(dim=1)
+        error = (peaks / target_height - 1.0).square_()
+        cost = torch.where(has_landed, error, 0.0).sum(dim=1)
         peaks.masked_fill_(has_landed, 0.0)
         return cost
 
@@ -447,10 +441,10 @@ class feet_swing_height:
         env: ManagerBasedRlEnv, params: dict[str, Any]
     ) -> tuple[str, list[tuple[str, int]]]:
         name = params["height_sensor_name"]
-        return f"the height sensor {name!r}", height_columns(env, name)
+        return f"height sensor {name!r}", height_columns(env, name)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Forget the swings that a reset cut off, so that the next episode does not pay for them."""
+        """Clear the peak heights of `env_ids`, so that unfinished swings do not affect the next episode."""
         self.peak_heights[slice(None) if env_ids is None else env_ids] = 0.0
 
 
@@ -463,8 +457,8 @@ def _check_slip(
 ) -> None:
     require_command(env, command_name)
     check_feet_sensor(env, sensor_name)
-    contacts = f"The contact sensor {sensor_name!r}", contact_columns(env, sensor_name)
-    check_same_feet(env, contacts, ("the selection of sites", site_columns(env, asset_cfg)))
+    contacts = f"contact sensor {sensor_name!r}", contact_columns(env, sensor_name)
+    check_same_feet(env, contacts, ("asset_cfg.site_names", site_columns(env, asset_cfg)))
 
 
 @checked_when_built(_check_slip)
@@ -475,13 +469,13 @@ def feet_slip(
     command_threshold: float = 0.01,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """Squared horizontal speed of the feet that touch the ground, summed (m^2/s^2).
+    """Sum of squared horizontal speeds of feet in contact (m^2/s^2).
 
     Args:
         env: The environment.
         sensor_name: Contact sensor of the feet.
-        command_name: Velocity command without which there is no cost.
-        command_threshold: Commanded motion above which there is a cost.
+        command_name: Velocity command that enables the cost.
+        command_threshold: Commanded motion that must be exceeded to enable the cost.
         asset_cfg: Entity, and the sites of the feet in the order of the sensor's columns.
     """
     in_contact = env.scene[sensor_name].data.found > 0
@@ -507,15 +501,15 @@ def soft_landing(
     command_name: str | None = None,
     command_threshold: float = 0.05,
 ) -> torch.Tensor:
-    """Force of the ground on the feet that land in this step, summed (N).
+    """Sum of ground contact forces of feet that land in this step (N).
 
-    It is the force of the last physics substep, not the peak of the impact.
+    Forces are those of the last physics substep, not the peak of the impact.
 
     Args:
         env: The environment.
         sensor_name: Contact sensor of the feet, with `track_air_time`.
-        command_name: Velocity command without which there is no cost; None: always.
-        command_threshold: Commanded motion above which there is a cost.
+        command_name: Velocity command that enables the cost. None: always enabled.
+        command_threshold: Commanded motion that must be exceeded to enable the cost.
     """
     sensor = env.scene[sensor_name]
     force = torch.linalg.vector_norm(sensor.data.force, dim=-1)
@@ -525,18 +519,18 @@ def soft_landing(
     return if_commanded(cost, env, command_name, command_threshold)
 
 
-# Quantities that several terms compute.
+# Shared quantities.
 
 
 def velocity_command(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """Return a velocity command (vx, vy, wz) in the frame of the root, (N, 3)."""
-    # That it exists was checked when the term was built.
+    """Return a velocity command (vx, vy, wz) in the root frame (m/s, rad/s), (N, 3)."""
+    # Terms check the command's name when they are built.
     manager: Any = env.command_manager
     return manager.get_command(command_name)
 
 
 def command_speed(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
-    """Return `|c_xy| + |c_z|` of a velocity command, (N,): how much motion is asked for."""
+    """Return the commanded motion `|c_xy| + |c_z|`, (N,)."""
     command = velocity_command(env, command_name)
     return torch.linalg.vector_norm(command[:, :2], dim=1).add_(command[:, 2].abs())
 
@@ -544,9 +538,9 @@ def command_speed(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
 def if_commanded(
     cost: torch.Tensor, env: ManagerBasedRlEnv, command_name: str | None, threshold: float
 ) -> torch.Tensor:
-    """Return `cost` (N,), and 0 where the command asks for no more motion than `threshold`.
+    """Return `cost`, (N,), or 0 for commanded motion <= `threshold`.
 
-    Without a command's name, `cost` is returned as it is.
+    With `command_name` None, returns `cost` unchanged.
     """
     if command_name is None:
         return cost
@@ -554,30 +548,30 @@ def if_commanded(
 
 
 def log_metric(env: ManagerBasedRlEnv, name: str, value: torch.Tensor) -> None:
-    """Log one number of this step under `Metrics/<name>`."""
+    """Log a scalar of this step as `Metrics/<name>`."""
     env.extras.setdefault("log", {})[f"Metrics/{name}"] = value
 
 
 def masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Return the mean of the finite values where `mask` is true, as one number; 0 if there are none."""
-    # `isfinite` takes twice the operations.
+    """Return the mean of finite values selected by `mask`, a scalar; 0 without values."""
+    # Half the operations of `isfinite`.
     mask = mask & (values.abs() < torch.inf)
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
 
 
 def tilt_of(quat: torch.Tensor) -> torch.Tensor:
-    """Return the squared horizontal part of "up" in frames of orientation (N, 4): sin(tilt)^2, (N,).
+    """Return sin(tilt)^2 of orientations `quat`, (N, 4): squared horizontal part of body z, (N,).
 
-    With x and y of a unit quaternion, that of the third row of its rotation matrix is
-    `4 s (1 - s)`, where s = x^2 + y^2.
+    For a unit quaternion (w, x, y, z), the squared horizontal part of the third row of its rotation
+    matrix is `4 s (1 - s)`, with s = x^2 + y^2.
     """
     x, y = quat[:, 1], quat[:, 2]
-    share = x * x + y * y
-    return 4.0 * share * (1.0 - share)
+    s = x * x + y * y
+    return 4.0 * s * (1.0 - s)
 
 
 def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None:
-    """Return the index of the selected body, or None for the root where none is selected.
+    """Return the index of the selected body; None without selection, for the root.
 
     Raises:
         ValueError: several bodies are selected; the message names them.
@@ -590,8 +584,8 @@ def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None
     if len(chosen) != 1:
         names = [entity.body_names[i] for i in chosen]
         raise ValueError(
-            f"asset_cfg selects the bodies {names} of entity {asset_cfg.name!r}; exactly one is "
-            f"needed, or no body_names for the root {entity.body_names[0]!r}."
+            f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
+            f"body_names for the root {entity.body_names[0]!r}."
         )
     return int(chosen[0])
 
@@ -604,11 +598,18 @@ def values_of_joints(
     above: float = -math.inf,
     least: float = -math.inf,
 ) -> list[float]:
-    """Return the value of each joint, of the parameter `name`, a table of patterns and values.
+    """Return the value of each joint from `table`, a dict of name pattern to value.
+
+    Args:
+        joints: Joint names.
+        name: Parameter name for messages.
+        table: Dict of joint name pattern to value.
+        above: Lower bound of the values, exclusive.
+        least: Lower bound of the values, inclusive.
 
     Raises:
         ValueError: a joint matches no pattern or several, a pattern matches no joint, or a value is
-            not `above` a bound or less than the `least`.
+            out of bounds.
     """
     try:
         _, covered, values = resolve_matching_names_values(table, joints)
@@ -617,24 +618,23 @@ def values_of_joints(
     missing = [joint for joint in joints if joint not in covered]
     if missing:
         raise ValueError(
-            f"{name} has no entry for the joints {missing}. Its patterns {list(table)} must cover "
-            "every selected joint."
+            f"{name}: expected patterns for all selected joints, got {list(table)}; missing: {missing}."
         )
     wrong = {
         pattern: value for pattern, value in table.items() if not (value > above and value >= least)
     }
     if wrong:
-        bound = f"above {above:g}" if above > least else f"of at least {least:g}"
+        bound = f"> {above:g}" if above > least else f">= {least:g}"
         raise ValueError(f"{name}: expected numbers {bound}, got {wrong}.")
     return [float(value) for value in values]
 
 
 def _site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
-    """Return the horizontal speed of the selected sites, (N, sites), in m/s."""
+    """Return the horizontal speed of the selected sites (m/s), (N, sites)."""
     asset: Entity = env.scene[asset_cfg.name]
     sites = as_columns(asset_cfg.site_ids, env.device)
     velocity = asset.data.site_lin_vel_w[:, sites]
-    # By components: a norm over a last dimension of two takes a CPU longer.
+    # By component: faster on CPU than a norm over a dimension of size 2.
     return velocity[..., 0].square().addcmul_(velocity[..., 1], velocity[..., 1]).sqrt_()
 
 

@@ -1,11 +1,11 @@
-"""Stepping controller: a biped that marches in place and catches itself, to teach policies to step.
+"""Biped stepping controller: marches in place and keeps balance, as a teacher for policies.
 
-A policy that learns to stand by its ankles finds no way to a step, because lifting a foot a little
-costs balance. This controller steps from the beginning, and balances as one-legged hoppers (Raibert,
+Policies that learn to balance with the ankles do not discover steps, because lifting a foot slightly
+costs balance. This controller steps from the beginning and balances as one-legged hoppers (Raibert,
 Legged Robots That Balance, 1986) and simulated bipeds (SIMBICON; Yin, Loken and van de Panne,
-SIGGRAPH 2007) do: the swing foot goes to where the robot moves, and the hip of the stance leg keeps
-the trunk upright. It takes no commands and knows the true state, so it is no policy for a robot.
-`RslRlSacAlgorithmCfg.teacher` lets one imitate it at first.
+SIGGRAPH 2007) do: foot placement follows the root velocity, and the stance hip keeps the trunk
+upright. The controller ignores commands and reads the true state, so it cannot run on a robot.
+`RslRlSacAlgorithmCfg.teacher` lets policies imitate the controller early in training.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 _SIDES = ("left", "right")
-# Each turns about its axis when the leg hangs straight, as on Unitree's humanoids.
+# Joint axes of a straight leg, as on Unitree humanoids.
 _AXES = {
     "hip_pitch": (0.0, 1.0, 0.0),
     "hip_roll": (1.0, 0.0, 0.0),
@@ -46,37 +46,37 @@ _LARGEST = 0.97
 
 @dataclass(kw_only=True)
 class SteppingGains:
-    """Gains of the stepping controller: numbers, or tensors (N, 1). The defaults are the G1's."""
+    """Gains of the stepping controller: numbers, or tensors (N, 1). Defaults are for the G1."""
 
     bend: float = 0.1
-    """Bend of a leg on the ground (rad): of the hip, and of the ankle; the knee bends twice as much."""
+    """Bend of hip and ankle of the stance leg (rad). The knee bends twice as much."""
     lift: float = 0.42
-    """Further bend in the middle of a swing (rad)."""
+    """Additional bend at mid-swing (rad)."""
     lead: float = 0.085
     """Forward angle of the swing leg at rest (rad)."""
     step_forward: float = 0.6
-    """Forward angle of the swing leg for a forward velocity (rad s/m)."""
+    """Gain from forward velocity to forward angle of the swing leg (rad s/m)."""
     step_sideways: float = 0.96
-    """Sideward angle of the swing leg for a sideward velocity (rad s/m)."""
+    """Gain from lateral velocity to lateral angle of the swing leg (rad s/m)."""
     trunk_pitch: float = 9.0
-    """Pitch target of the stance hip for the trunk's pitch (rad/rad)."""
+    """Gain from trunk pitch to stance hip pitch (rad/rad)."""
     trunk_roll: float = 5.9
-    """Roll target of the stance hip for the trunk's roll (rad/rad)."""
+    """Gain from trunk roll to stance hip roll (rad/rad)."""
     trunk_roll_rate: float = 0.26
-    """Roll target of the stance hip for the trunk's roll rate (s)."""
+    """Gain from trunk roll rate to stance hip roll (s)."""
     ankle_forward: float = 3.8
-    """Pitch target of the stance ankle for a forward velocity (rad s/m)."""
+    """Gain from forward velocity to stance ankle pitch (rad s/m)."""
     ankle_sideways: float = 1.3
-    """Roll target of the stance ankle for a sideward velocity (rad s/m)."""
+    """Gain from lateral velocity to stance ankle roll (rad s/m)."""
 
 
 class stepping_action:
-    """Action (N, A) of the stepping controller, for a joint position action; -1 to 1.
+    """Action of the stepping controller for a joint position action, in [-1, 1], (N, A).
 
-    With the gait clock's phase c of a leg (strides), the leg swings for c < 1/2 and stands else. Its
-    angles against the trunk are the measured alpha = -q_hip_pitch - q_knee / 2, forward, and
-    beta = q_hip_roll, to the left. Targets, with v the velocity of the root and w its angular velocity
-    in the root's frame, and x = 3 s^2 - 2 s^3 with s = min(1, 4 c):
+    With c the gait clock's phase of a leg (strides), the leg swings for c < 1/2, else it stands. Measured
+    leg angles relative to the trunk are alpha = -q_hip_pitch - q_knee / 2, forward, and
+    beta = q_hip_roll, to the left. Targets, with v and w the linear and angular velocity of the root in
+    the root frame, and x = 3 s^2 - 2 s^3 with s = min(1, 4 c):
 
         swing    alpha* = alpha + x (lead + step_forward v_x - alpha)
                  beta*  = beta + x (step_sideways v_y - beta)
@@ -85,23 +85,23 @@ class stepping_action:
         bend     b = bend + A lift max(0, sin 2 pi c), with A the clock's amplitude
         joints   hip_pitch = -alpha* - b, knee = 2 b, hip_roll = beta*
 
-    Ankles make the sole of an upright robot level, at the angles before the trunk's feedback. Those of a swing
-    leg subtract the trunk's pitch and roll, those of a stance leg add `ankle_forward v_x` and
-    `-ankle_sideways v_y`. Other joints have their default positions. Hip yaw is 2, outside the range of
-    actions, and so not imitated.
+    Ankles level the soles of an upright robot, for leg angles without trunk feedback. Swing ankles
+    subtract trunk pitch and roll; stance ankles add `ankle_forward v_x` and `-ankle_sideways v_y`. Other
+    joints are at their default positions. Hip yaw is 2, outside the action range, and therefore not
+    imitated.
 
     Params:
         gains: `SteppingGains`.
         command_name: Gait clock.
         action_name: Joint position action of the biped, with a scale.
-        joint: Name of a joint, with `{side}` (left, right) and `{joint}` (hip_pitch, hip_roll, hip_yaw,
-            knee, ankle_pitch, ankle_roll), which turn about y, x, z, y, y, x of the robot.
+        joint: Joint name pattern with `{side}` (left, right) and `{joint}` (hip_pitch, hip_roll,
+            hip_yaw, knee, ankle_pitch, ankle_roll). Axes are y, x, z, y, y, x of the robot.
 
-    Raises, when built: `ValueError` for an action of another kind, one without one of the joints, joints
-    about other axes, or a command that is no gait clock.
+    Raises, when built: `ValueError` for an action of another type, missing joints, joints about other
+    axes, or a command that is not a gait clock.
     """
 
-    # Follows from config and model, so it is no run-time state.
+    # Derived from config and model; not checkpointed.
     _transient = {"_clock", "_term", "_columns", "_joints"}
 
     def __init__(self, cfg: ObservationTermCfg, env: ManagerBasedRlEnv) -> None:
@@ -111,7 +111,8 @@ class stepping_action:
         term = env.action_manager.get_term(name)
         if not isinstance(term, JointPositionAction):
             raise ValueError(
-                f"action_name: expected a JointPositionAction, got {name!r}, a {type(term).__name__}."
+                f"action_name: expected a JointPositionAction, got {name!r} of type "
+                f"{type(term).__name__}."
             )
         self._term = term
         asset: Entity = env.scene[term.cfg.entity_name]
@@ -126,14 +127,14 @@ class stepping_action:
         mujoco.mj_kinematics(env.sim.mj_model, reference)
         for joint, axis in _AXES.items():
             names = [pattern.format(side=side, joint=joint) for side in _SIDES]
-            missing = [one for one in names if one not in term.target_names]
+            missing = [target for target in names if target not in term.target_names]
             if missing:
                 raise ValueError(
-                    f"joint: expected joints of the action {name!r}, got {missing}; it has "
+                    f"joint: expected joints of action {name!r}, got {missing}. Available: "
                     f"{list(term.target_names)}."
                 )
-            self._joints[joint] = ids([asset.joint_names.index(one) for one in names])
-            self._columns[joint] = ids([term.target_names.index(one) for one in names])
+            self._joints[joint] = ids([asset.joint_names.index(target) for target in names])
+            self._columns[joint] = ids([term.target_names.index(target) for target in names])
             _check_axes(reference, asset, names, axis)
 
     def __call__(
@@ -194,5 +195,5 @@ def _check_axes(
         if along < _MIN_ALIGNMENT:
             raise ValueError(
                 f"joint: expected {name!r} to turn about {axis} in the model's reference pose, got "
-                f"{data.xaxis[joint].round(2).tolist()}; the stepping controller knows no other legs."
+                f"{data.xaxis[joint].round(2).tolist()}; the stepping controller does not support this leg."
             )

@@ -1,4 +1,4 @@
-"""Termination terms of the velocity task. Each returns bool (N,)."""
+"""Termination terms of the velocity task, (N,) bool."""
 
 from __future__ import annotations
 
@@ -21,17 +21,16 @@ __all__ = [
 ]
 
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
-# Positions are those of before the reset until the second step of an episode.
+# Until the second step of an episode, positions are those before the reset.
 _MIN_STEPS = 2
 
 
 def out_of_terrain_bounds(
     env: ManagerBasedRlEnv, margin: float = 0.3, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """The root has left a generated terrain, or is closer than `margin` (m) to its edge.
+    """Root outside the generated terrain, or within `margin` (m) of its edge.
 
-    Never on a plane, which has no edge. The terrain is as large as the grid that was really built,
-    with its border.
+    Never on a plane. The extent is that of the grid as built, including the border.
     """
     asset: Entity = env.scene[asset_cfg.name]
     position = asset.data.root_link_pos_w
@@ -51,10 +50,10 @@ def terrain_edge_reached(
     threshold_fraction: float = 0.95,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
-    """The root is at the edge of the terrain cell in which the environment started.
+    """Root at the edge of the environment's terrain cell.
 
-    It is further from the environment's origin, in x or y, than `threshold_fraction` of half the
-    cell. Never on a plane, nor in the first two steps of an episode.
+    True if the distance to the environment origin, in x or y, exceeds `threshold_fraction` of half the
+    cell size. Never on a plane, nor in the first two steps of an episode.
     """
     asset: Entity = env.scene[asset_cfg.name]
     offset = (asset.data.root_link_pos_w - env.scene.env_origins)[:, :2].abs()

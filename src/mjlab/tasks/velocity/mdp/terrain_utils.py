@@ -1,4 +1,4 @@
-"""The direction of the ground under a robot, from rays."""
+"""Terrain normal under a robot, estimated from ray hits."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ __all__ = [
 ]
 
 _EPS = float(torch.finfo(torch.float32).eps)
-# Points lie in a plane if their spread across it is below this share of the spread along it.
+# Upper bound of l0 / l1 for points on a plane.
 _MAX_THICKNESS = 0.1
-# Points that lie on a line have no plane.
+# Lower bound of l1 / l2: points on a line do not define a plane.
 _MIN_WIDTH = 1e-6
 
 
 def terrain_normal_from_sensors(
     env: ManagerBasedRlEnv, sensor_names: tuple[str, ...], max_points: int = 32
 ) -> torch.Tensor:
-    """Return the upward normal of the ground that ray sensors see, (N, 3).
+    """Return the upward unit normal of the terrain that ray sensors hit, (N, 3).
 
     Args:
         env: The environment.
-        sensor_names: Ray sensors, whose hits are fitted together.
-        max_points: Most rays to take of each sensor; they are spread evenly over its rays.
+        sensor_names: Ray sensors; one plane is fitted to all hits.
+        max_points: Maximum number of rays per sensor, evenly spaced over its rays.
 
     Raises:
-        TypeError: a sensor is no ray sensor.
+        TypeError: a sensor is not a `RayCastSensor`.
     """
     points, valid = [], []
     for name in sensor_names:
@@ -56,7 +56,7 @@ def terrain_normal_from_sensors(
 
 
 def check_terrain_sensors(env: ManagerBasedRlEnv, sensor_names: tuple[str, ...]) -> None:
-    """Raise `ValueError` or `TypeError` unless these are ray sensors of the scene."""
+    """Raise `ValueError` for unknown sensors, `TypeError` for sensors other than `RayCastSensor`."""
     for name in sensor_names:
         require_sensor(env, name, RayCastSensor)
 
@@ -69,19 +69,19 @@ def _spread(count: int, max_points: int, device: str) -> torch.Tensor | slice:
 
 
 def fit_terrain_normal(points: torch.Tensor, valid_mask: torch.Tensor) -> torch.Tensor:
-    """Return the upward unit normals of the planes through points, (N, 3).
+    """Return the upward unit normals of least-squares planes through points, (N, 3).
 
-    It is the direction of least spread: with `C = sum (p - m)(p - m)^T` over the valid points and
-    their centre m, the eigenvector of the smallest of the eigenvalues `l0 <= l1 <= l2` of C.
-    Where that says nothing the normal is (0, 0, 1): with fewer than three valid points, where they
-    lie on a line (`l1 <= 1e-6 l2`), or where they are not flat (`l0 >= 0.1 l1`).
+    With the scatter matrix `C = sum (p - m)(p - m)^T` of the valid points p and their mean m, the normal
+    is the eigenvector of the smallest of the eigenvalues `l0 <= l1 <= l2` of C. The normal is (0, 0, 1)
+    for fewer than three valid points, points on a line (`l1 <= 1e-6 l2`), and points that do not lie in a
+    plane (`l0 >= 0.1 l1`).
 
     Args:
-        points: (N, P, 3) points, in world axes.
-        valid_mask: (N, P) bool, which of them count.
+        points: Points in the world frame, (N, P, 3).
+        valid_mask: Mask of valid points, (N, P) bool.
     """
     valid = valid_mask.unsqueeze(-1)
-    # In double precision, because points far from the origin differ by little from their centre.
+    # float64, because points far from the origin differ little from their mean.
     kept = torch.where(valid, points, 0.0).double()
     count = valid.sum(dim=1)
     center = kept.sum(dim=1) / count.clamp(min=1)
@@ -105,9 +105,9 @@ def fit_terrain_normal(points: torch.Tensor, valid_mask: torch.Tensor) -> torch.
 def _eigenvalues(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the eigenvalues of symmetric (N, 3, 3) matrices, each (N,), ascending.
 
-    The trigonometric solution of the characteristic polynomial (O. K. Smith, Communications of the
-    ACM 4(4), 1961). It takes a few element-wise operations, where a batched solver takes a call of
-    LAPACK for every matrix, and on a GPU waits for the device.
+    Trigonometric solution of the characteristic polynomial (O. K. Smith, Communications of the ACM
+    4(4), 1961). A few element-wise operations replace the batched solver, which calls LAPACK once per
+    matrix and synchronizes with the GPU.
     """
     mean = matrix.diagonal(dim1=-2, dim2=-1).mean(dim=-1)
     eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
@@ -116,7 +116,7 @@ def _eigenvalues(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torc
     safe = radius.clamp(min=torch.finfo(matrix.dtype).tiny ** 0.25)
     a, b, c = (shifted / safe[:, None, None]).unbind(dim=-2)
     half_det = (a * torch.linalg.cross(b, c)).sum(dim=-1) / 2.0
-    # Rounding may leave the domain of the arc cosine.
+    # Rounding errors may leave the domain of acos.
     angle = torch.acos(half_det.clamp(-1.0, 1.0)) / 3.0
     largest = mean + 2.0 * radius * torch.cos(angle)
     least = mean + 2.0 * radius * torch.cos(angle + 2.0 * math.pi / 3.0)
@@ -124,10 +124,10 @@ def _eigenvalues(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torc
 
 
 def _null_vector(matrix: torch.Tensor) -> torch.Tensor:
-    """Return unit vectors (N, 3) that symmetric matrices of rank 2 send to zero.
+    """Return unit null vectors of symmetric matrices of rank 2, (N, 3).
 
-    Such a vector is orthogonal to all rows, so a cross product of two rows; the longest one of the
-    three is the most precise.
+    A null vector is orthogonal to all rows and therefore parallel to the cross product of any two rows;
+    the longest of the three cross products is the most precise.
     """
     a, b, c = matrix.unbind(dim=-2)
     first = torch.stack((a, b, c), dim=1)

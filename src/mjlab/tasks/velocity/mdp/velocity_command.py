@@ -1,4 +1,4 @@
-"""The velocity command: how fast to go forward, sideways and around."""
+"""Velocity command: forward and lateral velocity, and yaw rate."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
-"""The ranges that every velocity command has."""
+"""Ranges of the command components (vx, vy, wz)."""
 _PROBABILITIES = (
     "rel_standing_envs",
     "rel_heading_envs",
@@ -38,7 +38,7 @@ _PROBABILITIES = (
     "rel_forward_envs",
     "init_velocity_prob",
 )
-# Of arrows: commanded linear and yaw, actual linear and yaw velocity.
+# Arrows: commanded linear velocity and yaw rate, actual linear velocity and yaw rate.
 _ARROW_COLORS: tuple[Color, ...] = (
     (0.2, 0.2, 0.6, 0.6),
     (0.2, 0.6, 0.2, 0.6),
@@ -46,79 +46,79 @@ _ARROW_COLORS: tuple[Color, ...] = (
     (0.0, 1.0, 0.4, 0.7),
 )
 _MIN_FORWARD_SPEED = 0.3
-"""Least speed that environments which only go forward are asked for, in m/s."""
+"""Minimum speed of forward commands (m/s)."""
 
 
 @dataclass(kw_only=True)
 class UniformVelocityCommandCfg(CommandTermCfg):
-    """Velocities drawn uniformly, some of them with a heading to keep, some of them zero."""
+    """Uniform velocity command configuration."""
 
     @dataclass
     class Ranges:
-        """Smallest and largest values that are drawn."""
+        """Ranges (low, high) of uniform sampling."""
 
         lin_vel_x: tuple[float, float]
-        """Forward velocity, in m/s."""
+        """Forward velocity (m/s)."""
         lin_vel_y: tuple[float, float]
-        """Velocity to the left, in m/s."""
+        """Velocity to the left (m/s)."""
         ang_vel_z: tuple[float, float]
-        """Yaw rate, in rad/s; also the bounds of what heading control asks for."""
+        """Yaw rate (rad/s). Also clips the yaw rate of heading commands."""
         heading: tuple[float, float] | None = None
-        """Heading to turn to, in rad; needed for `heading_command`, and only then."""
+        """Target heading (rad). Required with `heading_command`, else None."""
 
     @dataclass
     class VizCfg:
-        """How the command is drawn."""
+        """Visualization settings."""
 
         z_offset: float = 0.2
-        """Where the arrows start: above the root, in metres, before `scale`."""
+        """Height of the arrows above the root (m), before `scale`."""
         scale: float = 0.5
-        """Length of the arrow for 1 m/s or 1 rad/s, in metres."""
+        """Arrow length per m/s or rad/s (m)."""
 
     entity_name: str
-    """Entity that the command is for."""
+    """Name of the commanded entity."""
     heading_command: bool = False
-    """Whether some environments are given a heading instead of a yaw rate."""
+    """Command a heading instead of a yaw rate in a fraction of environments."""
     heading_control_stiffness: float = 1.0
-    """Yaw rate for a heading error of 1 rad, in 1/s."""
+    """Gain from heading error to yaw rate (1/s)."""
     rel_standing_envs: float = 0.0
-    """Share of the commands that ask to stand still."""
+    """Fraction of standing (zero) commands."""
     rel_heading_envs: float = 1.0
-    """Share of the commands with a heading, under `heading_command`."""
+    """Fraction of heading commands, with `heading_command`."""
     rel_world_envs: float = 0.0
-    """Share of the commands whose linear velocity is in world axes instead of the root's."""
+    """Fraction of commands with linear velocity in the world frame instead of the root frame."""
     rel_forward_envs: float = 0.0
-    """Share of the commands that only go forward, at no less than 0.3 m/s."""
+    """Fraction of forward commands: vx >= 0.3 m/s, other components zero."""
     init_velocity_prob: float = 0.0
-    """Probability that an episode starts with the robot moving as commanded."""
+    """Probability that an episode starts at the commanded velocity."""
     ranges: Ranges
-    """What is drawn from."""
+    """Ranges to sample from."""
     viz: VizCfg = field(default_factory=VizCfg)
-    """Drawing."""
+    """Visualization."""
 
     def __post_init__(self) -> None:
-        """Refuse a heading command without a range of headings."""
+        """Raise `ValueError` for `heading_command` without `ranges.heading`."""
         if self.heading_command and self.ranges.heading is None:
             raise ValueError(
-                "UniformVelocityCommandCfg: heading_command is True, but ranges.heading is None. "
-                "Give the range of headings, such as (-math.pi, math.pi)."
+                "UniformVelocityCommandCfg ranges.heading: expected a range with heading_command=True, "
+                "got None; use e.g. (-math.pi, math.pi)."
             )
 
     def build(self, env: ManagerBasedRlEnv) -> UniformVelocityCommand:
-        """Return the term; raises `ValueError` for ranges or shares that make no sense."""
+        """Build the term. Raises `ValueError` for invalid ranges or fractions."""
         return UniformVelocityCommand(self, env)
 
 
 def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
-    """Raise `ValueError` for ranges, shares or a heading that make no sense."""
+    """Raise `ValueError` for invalid ranges, fractions or heading settings."""
     for name in RANGES:
         check_range(f"ranges.{name}", getattr(cfg.ranges, name))
     if cfg.heading_command and cfg.ranges.heading is None:
-        raise ValueError("heading_command is True, but ranges.heading is None. Give the range.")
+        raise ValueError("ranges.heading: expected a range with heading_command=True, got None.")
     if not cfg.heading_command and cfg.ranges.heading is not None:
         raise ValueError(
-            f"ranges.heading is {cfg.ranges.heading}, but heading_command is False, so that no "
-            "heading is ever commanded. Set heading_command=True, or ranges.heading=None."
+            f"ranges.heading: expected None with heading_command=False, got {cfg.ranges.heading}; use "
+            "heading_command=True to command headings."
         )
     if cfg.ranges.heading is not None:
         check_range("ranges.heading", cfg.ranges.heading)
@@ -127,41 +127,44 @@ def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
 
 
 class UniformVelocityCommand(CommandTerm):
-    """Commands (vx, vy, wz) in the frame of the root, uniform within ranges.
+    """Velocity command (vx, vy, wz) in the root frame, sampled uniformly.
 
-    A command keeps until its time is over. Of these kinds, which are drawn independently,
+    Commands hold until they are resampled. The kinds are drawn independently:
 
-    - a **forward** command has vx of at least 0.3 m/s and no other component;
-    - a **heading** command turns towards a heading: `wz = clip(k wrap(target - heading))`;
-    - a **world** command holds its linear velocity in world axes, whichever way the robot turns;
-    - a **standing** command is zero, whatever else it is.
+    - **forward**: vx >= 0.3 m/s, other components zero;
+    - **heading**: turn to a target heading, `wz = clip(k wrap(target - heading))`;
+    - **world**: constant linear velocity in the world frame;
+    - **standing**: zero; overrides the other kinds.
 
-    The ranges in use are those of the term's own config (`term.cfg.ranges`), a copy: a curriculum
-    that widens them changes no config that others hold, and they are saved with a checkpoint.
+    `term.cfg.ranges` holds the ranges in use, a copy of those in the environment config: curricula
+    that edit them leave the environment config unchanged, and the ranges are checkpointed.
 
     The metrics `error_vel_xy` (m/s) and `error_vel_yaw` (rad/s) are means over the steps of an
     episode.
 
     Attributes:
-        vel_command_b: (N, 3) the command.
-        vel_command_w: (N, 3) what world commands hold.
-        heading_target: (N,) heading of heading commands, in rad.
-        heading_error: (N,) how far heading commands have to turn, in rad.
-        is_heading_env: (N,) bool; likewise `is_standing_env`, `is_world_env`, `is_forward_env`.
+        vel_command_b: Command in the root frame, (N, 3).
+        vel_command_w: Command in the world frame, used by world commands, (N, 3).
+        heading_target: Target heading of heading commands (rad), (N,).
+        heading_error: Heading error of heading commands (rad), (N,).
+        is_heading_env: True for heading commands, (N,) bool.
+        is_standing_env: True for standing commands, (N,) bool.
+        is_world_env: True for world commands, (N,) bool.
+        is_forward_env: True for forward commands, (N,) bool.
     """
 
     cfg: UniformVelocityCommandCfg
 
     def __init__(self, cfg: UniformVelocityCommandCfg, env: ManagerBasedRlEnv) -> None:
-        # The ranges change at run time, so that they are the term's own.
+        # Copy the ranges, because curricula edit them at run time.
         super().__init__(dataclasses.replace(cfg, ranges=dataclasses.replace(cfg.ranges)), env)
         check_command_cfg(cfg)
         check_exists("entity in entity_name", cfg.entity_name, env.scene.entities)
         self.robot: Entity = env.scene[cfg.entity_name]
         if cfg.init_velocity_prob > 0.0 and self.robot.is_fixed_base:
             raise ValueError(
-                f"init_velocity_prob is {cfg.init_velocity_prob}, but entity {cfg.entity_name!r} "
-                "has a fixed base, which cannot start moving. Set it to 0."
+                f"init_velocity_prob: expected 0 for entity {cfg.entity_name!r} with a fixed base, got "
+                f"{cfg.init_velocity_prob}."
             )
         self.vel_command_b = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.vel_command_w = torch.zeros_like(self.vel_command_b)
@@ -180,49 +183,48 @@ class UniformVelocityCommand(CommandTerm):
 
     @property
     def command(self) -> torch.Tensor:
-        """The command (vx, vy, wz) in the frame of the root, (N, 3), in m/s and rad/s."""
+        """Command (vx, vy, wz) in the root frame (m/s, rad/s), (N, 3)."""
         return self.vel_command_b
 
     @property
     def ranges(self) -> UniformVelocityCommandCfg.Ranges:
-        """The ranges in use, which may be changed; commands already given stay."""
+        """Ranges in use. May be edited; current commands are unchanged."""
         return self.cfg.ranges
 
     @property
     def elapsed_s(self) -> torch.Tensor:
-        """Seconds since each environment was last reset, (N,).
+        """Time since the last reset (s), (N,).
 
-        Unlike the length of an episode, which training starts at a random number, this is the time
-        that was really spent.
+        Unlike `episode_length_buf`, which training initializes randomly, this is simulated time.
         """
         return self._samples * self._env.step_dt
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
-        """Measure errors, advance time, redraw commands whose time is over, and update.
+        """Update metrics, advance time, resample expired commands, and update the command.
 
-        The arguments are those of `CommandTerm.compute`. A step that took no time, as the first
-        one after a reset does, is no sample of the error.
+        Arguments are those of `CommandTerm.compute`. Steps with `dt` = 0, such as the first one after
+        a reset, are not counted in the metrics.
         """
         self._add_sample(dt, env_ids)
         if self._joystick is None:
             super().compute(dt, env_ids)
             return
-        # Below the joystick the command goes on as drawn, so that it is there when that lets go.
-        self._joystick.let_go(self.vel_command_b)
+        # Update the sampled command below the joystick, which takes over again on release.
+        self._joystick.restore(self.vel_command_b)
         super().compute(dt, env_ids)
         self._joystick.write_to(self.vel_command_b)
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
-        """Draw new commands in these environments; return the mean errors of their episodes.
+        """Resample the commands of `env_ids`; return the mean errors of their episodes.
 
-        Environments that have not made a step are left out of the means. With
-        `init_velocity_prob`, writes the root velocity of some, in place of that of reset events.
+        Environments without a step are excluded from the means. With `init_velocity_prob`, overwrites
+        the root velocity that reset events set in a fraction of the environments.
         """
         ids = as_ids(env_ids, self.num_envs, self.device)
         if is_empty(ids):
             return {}
         if self._joystick is not None:
-            self._joystick.let_go(self.vel_command_b)
+            self._joystick.restore(self.vel_command_b)
         log = super().reset(ids)
         self._samples[ids] = 0.0
         if self.cfg.init_velocity_prob > 0.0:
@@ -241,14 +243,14 @@ class UniformVelocityCommand(CommandTerm):
         on_change: Callable[[], None] | None = None,
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
-        """Add sliders that, while they are enabled, command the environment in view."""
+        """Add sliders that command the environment in view while enabled."""
         self._joystick = VelocityJoystick(name, server, self.ranges, get_env_idx, on_change)
 
-    # Drawing commands.
+    # Sampling.
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         cfg = self.cfg
-        # One draw for all numbers, a row each, in the order in which rows are taken.
+        # One draw for all samples; each quantity takes the next row.
         rows = iter(
             torch.rand(
                 8 if cfg.heading_command else 6,
@@ -270,7 +272,7 @@ class UniformVelocityCommand(CommandTerm):
         forward[:, 0] = command[:, 0].abs().clamp_(min=_MIN_FORWARD_SPEED)
         command = torch.where(is_forward.unsqueeze(1), forward, command)
         self.vel_command_b[env_ids] = command
-        # Taken after the forward rule, which holds for world commands too.
+        # Set after the forward rule, which applies to world commands too.
         self.vel_command_w[env_ids] = command
 
     def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
@@ -278,7 +280,7 @@ class UniformVelocityCommand(CommandTerm):
         self._update_rows(index, self.robot.data.root_link_quat_w[index])
 
     def _update_rows(self, index: torch.Tensor | slice, quat: torch.Tensor) -> None:
-        """Update the commands of environments whose roots have the orientations `quat`."""
+        """Update the commands of environments `index` with root orientations `quat`."""
         cfg = self.cfg
         command = self.vel_command_b[index]
         if cfg.heading_command or cfg.rel_world_envs > 0.0:
@@ -298,13 +300,13 @@ class UniformVelocityCommand(CommandTerm):
             self.vel_command_w[index] = self.vel_command_w[index].masked_fill_(is_standing, 0.0)
 
     def _start_moving(self, env_ids: torch.Tensor) -> None:
-        """Write the commanded velocity into the state of environments that just reset."""
+        """Set the root velocity of environments that just reset to the command."""
         if is_empty(env_ids):
             return
-        # The state was written and nothing is derived from it yet.
+        # Read qpos, because derived quantities are not updated yet after the reset.
         pose = self.robot.data.indexing.free_joint_q_adr
         quat = self._env.sim.data.qpos[env_ids[:, None], pose[3:7]]
-        # What is commanded is known only after the update: it may be to stand, or in world axes.
+        # Update first, because standing and world commands change the command.
         self._update_rows(env_ids, quat)
         command = self.vel_command_b[env_ids]
         linear, angular = torch.zeros_like(command), torch.zeros_like(command)
@@ -312,13 +314,13 @@ class UniformVelocityCommand(CommandTerm):
         velocity = torch.cat((quat_apply(quat, linear), quat_apply(quat, angular)), dim=1)
         self.robot.write_root_link_velocity_to_sim(velocity, env_ids=env_ids)
 
-    # Metrics and drawing.
+    # Metrics and visualization.
 
     def _is_measured(self, env_ids: torch.Tensor) -> torch.Tensor:
         return self._samples[env_ids] > 0.0
 
     def _add_sample(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None) -> None:
-        """Take up the error of the command that the last step followed into the running means."""
+        """Add the tracking error of the last step to the running means."""
         if isinstance(dt, torch.Tensor) and dt.numel() > 1:
             is_sample: torch.Tensor | float = (dt > 0.0).float()
         elif dt > 0.0:
@@ -349,19 +351,19 @@ class UniformVelocityCommand(CommandTerm):
         rotations = matrix_from_quat(data.root_link_quat_w[indices])
         linear = data.root_link_lin_vel_b[indices]
         angular = data.root_link_ang_vel_b[indices]
-        asked = self.vel_command_b[indices]
-        zero = torch.zeros_like(asked[:, 0])
+        command = self.vel_command_b[indices]
+        zero = torch.zeros_like(command[:, 0])
         vectors = torch.stack(
             (
                 torch.stack((zero, zero, zero + viz.z_offset), dim=1),
-                torch.stack((asked[:, 0], asked[:, 1], zero), dim=1),
-                torch.stack((zero, zero, asked[:, 2]), dim=1),
+                torch.stack((command[:, 0], command[:, 1], zero), dim=1),
+                torch.stack((zero, zero, command[:, 2]), dim=1),
                 torch.stack((linear[:, 0], linear[:, 1], zero), dim=1),
                 torch.stack((zero, zero, angular[:, 2]), dim=1),
             ),
             dim=2,
         )
-        # Columns of (3, 5) matrices are the five vectors, in world axes.
+        # (M, 3, 5): the columns are the five vectors, rotated to the world frame.
         drawn = (viz.scale * rotations @ vectors).transpose(1, 2).cpu().numpy()
         roots = data.root_link_pos_w[indices].cpu().numpy()
         for root, (offset, *arrows) in zip(roots, drawn, strict=True):
@@ -374,13 +376,13 @@ def _scaled(unit: torch.Tensor, bounds: tuple[float, float]) -> torch.Tensor:
 
 
 def _heading_of(quat: torch.Tensor) -> torch.Tensor:
-    """Return the angle from world x to the horizontal projection of the frame's x axis, (K,)."""
+    """Return the heading: angle from world x to the horizontal projection of body x (rad), (K,)."""
     w, x, y, z = quat.unbind(-1)
     return torch.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 def _rotated(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Return the horizontal parts of vectors, turned about z, (K, 2)."""
+    """Return the horizontal components of vectors rotated about z by `angle`, (K, 2)."""
     cos, sin = torch.cos(angle), torch.sin(angle)
     x, y = vector[:, 0], vector[:, 1]
     return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1)

@@ -1,4 +1,4 @@
-"""Sliders in the browser viewer that command the robot in view."""
+"""Velocity joystick: sliders in the browser viewer that command the environment in view."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 _STEP = 0.05
 _MAX_BOUNDS = (0.1, 10.0)
-# Ranges of the command, and what a person calls them.
+# Slider labels of the command components.
 _COMPONENTS = {
     "lin_vel_x": "Forward (m/s)",
     "lin_vel_y": "Left (m/s)",
@@ -21,7 +21,7 @@ _COMPONENTS = {
 
 
 class VelocityJoystick:
-    """A panel with a slider for each component of the command, and one for each slider's range."""
+    """Panel with one slider per command component, and one for the limit of each."""
 
     def __init__(
         self,
@@ -31,12 +31,12 @@ class VelocityJoystick:
         get_env_idx: Callable[[], int],
         on_change: Callable[[], None] | None = None,
     ) -> None:
-        """Add the panel to the current place in the page.
+        """Add the panel to the current GUI container.
 
         Args:
             name: Title of the panel.
-            server: The page's server.
-            ranges: `UniformVelocityCommandCfg.Ranges`; sliders go up to their upper bounds.
+            server: Viser server.
+            ranges: `UniformVelocityCommandCfg.Ranges`; slider limits are their largest magnitudes.
             get_env_idx: Returns the environment in view.
             on_change: Called after every change.
         """
@@ -62,7 +62,7 @@ class VelocityJoystick:
 
     def _add_slider(self, server: viser.ViserServer, component: str, ranges: Any) -> Any:
         low, high = _MAX_BOUNDS
-        # A range may be negative or empty, and a slider may not.
+        # Ranges may be negative or empty, sliders may not.
         limit = min(max(abs(bound) for bound in (*getattr(ranges, component), low)), high)
         label = _COMPONENTS[component]
         slider = server.gui.add_slider(label, -limit, limit, _STEP, 0.0)
@@ -76,15 +76,15 @@ class VelocityJoystick:
 
         return slider
 
-    def let_go(self, command: torch.Tensor) -> None:
-        """Put the row of (N, 3) commands back that was overwritten last, if one was."""
+    def restore(self, command: torch.Tensor) -> None:
+        """Restore the row of `command`, (N, 3), that `write_to` overwrote last, if any."""
         if self._replaced is not None:
             index, row = self._replaced
             command[index] = row
             self._replaced = None
 
     def write_to(self, command: torch.Tensor) -> None:
-        """Overwrite the row of the environment in view of (N, 3) commands, if enabled."""
+        """Overwrite the row of the environment in view in `command`, (N, 3), if enabled."""
         index = self._get_env_idx()
         if self._enabled.value and 0 <= index < len(command):
             self._replaced = index, command[index].clone()
@@ -92,7 +92,7 @@ class VelocityJoystick:
             command[index] = torch.tensor(values, dtype=command.dtype, device=command.device)
 
     def _moved(self, event: Any) -> None:
-        # Whoever moves a slider wants to drive; `Zero` and `Max` move them without a person.
+        # Enable on user input only; `Zero` and `Max` set sliders without a client.
         if event.client is not None and not self._enabled.value:
             self._enabled.value = True
         self._changed(event)

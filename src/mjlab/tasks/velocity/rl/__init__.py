@@ -1,3 +1,3 @@
-"""Training of the velocity task."""
+"""Runner and learner configs of the velocity task."""
 
 from mjlab.tasks.velocity.rl.runner import VelocityOnPolicyRunner as VelocityOnPolicyRunner

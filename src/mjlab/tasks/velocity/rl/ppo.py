@@ -1,25 +1,24 @@
-"""PPO settings of the velocity tasks, their profiles, and the errors that evaluations measure.
+"""PPO config of the velocity tasks, their profiles, and tracking errors of evaluations.
 
-The `cpu` profile is the Go1's, and for other robots; the G1 has its own. A few cores step some ten
-thousand environments a second, a hundredth of a GPU. Under the task's own settings a robot has not left its
-first idea by then, which is to stand still: trying to move costs more penalty than it earns. So the profile
-makes the task easier to learn, not easier to pass:
+The `cpu` profile is for the Go1 and for other robots; the G1 has a separate one. A few cores simulate about
+10,000 environment steps per second, a hundredth of a GPU. With the task's settings and that budget, a robot
+stays in the local optimum of standing still, because first attempts to move cost more penalty than they
+earn. The profile makes the task easier to learn, not easier to pass:
 
-- Penalties start at a fraction of their weight and grow to it, those that lift the feet sooner than
-  the others, and so do pushes; a reward for feet in the air, which the task has but does not weigh,
-  fades out meanwhile.
-- Contacts have no rolling and torsional friction, and a pyramidal friction cone. The solver then
-  takes half the time.
-- The mirror image of each sample is one more sample. Without it, a policy walks as soon, and stumbles
-  far longer in the directions that it has seen least.
-- Batches and networks are small, a policy may change more in an iteration, and rewards far away count
-  less: what a leg does shows within a second.
+- Penalties and pushes start at a fraction of their size and grow; penalties that make the robot lift its feet
+  grow faster. Meanwhile a reward for air time, of weight 0 in the task, fades out.
+- Contacts have pyramidal friction cones, without torsional and rolling friction. This halves the time of
+  the solver.
+- The mirror image of each sample is a further sample. Without mirror images a policy walks as early, but
+  stumbles for much longer in rarely commanded directions.
+- Batches and networks are small, the KL target is larger, and the discount factor is smaller: leg motion has
+  its effect within a second.
 
-Evaluations, `play` and `evaluate` undo the first two: what they show is the task as it is.
+Evaluations, `play` and `evaluate` undo the first two and run the original task.
 
-The `blind` profile is for rough terrain: a student that does not see the ground. A teacher with the height
-scan learns first, under the profile `cpu`. The student then learns to act as the teacher does, from the
-other observations of the last steps.
+The `blind` profile trains a student without height scan on rough terrain. A teacher with height scan is
+trained first, with the profile `cpu`. The student then learns to imitate the teacher from a history of the
+other observations.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from mjlab.tasks.easing import ease_weight
 
 _STUDENT = "student"
 _SCAN = "height_scan"
-# How a foot met the ground shows for about two tenths of a second.
+# A foot contact affects proprioception for about 0.2 s.
 _BLIND_HISTORY = 10
 _BLIND_STEPS = 24
 _ROBOT = "robot"
@@ -55,13 +54,13 @@ _NUM_ENVS = 512
 _PENALTY_AT_FIRST = 0.02
 _AIR_TIME_AT_FIRST = 0.5
 _EASED_SAMPLES = 6_000_000
-# Whoever drags the feet falls at each change of command.
+# Robots that drag their feet fall at each change of command, so these penalties grow faster.
 _LIFTING = ("foot_clearance", "foot_swing_height")
 _LIFTING_EASED_SAMPLES = 2_000_000
 
 
 def velocity_ppo_runner_cfg(experiment_name: str, max_iterations: int) -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of a robot."""
+    """Return the PPO config of a robot."""
     return RslRlOnPolicyRunnerCfg(
         actor=RslRlModelCfg(
             hidden_dims=(512, 256, 128),
@@ -77,19 +76,19 @@ def velocity_ppo_runner_cfg(experiment_name: str, max_iterations: int) -> RslRlO
 
 
 def lin_vel_error(env: Any) -> torch.Tensor:
-    """Return |c_xy - v_xy|, (num_envs,), in m/s: linear velocity of the root link, in its frame."""
+    """Return |c_xy - v_xy| (m/s), with v the root link velocity in its own frame, (num_envs,)."""
     command = env.command_manager.get_command(_COMMAND)
     return (command[:, :2] - env.scene[_ROBOT].data.root_link_lin_vel_b[:, :2]).norm(dim=-1)
 
 
 def ang_vel_error(env: Any) -> torch.Tensor:
-    """Return |c_z - w_z|, (num_envs,), in rad/s: turning rate of the root link, in its frame."""
+    """Return |c_z - w_z| (rad/s), with w_z the yaw rate of the root link in its own frame, (num_envs,)."""
     command = env.command_manager.get_command(_COMMAND)
     return (command[:, 2] - env.scene[_ROBOT].data.root_link_ang_vel_b[:, 2]).abs()
 
 
 TRACKING_ERRORS = {"lin_vel_error": lin_vel_error, "ang_vel_error": ang_vel_error}
-"""The errors by the name under which evaluations report them."""
+"""Velocity errors by their names in evaluations."""
 
 
 # Profiles.
@@ -108,7 +107,7 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None
     evaluation.trigger_return = 3600.0
     terrain = env_cfg.scene.terrain
     if terrain is not None and terrain.terrain_type == "plane":
-        # There a Go1 may walk after a minute, long before the training return is that high.
+        # On a plane, a Go1 may walk after a minute, long before it reaches this training return.
         evaluation.first_iteration, evaluation.trigger_return = 80, -math.inf
     evaluation.solved_below = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
@@ -121,11 +120,11 @@ cpu = cpu_profile(
     unpushed_samples=2_000_000,
     mirror="mjlab.tasks.velocity.symmetry:mirror_left_right",
 )
-"""Profile of the velocity tasks."""
+"""The `cpu` profile of the velocity tasks."""
 
 
 def blind(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlBaseRunnerCfg:
-    """Edit the task's config in place as `cpu` does, and return the config of a distillation."""
+    """Apply `cpu`, add a blind student, and return the distillation config."""
     cpu(env_cfg, rl_cfg)
     student = copy.deepcopy(env_cfg.observations["actor"])
     assert student is not None

@@ -1,7 +1,7 @@
-"""The runner of the velocity task."""
+"""Runner of the velocity task."""
 
 from mjlab.rl.runner import ExportingOnPolicyRunner
 
 
 class VelocityOnPolicyRunner(ExportingOnPolicyRunner):
-    """Trains as `MjlabOnPolicyRunner` does, and exports the policy whenever it saves."""
+    """`MjlabOnPolicyRunner` that exports the policy with each checkpoint."""

@@ -1,1 +1,1 @@
-"""Import of whole packages of tasks."""
+"""Import of task packages."""

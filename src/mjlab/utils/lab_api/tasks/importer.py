@@ -1,4 +1,4 @@
-"""Import of a package together with its sub-packages, so that their tasks register themselves."""
+"""Recursive package import, for task registration."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Sequence
 
 
 def import_packages(package_name: str, blacklist_pkgs: Sequence[str] | None = None) -> None:
-    """Import a package and, recursively, its sub-packages (plain modules are left alone).
+    """Import a package and, recursively, its sub-packages (plain modules are not imported).
 
     Args:
         package_name: Dotted name of the package.
-        blacklist_pkgs: A sub-package whose dotted name contains one of these is left out, together
-            with what lies below it.
+        blacklist_pkgs: Sub-packages to skip, with their descendants: those whose dotted name contains
+            one of these strings.
 
-    Errors raised while importing are passed on.
+    Import errors propagate.
     """
     blacklist = tuple(blacklist_pkgs or ())
     package = importlib.import_module(package_name)

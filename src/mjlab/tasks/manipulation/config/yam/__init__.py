@@ -1,4 +1,4 @@
-"""Registers the manipulation tasks of the YAM arm. Names are imported when they are first used."""
+"""Registration of the YAM arm's manipulation tasks. Names are imported on first use."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _RL_CFG = "mjlab.tasks.manipulation.config.yam.rl_cfg"
 _RUNNER = "mjlab.tasks.manipulation.rl"
 _PROFILES = "mjlab.tasks.manipulation.config.yam.rl_cfg"
 
-# Task: config of the environment, config of the learner, profile.
+# Task: environment config, runner config, profile.
 for _task, (_env, _rl, _profile) in {
     "Mjlab-Lift-Cube-Yam": ("lift_cube", "lift_cube", "cpu"),
     "Mjlab-Lift-Cube-Yam-Rgb": ("lift_cube_rgb", "lift_cube_vision", "cpu_vision"),

@@ -1,4 +1,4 @@
-"""The manipulation tasks of the YAM arm."""
+"""Manipulation tasks of the YAM arm."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _HAND = ("grasp_site",)
 _FINGERTIPS = "[lr]f_down(6|7|8|9|10|11)_collision"
 _CAMERA = "camera_d405"
 _IMAGE_SIZE = 32
-# What the camera sees: ground and cubes (0), and what of the arm can touch something (3).
+# Geom groups in camera images: ground and cubes (0), collision geoms of the arm (3).
 _SEEN_GROUPS = (0, 3)
 _DEPTH_CUTOFF = 0.5
 _PLAY_GOAL_TIME = 4.0
-# Contacts that Warp reserves for each cube: it can touch all of the gripper and the other cubes.
+# Warp contacts to reserve per cube: cubes can touch the whole gripper and the other cubes.
 _CONTACTS_PER_CUBE = 120
 
 
@@ -41,12 +41,12 @@ def get_cube_spec(
     mass: float = 0.05,
     rgba: tuple[float, float, float, float] = (0.8, 0.2, 0.2, 1.0),
 ) -> mujoco.MjSpec:
-    """Return a new spec of a cube that floats.
+    """Return a new spec of a cube with a free joint.
 
     Args:
-        cube_size: Half the length of an edge, in metres.
-        mass: Mass, in kg.
-        rgba: Red, green, blue and opacity.
+        cube_size: Half-length of an edge (m).
+        mass: Mass (kg).
+        rgba: Color and opacity.
     """
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="cube")
@@ -63,7 +63,7 @@ def get_cube_spec(
 
 @dataclass(frozen=True)
 class _ColoredCube:
-    """A `spec_fn` that can be pickled and compared, as configs are."""
+    """Picklable and comparable `spec_fn`, as configs require."""
 
     rgba: tuple[float, float, float, float]
 
@@ -72,7 +72,7 @@ class _ColoredCube:
 
 
 def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task from the state, to train or to `play` with."""
+    """Return the config of the state-based task, for training or `play`."""
     cfg = make_lift_cube_env_cfg()
     cfg.scene.entities = {
         "robot": get_yam_robot_cfg(),
@@ -93,16 +93,16 @@ def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     hand_on_the_ground.primary.pattern = "link_6"
     cfg.viewer.body_name = "arm"
     if play:
-        _make_playable(cfg)
+        _make_play_cfg(cfg)
     return cfg
 
 
 def yam_lift_cube_vision_env_cfg(
     cam_type: Literal["rgb", "depth"], play: bool = False
 ) -> ManagerBasedRlEnvCfg:
-    """Return the task from images of the wrist camera, to train or to `play` with.
+    """Return the config of the task with wrist camera images, for training or `play`.
 
-    The actor does not know where the cube is, except from the image; the critic does.
+    The actor observes the cube in the image only; the critic also observes its position.
 
     Raises:
         ValueError: `cam_type` is neither `rgb` nor `depth`.
@@ -128,24 +128,24 @@ def yam_lift_cube_vision_env_cfg(
     cfg.observations["camera"] = ObservationGroupCfg(
         terms={f"{_CAMERA}_{cam_type}": image}, enable_corruption=False
     )
-    _hide_the_cube(cfg, "actor")
+    _replace_cube_by_goal(cfg, "actor")
     return cfg
 
 
 def yam_lift_cube_rgb_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task from colour images."""
+    """Return the config of the task with RGB images."""
     return yam_lift_cube_vision_env_cfg("rgb", play=play)
 
 
 def yam_lift_cube_depth_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task from depth images."""
+    """Return the config of the task with depth images."""
     return yam_lift_cube_vision_env_cfg("depth", play=play)
 
 
 def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task of lifting one out of several cubes, to train or to `play` with.
+    """Return the config of lifting one of several cubes, for training or `play`.
 
-    Images are of depth, and a mask that says which cube is wanted.
+    Image observations are depth and a mask of the target cube.
 
     Raises:
         ValueError: `num_cubes` is below 1.
@@ -158,7 +158,7 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
         color = (*colorsys.hsv_to_rgb(index / num_cubes, 0.8, 0.9), 1.0)
         cfg.scene.entities[name] = EntityCfg(spec_fn=_ColoredCube(color))
     cfg.sim.nconmax = max(cfg.sim.nconmax or 0, 55 + _CONTACTS_PER_CUBE * num_cubes)
-    _want_one_of(cfg, cubes)
+    _use_multi_cube_terms(cfg, cubes)
     cfg.scene.sensors += (_camera(("depth", "segmentation")),)
     mask = ObservationTermCfg(
         func=mdp.camera_target_cube_mask,
@@ -167,16 +167,16 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
     cfg.observations["camera"] = ObservationGroupCfg(
         terms={"depth": _depth_image(), "target_mask": mask},
         enable_corruption=False,
-        # Of one environment's image: the channels.
+        # Channels; the batch dimension does not count.
         concatenate_dim=0,
     )
     for group in ("actor", "critic"):
-        _hide_the_cube(cfg, group)
+        _replace_cube_by_goal(cfg, group)
     return cfg
 
 
-def _want_one_of(cfg: ManagerBasedRlEnvCfg, cubes: tuple[str, ...]) -> None:
-    """Replace command and rewards about the cube by those about one of several."""
+def _use_multi_cube_terms(cfg: ManagerBasedRlEnvCfg, cubes: tuple[str, ...]) -> None:
+    """Replace the single-cube command and rewards by the multi-cube ones."""
     command = cfg.commands["lift_height"]
     assert isinstance(command, mdp.LiftingCommandCfg)
     cfg.commands["lift_height"] = mdp.MultiCubeLiftingCommandCfg(
@@ -194,8 +194,8 @@ def _want_one_of(cfg: ManagerBasedRlEnvCfg, cubes: tuple[str, ...]) -> None:
         cfg.rewards[name] = RewardTermCfg(func=func, weight=old.weight, params=params)
 
 
-def _hide_the_cube(cfg: ManagerBasedRlEnvCfg, group: str) -> None:
-    """Let a group know the goal, as the hand sees it, in place of anything about the cube."""
+def _replace_cube_by_goal(cfg: ManagerBasedRlEnvCfg, group: str) -> None:
+    """Replace the cube terms of an observation group by the goal position in the hand frame."""
     terms = _terms(cfg, group)
     del terms["ee_to_cube"], terms["cube_to_goal"]
     terms["goal_position"] = ObservationTermCfg(
@@ -227,10 +227,10 @@ def _depth_image() -> ObservationTermCfg:
     )
 
 
-def _make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Turn a config to train with into one to look at what was learned.
+def _make_play_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
+    """Turn a training config into a play config.
 
-    Episodes do not end by time, observations are without noise, and goals change often.
+    Episodes have no time limit, observations no noise, and goals are resampled often.
     """
     cfg.episode_length_s = int(1e9)
     actor = cfg.observations["actor"]
@@ -245,7 +245,7 @@ def _make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
 def _terms(cfg: ManagerBasedRlEnvCfg, group: str) -> dict[str, ObservationTermCfg]:
     found = cfg.observations[group]
     assert found is not None
-    # None of them is switched off here.
+    # No term is None here.
     return found.terms  # ty: ignore[invalid-explicit-return]
 
 

@@ -1,13 +1,14 @@
-"""How the YAM arm learns the manipulation tasks: PPO, success of evaluations, and the `cpu` profiles.
+"""PPO settings, success criterion and `cpu` profiles of the YAM arm's manipulation tasks.
 
-A few cores step some ten thousand environments a second, a hundredth of a GPU. So under the profiles a batch is
-small, and the networks are small enough for their update not to take longer than the physics.
+A few CPU cores simulate some ten thousand environment steps per second, a hundredth of a GPU. The
+profiles therefore use small batches, and networks small enough that their update takes no longer
+than the physics.
 
-That is all that the tasks from images get; how fast these learn has not been measured. From the state,
-the task's own reward for reaching is so wide (0.2 m) that closed fingers on top of the cube get 98 %
-of it, and a gripper takes half a second to open or to close. So training has a narrow one beside it,
-which only open fingers around the cube can get, and contacts without rolling and torsional friction.
-Evaluations, `evaluate` and `play` have neither.
+The image-based tasks get nothing more; their learning speed has not been measured. In the
+state-based task, the reaching reward is so wide (0.2 m) that closed fingers on top of the cube get
+98 % of it, and the gripper takes half a second to open or to close. Training therefore adds a
+narrow reaching reward, reachable only with open fingers around the cube, and drops rolling and
+torsional friction. Evaluations, `evaluate` and `play` use neither.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ _CNN: dict[str, Any] = {
 
 
 def yam_lift_cube_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of the task from the state."""
+    """Return the PPO settings of the state-based task."""
     sizes = (512, 256, 128)
     return RslRlOnPolicyRunnerCfg(
         actor=RslRlModelCfg(
@@ -65,17 +66,17 @@ def yam_lift_cube_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
 
 
 def yam_lift_cube_vision_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of the tasks from images of one cube."""
+    """Return the PPO settings of the image-based tasks with one cube."""
     return _vision("yam_lift_cube_vision")
 
 
 def yam_multi_cube_seg_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of the task from images of several cubes."""
+    """Return the PPO settings of the image-based task with several cubes."""
     return _vision("yam_multi_cube_seg")
 
 
 def _vision(experiment_name: str) -> RslRlOnPolicyRunnerCfg:
-    """Return settings with an encoder of images in front of each network."""
+    """Return PPO settings with an image encoder in front of each network."""
 
     def model(distribution_cfg: dict[str, Any] | None) -> RslRlModelCfg:
         return RslRlModelCfg(
@@ -101,15 +102,15 @@ def _evaluation() -> EvaluationCfg:
     return EvaluationCfg(success_func=placed_at_goal, metrics=dict(PLACEMENT))
 
 
-# Evaluations: whether, and how well, objects are placed.
+# Evaluation: success and placement metrics.
 
 
 def placed_at_goal(env: Any) -> torch.Tensor:
-    """Return whether the object was at its goal, or, where time ran out on one too new, at the last.
+    """Return whether the object is at its goal, or was at the last one if time ran out on a new one.
 
-    (num_envs,) bool. That is asked at the end of an episode. A goal is too new that came so shortly
-    before that nobody could have reached it; see `GoalCommand.goal_is_met`. Where it is not time that
-    ended the episode, the goal that there was then counts, however new.
+    (num_envs,) bool, read at the end of an episode. A goal is new if it is younger than the
+    shortest resampling time; see `GoalCommand.goal_is_met`. Episodes that end before their time
+    limit are scored against the current goal at any age.
     """
     term = env.command_manager.get_term(_COMMAND)
     is_last_step = env.episode_length_buf >= env.max_episode_length - 1
@@ -117,18 +118,18 @@ def placed_at_goal(env: Any) -> torch.Tensor:
 
 
 def position_error(env: Any) -> torch.Tensor:
-    """Return the distance from the object to its goal, (num_envs,), in metres."""
+    """Return the distance from the object to its goal (m), (num_envs,)."""
     return env.command_manager.get_term(_COMMAND).metrics["position_error"]
 
 
 def at_goal(env: Any) -> torch.Tensor:
-    """Return 1 where the object is at its goal, else 0, (num_envs,)."""
+    """Return 1 if the object is at its goal, else 0, (num_envs,)."""
     return env.command_manager.get_term(_COMMAND).metrics["at_goal"]
 
 
 PLACEMENT = {"position_error": position_error, "at_goal": at_goal}
-"""Metrics by the name under which evaluations report them; of `at_goal`, the mean over an episode
-is the share of the time that the object was at its goal."""
+"""Evaluation metrics by name. The episode mean of `at_goal` is the fraction of time that the object
+is at its goal."""
 
 
 # Profiles.
@@ -151,7 +152,7 @@ def _reward_narrow_reach(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRun
 
 def _evaluate_from_images(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     _evaluate(env_cfg, rl_cfg)
-    # Of at most 3000.
+    # Of a maximum return of 3000.
     rl_cfg.evaluation.trigger_return = 1800.0
 
 
@@ -163,9 +164,9 @@ def _evaluate(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> 
 
 
 cpu = cpu_profile(_reward_narrow_reach, simple_contacts=True, **_SHARED)
-"""Profile of the task from the state."""
+"""Profile of the state-based task."""
 
 
-# Encoders take most of the time, of the update above all.
+# Image encoders take most of the time, above all in the update.
 cpu_vision = cpu_profile(_evaluate_from_images, num_envs=256, **_SHARED)
-"""Profile of the tasks from images."""
+"""Profile of the image-based tasks."""

@@ -1,4 +1,4 @@
-"""Registers motion tracking of the Unitree G1. Names are imported when they are first used."""
+"""Registration of Unitree G1 motion tracking. Names are imported on first use."""
 
 from __future__ import annotations
 

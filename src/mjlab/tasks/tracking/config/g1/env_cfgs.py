@@ -1,4 +1,4 @@
-"""Motion tracking by the Unitree G1."""
+"""Unitree G1 motion tracking tasks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mjlab.tasks.tracking import mdp
 from mjlab.tasks.tracking.tracking_env_cfg import make_tracking_env_cfg
 
 MOTIONS = "squat,wave"
-"""What is imitated unless another motion is named: motions that ship with the package."""
+"""Default motions, bundled with the package."""
 
 _TORSO = "torso_link"
 _BODIES = (
@@ -41,12 +41,12 @@ _FOOT_GEOMS = r"^(left|right)_foot[1-7]_collision$"
 def unitree_g1_flat_tracking_env_cfg(
     has_state_estimation: bool = True, play: bool = False
 ) -> ManagerBasedRlEnvCfg:
-    """Return the task, to train or to `play` with.
+    """Return the config of the task, for training or `play`.
 
     Args:
-        has_state_estimation: Whether the policy knows its own velocity and where the reference is,
-            which a robot has to estimate.
-        play: Start at the first frame and as the motion does, without noise and pushes.
+        has_state_estimation: Let the policy observe its base velocity and the position of the
+            reference anchor, which a real robot must estimate.
+        play: Start at the first frame without perturbation; no noise, no pushes.
     """
     cfg = make_tracking_env_cfg()
     cfg.scene.entities = {"robot": get_g1_robot_cfg()}
@@ -85,18 +85,18 @@ def unitree_g1_flat_tracking_env_cfg(
         actor.terms.pop("motion_anchor_pos_b")
         actor.terms.pop("base_lin_vel")
     if play:
-        _make_playable(cfg)
+        _make_play_cfg(cfg)
     return cfg
 
 
 def unitree_g1_flat_tracking_no_state_estimation_env_cfg(
     play: bool = False,
 ) -> ManagerBasedRlEnvCfg:
-    """Return the task for a robot that estimates neither its velocity nor its position."""
+    """Return the config of the task without observations of base velocity and anchor position."""
     return unitree_g1_flat_tracking_env_cfg(has_state_estimation=False, play=play)
 
 
-def _make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
+def _make_play_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     cfg.episode_length_s = int(1e9)
     actor = cfg.observations["actor"]
     assert actor is not None

@@ -1,17 +1,16 @@
-"""How the Unitree G1 learns to imitate: PPO, and the `cpu` profile.
+"""PPO settings and `cpu` profile of Unitree G1 motion tracking.
 
-A few cores step some thousands of environments a second, a hundredth of a GPU. A humanoid with soft
-drives falls within a second unless it balances, and that is what takes most of the learning. So the
-profile makes the task easier to learn, not easier to pass:
+A few CPU cores simulate some thousands of environment steps per second, a hundredth of a GPU. A
+humanoid with soft position actuators falls within a second unless it balances, and learning to
+balance takes most of the training. The profile makes the task easier to learn, not easier to pass:
 
-- Starts are perturbed, and robots pushed, by nothing at first and by as much as in the task later; the
-  penalty for quick actions grows likewise.
-- The physics takes two steps of 10 ms for a step of the environment, instead of four of 5 ms.
-- The policy starts out as a position controller on the reference (`ReferenceActor`).
-- Batches and networks are small, a policy may change more in an iteration, and rewards far away count
-  less.
+- Start perturbations, pushes and the action rate penalty start small and grow to the task's values.
+- The physics takes two steps of 10 ms per environment step instead of four of 5 ms.
+- The policy is initialized as a position controller on the reference (`ReferenceActor`).
+- Batches and networks are smaller, the desired KL divergence is larger, and the discount factor is
+  smaller.
 
-Evaluations, `play` and `evaluate` undo the first two: what they show is the task as it is.
+Evaluations, `play` and `evaluate` undo the first two and run the original task.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
     )
 
 
-# The cpu profile.
+# `cpu` profile.
 
 
 def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo:
@@ -79,9 +78,9 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo
 
 
 class GrowingStarts(Easing):
-    """Lets the perturbation of starts grow from nothing to what the command's config says.
+    """Curriculum that scales start perturbations from zero to the command's configured ranges.
 
-    Returns the fraction that it has reached.
+    Returns the current scale, from 0 to 1.
     """
 
     def __call__(
@@ -105,4 +104,4 @@ cpu = cpu_profile(
     physics_steps=2,
     unpushed_samples=12_000_000,
 )
-"""Profile of the tracking tasks."""
+"""`cpu` profile of the tracking tasks."""

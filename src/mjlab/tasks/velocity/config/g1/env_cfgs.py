@@ -1,4 +1,4 @@
-"""The velocity tasks of the Unitree G1."""
+"""Environment configs of the velocity tasks of the Unitree G1."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mjlab.tasks.velocity.velocity_env_cfg import (
 )
 
 _TORSO = "torso_link"
-# In the order of the model, as contacts and sites are.
+# Model order, the order of contacts and sites.
 _FEET = ("left_foot", "right_foot")
 _FOOT_GEOMS = tuple(f"{foot}{i}_collision" for foot in _FEET for i in range(1, 8))
 
-# Standard deviations of joint angles, in rad: legs bend to walk and swing to run, arms follow.
+# Standard deviations of joint angles (rad) of the pose reward.
 _STD_WALKING = {
     r".*hip_pitch.*": 0.3,
     r".*hip_roll.*": 0.15,
@@ -56,7 +56,7 @@ _STD_RUNNING = {
 
 
 def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task on rough terrain, to train or to `play` with."""
+    """Return the rough-terrain task, for training or for `play`."""
     cfg = make_velocity_env_cfg()
     cfg.sim.mujoco.ccd_iterations = 500
     cfg.sim.contact_sensor_maxmatch = 500
@@ -71,7 +71,7 @@ def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     assert isinstance(joint_pos, mdp.JointPositionActionCfg)
     joint_pos.scale = dict(G1_ACTION_SCALE)
     assert isinstance(twist, mdp.UniformVelocityCommandCfg)
-    # Above the head.
+    # Draw the command above the head.
     twist.viz.z_offset = 1.15
     friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
     assert friction is not None
@@ -86,7 +86,7 @@ def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
 
 
 def unitree_g1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task on flat ground, to train or to `play` with."""
+    """Return the flat-ground task, for training or for `play`."""
     cfg = unitree_g1_rough_env_cfg(play=play)
     make_flat(cfg, play)
     return cfg

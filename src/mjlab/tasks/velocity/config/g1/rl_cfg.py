@@ -1,22 +1,22 @@
-"""How the Unitree G1 learns the velocity tasks: PPO, and the `cpu` profile.
+"""Learner configs of the velocity tasks of the Unitree G1: PPO, and the `cpu` profile.
 
-With the profile, a humanoid learns to walk on two cores. PPO does not get there in an hour, so the learner is
-the off-policy one (`mjlab.rl.sac`), and the task is made easier to learn, not easier to pass.
-`docs/guides/learning.md` has the experiments.
+With the profile, a humanoid learns to walk on two cores. PPO does not learn to walk in an hour, so the learner is
+SAC (`mjlab.rl.sac`), and the task is made easier to learn, not easier to pass. `docs/guides/learning.md` has
+the experiments.
 
-- A controller from a textbook steps in place (`stepping_action`). It acts for the first 60 environment steps, and the
-  policy imitates it, less and less, for the first 1,200 of some 3,000. Without it, policies learn to stand and
-  no more.
-- Actions are bounded, and policies observe a gait clock and the last five velocities, turning rates and
-  directions of gravity, to filter sensor noise. They keep all three.
-- Rewards say what a gait is: feet as high as the clock says and not in each other's way, a pelvis that
-  neither sinks nor tips, joints near the default pose. The penalties of the task are there too.
-- Commands and pushes grow as the robot copes with them.
-- The physics takes three steps for a step of the environment, and feet have two capsules instead of seven.
-  Legs and hands do collide: without that, feet walk through one another. The solver keeps its iterations:
-  with four, feet slip on ground that is not slippery.
+- A textbook controller steps in place (`stepping_action`). The controller acts for the first 60 environment
+  steps, and the policy imitates it, with decreasing weight, for the first 1,200 of about 3,000. Without
+  imitation, policies only learn to stand.
+- Actions are bounded, and policies observe a gait clock and a history of five linear velocities, angular
+  velocities and gravity directions, to filter sensor noise. Policies keep all three.
+- Rewards define the gait: feet at the height given by the clock and apart from each other, a pelvis at constant
+  height and upright, joints near the default pose. The penalties of the task stay.
+- Commands and pushes grow with a curriculum.
+- The decimation is three, and feet have two capsules instead of seven. Legs and hands still collide;
+  otherwise feet pass through each other. The number of solver iterations is unchanged: with four, feet
+  slip on ground of high friction.
 
-Evaluations, `evaluate` and `play` have the task's own physics, rewards, commands, pushes, noise and ends.
+Evaluations, `evaluate` and `play` use the task's physics, rewards, commands, pushes, noise and terminations.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ _CLOCK = "gait"
 _TEACHER = "teacher"
 _LINEAR = "linear"
 _STRIDES_PER_SECOND = 1.88
-"""Strides per second of the stepping controller's gains."""
-# Observations that are shown with the steps before, as a filter of their noise.
+"""Stride frequency (Hz) that the gains of the stepping controller are tuned for."""
+# Observations with history, to filter noise.
 _FILTERED = ("base_lin_vel", "base_ang_vel", "projected_gravity")
 _HISTORY = 5
-# Largest distance of a target from the default pose (rad).
+# Largest offset of a joint target from the default pose (rad).
 _BOUNDS = {
     r".*_(hip_pitch|knee|ankle_pitch)_joint": 1.0,
     r".*_hip_(roll|yaw)_joint": 0.6,
@@ -73,14 +73,14 @@ _BOUNDS = {
     r".*_elbow_joint": 0.3,
     r".*_wrist_.*_joint": 0.1,
 }
-# Weights of squared distances from the default pose, as UniLab's (arXiv 2605.30313) G1 has them.
+# Weights of squared joint deviations from the default pose, from the G1 of UniLab (arXiv 2605.30313).
 _POSE = {
     r".*_(hip_pitch|knee)_joint": 0.01,
     r".*_hip_roll_joint": 1.0,
     r".*_(hip_yaw|ankle_pitch|ankle_roll)_joint": 5.0,
     r"(waist|.*_shoulder|.*_elbow|.*_wrist)_.*": 50.0,
 }
-# Geoms that collide: the long capsules of the feet, and what they or the hands may hit.
+# Colliding geoms: the long capsules of the feet, and the limbs that feet or hands may hit.
 _FOOT = r"^(left|right)_foot[26]_collision$"
 _LIMBS = tuple(
     rf".*_{part}_collision" for part in ("shin", "linkage_brace", "thigh", "hip", "hand", "wrist")
@@ -88,23 +88,23 @@ _LIMBS = tuple(
 
 
 def unitree_g1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of both tasks."""
+    """Return the PPO config of both tasks."""
     return velocity_ppo_runner_cfg(experiment_name="g1_velocity", max_iterations=30_000)
 
 
 def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlBaseRunnerCfg:
-    """Edit the task's config in place, and return that of the learner.
+    """Edit the environment config in place, and return the learner config.
 
-    Solved means that it walks: four of five episodes last for 20 s, with the task's pushes.
+    Solved: four of five episodes last 20 s, with the task's pushes, and tracking errors are small.
     """
     env_cfg.scene.num_envs = _NUM_ENVS
-    _let_step(env_cfg)
+    _add_stepping(env_cfg)
     undos = [
         drop_easing,
         coarsen_physics(env_cfg, num_steps=3),
-        _collide_less(env_cfg),
+        _reduce_collisions(env_cfg),
         _shape_rewards(env_cfg),
-        _end_early(env_cfg),
+        _terminate_early(env_cfg),
     ]
     grow_difficulty(
         env_cfg,
@@ -122,8 +122,8 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlB
     return cfg
 
 
-def _let_step(env_cfg: ManagerBasedRlEnvCfg) -> None:
-    """Bound actions, add clock and history to the observations, and the stepping controller as teacher."""
+def _add_stepping(env_cfg: ManagerBasedRlEnvCfg) -> None:
+    """Bound actions, and add a gait clock, observation history and the stepping controller as teacher."""
     env_cfg.commands[_CLOCK] = mdp.GaitClockCommandCfg(
         frequency=_STRIDES_PER_SECOND, starts=(0.0, 0.5), fade_s=0.3, velocity_command_name=None
     )
@@ -146,7 +146,7 @@ def _let_step(env_cfg: ManagerBasedRlEnvCfg) -> None:
     )
 
 
-def _collide_less(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
+def _reduce_collisions(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     robot = env_cfg.scene.entities["robot"]
     before = robot.collisions
     fewer = copy.deepcopy(FULL_COLLISION)
@@ -161,7 +161,7 @@ def _collide_less(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
 
 
 def _shape_rewards(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
-    """Replace what the task rewards, and add to what it penalizes."""
+    """Replace the rewards of the task, and add penalties."""
     twist = {"command_name": "twist"}
     penalties = {
         name: term
@@ -169,7 +169,7 @@ def _shape_rewards(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
         if term is not None and term.weight < 0.0
     }
     rewards = {
-        # The narrow one alone pays nothing for a first step, the wide one too little for the last.
+        # The narrow kernel gives no gradient at first, the wide one too little in the end.
         _LINEAR: RewardTermCfg(
             func=mdp.track_linear_velocity, weight=3.0, params={"std": 0.5, **twist}
         ),
@@ -210,8 +210,8 @@ def _shape_rewards(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     return replace_rewards(env_cfg, rewards)
 
 
-def _end_early(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
-    """End episodes before all is lost: what follows teaches little."""
+def _terminate_early(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
+    """Terminate falling robots earlier: the rest of a fall teaches little."""
     fell = env_cfg.terminations["fell_over"]
     assert fell is not None
     before, early = fell.params["limit_angle"], math.radians(60.0)
@@ -239,7 +239,7 @@ def _learner(rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlOffPolicyRunnerCfg:
     cfg.actor.hidden_dims = cfg.critic.hidden_dims = (256, 128, 64)
     cfg.actor.distribution_cfg = squashed_gaussian(0.15, log_std_max=-1.2)
     algorithm = cfg.algorithm
-    # Five updates of 2,048 take as long as the physics of 1,024 environments: ten uses of a transition.
+    # Five updates of batch size 2,048 take as long as stepping 1,024 environments; replay ratio: 10.
     algorithm.num_updates = 5
     algorithm.replay_steps = 600
     algorithm.learning_starts = 20
@@ -261,7 +261,7 @@ def _learner(rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlOffPolicyRunnerCfg:
     }
     evaluation = cfg.evaluation
     evaluation.num_episodes = 100
-    # An evaluation takes as long as four iterations, and before that policies fall too often.
+    # An evaluation costs four iterations, and before iteration 80 policies fall too often.
     evaluation.first_iteration, evaluation.min_interval = 80, 10
     evaluation.trigger_return = -math.inf
     evaluation.solved_below = {"lin_vel_error": 0.35, "ang_vel_error": 0.45, "failure_rate": 0.2}

@@ -1,4 +1,4 @@
-"""Registers the velocity tasks of the Unitree Go1. Names are imported when they are first used."""
+"""Velocity tasks of the Unitree Go1. Names are imported on first use."""
 
 from __future__ import annotations
 

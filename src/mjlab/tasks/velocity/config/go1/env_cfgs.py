@@ -1,4 +1,4 @@
-"""The velocity tasks of the Unitree Go1."""
+"""Environment configs of the velocity tasks of the Unitree Go1."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from mjlab.tasks.velocity.velocity_env_cfg import (
 )
 
 TerrainType = Literal["rough", "obstacles"]
-"""Terrain of a task that does not walk on flat ground."""
+"""Terrain type of tasks on uneven ground."""
 
 _TRUNK = "trunk"
-# In the order of the model, as contacts and sites are.
+# Model order, the order of contacts and sites.
 _FEET = ("FR", "FL", "RR", "RL")
 _FOOT_GEOMS = tuple(f"{foot}_foot_collision" for foot in _FEET)
 
 
 def unitree_go1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task on rough terrain, to train or to `play` with."""
+    """Return the rough-terrain task, for training or for `play`."""
     cfg = make_velocity_env_cfg()
     cfg.sim.mujoco.ccd_iterations = 500
     cfg.sim.mujoco.impratio = 10
@@ -55,10 +55,10 @@ def unitree_go1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
 
 
 def unitree_go1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the task on flat ground, to train or to `play` with."""
+    """Return the flat-ground task, for training or for `play`."""
     cfg = unitree_go1_rough_env_cfg(play=play)
     make_flat(cfg, play)
-    # On a plane it is enough to see that the robot has fallen.
+    # On a plane, orientation alone detects falls.
     remove_sensors(
         cfg, "self_collision", "thigh_ground_touch", "shank_ground_touch", "trunk_ground_touch"
     )
@@ -99,7 +99,7 @@ def _set_sensors(cfg: ManagerBasedRlEnvCfg) -> None:
 
 
 def _touch(name: str, geoms: list[str]) -> ContactSensorCfg:
-    """Return a sensor of the strongest contact of each geom with the ground, in every substep."""
+    """Return a sensor of the strongest ground contact of each geom, with a history of substeps."""
     return ContactSensorCfg(
         name=name,
         primary=ContactMatch(mode="geom", pattern=tuple(geoms), entity="robot"),
@@ -118,7 +118,7 @@ def _set_actions_and_events(cfg: ManagerBasedRlEnvCfg) -> None:
     base_com = cfg.events["base_com"]
     assert base_com is not None
     base_com.params["asset_cfg"].body_names = (_TRUNK,)
-    # Feet of condim 6 also resist spinning and rolling, which spread over orders of magnitude.
+    # Feet have condim 6; torsional and rolling friction range over orders of magnitude.
     cfg.events.pop("foot_friction")
     cfg.events["foot_friction_slide"] = _foot_friction(0, (0.3, 1.5))
     cfg.events["foot_friction_spin"] = _foot_friction(1, (1e-4, 2e-2), "log_uniform")
@@ -145,7 +145,7 @@ def _foot_friction(
 def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
     params = {name: term.params for name, term in cfg.rewards.items() if term is not None}
     params["upright"]["asset_cfg"].body_names = (_TRUNK,)
-    # On slopes the trunk follows the ground.
+    # On slopes, the trunk should be parallel to the ground.
     params["upright"]["terrain_sensor_names"] = ("terrain_scan",)
     params["body_ang_vel"]["asset_cfg"].body_names = (_TRUNK,)
     for name in ("foot_clearance", "foot_slip"):

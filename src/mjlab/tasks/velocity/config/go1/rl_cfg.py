@@ -1,4 +1,4 @@
-"""How the Unitree Go1 learns the velocity tasks."""
+"""Learner config of the velocity tasks of the Unitree Go1."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from mjlab.tasks.velocity.rl.ppo import velocity_ppo_runner_cfg
 
 
 def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO settings of both tasks."""
+    """Return the PPO config of both tasks."""
     return velocity_ppo_runner_cfg(experiment_name="go1_velocity", max_iterations=10_000)
