@@ -20,31 +20,31 @@ from mjlab.envs.mdp.terminations import time_out
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
     ActionManager,
+    ActionTermCfg,
     CommandManager,
+    CommandTermCfg,
     CurriculumManager,
+    CurriculumTermCfg,
     EventManager,
+    EventTermCfg,
     MetricsManager,
+    MetricsTermCfg,
     NullCommandManager,
     NullCurriculumManager,
     NullMetricsManager,
     NullRecorderManager,
+    ObservationGroupCfg,
     ObservationManager,
     RecorderManager,
+    RecorderTermCfg,
     RewardManager,
+    RewardTermCfg,
     TerminationManager,
+    TerminationTermCfg,
 )
-from mjlab.managers.action_manager import ActionTermCfg
-from mjlab.managers.command_manager import CommandTermCfg
-from mjlab.managers.curriculum_manager import CurriculumTermCfg
-from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.lookup import Lookup, look_up
 from mjlab.managers.manager_base import SensorSwitches
-from mjlab.managers.metrics_manager import MetricsTermCfg
-from mjlab.managers.observation_manager import ObservationGroupCfg
-from mjlab.managers.recorder_manager import RecorderTermCfg
-from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.managers.term_checks import check_real
-from mjlab.managers.termination_manager import TerminationTermCfg
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim.config import SimulationCfg
 from mjlab.sim.engine import resolve_engine_name
