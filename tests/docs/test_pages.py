@@ -1,4 +1,4 @@
-"""What the pages of the documentation name exists."""
+"""Names, commands, flags and links in the pages of the documentation exist."""
 
 from __future__ import annotations
 

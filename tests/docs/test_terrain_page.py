@@ -1,4 +1,4 @@
-"""What `docs/how-to/terrains.md` says and shows."""
+"""Code, table and picture of `docs/how-to/terrains.md`."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 
 from mjlab.sensor import ContactSensor
-from mjlab.utils.errors import WrongTypeError, check_exists, check_positive
+from mjlab.utils.errors import WrongTypeError, check_exists
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -97,11 +97,6 @@ def require_command(env: ManagerBasedRlEnv, name: str | None) -> None:
 
 
 # Values.
-
-
-def check_std(std: float) -> None:
-    """Raise `ValueError` unless a standard deviation is positive."""
-    check_positive("std", std)
 
 
 def check_range(name: str, bounds: Any) -> None:

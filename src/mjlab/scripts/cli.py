@@ -20,6 +20,7 @@ from mjlab.scripts import prepare_threads
 from mjlab.utils.errors import BadCallError, MjlabError, UserError
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
+from mjlab.utils.string import suggest
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
@@ -271,8 +272,6 @@ def _dispatch(argv: list[str]) -> None:
         return
     name = argv[0].replace("_", "-")
     if name not in _BY_NAME:
-        from mjlab.utils.string import suggest
-
         raise BadCallError(f"Unknown command {argv[0]!r}; {suggest(name, _BY_NAME)}")
     run_subcommand(_BY_NAME[name], argv[1:], f"mjlab {name}")
 
@@ -423,8 +422,7 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
 
 
 def _message(error: BaseException) -> str:
-    # str(KeyError) is quoted.
-    text = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
+    text = str(error).strip()
     return shorten(text) if text else type(error).__name__
 
 

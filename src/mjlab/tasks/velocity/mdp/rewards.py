@@ -17,7 +17,7 @@ import torch
 from mjlab.compat import accepts_older_params, older_names
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.managers import RewardTermCfg, SceneEntityCfg
-from mjlab.managers.term_checks import check_std, checked_when_built, require_command
+from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.observations import (
     Source,
     check_air_time_sensor,
@@ -61,7 +61,7 @@ _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
 def _check_tracking(env: ManagerBasedRlEnv, std: float, command_name: str, **_: Any) -> None:
-    check_std(std)
+    check_positive("std", std)
     require_command(env, command_name)
 
 
@@ -125,7 +125,7 @@ class upright:
     _transient = {"_normal"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
-        check_std(cfg.params["std"])
+        check_positive("std", cfg.params["std"])
         self._env = env
         self._asset_cfg: SceneEntityCfg = cfg.params.get("asset_cfg", _DEFAULT_ASSET_CFG)
         self._body = single_body(env, self._asset_cfg)
