@@ -5,7 +5,6 @@ Functions on specs and values; `Entity` calls them in the order of this file.
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -19,6 +18,7 @@ from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
 from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS, XmlActuatorCfg
 from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.mujoco import control_inputs, qpos_width
+from mjlab.utils.spec import authored_position
 from mjlab.utils.string import resolve_expr
 
 KEY_NAME = "init_state"
@@ -519,12 +519,9 @@ def _initial_ctrl(
 
 def _reference(joint: mujoco.MjsJoint) -> list[float]:
     """Return the compiled `qpos0` of a joint."""
-    if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+    if joint.type == _FREE:
         return [*joint.parent.pos, *joint.parent.quat]
-    if joint.type == mujoco.mjtJoint.mjJNT_BALL:
-        return [1.0, 0.0, 0.0, 0.0]
-    in_degrees = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
-    return [math.radians(joint.ref) if in_degrees else float(joint.ref)]
+    return [1.0, 0.0, 0.0, 0.0] if joint.type == _BALL else [authored_position(joint, joint.ref)]
 
 
 def _vector(values: tuple[float, ...], length: int, name: str) -> tuple[float, ...]:
