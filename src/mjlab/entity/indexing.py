@@ -228,18 +228,12 @@ def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> li
     name = object_type.name.removeprefix("mjOBJ_").lower()
     ids = []
     for element in elements:
-        found = element.id
-        if element.name:
-            found = mujoco.mj_name2id(model, object_type, element.name)
-            if found < 0:
-                raise ValueError(
-                    f"The compiled model has no {name} {element.name!r}; initialize an entity with the "
-                    "model compiled from the entity's spec."
-                )
-        elif found < 0:
+        # Unnamed elements are known by their number, which only compiling the spec itself gives.
+        found = mujoco.mj_name2id(model, object_type, element.name) if element.name else element.id
+        if found < 0:
             raise ValueError(
-                f"Unnamed {name} not found in the model, because its spec changed after it was "
-                "compiled; compile that spec, not a copy of it."
+                f"The compiled model has no {name} {element.name or '(unnamed)'!r}; initialize an entity "
+                "with the model compiled from its current spec, not from a copy."
             )
         ids.append(found)
     return ids
