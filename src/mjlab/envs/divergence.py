@@ -39,9 +39,7 @@ class DivergenceLog:
         """Log the first environment of the mask `diverged`, (N,), if any. Called before resets."""
         if self.is_done:
             return
-        ids = self._found.take(diverged)
-        if ids is None:
-            ids = diverged.nonzero().flatten()
+        ids = self._found.ids_of(diverged)
         if len(ids) == 0:
             return
         self.is_done = True
