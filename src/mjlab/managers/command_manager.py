@@ -16,9 +16,10 @@ from mjlab.managers.manager_base import (
     DebugVisSwitches,
     ManagerTermBase,
     NullManager,
+    term_table,
 )
 from mjlab.managers.nonfinite import finite_mean
-from mjlab.utils.errors import UnsupportedError
+from mjlab.utils.errors import UnsupportedError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
 
 if TYPE_CHECKING:
@@ -223,6 +224,11 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
     def __init__(self, cfg: Mapping[str, CommandTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
 
+    def __str__(self) -> str:
+        """Return a table of the active terms."""
+        rows = [(name, type(term).__name__) for name, term in self._terms.items()]
+        return term_table(self, ["name", "type"], rows)
+
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Advance all commands by `dt` seconds; see `CommandTerm.compute`."""
         for term in self._terms.values():
@@ -246,7 +252,7 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
 
     def get_term_cfg(self, name: str) -> CommandTermCfg:
         """Return the live config of a command. Raises `ValueError` if unknown."""
-        self._check_known(name, self.active_terms)
+        check_exists("CommandManager term", name, self._terms)
         return self._terms[name].cfg
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
@@ -279,10 +285,6 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         """Call `apply_gui_reset` of all commands; return True if one of them wrote a state."""
         wrote = [term.apply_gui_reset(env_ids) for term in self._terms.values()]
         return any(wrote)
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        rows = [(name, type(term).__name__) for name, term in self._terms.items()]
-        return ["name", "type"], rows
 
 
 class NullCommandManager(NullManager, CommandManager):
