@@ -21,6 +21,7 @@ from mjlab.managers.manager_base import (
 from mjlab.managers.nonfinite import finite_mean
 from mjlab.utils.errors import UnsupportedError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
+from mjlab.utils.lab_api.math import sample_uniform
 
 if TYPE_CHECKING:
     import viser
@@ -100,8 +101,6 @@ class CommandTerm(ManagerTermBase):
         Args:
             dt: Elapsed time (s): one number, or (num_envs,) if `env_ids` is None.
             env_ids: Environments to advance; the others keep time, command and metrics. None: all.
-
-        Raises `ValueError` for a `dt` with several elements together with `env_ids`.
         """
         if env_ids is None:
             self._update_metrics()
@@ -110,11 +109,6 @@ class CommandTerm(ManagerTermBase):
             if due is None:
                 due = (self.time_left <= 0.0).nonzero().flatten()
         else:
-            if isinstance(dt, torch.Tensor) and dt.numel() != 1:
-                raise ValueError(
-                    f"{self.name}.compute dt: expected one number together with env_ids, got shape "
-                    f"{tuple(dt.shape)}."
-                )
             # `_update_metrics` updates all environments. Metrics that accumulate would count a step
             # that the other environments have not made, so their values are restored.
             before = {name: (values, values.clone()) for name, values in self.metrics.items()}
@@ -189,11 +183,8 @@ class CommandTerm(ManagerTermBase):
         return False
 
     def _resample(self, env_ids: torch.Tensor) -> None:
-        low, high = self.cfg.resampling_time_range
-        times = (
-            torch.rand(len(env_ids), dtype=torch.float32, device=self.device) * (high - low) + low
-        )
-        self.time_left[env_ids] = times
+        bounds = self.cfg.resampling_time_range
+        self.time_left[env_ids] = sample_uniform(*bounds, len(env_ids), self.device)
         self._resample_command(env_ids)
         self.command_counter[env_ids] += 1
 

@@ -24,6 +24,7 @@ from mjlab.managers.term_checks import is_interval
 from mjlab.sim.randomization import RecomputeLevel
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_ids, is_empty
+from mjlab.utils.lab_api.math import sample_uniform
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -233,9 +234,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
     def _sample_interval(
         self, cfg: EventTermCfg, count: int, device: str | None = None
     ) -> torch.Tensor:
-        low, high = cfg.interval_range_s or (0.0, 0.0)
-        samples = torch.rand(count, dtype=torch.float32, device=device or self.device)
-        return samples * (high - low) + low
+        return sample_uniform(*(cfg.interval_range_s or (0.0, 0.0)), count, device or self.device)
 
 
 # Model fields that events declare.
