@@ -383,48 +383,11 @@ class ManagerBasedRlEnv:
             )
         self._clear_extras()
         self.action_manager.process_action(action)
-
-        # Physics.
-        self._divergence_log.begin_step()
-        substeps = self.cfg.decimation
-        if self._steps_as_one:
-            self._sim_step_counter += substeps
-            self.action_manager.apply_action()
-            self.scene.write_data_to_sim()
-            recorded = self.sim.step(substeps, self.scene.recorded_fields)
-            self.scene.update(self.physics_dt, recorded, substeps)
-        else:
-            for substep in range(substeps):
-                self._sim_step_counter += 1
-                if substep == 0 or self._acts_between_substeps:
-                    self.action_manager.apply_action()
-                    self.scene.write_data_to_sim()
-                self.sim.step()
-                self.scene.update(dt=self.physics_dt)
-                self.metrics_manager.compute_substep()
+        self._run_physics()
         self.episode_length_buf += 1
         if not self._holds_common_steps:
             self.common_step_counter += 1
-
-        # Terminations, rewards and metrics. Diverged episodes end with zero reward.
-        self.diverged.copy_(self.sim.bad_states())
-        for manager in (self.termination_manager, self.reward_manager):
-            manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
-        self.reset_buf = self.termination_manager.compute()
-        self.reset_terminated = self.termination_manager.terminated
-        self.reset_time_outs = self.termination_manager.time_outs
-        self.reset_terminated |= self.diverged
-        self.reset_buf |= self.diverged
-        self._nan_resets += self.diverged
-        self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
-        # Covers rewards added by subclasses of the manager.
-        self.reward_buf.masked_fill_(self.diverged, 0.0)
-        log = self.extras["log"]
-        log["Simulation/nan_resets"] = self.diverged.sum()
-        log["Simulation/nan_rewards"] = self.reward_manager.nonfinite.count
-        log["Simulation/nan_terminations"] = self.termination_manager.nonfinite.count
-        self.metrics_manager.excluded = self.diverged
-        self.metrics_manager.compute()
+        self._evaluate_step()
 
         # Events.
         self._look_ahead()
@@ -487,6 +450,46 @@ class ManagerBasedRlEnv:
     def get_observations(self) -> VecEnvObs:
         """Return the observations of the last step or reset."""
         return self.observation_manager.compute()
+
+    def _run_physics(self) -> None:
+        self._divergence_log.begin_step()
+        substeps = self.cfg.decimation
+        if self._steps_as_one:
+            self._sim_step_counter += substeps
+            self.action_manager.apply_action()
+            self.scene.write_data_to_sim()
+            recorded = self.sim.step(substeps, self.scene.recorded_fields)
+            self.scene.update(self.physics_dt, recorded, substeps)
+            return
+        for substep in range(substeps):
+            self._sim_step_counter += 1
+            if substep == 0 or self._acts_between_substeps:
+                self.action_manager.apply_action()
+                self.scene.write_data_to_sim()
+            self.sim.step()
+            self.scene.update(dt=self.physics_dt)
+            self.metrics_manager.compute_substep()
+
+    def _evaluate_step(self) -> None:
+        """Compute terminations, rewards and metrics; end the episodes whose physics diverged."""
+        self.diverged.copy_(self.sim.bad_states())
+        for manager in (self.termination_manager, self.reward_manager):
+            manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
+        self.reset_buf = self.termination_manager.compute()
+        self.reset_terminated = self.termination_manager.terminated
+        self.reset_time_outs = self.termination_manager.time_outs
+        self.reset_terminated |= self.diverged
+        self.reset_buf |= self.diverged
+        self._nan_resets += self.diverged
+        self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
+        # Covers rewards added by subclasses of the manager.
+        self.reward_buf.masked_fill_(self.diverged, 0.0)
+        log = self.extras["log"]
+        log["Simulation/nan_resets"] = self.diverged.sum()
+        log["Simulation/nan_rewards"] = self.reward_manager.nonfinite.count
+        log["Simulation/nan_terminations"] = self.termination_manager.nonfinite.count
+        self.metrics_manager.excluded = self.diverged
+        self.metrics_manager.compute()
 
     def _look_ahead(self) -> None:
         """Look up environments that end or are due for events or commands with one GPU sync.
