@@ -207,7 +207,8 @@ def _check_model(observations: TensorDict, cfg: Mapping[str, Any], model: str) -
             images.append(group)
     if isinstance(kind, type) and issubclass(kind, CNNModel):
         if model != "critic" or not algorithm.get("share_cnn_encoders"):
-            _check_encoders(model, kind, settings.get("cnn_cfg"), observations.select(*images))
+            shapes = {group: tuple(observations[group].shape[1:]) for group in images}
+            _check_encoders(model, kind, settings.get("cnn_cfg"), shapes)
         return images
     # Models of other packages may accept images.
     if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
@@ -220,9 +221,9 @@ def _check_model(observations: TensorDict, cfg: Mapping[str, Any], model: str) -
     return []
 
 
-def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: TensorDict) -> None:
+def _check_encoders(model: str, kind: type, cnn_cfg: Any, shapes: dict[str, Any]) -> None:
     """Check each encoder of `model` by building it once, without allocating memory."""
-    name, groups = f"agent.{model} cnn_cfg", [*images.keys()]
+    name, groups = f"agent.{model} cnn_cfg", list(shapes)
     if not cnn_cfg or not isinstance(cnn_cfg, dict):
         raise ValueError(
             f"{name}: expected a dict for the images {groups}, got {cnn_cfg!r}. {_CNN_EXAMPLE}"
@@ -232,14 +233,13 @@ def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: TensorDict) ->
         check_positive(f"{name} spatial_softmax_temperature", temperature)
         if kind is not CNNModel:
             settings = {k: v for k, v in settings.items() if k not in SPATIAL_SOFTMAX_KEYS}
-        shape = tuple(images[group].shape[1:])
         try:
             # The meta device neither computes nor draws random numbers.
             with torch.device("meta"):
-                channels, height, width = shape
-                CNN((height, width), channels, **settings)(torch.empty(1, *shape))
+                channels, height, width = shapes[group]
+                CNN((height, width), channels, **settings)(torch.empty(1, *shapes[group]))
         except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
             raise ValueError(
-                f"{name}: expected settings of an encoder for the images {group!r} of shape {shape}, "
+                f"{name}: expected settings of an encoder for the images {group!r} of shape {shapes[group]}, "
                 f"large enough for all layers, got {settings}: {str(error).splitlines()[0]}."
             ) from error

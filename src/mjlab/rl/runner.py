@@ -404,7 +404,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         saves_replay = self.cfg["algorithm"].get("save_replay", False)
         if saves_replay:
             # First, so that the newest checkpoint has a replay even if writing is interrupted.
-            ReplayFiles(path).write(self.alg.storage)
+            storage: Any = self.alg.storage
+            ReplayFiles(path).write(storage)
         save_checkpoint(checkpoint, path)
         if saves_replay:
             ReplayFiles(path).remove_others()
