@@ -351,6 +351,6 @@ def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
         if waited > _SECONDS_OF_SILENCE and not warned:
             logger.warning("%s waits for the others %s. %s", names, progress, hint)
             warned = True
-        time.sleep(0.05)
+        time.sleep(_SECONDS_BETWEEN_LOOKS)
         joined = store.add("mjlab/joined", 0)
     return store
