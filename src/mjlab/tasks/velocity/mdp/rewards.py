@@ -60,12 +60,15 @@ __all__ = [
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
-def _check_tracking(env: ManagerBasedRlEnv, std: float, command_name: str, **_: Any) -> None:
-    check_positive("std", std)
+def check_command(
+    env: ManagerBasedRlEnv, command_name: str | None = None, std: float = 1.0, **_: Any
+) -> None:
+    """Raise `ValueError` unless the command exists and `std` > 0."""
     require_command(env, command_name)
+    check_positive("std", std)
 
 
-@checked_when_built(_check_tracking)
+@checked_when_built(check_command)
 def track_linear_velocity(
     env: ManagerBasedRlEnv,
     std: float,
@@ -85,7 +88,7 @@ def track_linear_velocity(
     return torch.exp(error.square().sum(dim=1) / -(std**2))
 
 
-@checked_when_built(_check_tracking)
+@checked_when_built(check_command)
 def track_angular_velocity(
     env: ManagerBasedRlEnv,
     std: float,
@@ -178,13 +181,29 @@ class upright:
         return data.body_link_quat_w[:, self._body]
 
 
-def _check_body(
+def single_body(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG, **_: Any
-) -> None:
-    single_body(env, asset_cfg)
+) -> int | None:
+    """Return the index of the selected body; None without selection, for the root.
+
+    Raises:
+        ValueError: several bodies are selected; the message names them.
+    """
+    ids: Any = asset_cfg.body_ids
+    entity: Entity = env.scene[asset_cfg.name]
+    if isinstance(ids, slice) and asset_cfg.body_names is None:
+        return None
+    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else list(ids)
+    if len(chosen) != 1:
+        names = [entity.body_names[i] for i in chosen]
+        raise ValueError(
+            f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
+            f"body_names for the root {entity.body_names[0]!r}."
+        )
+    return int(chosen[0])
 
 
-@checked_when_built(_check_body)
+@checked_when_built(single_body)
 def body_angular_velocity_penalty(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -321,20 +340,25 @@ def feet_air_time(
     return if_commanded(swinging.sum(dim=1).float(), env, command_name, command_threshold)
 
 
-def _check_clearance(
+def _check_feet(
     env: ManagerBasedRlEnv,
-    height_sensor_name: str,
+    sensor_name: str = "",
+    height_sensor_name: str | None = None,
     command_name: str | None = None,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
     **_: Any,
 ) -> None:
+    """Check the command, and that contacts or heights are those of the selected sites."""
     require_command(env, command_name)
-    heights = f"height sensor {height_sensor_name!r}", height_columns(env, height_sensor_name)
-    check_same_feet(env, heights, ("asset_cfg.site_names", site_columns(env, asset_cfg)))
+    if height_sensor_name is None:
+        source = contact_columns(env, sensor_name)
+    else:
+        source = height_columns(env, height_sensor_name)
+    check_same_feet(env, source, site_columns(env, asset_cfg))
 
 
 @accepts_older_params
-@checked_when_built(_check_clearance)
+@checked_when_built(_check_feet)
 def feet_clearance(
     env: ManagerBasedRlEnv,
     target_height: float,
@@ -391,16 +415,13 @@ class feet_swing_height:
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         params = cfg.params
-        contact = params["sensor_name"]
         require_command(env, params["command_name"])
-        check_air_time_sensor(env, contact)
-        check_feet_sensor(env, contact)
+        check_air_time_sensor(env, params["sensor_name"])
         check_positive("target_height", params["target_height"])
-        feet = contact_columns(env, contact)
-        contacts = f"contact sensor {contact!r}", feet
-        self._check_feet(env, contacts, self._height_columns(env, params))
+        contacts = contact_columns(env, params["sensor_name"])
+        self._check_heights(env, params, contacts)
         self.peak_heights = torch.zeros(
-            env.num_envs, len(feet), dtype=torch.float32, device=env.device
+            env.num_envs, len(contacts.columns), dtype=torch.float32, device=env.device
         )
 
     def __call__(
@@ -433,35 +454,18 @@ class feet_swing_height:
         peaks.masked_fill_(has_landed, 0.0)
         return cost
 
-    def _check_feet(self, env: ManagerBasedRlEnv, contacts: Source, heights: Source) -> None:
-        check_same_feet(env, contacts, heights)
-
-    @staticmethod
-    def _height_columns(
-        env: ManagerBasedRlEnv, params: dict[str, Any]
-    ) -> tuple[str, list[tuple[str, int]]]:
-        name = params["height_sensor_name"]
-        return f"height sensor {name!r}", height_columns(env, name)
+    def _check_heights(
+        self, env: ManagerBasedRlEnv, params: dict[str, Any], contacts: Source
+    ) -> None:
+        """Raise `ValueError` unless heights and contacts are those of the same feet."""
+        check_same_feet(env, contacts, height_columns(env, params["height_sensor_name"]))
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Clear the peak heights of `env_ids`, so that unfinished swings do not affect the next episode."""
         self.peak_heights[slice(None) if env_ids is None else env_ids] = 0.0
 
 
-def _check_slip(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    command_name: str,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    require_command(env, command_name)
-    check_feet_sensor(env, sensor_name)
-    contacts = f"contact sensor {sensor_name!r}", contact_columns(env, sensor_name)
-    check_same_feet(env, contacts, ("asset_cfg.site_names", site_columns(env, asset_cfg)))
-
-
-@checked_when_built(_check_slip)
+@checked_when_built(_check_feet)
 def feet_slip(
     env: ManagerBasedRlEnv,
     sensor_name: str,
@@ -568,26 +572,6 @@ def tilt_of(quat: torch.Tensor) -> torch.Tensor:
     x, y = quat[:, 1], quat[:, 2]
     s = x * x + y * y
     return 4.0 * s * (1.0 - s)
-
-
-def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None:
-    """Return the index of the selected body; None without selection, for the root.
-
-    Raises:
-        ValueError: several bodies are selected; the message names them.
-    """
-    ids: Any = asset_cfg.body_ids
-    entity: Entity = env.scene[asset_cfg.name]
-    if isinstance(ids, slice) and asset_cfg.body_names is None:
-        return None
-    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else list(ids)
-    if len(chosen) != 1:
-        names = [entity.body_names[i] for i in chosen]
-        raise ValueError(
-            f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
-            f"body_names for the root {entity.body_names[0]!r}."
-        )
-    return int(chosen[0])
 
 
 def values_of_joints(
