@@ -18,7 +18,7 @@ from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.observations import height_columns
 from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
-from mjlab.utils.errors import check_exists, check_positive
+from mjlab.utils.errors import check_exists, check_field, check_fields_positive, check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.torch import constant_tensor
@@ -89,14 +89,12 @@ class GaitClockCommand(CommandTerm):
 
     def __init__(self, cfg: GaitClockCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        check_positive("frequency", cfg.frequency)
-        if not 0.0 <= cfg.fade_s < math.inf:
-            raise ValueError(f"fade_s: expected a time of at least 0 s, got {cfg.fade_s!r}.")
-        starts = cfg.starts
-        if starts is not None and not (starts and all(0.0 <= start < 1.0 for start in starts)):
-            raise ValueError(
-                f"starts: expected offsets from 0 to below 1 (strides), got {starts!r}; use None for any."
-            )
+        check_fields_positive(cfg, "frequency")
+        check_field(cfg, "fade_s", 0.0 <= cfg.fade_s < math.inf, "a time >= 0 (s)")
+        fits = cfg.starts is None or (cfg.starts and all(0.0 <= o < 1.0 for o in cfg.starts))
+        check_field(
+            cfg, "starts", bool(fits), "offsets from 0 to below 1 (strides), or None for any"
+        )
         # Names are read from the config, because the command manager is still being built.
         if cfg.velocity_command_name is not None:
             names = [name for name, command in env.cfg.commands.items() if command is not None]
@@ -262,7 +260,7 @@ class weighted_joint_deviation:
         asset: Entity = env.scene[asset_cfg.name]
         # Resolved names are in the order of the joint ids.
         joints = list(asset_cfg.joint_names or asset.joint_names)
-        values = values_of_joints(joints, "weights", weights, least=0.0)
+        values = values_of_joints(joints, "weights", weights, allow_zero=True)
         self._weights = torch.tensor(values, dtype=torch.float32, device=env.device)
 
     def __call__(

@@ -9,7 +9,6 @@ feet in the same order. The terms check the order when they are built.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -145,7 +144,7 @@ class upright:
         terrain_sensor_names: tuple[str, ...] | None = None,
     ) -> torch.Tensor:
         """Return the reward."""
-        quat = self._quat()
+        quat = body_quat(env.scene[asset_cfg.name].data, self._body)
         if terrain_sensor_names:
             # Copied in place: assignment in a rollout under `inference_mode` would leave an inference
             # tensor, and `reset` could not write it afterwards.
@@ -162,23 +161,18 @@ class upright:
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
         """Draw the reference direction (green) and the body z axis (blue)."""
         data = self._env.scene[self._asset_cfg.name].data
+        quat = body_quat(data, self._body)
         for index in visualizer.get_env_indices(self._env.num_envs):
             start = data.root_link_pos_w[index]
             if self._body is not None:
                 start = data.body_link_pos_w[index, self._body]
-            body_z = quat_apply(self._quat()[index : index + 1], self._up)[0]
+            body_z = quat_apply(quat[index : index + 1], self._up)[0]
             base = start.cpu().numpy()
             for direction, color in (
                 (self._normal[index], (0.2, 0.8, 0.2, 0.8)),
                 (body_z, (0.2, 0.4, 1.0, 0.8)),
             ):
                 visualizer.add_arrow(base, base + 0.3 * direction.cpu().numpy(), color)
-
-    def _quat(self) -> torch.Tensor:
-        data = self._env.scene[self._asset_cfg.name].data
-        if self._body is None:
-            return data.root_link_quat_w
-        return data.body_link_quat_w[:, self._body]
 
 
 def single_body(
@@ -201,6 +195,11 @@ def single_body(
             f"body_names for the root {entity.body_names[0]!r}."
         )
     return int(chosen[0])
+
+
+def body_quat(data: Any, body: int | None) -> torch.Tensor:
+    """Return the orientation of a body, or of the root link for None, (N, 4)."""
+    return data.root_link_quat_w if body is None else data.body_link_quat_w[:, body]
 
 
 @checked_when_built(single_body)
@@ -270,8 +269,7 @@ class variable_posture:
         joints = list(asset_cfg.joint_names)
         tables = [f"std_{gait}" for gait in ("standing", "walking", "running")]
         stds = torch.tensor(
-            [values_of_joints(joints, name, params[name], above=0.0) for name in tables],
-            dtype=torch.float32,
+            [values_of_joints(joints, name, params[name]) for name in tables], dtype=torch.float32
         )
         # Weights of squared errors, (3, joints); 1 / len(joints) makes the sum a mean.
         self._weights = (1.0 / (stds.square() * len(joints))).to(env.device)
@@ -575,12 +573,7 @@ def tilt_of(quat: torch.Tensor) -> torch.Tensor:
 
 
 def values_of_joints(
-    joints: list[str],
-    name: str,
-    table: dict[str, float],
-    *,
-    above: float = -math.inf,
-    least: float = -math.inf,
+    joints: list[str], name: str, table: dict[str, float], allow_zero: bool = False
 ) -> list[float]:
     """Return the value of each joint from `table`, a dict of name pattern to value.
 
@@ -588,12 +581,11 @@ def values_of_joints(
         joints: Joint names.
         name: Parameter name for messages.
         table: Dict of joint name pattern to value.
-        above: Lower bound of the values, exclusive.
-        least: Lower bound of the values, inclusive.
+        allow_zero: Accept 0, besides numbers > 0.
 
     Raises:
         ValueError: a joint matches no pattern or several, a pattern matches no joint, or a value is
-            out of bounds.
+            negative or not allowed to be 0.
     """
     try:
         _, covered, values = resolve_matching_names_values(table, joints)
@@ -604,11 +596,9 @@ def values_of_joints(
         raise ValueError(
             f"{name}: expected patterns for all selected joints, got {list(table)}; missing: {missing}."
         )
-    wrong = {
-        pattern: value for pattern, value in table.items() if not (value > above and value >= least)
-    }
+    wrong = {p: v for p, v in table.items() if not (v >= 0.0 if allow_zero else v > 0.0)}
     if wrong:
-        bound = f"> {above:g}" if above > least else f">= {least:g}"
+        bound = ">= 0" if allow_zero else "> 0"
         raise ValueError(f"{name}: expected numbers {bound}, got {wrong}.")
     return [float(value) for value in values]
 

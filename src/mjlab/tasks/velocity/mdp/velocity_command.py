@@ -13,7 +13,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
-from mjlab.utils.errors import check_in_range
+from mjlab.utils.errors import check_field, check_in_range
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply, wrap_to_pi
 
@@ -159,11 +159,8 @@ class UniformVelocityCommand(CommandTerm):
         super().__init__(dataclasses.replace(cfg, ranges=dataclasses.replace(cfg.ranges)), env)
         check_command_cfg(cfg)
         self.robot: Entity = env.scene[cfg.entity_name]
-        if cfg.init_velocity_prob > 0.0 and self.robot.is_fixed_base:
-            raise ValueError(
-                f"init_velocity_prob: expected 0 for entity {cfg.entity_name!r} with a fixed base, got "
-                f"{cfg.init_velocity_prob}."
-            )
+        is_possible = cfg.init_velocity_prob == 0.0 or not self.robot.is_fixed_base
+        check_field(cfg, "init_velocity_prob", is_possible, "0 for an entity with a fixed base")
         self.vel_command_b = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.vel_command_w = torch.zeros_like(self.vel_command_b)
         self.heading_target = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
