@@ -260,16 +260,16 @@ class variable_posture:
                 f"walking_threshold: expected at most running_threshold {thresholds[1]}, got "
                 f"{thresholds[0]}."
             )
-        asset_cfg: SceneEntityCfg = params["asset_cfg"]
-        if asset_cfg.joint_names is None:
+        # Resolved names are in the order of the joint ids.
+        joints = params["asset_cfg"].joint_names
+        if joints is None:
             raise ValueError(
                 "asset_cfg.joint_names: expected joint names, got None; use ('.*',) for all joints."
             )
-        # Resolved names are in the order of the joint ids.
-        joints = list(asset_cfg.joint_names)
         tables = [f"std_{gait}" for gait in ("standing", "walking", "running")]
         stds = torch.tensor(
-            [values_of_joints(joints, name, params[name]) for name in tables], dtype=torch.float32
+            [values_of_joints(list(joints), name, params[name]) for name in tables],
+            dtype=torch.float32,
         )
         # Weights of squared errors, (3, joints); 1 / len(joints) makes the sum a mean.
         self._weights = (1.0 / (stds.square() * len(joints))).to(env.device)

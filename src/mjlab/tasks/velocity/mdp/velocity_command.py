@@ -169,11 +169,9 @@ class UniformVelocityCommand(CommandTerm):
         self.is_standing_env = torch.zeros_like(self.is_heading_env)
         self.is_world_env = torch.zeros_like(self.is_heading_env)
         self.is_forward_env = torch.zeros_like(self.is_heading_env)
-        self.metrics = {
-            "error_vel_xy": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
-            "error_vel_yaw": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
-        }
-        self._samples = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
+        for name in ("error_vel_xy", "error_vel_yaw"):
+            self.metrics[name] = torch.zeros_like(self.heading_target)
+        self._samples = torch.zeros_like(self.heading_target)
         self._joystick: VelocityJoystick | None = None
 
     @property
@@ -290,8 +288,7 @@ class UniformVelocityCommand(CommandTerm):
                 cos, sin = torch.cos(heading), torch.sin(heading)
                 x, y = self.vel_command_w[index, 0], self.vel_command_w[index, 1]
                 turned = torch.stack((cos * x + sin * y, cos * y - sin * x), dim=1)
-                is_world = self.is_world_env[index].unsqueeze(1)
-                command[:, :2] = torch.where(is_world, turned, command[:, :2])
+                command[:, :2] = torch.where(self.is_world_env[index, None], turned, command[:, :2])
         is_standing = self.is_standing_env[index].unsqueeze(1)
         self.vel_command_b[index] = command.masked_fill_(is_standing, 0.0)
         if cfg.rel_world_envs > 0.0:

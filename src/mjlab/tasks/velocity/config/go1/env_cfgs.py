@@ -137,10 +137,8 @@ def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
     params["body_ang_vel"]["asset_cfg"].body_names = (_TRUNK,)
     for name in ("foot_clearance", "foot_slip"):
         params[name]["asset_cfg"].site_names = _FEET
-    hips_and_thighs, calves = (
-        r".*(FR|FL|RR|RL)_(hip|thigh)_joint.*",
-        r".*(FR|FL|RR|RL)_calf_joint.*",
-    )
+    hips_and_thighs = r".*(FR|FL|RR|RL)_(hip|thigh)_joint.*"
+    calves = r".*(FR|FL|RR|RL)_calf_joint.*"
     params["pose"]["std_standing"] = {hips_and_thighs: 0.05, calves: 0.1}
     params["pose"]["std_walking"] = {hips_and_thighs: 0.3, calves: 0.6}
     params["pose"]["std_running"] = {hips_and_thighs: 0.3, calves: 0.6}
