@@ -105,9 +105,8 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
     step counters and running means, is restored completely, because a reset takes no simulation time.
     Generators are not restored, so that later samples differ.
     """
-    if env_ids is not None:
-        env_ids = as_ids(env_ids, term.num_envs, term.device)
-    if env_ids is None or len(env_ids) == term.num_envs:
+    env_ids = as_ids(env_ids, term.num_envs, term.device)
+    if len(env_ids) == term.num_envs:
         yield
         return
     data = term._env.sim.data

@@ -47,7 +47,7 @@ import numpy as np
 import torch
 
 from mjlab.rl.checkpoint import CheckpointError
-from mjlab.utils.os import replacing
+from mjlab.utils.os import write_atomically
 from mjlab.utils.torch import torch_threads
 
 if TYPE_CHECKING:
@@ -172,13 +172,6 @@ def _memories(inputs: Iterable[str], outputs: Iterable[str]) -> dict[str, str]:
     pairs = {name: f"{name.removesuffix('_in')}_out" for name in inputs if name.endswith("_in")}
     known = set(outputs)
     return {before: after for before, after in pairs.items() if after in known}
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write `content` to `path` through a temporary file in the same folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(content)
 
 
 # Metadata.

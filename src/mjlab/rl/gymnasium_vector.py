@@ -14,7 +14,7 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mjlab.envs.manager_based_rl_env import as_action
+from mjlab.managers.action_manager import as_action
 from mjlab.utils.errors import WrongStateError, check_one_of, check_positive
 
 if TYPE_CHECKING:
