@@ -207,12 +207,9 @@ def flat_orientation(
     env: ManagerBasedRlEnv, std: float, asset_cfg: SceneEntityCfg = ROBOT
 ) -> torch.Tensor:
     """Reward upright orientation of a body: `upright` without terrain sensors."""
-    from mjlab.tasks.velocity.mdp.rewards import single_body, tilt_of
+    from mjlab.tasks.velocity.mdp.rewards import body_quat, single_body, tilt_of
 
-    asset: Entity = env.scene[asset_cfg.name]
-    body = single_body(env, asset_cfg)
-    data = asset.data
-    quat = data.root_link_quat_w if body is None else data.body_link_quat_w[:, body]
+    quat = body_quat(env.scene[asset_cfg.name].data, single_body(env, asset_cfg))
     return torch.exp(tilt_of(quat) / -(std**2))
 
 
