@@ -14,7 +14,7 @@ import torch
 
 from mjlab.envs import env_state
 from mjlab.envs.divergence import DivergenceLog
-from mjlab.envs.mdp import reset_scene_to_default, time_out
+from mjlab.envs.mdp.events import reset_scene_to_default
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
     ActionManager,
@@ -48,8 +48,7 @@ from mjlab.sim import Simulation, SimulationCfg
 from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
-from mjlab.utils.spaces import batch_space
-from mjlab.viewer import ViewerConfig
+from mjlab.viewer.viewer_config import ViewerConfig
 
 if TYPE_CHECKING:
     import numpy as np
@@ -179,7 +178,7 @@ class ManagerBasedRlEnv:
         self._renderer = None
         self._renderer_is_open = False
         if render_mode == "rgb_array":
-            from mjlab.viewer import OffscreenRenderer
+            from mjlab.viewer.offscreen_renderer import OffscreenRenderer
 
             self._renderer = OffscreenRenderer(
                 model=self.sim.mj_model,
@@ -265,10 +264,10 @@ class ManagerBasedRlEnv:
         self.recorder_manager = (
             RecorderManager(cfg.recorders, self) if cfg.recorders else NullRecorderManager()
         )
-        self.single_observation_space = self.observation_manager.space
-        self.single_action_space = self.action_manager.space
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.single_observation_space = self.observation_manager.single_space
+        self.observation_space = self.observation_manager.space
+        self.single_action_space = self.action_manager.single_space
+        self.action_space = self.action_manager.space
         # Targets that are constant within a step are written once.
         self._acts_between_substeps = self.action_manager.needs_substep or any(
             entity.needs_substep for entity in self.scene.entities.values()
@@ -670,12 +669,6 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     length = cfg.episode_length_s
     if not (isinstance(length, Real) and math.isfinite(length) and length >= 0):
         raise ValueError(f"episode_length_s: expected a finite number >= 0 (s), got {length!r}.")
-    for name, term in cfg.terminations.items():
-        if length == 0 and term is not None and term.func is time_out:
-            raise ValueError(
-                f"episode_length_s: expected a number > 0 (s), got 0; the termination {name!r} would "
-                "fire at every step. Set episode_length_s, or remove the term."
-            )
 
 
 def check_device(device: Any) -> None:

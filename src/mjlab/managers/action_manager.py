@@ -16,7 +16,7 @@ from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase, term
 from mjlab.managers.term_checks import check_real
 from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import as_index
-from mjlab.utils.spaces import Box
+from mjlab.utils.spaces import Box, Space, batch_space
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -116,9 +116,14 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         return sum(self.action_term_dim)
 
     @property
-    def space(self) -> Box:
+    def single_space(self) -> Box:
         """Space of the action of one environment."""
         return Box(shape=(self.total_action_dim,))
+
+    @property
+    def space(self) -> Space:
+        """Space of the actions of all environments."""
+        return batch_space(self.single_space, self.num_envs)
 
     @property
     def action(self) -> torch.Tensor:

@@ -24,7 +24,7 @@ from mjlab.utils.errors import WrongTypeError, check_count, check_exists, check_
 from mjlab.utils.indexing import is_empty
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
-from mjlab.utils.spaces import Box, Dict, Space
+from mjlab.utils.spaces import Box, Dict, Space, batch_space
 from mjlab.utils.state import capture_state, is_stateful, restore_state, stateful
 
 if TYPE_CHECKING:
@@ -173,13 +173,18 @@ class ObservationManager(ManagerBase):
         return {name: group.cfg.concatenate_terms for name, group in self._groups.items()}
 
     @property
-    def space(self) -> Dict:
+    def single_space(self) -> Dict:
         """Space of the observations of one environment; groups that are dicts by term are `Dict`."""
         groups: dict[str, Space] = {}
         for name, group in self._groups.items():
             boxes: dict[str, Space] = {key: Box(t.shape) for key, t in group.terms.items()}
             groups[name] = Dict(spaces=boxes) if group.shape is None else Box(group.shape)
         return Dict(spaces=groups)
+
+    @property
+    def space(self) -> Space:
+        """Space of the observations of all environments."""
+        return batch_space(self.single_space, self.num_envs)
 
     def compute(
         self, update_history: bool = False, env_ids: torch.Tensor | None = None
