@@ -24,6 +24,8 @@ from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
 from mjlab.sim.engine import (
     ACCELERATION_FIELDS,
     COLLISION_MASKS,
+    CONSTANTS_AT_QPOS0,
+    FIXED_CONSTANTS,
     INPUTS,
     RESULTS_ZERO_ON_RESET,
     ROTATION_MATRICES,
@@ -37,7 +39,6 @@ from mjlab.sim.engine import (
 )
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
-from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.utils.errors import UnknownAttributeError, check_count
 from mjlab.utils.processes import cores_per_process
 
