@@ -223,8 +223,8 @@ class NativeEngine(Engine):
                 if mark not in self._frame_marks:
                     self._frame_marks[mark] = self._batch.expand(mark)
                     self._frame_marks[mark][:] = 0
-            in_batch = name if name in MODEL_FIELDS else f"opt.{name}"
-            values = _as_tensor(self._batch.expand(in_batch))
+            option = f"opt.{name}"
+            values = _as_tensor(self._batch.expand(option if option in MODEL_FIELDS else name))
             if values.dtype == torch.float64:
                 self._model_copies[name] = _Input(values, torch.float32)
                 values = self._model_copies[name].values
