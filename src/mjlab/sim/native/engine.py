@@ -296,7 +296,7 @@ class NativeEngine(Engine):
             with contextlib.suppress(SimulationError):
                 values = self._batch.rollout(nstep, record=tuple(items.values()))
                 for name, after in recorded.items():
-                    value = _like_mujoco(name, _as_tensor(values[items[name]]).transpose(0, 1))
+                    value = _as_tensor(values[items[name]]).transpose(0, 1)
                     after.copy_(value.reshape(after.shape))
                 again = (self._batch.warning != warnings).reshape(self.num_envs, -1).any(axis=1)
         if not again.any():
