@@ -307,7 +307,7 @@ class ContactSlot:
     @property
     def data_view(self) -> torch.Tensor:
         """Current values, (N, number of slots * field size)."""
-        values = self.sensor._split(self.sensor._block())[self.field_name]
+        values = self.sensor._split(self.sensor._block(), to_world=False)[self.field_name]
         num_slots = self.sensor.cfg.num_slots
         first = self.index * num_slots
         return values[:, first : first + num_slots].flatten(1)
@@ -316,7 +316,7 @@ class ContactSlot:
 def contact_slots(sensor: ContactSensor) -> list[ContactSlot]:
     """Return the fields of all primaries, grouped by primary."""
     return [
-        ContactSlot(primary, field, sensor._element_name(primary), sensor, index)
+        ContactSlot(primary, field, f"{sensor.cfg.name}_{primary}", sensor, index)
         for index, primary in enumerate(sensor.primary_names)
         for field in sensor.cfg.fields
     ]

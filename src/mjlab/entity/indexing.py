@@ -12,6 +12,7 @@ import torch
 
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.mujoco import (
+    OBJECT_TYPES,
     control_columns,
     dof_width,
     force_columns,
@@ -24,22 +25,6 @@ Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
 
 IdsT = TypeVar("IdsT", bound="Ids | int")
 
-_OBJECT_TYPES = {
-    "bodies": mujoco.mjtObj.mjOBJ_BODY,
-    "joints": mujoco.mjtObj.mjOBJ_JOINT,
-    "geoms": mujoco.mjtObj.mjOBJ_GEOM,
-    "sites": mujoco.mjtObj.mjOBJ_SITE,
-    "tendons": mujoco.mjtObj.mjOBJ_TENDON,
-    "cameras": mujoco.mjtObj.mjOBJ_CAMERA,
-    "lights": mujoco.mjtObj.mjOBJ_LIGHT,
-    "meshes": mujoco.mjtObj.mjOBJ_MESH,
-    "materials": mujoco.mjtObj.mjOBJ_MATERIAL,
-    "textures": mujoco.mjtObj.mjOBJ_TEXTURE,
-    "pairs": mujoco.mjtObj.mjOBJ_PAIR,
-    "actuators": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "equalities": mujoco.mjtObj.mjOBJ_EQUALITY,
-    "sensors": mujoco.mjtObj.mjOBJ_SENSOR,
-}
 # Fields of `EntityIndexing` with elements, and with their ids.
 _ID_FIELDS = {
     "bodies": "body_ids",
@@ -224,7 +209,7 @@ def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> li
     Raises:
         ValueError: an element is not in the model, or is unnamed in a spec that was not compiled.
     """
-    object_type = _OBJECT_TYPES[kind]
+    object_type = OBJECT_TYPES[kind]
     name = object_type.name.removeprefix("mjOBJ_").lower()
     ids = []
     for element in elements:

@@ -35,15 +35,14 @@ from mjlab.entity.variant_merge import (
 from mjlab.entity.variant_merge import SlotKey as SlotKey
 from mjlab.entity.variant_merge import VariantSlot as VariantSlot
 from mjlab.entity.variant_merge import validate_variant_specs as validate_variant_specs
+from mjlab.sim.engine import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
+from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
 from mjlab.sim.randomization import (
-    CONSTANTS_AT_QPOS0,
-    FIXED_CONSTANTS,
     VariantColumns,
     VariantInfo,
     VariantValues,
     put_variant_model,
 )
-from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
 from mjlab.utils.errors import check_exists
 from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 from mjlab.utils.spec import compile_composed, compile_spec
