@@ -106,7 +106,8 @@ class NativeRays:
     def _ground(self, groups: Array, excluded: Array) -> tuple[GroundTable | None, bool]:
         """Return a table of all visible static geoms, and True if other geoms are visible.
 
-        `groups` is the mask of visible groups, (6,), `excluded` the bodies to ignore. The table is None if it cannot hold all of them, or would not be faster.
+        `groups` is the mask of visible groups, (6,), `excluded` are the ids of bodies to ignore. The
+        table is None if it cannot hold all these geoms, or would not be faster.
         """
         model = self._model
         in_groups = groups[model.geom_group.clip(0, 5)].astype(bool)

@@ -119,7 +119,7 @@ class NativeRenderer:
 
 def render_problem(model: mujoco.MjModel) -> str | None:
     """Return an error message if cameras do not support the model; None if they do."""
-    kinds = set(model.geom_type.tolist()).difference(KINDS)
+    kinds = set(model.geom_type.tolist()) - KINDS
     names = sorted(mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds)
     if model.nflex:
         names.append("flexes")

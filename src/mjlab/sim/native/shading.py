@@ -16,11 +16,10 @@ import torch
 from torch import Tensor
 
 _T = mujoco.mjtGeom
-KINDS = PLANE, HFIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = tuple(
+PLANE, HFIELD, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = (
     int(getattr(_T, f"mjGEOM_{name}"))
     for name in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH")
 )
-"""Geom types that cameras render."""
 _TINY = 1e-6
 
 ReadField = Callable[[str], Tensor]
@@ -281,9 +280,7 @@ class Textures:
                 mat = geoms.mat[:, i].permute(1, 2, 0)[..., None]
                 point = _rotate_inverse(mat, met.points - center)
                 size = geoms.size[:, i].t()[..., None]
-                uv = texture_coordinates(
-                    PLANE, point, point, size, repeat[:, :, i, None], uniform[:, i, None]
-                )
+                uv = _plane(point, point, size, repeat[:, :, i, None], uniform[:, i, None])
                 color = self._sample(texture[:, i, None].clamp(min=0), uv)
                 rgb *= torch.where(is_here, color, 1.0)
             texture = texture.masked_fill(is_plane, -1)
@@ -301,11 +298,10 @@ class Textures:
             uniform.expand(n, -1)[env, column],
         )
         uv, kinds = torch.empty(2, len(env)), self._kinds[column]
-        for kind in KINDS:
+        for kind, mapping in _MAPPINGS.items():
             chosen = (kinds == kind).nonzero().squeeze(1)
             if len(chosen):
-                chosen_inputs = (values[..., chosen] for values in inputs)
-                uv[:, chosen] = texture_coordinates(kind, *chosen_inputs)
+                uv[:, chosen] = mapping(*(values[..., chosen] for values in inputs))
         color = self._sample(texture, uv)
         if self._has_coordinates.any():
             mesh = geoms.dataid[env, column].masked_fill(kinds != MESH, -1).long()
@@ -316,25 +312,11 @@ class Textures:
     def paint_sky(self, rgb: Tensor, missed: Tensor, directions: Tensor) -> None:
         """Set the colors `rgb`, (3, n, P), of the rays `missed`, (n, P) bool, to the skybox.
 
-        `directions` are world-frame directions of these rays, (3, K). The texture is a strip of the
-        faces +x, -x, +y, -y, +z, -z of a cube, which is rotated by 90 degrees about x.
+        `directions` are world-frame directions of these rays, (3, K).
         """
-        if self._sky is None:
-            return
-        x, y, z = directions[0], directions[2], -directions[1]
-        on_x = (x.abs() >= y.abs()) & (x.abs() >= z.abs())
-        on_y = ~on_x & (y.abs() >= z.abs())
-        main = torch.where(on_x, x, torch.where(on_y, y, z))
-        sign = torch.where(main > 0.0, 1.0, -1.0)
-        face = torch.where(on_x, 0.0, torch.where(on_y, 2.0, 4.0)) + (sign < 0.0)
-        s = torch.where(on_x, -sign * z, torch.where(on_y, x, sign * x))
-        t = torch.where(on_y, sign * z, -y)
-        reach = main.abs().clamp(min=_TINY)
-        # Clamp, so that colors of neighboring faces do not mix.
-        margin = 0.5 / int(self._width[self._sky])
-        t = ((t / reach + 1.0) / 2.0).clamp(margin, 1.0 - margin)
-        uv = torch.stack(((s / reach + 1.0) / 2.0, (face + t) / 6.0))
-        rgb[:, missed] = self._sample(torch.tensor(self._sky), uv)
+        if self._sky is not None:
+            uv = _sky_coordinates(directions, int(self._width[self._sky]))
+            rgb[:, missed] = self._sample(torch.tensor(self._sky), uv)
 
     def _sample(self, texture: Tensor, uv: Tensor) -> Tensor:
         """Return colors, (3, ...), of textures, (...), at coordinates `uv` in [0, 1), (2, ...).
@@ -382,70 +364,115 @@ def _rotate_inverse(mat: Tensor, vectors: Tensor) -> Tensor:
     return torch.stack([mat[0, i] * x + mat[1, i] * y + mat[2, i] * z for i in range(3)])
 
 
-def _azimuth(x: Tensor, y: Tensor) -> Tensor:
+# Texture mappings: points and normals in the geom frame (3, K), geom sizes (3, K), and texrepeat
+# (2, K) and texuniform (K,) of the material -> texture coordinates in [0, 1), (2, K). Axes after
+# the first may have any broadcastable shape.
+
+
+def _wrap(u, v, repeat, offset=0.0) -> Tensor:
+    uv = torch.stack((u, v)) * repeat + offset
+    return uv - uv.floor()
+
+
+def _scaled(repeat, uniform, lengths) -> Tensor:
+    """Return texture repetitions along a geom: `repeat`, per unit length if `uniform`."""
+    return torch.where(uniform, repeat * lengths, repeat)
+
+
+def _azimuth(x, y) -> Tensor:
     """Return the angle about z in turns, in [0, 1)."""
     turns = torch.atan2(y, x) / (2.0 * torch.pi)
     return torch.where(turns < 0.0, turns + 1.0, turns)
 
 
-def texture_coordinates(
-    kind: int, point: Tensor, normal: Tensor, size: Tensor, repeat: Tensor, uniform: Tensor
-) -> Tensor:
-    """Return texture coordinates in [0, 1), (2, K), of K points on geoms of one type.
+def _plane(point, normal, size, repeat, uniform) -> Tensor:
+    is_finite = size[:2] > 0.0
+    along = [
+        torch.where(finite, (p + side) / (2.0 * side.clamp(min=_TINY)), 0.5 * p)
+        for p, side, finite in zip((point[0], -point[1]), size[:2], is_finite, strict=True)
+    ]
+    repeat = torch.where(is_finite & uniform, repeat * size[:2], repeat)
+    return _wrap(*along, repeat, torch.where(is_finite.all(dim=0), 0.0, -0.5))
 
-    Axes after the first may have any broadcastable shape.
 
-    Args:
-        kind: Geom type, one of `KINDS`.
-        point: Points in the geom frame, (3, K).
-        normal: Normals in the geom frame, (3, K).
-        size: Geom sizes, (3, K).
-        repeat: `texrepeat` of the materials, (2, K).
-        uniform: `texuniform` of the materials, (K,). Repeats per unit length.
+def _ellipsoid(point, normal, size, repeat, uniform) -> Tensor:
+    direction = point / size.clamp(min=_TINY)
+    x, y, z = direction / direction.norm(dim=0).clamp(min=_TINY)
+    v = 0.5 - torch.asin(z.clamp(-1.0, 1.0)) / torch.pi
+    return _wrap(_azimuth(x, y), v, _scaled(repeat, uniform, size[:2]))
+
+
+def _sphere(point, normal, size, repeat, uniform) -> Tensor:
+    return _ellipsoid(point, normal, size[:1].expand_as(size), repeat, uniform)
+
+
+def _cylinder(point, normal, size, repeat, uniform) -> Tensor:
+    (x, y, z), (radius, half, _) = point, size.clamp(min=_TINY)
+    is_end = normal[2].abs() > _END
+    u = torch.where(is_end, 0.5 + 0.5 * x / radius, _azimuth(x, y))
+    v = torch.where(is_end, 0.5 + 0.5 * y / radius, (half - z) / (2.0 * half))
+    return _wrap(u, v, _scaled(repeat, uniform, size[0]))
+
+
+def _capsule(point, normal, size, repeat, uniform) -> Tensor:
+    (x, y, z), (radius, half, _) = point, size.clamp(min=_TINY)
+    on_cap = torch.asin(((z.abs() - half) / radius).clamp(0.0, 1.0)) * (2.0 / torch.pi)
+    v = torch.where(z > half, 1.0 - on_cap, (half - z) / (2.0 * half))
+    v = torch.where(z < -half, on_cap, v)
+    return _wrap(_azimuth(x, y), v, _scaled(repeat, uniform, size[0]))
+
+
+def _box(point, normal, size, repeat, uniform) -> Tensor:
+    # Coordinates in [-1, 1] along each side.
+    x, y, z = point / size.clamp(min=_TINY)
+    across = normal.abs()
+    on_z = (across[2] >= across[0]) & (across[2] >= across[1])
+    on_x = ~on_z & (across[0] >= across[1])
+    sign = torch.where(normal >= 0.0, 1.0, -1.0)
+    u = torch.where(on_z, x, torch.where(on_x, sign[0] * y, -sign[1] * x))
+    v = torch.where(on_z, -sign[2] * y, -z)
+    return _wrap(0.5 + 0.5 * u, 0.5 + 0.5 * v, _scaled(repeat, uniform, size[:2]))
+
+
+def _hfield(point, normal, size, repeat, uniform) -> Tensor:
+    x, y = point[:2] / size[:2].clamp(min=_TINY)
+    return _wrap(0.5 + 0.5 * x, 0.5 - 0.5 * y, _scaled(repeat, uniform, size[:2]))
+
+
+def _mesh(point, normal, size, repeat, uniform) -> Tensor:
+    scaled = torch.where((size[:2] > 0.0) & ~uniform, repeat / size[:2], repeat)
+    return _wrap(0.5 * point[0], -0.5 * point[1], scaled, -0.5)
+
+
+_MAPPINGS = {
+    PLANE: _plane,
+    SPHERE: _sphere,
+    ELLIPSOID: _ellipsoid,
+    CYLINDER: _cylinder,
+    CAPSULE: _capsule,
+    BOX: _box,
+    HFIELD: _hfield,
+    MESH: _mesh,
+}
+KINDS = frozenset(_MAPPINGS)
+"""Geom types that cameras render."""
+
+
+def _sky_coordinates(direction: Tensor, width: int) -> Tensor:
+    """Return skybox coordinates, (2, K), of world directions, (3, K), in the strip of six faces.
+
+    The cube is rotated by 90 degrees about x. Faces in order: +x, -x, +y, -y, +z, -z.
     """
-    x, y, z = point
-    radius, half, _ = size.clamp(min=_TINY)
-    lengths, offset = size[:2], 0.0
-    if kind == PLANE:
-        is_finite = size[:2] > 0.0
-        u, v = (
-            torch.where(finite, (p + side) / (2.0 * side.clamp(min=_TINY)), 0.5 * p)
-            for p, side, finite in zip((x, -y), size[:2], is_finite, strict=True)
-        )
-        lengths = torch.where(is_finite, lengths, 1.0)
-        offset = torch.where(is_finite.all(dim=0), 0.0, -0.5)
-    elif kind in (SPHERE, ELLIPSOID):
-        radii = size[:1].expand_as(size) if kind == SPHERE else size
-        direction = point / radii.clamp(min=_TINY)
-        x, y, z = direction / direction.norm(dim=0).clamp(min=_TINY)
-        u, v = _azimuth(x, y), 0.5 - torch.asin(z.clamp(-1.0, 1.0)) / torch.pi
-        lengths = radii[:2]
-    elif kind == CYLINDER:
-        is_end = normal[2].abs() > _END
-        u = torch.where(is_end, 0.5 + 0.5 * x / radius, _azimuth(x, y))
-        v = torch.where(is_end, 0.5 + 0.5 * y / radius, (half - z) / (2.0 * half))
-        lengths = size[0]
-    elif kind == CAPSULE:
-        on_cap = torch.asin(((z.abs() - half) / radius).clamp(0.0, 1.0)) * (2.0 / torch.pi)
-        u, v = _azimuth(x, y), torch.where(z > half, 1.0 - on_cap, (half - z) / (2.0 * half))
-        v = torch.where(z < -half, on_cap, v)
-        lengths = size[0]
-    elif kind == BOX:
-        # Coordinates in [-1, 1] along each side.
-        x, y, z = point / size.clamp(min=_TINY)
-        across = normal.abs()
-        on_z = (across[2] >= across[0]) & (across[2] >= across[1])
-        on_x = ~on_z & (across[0] >= across[1])
-        sign = torch.where(normal >= 0.0, 1.0, -1.0)
-        u = 0.5 + 0.5 * torch.where(on_z, x, torch.where(on_x, sign[0] * y, -sign[1] * x))
-        v = 0.5 + 0.5 * torch.where(on_z, -sign[2] * y, -z)
-    elif kind == HFIELD:
-        x, y = point[:2] / size[:2].clamp(min=_TINY)
-        u, v = 0.5 + 0.5 * x, 0.5 - 0.5 * y
-    else:
-        u, v, offset = 0.5 * x, -0.5 * y, -0.5
-        repeat = torch.where((lengths > 0.0) & ~uniform, repeat / lengths, repeat)
-        lengths = torch.ones_like(lengths)
-    repeat = torch.where(uniform, repeat * lengths, repeat)
-    uv = torch.stack((u, v)) * repeat + offset
-    return uv - uv.floor()
+    x, y, z = direction[0], direction[2], -direction[1]
+    on_x = (x.abs() >= y.abs()) & (x.abs() >= z.abs())
+    on_y = ~on_x & (y.abs() >= z.abs())
+    main = torch.where(on_x, x, torch.where(on_y, y, z))
+    sign = torch.where(main > 0.0, 1.0, -1.0)
+    face = torch.where(on_x, 0.0, torch.where(on_y, 2.0, 4.0)) + (sign < 0.0)
+    s = torch.where(on_x, -sign * z, torch.where(on_y, x, sign * x))
+    t = torch.where(on_y, sign * z, -y)
+    reach = main.abs().clamp(min=_TINY)
+    # Clamp, so that colors of neighboring faces do not mix.
+    margin = 0.5 / width
+    t = ((t / reach + 1.0) / 2.0).clamp(margin, 1.0 - margin)
+    return torch.stack(((s / reach + 1.0) / 2.0, (face + t) / 6.0))
