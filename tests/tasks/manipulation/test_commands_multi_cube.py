@@ -237,7 +237,6 @@ def test_viewers_show_the_goal_and_mark_the_wanted_cube():
     ("fields", "message"),
     [
         ({"entity_names": ()}, r"entity_names: .*got \(\)"),
-        ({"entity_names": ("cube_0", "cube")}, "entity_names 'cube'.*'cube_0', 'cube_1'"),
         ({"object_pose_range": PoseRange(x=(1.0, 0.0))}, "object_pose_range.x"),
         ({"difficulty": "hard"}, "difficulty"),
     ],
