@@ -170,11 +170,9 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
     arrays = {key: np.asarray(getattr(motion, key)) for key in _ARRAYS}
     _check_arrays(path, arrays)
     entries |= {key: array.astype(np.float32) for key, array in arrays.items()}
-    entries |= {
-        key: np.array(names)
-        for key in ("joint_names", "body_names")
-        if (names := getattr(motion, key))
-    }
+    for key in ("joint_names", "body_names"):
+        if getattr(motion, key):
+            entries[key] = np.array(getattr(motion, key))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for key, array in entries.items():
@@ -233,14 +231,12 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     sizes: dict[str | int, int] = {3: 3, 4: 4}
     for key, axes in _ARRAYS.items():
         value = arrays[key]
-        if value.ndim == len(axes):
-            sizes = dict(zip(axes, value.shape, strict=True)) | sizes
+        sizes = dict(zip(axes, value.shape, strict=False)) | sizes
         expected = tuple(sizes.get(axis, axis) for axis in axes)
         if value.dtype.kind not in "fiu" or value.shape != expected:
             shape = ", ".join(map(str, expected))
             raise MotionFileError(
-                f"Motion {path} {key}: expected numbers of shape ({shape}), got {value.dtype} of "
-                f"shape {value.shape}."
+                f"Motion {path} {key}: expected numbers ({shape}), got {value.dtype} {value.shape}."
             )
         # Motions are stored as float32: values above 3.4e38 become infinite.
         with np.errstate(over="ignore"):

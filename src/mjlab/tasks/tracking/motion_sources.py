@@ -46,11 +46,8 @@ def find_motions(text: str) -> list[Path]:
     shipped, files = shipped_motions(), []
     for part in filter(None, _parts_of(text)):
         path = Path(part).expanduser()
-        if os.path.isfile(path):
-            found = [path]
-        elif os.path.isdir(path):
-            found = sorted(path.glob("*.npz"))
-        else:
+        found = sorted(path.glob("*.npz")) if os.path.isdir(path) else [path]
+        if not os.path.exists(path):
             found = [shipped[part]] if part in shipped else []
         if not found:
             raise MotionFileError(
@@ -129,26 +126,24 @@ def recorded_motions(run_dir: Path) -> list[Path]:
     Raises:
         MotionFileError: the record is damaged, or a copy is missing or does not match its hash.
     """
-    index = run_dir / FOLDER / INDEX
+    folder = run_dir / FOLDER
+    index = folder / INDEX
     if not index.is_file():
         return []
     try:
         entries = json.loads(index.read_text())
-        listed = [(Path(str(entry["file"])).name, str(entry["sha256"])) for entry in entries]
+        hashes = {folder / Path(str(entry["file"])).name: entry["sha256"] for entry in entries}
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise MotionFileError(
             f"{index} is damaged ({error}); select the motion with --motion-file."
         ) from error
-    paths = []
-    for name, expected in listed:
-        path = run_dir / FOLDER / name
+    for path, expected in hashes.items():
         if not path.is_file() or motion_hash(path) != expected:
             raise MotionFileError(
                 f"Run {run_dir}: the copy {path} of a training motion is missing or was changed "
                 "since; select the motion with --motion-file."
             )
-        paths.append(path)
-    return paths
+    return list(hashes)
 
 
 # Weights & Biases.

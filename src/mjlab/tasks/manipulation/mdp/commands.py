@@ -464,11 +464,9 @@ def distance_apart(
     covered = sum(math.pi * radius**2 for radius in largest)
     if len(largest) > 1 and covered > _CROWDED * sides[0] * sides[1]:
         logger.warning(
-            "object_pose_range is small for the %d objects %s: objects may start in penetration "
-            "and be thrown apart. Widen x or y, or use fewer or smaller objects.",
-            len(largest),
-            list(names),
-        )
+            "object_pose_range is small for the objects %s: objects may start in penetration "
+            "and be thrown apart. Widen x or y, or use fewer or smaller objects.", list(names),
+        )  # fmt: skip
     return radii.unsqueeze(1) + radii.unsqueeze(2)
 
 

@@ -14,7 +14,7 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.lookup import Lookup
-from mjlab.managers.term_checks import check_range, require_command
+from mjlab.managers.term_checks import check_range
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
     MotionReader,
@@ -487,11 +487,11 @@ def check_motion_term(
     """Check a term that reads a motion command.
 
     Raises:
-        ValueError: unknown command, a body that the command does not track, empty `body_names`, or
-            `std` or `threshold` not positive.
+        KeyError: unknown command.
+        ValueError: a body that the command does not track, empty `body_names`, or `std` or
+            `threshold` not positive.
         TypeError: the command lacks attributes of `MotionCommand`.
     """
-    require_command(env, command_name)
     command: Any = motion_command(env, command_name)
     missing: list[str] = []
     if not isinstance(command, MotionCommand):
@@ -576,11 +576,10 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
             f"body_names: expected bodies of entity {cfg.entity_name!r}, got {missing}. Available: "
             f"{list(robot.body_names)}."
         )
-    root = robot.body_names[0]
-    if cfg.body_names[0] != root:
+    if cfg.body_names[0] != robot.body_names[0]:
         raise ValueError(
-            f"body_names: expected the floating base {root!r} first, got {cfg.body_names[0]!r}. "
-            "Episodes start from its pose."
+            f"body_names: expected the floating base {robot.body_names[0]!r} first, got "
+            f"{cfg.body_names[0]!r}. Episodes start from its pose."
         )
     return robot
 

@@ -69,8 +69,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         super().__init__(env, train_cfg, log_dir, device)
         manager: Any = self.env.unwrapped.command_manager
         terms = {name: manager.get_term(name) for name in manager.active_terms}
-        found = [name for name, term in terms.items() if isinstance(term, MotionCommand)]
-        name = found[0] if found else "motion"
+        name = next((n for n, term in terms.items() if isinstance(term, MotionCommand)), "motion")
         check_exists("motion command", name, terms)
         self.motion_command: Any = terms[name]
         actor = self.alg.get_policy()

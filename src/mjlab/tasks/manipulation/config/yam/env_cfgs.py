@@ -76,10 +76,7 @@ class _ColoredCube:
 def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the config of the state-based task, for training or `play`."""
     cfg: Any = make_lift_cube_env_cfg()
-    cfg.scene.entities = {
-        "robot": get_yam_robot_cfg(),
-        "cube": EntityCfg(spec_fn=get_cube_spec),
-    }
+    cfg.scene.entities = {"robot": get_yam_robot_cfg(), "cube": EntityCfg(spec_fn=get_cube_spec)}
     cfg.actions["joint_pos"].scale = dict(YAM_ACTION_SCALE)
     actor, critic = cfg.observations["actor"], cfg.observations["critic"]
     for term in (actor.terms["ee_to_cube"], critic.terms["ee_to_cube"], cfg.rewards["lift"]):
