@@ -222,7 +222,7 @@ def camera_target_cube_mask(
 
 
 def goal_command(env: ManagerBasedRlEnv, name: str, *kinds: type) -> Any:
-    """Return the command; raises `TypeError` unless it is of one of `kinds` (default: any goal)."""
+    """Return the command; raises `TypeError` unless it is of one of `kinds` (default: either lifting command)."""
     kinds = kinds or (LiftingCommand, MultiCubeLiftingCommand)
     command = env.command_manager.get_term(name)
     if not isinstance(command, kinds):
