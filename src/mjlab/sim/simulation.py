@@ -26,7 +26,7 @@ from mjlab.sim.engine import (
     create_engine,
     resolve_engine_name,
 )
-from mjlab.sim.memory import bytes_per_environment, check_memory
+from mjlab.sim.memory import LEAST_BYTES, bytes_per_environment, check_memory
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.sim.sim_data import FieldView
 from mjlab.sim.warning_log import collect_mujoco_warnings
@@ -119,6 +119,12 @@ class Simulation:
             model_fields=lambda: {name: getattr(self.model, name) for name in self.expanded_fields},
         )
         logger.debug("Physics: %s, %d environments.", self.capabilities.description, num_envs)
+
+    @staticmethod
+    def check(num_envs: int, cfg: SimulationCfg, device: str) -> None:
+        """Check engine, device and memory before a model exists. Raises as the constructor does."""
+        resolve_engine_name(cfg.engine, device)
+        check_memory(num_envs, LEAST_BYTES, device)
 
     # Properties.
 
