@@ -251,7 +251,7 @@ class LiftingCommandCfg(GoalCommandCfg):
     """Visualization settings."""
 
     def build(self, env: ManagerBasedRlEnv) -> LiftingCommand:
-        """Build the term; raises `ValueError` for invalid ranges or an invalid object."""
+        """Build the term; raises `ValueError` for invalid ranges or a fixed object."""
         return LiftingCommand(self, env)
 
 
@@ -315,7 +315,7 @@ class MultiCubeLiftingCommandCfg(GoalCommandCfg):
     """Ranges of the object poses."""
 
     def build(self, env: ManagerBasedRlEnv) -> MultiCubeLiftingCommand:
-        """Build the term; raises `ValueError` for invalid ranges or objects."""
+        """Build the term; raises `ValueError` for invalid ranges or fixed objects."""
         return MultiCubeLiftingCommand(self, env)
 
 
