@@ -78,6 +78,14 @@ class Boxes:
             geom.quat = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
         self.keep(geom, color)
 
+    def add_off_center(
+        self, offset: np.ndarray, extent: np.ndarray, top: float, color: RGBA, **options: float
+    ) -> None:
+        """Add a box with its center at an offset (m), (2,), from the center; see `add`."""
+        x, y = (np.array(self.center) + offset).tolist()
+        length_x, length_y = extent.tolist()
+        self.add((x, y), (length_x, length_y), top, color, **options)
+
     def add_ring(
         self,
         outer: tuple[float, float],

@@ -160,8 +160,7 @@ class HfPyramidSlopedTerrainCfg(SubTerrainCfg):
         row, col = (max(count // 2 - half, 0) for count in pixels.inner)
         cut = raw[row, col]
         raw = np.clip(raw, min(cut, 0.0), max(cut, 0.0))
-        noise = pixels.with_border(np.rint(raw).astype(int))
-        field = add_noise(self, spec, noise)
+        field = add_noise(self, spec, pixels.with_border(np.rint(raw).astype(int)))
         center = field.surface[pixels.rows // 2, pixels.cols // 2]
         return finish(self, field, float(center), rng)
 
@@ -195,22 +194,19 @@ class HfRandomUniformTerrainCfg(SubTerrainCfg):
         pixels = divide_into_pixels(self)
         check_field_range(self, "noise_range")
         step = int(self.noise_step / self.vertical_scale)
-        expected = f"a length >= vertical_scale = {self.vertical_scale:g} m"
-        check_field(self, "noise_step", step >= 1, expected)
+        check_field(self, "noise_step", step >= 1, f">= vertical_scale = {self.vertical_scale:g} m")
         # At least two heights along each side.
         coarse, most = self.downsampled_scale, min(pixels.inner_size) / 2
-        check_field(
-            self, "downsampled_scale", coarse is None or self.horizontal_scale <= coarse <= most,
-            f"a length from horizontal_scale = {self.horizontal_scale:g} to {most:g} m",
-        )  # fmt: skip
+        fits = coarse is None or self.horizontal_scale <= coarse <= most
+        expected = f"a length from horizontal_scale = {self.horizontal_scale:g} to {most:g} m"
+        check_field(self, "downsampled_scale", fits, expected)
         spacing = self.horizontal_scale if coarse is None else coarse
         factor = difficulty if self.scale_with_difficulty else 1.0
         low, high = (int(factor * end / self.vertical_scale) for end in self.noise_range)
         # The first axis is the row (y).
         counts = [int(extent / spacing) for extent in pixels.inner_size[::-1]]
         drawn = rng.choice(np.arange(low, high + step, step), size=counts)
-        noise = pixels.with_border(interpolate_cubic(drawn, pixels.inner))
-        field = add_noise(self, spec, noise)
+        field = add_noise(self, spec, pixels.with_border(interpolate_cubic(drawn, pixels.inner)))
         return finish(self, field, field.max_height_near_center(), rng)
 
 
@@ -288,11 +284,9 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
         check_field_range(self, "height_range", lowest=0.0)
         pixels = divide_into_pixels(self, "resolution")
         frequency = self.scale * self.resolution / self.horizontal_scale
-        check_field(
-            self, "scale", 2 * frequency <= min(pixels.inner),
-            f"a number with at most {min(pixels.inner) // 2} hills along each side (>= 2 of the "
-            f"{min(pixels.inner)} pixels per hill; hills with this value: {frequency:g})",
-        )  # fmt: skip
+        side = min(pixels.inner)
+        expected = f"at most one hill per 2 of the {side} pixels along a side, not {frequency:g}"
+        check_field(self, "scale", 2 * frequency <= side, expected)
         noise = fractal_noise(
             pixels.inner, frequency, self.octaves, self.persistence, self.lacunarity, rng
         )
@@ -338,17 +332,12 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
     """
     check_fields_positive(cfg, pixel_field)
     pixel, border_width = getattr(cfg, pixel_field), getattr(cfg, "border_width")  # noqa: B009
-    check_field(
-        cfg, "border_width", border_width == 0.0 or border_width >= pixel,
-        f"0 or a length of at least one pixel ({pixel_field} = {pixel:g} m)",
-    )  # fmt: skip
+    expected = f"0 or a length of at least one pixel ({pixel_field} = {pixel:g} m)"
+    check_field(cfg, "border_width", border_width == 0.0 or border_width >= pixel, expected)
     # In floats, because the number of tiny pixels overflows an integer.
     num_pixels = float(np.floor(cfg.size[0] / pixel) * np.floor(cfg.size[1] / pixel))
-    check_field(
-        cfg, pixel_field, num_pixels <= _MAX_PIXELS,
-        f"a length with at most {_MAX_PIXELS:,} pixels in {tuple(cfg.size)} m (pixels with this "
-        f"value: {num_pixels:,.0f})",
-    )  # fmt: skip
+    expected = f"at most {_MAX_PIXELS:,} pixels in {tuple(cfg.size)} m, not {num_pixels:,.0f}"
+    check_field(cfg, pixel_field, num_pixels <= _MAX_PIXELS, expected)
     border = int(border_width / pixel)
     cols, rows = (int(extent / pixel) for extent in cfg.size)
     check_field(

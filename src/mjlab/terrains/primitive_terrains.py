@@ -160,17 +160,13 @@ class BoxOpenStairsTerrainCfg(SubTerrainCfg):
         count = _count_steps(inner, self.platform_width, width)
         boxes.add_border(self.border_width, 0.0, border_color(BLUE), bottom=-height)
         tops = [-k * height if self.inverted else (k + 1) * height for k in range(count + 1)]
+        slab = self.step_thickness
         for step in range(count):
-            boxes.add_ring(
-                inset(inner, step * width), width, tops[step], _shade(BLUE, step, count),
-                slab=self.step_thickness,
-            )  # fmt: skip
-        top = tops[count]
-        boxes.add(
-            boxes.center, inset(inner, count * width), top, brand_ramp(BLUE, 1.0),
-            slab=self.step_thickness,
-        )  # fmt: skip
-        return boxes.output(top)
+            shade = _shade(BLUE, step, count)
+            boxes.add_ring(inset(inner, step * width), width, tops[step], shade, slab=slab)
+        platform = inset(inner, count * width)
+        boxes.add(boxes.center, platform, tops[count], brand_ramp(BLUE, 1.0), slab=slab)
+        return boxes.output(tops[count])
 
 
 @dataclass(kw_only=True)
@@ -409,6 +405,13 @@ def _lay_out(
     )
 
 
+def _check_lengths(cfg: SubTerrainCfg, *fields: str) -> None:
+    """Raise `ValueError` unless each of the fields is (low, high) with 0 < low <= high, finite."""
+    for field in fields:
+        check_field_range(cfg, field, lowest=0.0)
+        check_field(cfg, field, getattr(cfg, field)[0] > 0.0, "lengths > 0")
+
+
 # Boxes on flat ground.
 
 
@@ -440,9 +443,7 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
-        for field in ("box_width_range", "box_length_range", "box_height_range"):
-            check_field_range(self, field, lowest=0.0)
-            check_field(self, field, getattr(self, field)[0] > 0.0, "lengths > 0")
+        _check_lengths(self, "box_width_range", "box_length_range", "box_height_range")
         check_field_range(self, "box_yaw_range")
         check_field(self, "num_boxes", self.num_boxes >= 0, "a number >= 0")
         boxes = Boxes(spec, self.size)
@@ -467,16 +468,12 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         place = np.array([rng.uniform(-room[0], room[0]), rng.uniform(-room[1], room[1])])
         yaw = math.radians(rng.uniform(*self.box_yaw_range))
         # The sampling ranges above keep only the unrotated box inside the border.
-        reach = _rotated_extent(length, yaw) / 2
-        limit = np.maximum(np.array(inner) / 2 - reach, 0.0)
+        limit = np.array(inner) / 2 - _rotated_extent(length, yaw) / 2
         place = np.clip(place, -limit, limit)
-        fits = (reach <= np.array(inner) / 2).all()
-        if not fits or _touches_square(place, length, yaw, self.platform_width):
+        if (limit < 0.0).any() or _touches_square(place, length, yaw, self.platform_width):
             return
         color = brand_ramp(BLUE, float(rng.uniform(0.3, 0.8)))
-        x, y = (np.array(boxes.center) + place).tolist()
-        length_x, length_y = length.tolist()
-        boxes.add((x, y), (length_x, length_y), top, color, bottom=0.0, yaw=yaw)
+        boxes.add_off_center(place, length, top, color, bottom=0.0, yaw=yaw)
 
 
 def _rotated_extent(length: np.ndarray, yaw: float) -> np.ndarray:
@@ -586,9 +583,7 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
         rise = self.stone_height_variation * difficulty
         top = self.stone_height + float(rng.uniform(-rise, rise))
         color = brand_ramp(GREEN, float(rng.uniform(0.4, 0.7)))
-        x, y = (np.array(boxes.center) + (low + high) / 2).tolist()
-        length_x, length_y = (high - low).tolist()
-        boxes.add((x, y), (length_x, length_y), top, color, bottom=-self.floor_depth)
+        boxes.add_off_center((low + high) / 2, high - low, top, color, bottom=-self.floor_depth)
 
 
 @dataclass(kw_only=True)
@@ -619,8 +614,7 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "floor_depth")
-        check_field_range(self, "beam_width_range", lowest=0.0)
-        check_field(self, "beam_width_range", self.beam_width_range[0] > 0.0, "widths > 0")
+        _check_lengths(self, "beam_width_range")
         boxes = Boxes(spec, self.size)
         width = lerp(self.beam_width_range[::-1], difficulty)
         radius = self.platform_width / 2
@@ -687,8 +681,7 @@ class BoxNestedRingsTerrainCfg(SubTerrainCfg):
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "floor_depth")
-        check_field_range(self, "ring_width_range", lowest=0.0)
-        check_field(self, "ring_width_range", self.ring_width_range[0] > 0.0, "widths > 0")
+        _check_lengths(self, "ring_width_range")
         check_field_range(self, "gap_range", lowest=0.0)
         boxes = Boxes(spec, self.size)
         width = lerp(self.ring_width_range[::-1], difficulty)
