@@ -37,14 +37,19 @@ def choose_graphics_library() -> None:
     if value not in known:
         options = ", ".join(("glfw", *_OF_PLATFORM.get(sys.platform, ()), _OFF))
         problem = f"{_VARIABLE}={setting} is unknown to MuJoCo; unset it, or choose from {options}"
-    elif (value == "egl" and not _has_egl()) or (
-        # Same lookup as in PyOpenGL.
-        value == "osmesa" and ctypes.util.find_library("OSMesa") is None
-    ):
+    elif not _is_installed(value):
         problem = f"{_VARIABLE}={setting}, but this library is not installed"
     else:
         return
     os.environ[_VARIABLE] = _OFF
+
+
+def _is_installed(value: str) -> bool:
+    """Return False if `MUJOCO_GL` names a library that is known to be missing."""
+    if value == "osmesa":
+        # Same lookup as in PyOpenGL.
+        return ctypes.util.find_library("OSMesa") is not None
+    return value != "egl" or _has_egl()
 
 
 def _has_egl() -> bool:

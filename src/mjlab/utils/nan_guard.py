@@ -15,7 +15,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.utils.errors import check_count
+from mjlab.utils.errors import check_count, check_in_range, check_one_of
 from mjlab.utils.os import own_folder, replacing, write_atomically
 
 if TYPE_CHECKING:
@@ -33,6 +33,11 @@ _MOCAP_STATE = ("mocap_pos", "mocap_quat")
 _INPUTS = ("ctrl", "xfrc_applied")
 _FORMAT = 2
 _ARCHIVE = b"PK\x03\x04"
+# Metadata entry that explains a dump to readers of the file.
+_NOTE = (
+    "States are those before each substep; the last state led to the NaN. Arrays model_<field> hold "
+    "per-environment values of the dumped environments; the model file holds the compiled values."
+)
 # Metadata entries required for replay, and their types.
 _METADATA = {
     "model_file": str,
@@ -114,11 +119,10 @@ class NanGuard:
         """Return True if any environment has NaN; write a dump on the first detection."""
         if not self.enabled or self._dumped:
             return False
-        invalid = self.detect_nans(data)
-        if not bool(invalid.any()):
+        ids = self.detect_nans(data).nonzero().flatten().tolist()
+        if not ids:
             return False
         self._dumped = True
-        ids = invalid.nonzero().flatten().tolist()
         try:
             self.dump_path = self._dump(ids)
         except OSError as error:
@@ -126,11 +130,9 @@ class NanGuard:
             message = f"but the dump could not be written to {self.cfg.output_dir}: {error}"
             logger.error("NaN in environments %s, %s.", ids[:10], message)
         else:
+            message = f"previous states are in {self.dump_path} (view with viz-nan)"
             logger.warning(
-                "NaN in environments %s at substep %d; previous states are in %s (view with viz-nan).",
-                ids[:10],
-                self._steps,
-                self.dump_path,
+                "NaN in environments %s at substep %d; %s.", ids[:10], self._steps, message
             )
         self.buffer.clear()
         return True
@@ -215,11 +217,7 @@ class NanGuard:
             "detection_step": self._steps,
             "timestamp": stamp,
             "model_file": model_path.name,
-            "note": (
-                "States are those before each substep; the last state led to the NaN. Arrays "
-                "model_<field> hold per-environment values of the dumped environments; the model "
-                "file holds the compiled values."
-            ),
+            "note": _NOTE,
         }
 
 
@@ -299,21 +297,17 @@ class NanDump:
         """
         import mujoco
 
-        if step not in self.steps or not 0 <= row < self.metadata["num_envs_dumped"]:
-            raise ValueError(
-                f"NanDump.apply: expected substep {self.steps[0]} to {self.steps[-1]} and row < "
-                f"{self.metadata['num_envs_dumped']}, got substep {step} and row {row}."
-            )
+        check_one_of("NanDump.apply substep", step, self.steps)
+        check_in_range("NanDump.apply row", row, 0, self.metadata["num_envs_dumped"] - 1)
         state = self.arrays[f"states_step_{step:06d}"][row]
         mujoco.mj_setState(mj_model, mj_data, state, self.metadata["state_spec"])
         for name in _INPUTS:
             values = self.arrays.get(f"{name}_step_{step:06d}")
             if values is not None:
                 getattr(mj_data, name)[:] = values[row]
-        for name, values in self.arrays.items():
-            field = name.removeprefix("model_")
-            if field == name:
-                continue
+        names = [name for name in self.arrays if name.startswith("model_")]
+        for name in names:
+            field, values = name.removeprefix("model_"), self.arrays[name]
             owner: Any = mj_model if hasattr(mj_model, field) else mj_model.opt
             present = getattr(owner, field)
             if getattr(present, "shape", ()):

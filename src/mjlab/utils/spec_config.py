@@ -39,6 +39,10 @@ _LIGHT_FIELDS = (
     *("name", "castshadow", "pos", "dir", "cutoff", "exponent", "diffuse"),
     *("specular", "ambient", "active", "attenuation"),
 )
+_TEXTURE_FIELDS = (
+    *("markrgb", "random", "nchannel", "hflip", "vflip", "rgb1", "rgb2"),
+    *("width", "height", "file", "gridsize"),
+)
 # MuJoCo enum and prefix of its members.
 _TEXTURE = (mujoco.mjtTexture, "mjTEXTURE_")
 _BUILTIN = (mujoco.mjtBuiltin, "mjBUILTIN_")
@@ -258,16 +262,8 @@ class TextureCfg(SpecCfg):
             type=mujoco_enum(self, "type", _TEXTURE),
             builtin=mujoco_enum(self, "builtin", _BUILTIN),
             mark=mujoco_enum(self, "mark", _MARK),
-            markrgb=self.markrgb,
-            random=self.random,
-            nchannel=self.nchannel,
-            hflip=self.hflip,
-            vflip=self.vflip,
         )
-        for field in ("rgb1", "rgb2", "width", "height", "file", "gridsize"):
-            value = getattr(self, field)
-            if value is not None:
-                setattr(texture, field, value)
+        _set_given(texture, self, _TEXTURE_FIELDS)
         for face, path in enumerate(self.cubefiles or ()):
             texture.cubefiles[face] = path
         for cell, letter in enumerate(self.gridlayout or ""):
@@ -376,10 +372,7 @@ class LightCfg(SpecCfg):
         )
         if self.target is not None:
             light.targetbody = find_body(self, spec, self.target).name
-        for field in _LIGHT_FIELDS:
-            value = getattr(self, field)
-            if value is not None:
-                setattr(light, field, value)
+        _set_given(light, self, _LIGHT_FIELDS)
 
     def validate(self) -> None:
         """Raise `ValueError` for an unknown mode or type, or a target mode without `target`."""
@@ -424,6 +417,14 @@ class CameraCfg(SpecCfg):
         _validate_mode(self)
 
 
+def _set_given(element: Any, cfg: SpecCfg, fields: Sequence[str]) -> None:
+    """Set attributes of a spec element to those of the fields that are not None."""
+    for field in fields:
+        value = getattr(cfg, field)
+        if value is not None:
+            setattr(element, field, value)
+
+
 def warn_overlapping_geom_edits(
     geom_cfgs: Sequence[GeomCfg],
     collision_cfgs: Sequence[CollisionCfg],
@@ -438,18 +439,14 @@ def warn_overlapping_geom_edits(
     for cfg in collision_cfgs:
         if cfg.disable_other_geoms:
             _, others = _split_geoms(spec, cfg.geom_names_expr)
-            for geom in others:
-                overwritten |= {(geom.name, "contype"), (geom.name, "conaffinity")}
+            overwritten |= {(geom.name, f) for geom in others for f in ("contype", "conaffinity")}
     overlap = sorted(patched & overwritten)
     if overlap:
         listed = ", ".join(f"{geom}.{field}" for geom, field in overlap[:_MAX_LISTED])
-        more = len(overlap) - _MAX_LISTED
-        warnings.warn(
-            f"A CollisionCfg overwrites values set by a GeomCfg: {listed}"
-            + (f" and {more} more." if more > 0 else "."),
-            UserWarning,
-            stacklevel=2,
-        )
+        if len(overlap) > _MAX_LISTED:
+            listed += f" and {len(overlap) - _MAX_LISTED} more"
+        message = f"A CollisionCfg overwrites values set by a GeomCfg: {listed}."
+        warnings.warn(message, UserWarning, stacklevel=2)
 
 
 def _edited_attributes(

@@ -60,12 +60,11 @@ def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
     copy.meshdir = copy.texturedir = ""
     copy.assets = contents
     xml = fix_spec_xml(copy.to_xml(), meshdir=_ASSETS if contents else None)
-    for name, content in contents.items():
-        path = folder / _ASSETS / name
+    files = {f"{_ASSETS}/{name}": content for name, content in contents.items()}
+    for name, content in (files | {_XML_NAME: xml.encode()}).items():
+        path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / _XML_NAME).write_text(xml)
 
 
 def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None) -> None:
@@ -110,12 +109,8 @@ def fix_spec_xml(xml: str, meshdir: str | None = None) -> str:
     result from attaching specs. `meshdir`, if not None, is set as folder of meshes and textures.
     """
     root = ElementTree.fromstring(xml)
-    used = {
-        element.get(key)
-        for element in root.iter()
-        for key in ("class", "childclass")
-        if element.tag != "default"
-    }
+    users = [element for element in root.iter() if element.tag != "default"]
+    used = {element.get(key) for element in users for key in ("class", "childclass")}
     for default in root.findall("default"):
         _clean_default(default, used)
         if len(default) == 0:

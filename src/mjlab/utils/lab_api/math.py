@@ -653,10 +653,7 @@ def interpolate_poses(
     exactly one of `num_steps` and `step_size` is not None.
     """
     if (num_steps is None) == (step_size is None):
-        raise ValueError(
-            f"Expected either num_steps or step_size, got num_steps={num_steps} and "
-            f"step_size={step_size}."
-        )
+        raise ValueError(f"Expected either num_steps or step_size, got {num_steps}, {step_size}.")
     (pos_1, rot_1), (pos_2, rot_2) = unmake_pose(pose_1), unmake_pose(pose_2)
     if num_steps is None:
         num_steps = math.ceil(float(torch.linalg.vector_norm(pos_2 - pos_1)) / (step_size or 1.0))
