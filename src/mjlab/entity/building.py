@@ -490,17 +490,16 @@ def _initial_ctrl(
     """Return the controls that hold the joints at `joint_pos`, or those of a keyframe."""
     positions = {joint.name: value for joint, value in zip(joints, joint_pos, strict=True)}
     known = key.ctrl if key is not None else ()
-    ctrl, start = {}, 0
+    ctrl = {}
     for actuator in spec.actuators:
         inputs = control_inputs(actuator)
-        stop = start + len(inputs)
         # XML actuators come first, in the order of the keyframe.
-        if stop <= len(known):
-            ctrl[actuator] = tuple(map(float, known[start:stop]))
+        if len(inputs) <= len(known):
+            ctrl[actuator] = tuple(map(float, known[: len(inputs)]))
         else:
             # Joint positions are commands of position inputs only.
             on_joint = actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT
             held = positions.get(actuator.target, 0.0) if on_joint else 0.0
             ctrl[actuator] = tuple(held if kind == "position" else 0.0 for kind in inputs)
-        start = stop
+        known = known[len(inputs) :]
     return ctrl

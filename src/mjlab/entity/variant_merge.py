@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
+from itertools import chain
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
@@ -449,7 +450,6 @@ def merge_specs(
 def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:
     """Copy all meshes, materials and textures into the first spec, as `<variant>/<name>`."""
     merged = specs[0]
-    files = dict(merged.assets)
     _rename_own(merged, f"{names[0]}/")
     assets: Assets = {kind: [list(getattr(merged, kind))] for kind in _COPY}
     for name, spec in zip(names[1:], specs[1:], strict=True):
@@ -465,8 +465,7 @@ def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:
         for mesh in assets["meshes"][-1]:
             if mesh.material:
                 mesh.material = f"{name}/{mesh.material}"
-        files |= spec.assets
-    merged.assets = files
+    merged.assets = {path: data for spec in specs for path, data in spec.assets.items()}
     return assets
 
 
@@ -518,14 +517,13 @@ def _make_hulls(
     mesh per slot. A mesh keeps its hull after the geom is deleted.
     """
     needed: dict[str, None] = {}
-    for own in slots:
-        for slot in own:
-            if slot.key.role != "collision" or slot.kind[0] != MESH:
-                continue
-            for k, geom in enumerate(slot.geoms):
-                if geom is not None and k > 0:
-                    names = [mesh.name for mesh in specs[k].meshes]
-                    needed[assets["meshes"][k][names.index(geom.meshname)].name] = None
+    for slot in chain.from_iterable(slots):
+        if slot.key.role != "collision" or slot.kind[0] != MESH:
+            continue
+        for k, geom in enumerate(slot.geoms):
+            if geom is not None and k > 0:
+                names = [mesh.name for mesh in specs[k].meshes]
+                needed[assets["meshes"][k][names.index(geom.meshname)].name] = None
     users = [
         merged.worldbody.add_geom(type=MESH, meshname=name, contype=1, conaffinity=1, mass=0.0)
         for name in needed
