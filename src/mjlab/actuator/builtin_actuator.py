@@ -275,6 +275,14 @@ class DcMotorInputMode(IntEnum):
     VELOCITY = 2
 
 
+# Fields of `BuiltinDcMotorActuatorCfg` that a mode does not use.
+_UNUSED_GAINS = {
+    DcMotorInputMode.VOLTAGE: ("stiffness", "damping", "integral_gain"),
+    DcMotorInputMode.VELOCITY: ("integral_gain",),
+    DcMotorInputMode.POSITION: (),
+}
+
+
 @dataclass
 class DcMotorDatasheetParams:
     """Datasheet parameters of a DC motor."""
@@ -349,12 +357,7 @@ class BuiltinDcMotorActuatorCfg(ActuatorCfg):
         has_controller = mode != DcMotorInputMode.VOLTAGE
         for name in ("stiffness", "voltage_limit") if has_controller else ():
             check_positive(f"{self._label(name)} in mode {mode.name}", getattr(self, name))
-        unused = {
-            DcMotorInputMode.VOLTAGE: ("stiffness", "damping", "integral_gain"),
-            DcMotorInputMode.VELOCITY: ("integral_gain",),
-            DcMotorInputMode.POSITION: (),
-        }
-        for name in unused[mode]:
+        for name in _UNUSED_GAINS[mode]:
             if getattr(self, name) != 0.0:
                 raise ValueError(
                     f"{self._label(name)}: expected 0 in mode {mode.name}, got "
