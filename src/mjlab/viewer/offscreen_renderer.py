@@ -11,6 +11,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
+from contextlib import closing, suppress
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -229,20 +230,16 @@ def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Rend
         small = _open(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8)
     except Exception:
         raise RenderingUnavailableError.offscreen(failure) from failure
-    try:
+    limit_hint = ""
+    with closing(small), suppress(Exception):
         from OpenGL import GL
 
         limit = int(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE))
         limit_hint = f" Its limit is {limit} x {limit}, if memory allows."
-    except Exception:
-        limit_hint = ""
-    finally:
-        small.close()
     reason = " ".join(str(failure).split())
     raise RenderingUnavailableError(
         f"The graphics library of this machine cannot render an image of {width} x {height} pixels "
-        f"({reason}).{limit_hint} Use a smaller width or height; for clips, --video-width and "
-        "--video-height."
+        f"({reason}).{limit_hint} Use a smaller size (of clips: --video-width, --video-height)."
     ) from failure
 
 

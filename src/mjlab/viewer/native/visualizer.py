@@ -112,22 +112,24 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         pose_ghost(data, qpos, mocap_pos, mocap_quat)
         compute_poses(model, data)
         first = self.scn.ngeom
-        if first >= self.scn.maxgeom:
-            self._warn_full()
+        if self._is_full():
             return
         add_moving_geoms(self.scn, model, data, self._ghost_option)
         for index in range(first, self.scn.ngeom):
             self.scn.geoms[index].rgba[3] = alpha
             self.scn.geoms[index].category = int(mujoco.mjtCatBit.mjCAT_DECOR)
 
-    def _warn_full(self) -> None:
-        if not self._warned_full:
+    def _is_full(self) -> bool:
+        """Return True, with a warning the first time, if the scene has no room for a geom."""
+        full = self.scn.ngeom >= self.scn.maxgeom
+        if full and not self._warned_full:
             self._warned_full = True
             log.warning(
                 "The scene is full (%d geoms) and some debug drawings are left out; draw fewer "
                 "environments or fewer items.",
                 self.scn.maxgeom,
             )
+        return full
 
     def _add_geom(
         self,
@@ -137,19 +139,12 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
         mat: np.ndarray,
         color: Color,
     ) -> None:
-        if self.scn.ngeom >= self.scn.maxgeom:
-            self._warn_full()
+        if self._is_full():
             return
         geom = self.scn.geoms[self.scn.ngeom]
         self.scn.ngeom += 1
-        mujoco.mjv_initGeom(
-            geom,
-            int(kind),
-            np.asarray(size, dtype=np.float64).reshape(3),
-            np.asarray(center, dtype=np.float64).reshape(3),
-            np.asarray(mat, dtype=np.float64).reshape(9),
-            np.asarray(color, dtype=np.float32),
-        )
+        vectors = (np.asarray(value, dtype=np.float64).ravel() for value in (size, center, mat))
+        mujoco.mjv_initGeom(geom, int(kind), *vectors, np.asarray(color, dtype=np.float32))
         geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
 
     def _add_connector(

@@ -104,9 +104,7 @@ class ViserTermPlotter:
         self._plots.clear()
 
     def _add_selection(self, names: list[str]) -> None:
-        pattern = self._gui.add_text(
-            "Filter", "", hint="Show only terms whose name contains this text."
-        )
+        pattern = self._gui.add_text("Filter", "", hint="Show terms whose name contains this.")
         buttons = self._gui.add_button_group("Select", ["All", "None"])
 
         def show_chosen() -> None:

@@ -333,10 +333,7 @@ class SimulationControls:
         self._pause.on_click(lambda _: request_action("toggle_pause"))
         self._step.on_click(lambda _: request_action("single_step"))
         reset.on_click(lambda _: request_action("reset"))
-
-        @speed.on_click
-        def _(event: Any) -> None:
-            request_action(_SPEED_ACTIONS[event.target.value])
+        speed.on_click(lambda event: request_action(_SPEED_ACTIONS[event.target.value]))
 
     def show_paused(self, paused: bool) -> None:
         """Update the labels of the buttons."""
@@ -412,18 +409,14 @@ class CheckpointPanel:
             self.show_error(f"Cannot list checkpoints: {error}")
             return
         self._about.content = "**Local checkpoints**"
-        if self._manager.run_name is not None:
-            name, status = f"`{self._manager.run_name}`", ""
-            if self._manager.run_url is not None:
-                name = f"[{self._manager.run_name}]({self._manager.run_url})"
-            if self._manager.run_status is not None:
-                status = f" ({self._manager.run_status})"
+        run, url, state = self._manager.run_name, self._manager.run_url, self._manager.run_status
+        if run is not None:
+            name = f"`{run}`" if url is None else f"[{run}]({url})"
+            status = "" if state is None else f" ({state})"
             self._about.content = f"**Run:** {name}{status}"
         chosen = self._labels.get(self._choice.value)
         # Newest first: users usually want the latest checkpoint.
-        self._labels = {
-            f"{name} ({age})" if age else name: name for name, age in reversed(checkpoints)
-        }
+        self._labels = {f"{name} ({age})" if age else name: name for name, age in checkpoints[::-1]}
         self._set_silently("options", list(self._labels) or [_NONE_FOUND])
         self.select(chosen or self._manager.current_name)
         self._show(f"{len(checkpoints)} found.")
