@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from mjlab.scripts import prepare_threads
-from mjlab.utils.errors import BadCallError, MjlabError, UserError
+from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
-from mjlab.utils.string import suggest
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
@@ -271,8 +270,7 @@ def _dispatch(argv: list[str]) -> None:
         print(version("mjlab"))
         return
     name = argv[0].replace("_", "-")
-    if name not in _BY_NAME:
-        raise BadCallError(f"Unknown command {argv[0]!r}; {suggest(name, _BY_NAME)}")
+    check_exists("command", name, _BY_NAME, BadCallError)
     run_subcommand(_BY_NAME[name], argv[1:], f"mjlab {name}")
 
 
@@ -386,11 +384,12 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     the exit status is `MjlabError.exit_status`, else 1. Other errors keep their traceback.
     """
     prepare_threads()
-    # Plain library messages; one line per warning.
+    # Plain library messages.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("mjlab").setLevel(logging.INFO)
     logging.captureWarnings(True)
-    warnings.formatwarning = _one_line  # ty: ignore[invalid-assignment]
+    # One line per warning, without file and source line.
+    warnings.formatwarning = lambda message, category, *_: f"{category.__name__}: {message}"  # ty: ignore[invalid-assignment]
     try:
         command(sys.argv[1:])
     except KeyboardInterrupt:
@@ -424,16 +423,6 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
 def _message(error: BaseException) -> str:
     text = str(error).strip()
     return shorten(text) if text else type(error).__name__
-
-
-def _one_line(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    line: str | None = None,
-) -> str:
-    return f"{category.__name__}: {message}"
 
 
 if __name__ == "__main__":

@@ -288,16 +288,10 @@ def band(
     with probability 1 - a, if seeds are normally distributed. Student's t accounts for the uncertainty
     of s: for n = 3 and a = 1/60, t = 7.6 instead of 2.4 for the normal distribution. Seeds may agree
     by chance, so s is at least `standard_error`, that of one evaluation.
-
-    Raises:
-        ValueError: fewer than two curves; their deviation is undefined.
+    The deviation of fewer than two seeds is undefined.
     """
     import numpy as np
 
-    if len(curves) < 2:
-        raise ValueError(
-            f"reference seeds: expected at least 2, got {len(curves)}; train more seeds."
-        )
     values = np.stack([np.interp(at, *curve) for curve in curves])
     deviation = np.maximum(values.std(axis=0, ddof=1), standard_error)
     return values.mean(axis=0), _width(len(curves), 1.0 - _TAIL / 2) * deviation
