@@ -287,8 +287,7 @@ def band(
 
     with probability 1 - a, if seeds are normally distributed. Student's t accounts for the uncertainty
     of s: for n = 3 and a = 1/60, t = 7.6 instead of 2.4 for the normal distribution. Seeds may agree
-    by chance, so s is at least `standard_error`, that of one evaluation.
-    The deviation of fewer than two seeds is undefined.
+    by chance, so s is at least `standard_error`, that of one evaluation. s is undefined for n < 2.
     """
     import numpy as np
 
