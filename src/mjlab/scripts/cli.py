@@ -400,12 +400,14 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
-        if isinstance(error, MemoryError) or any(text in str(error) for text in _OUT_OF_MEMORY):
+        text = shorten(str(error).strip() or type(error).__name__)
+        if isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY):
             # The original message names the failed call, not the lack of memory.
-            error = UserError(
-                f"Out of memory or threads ({_message(error)}). Use fewer environments, or raise the "
-                "limits (ulimit)."
+            text = (
+                f"Out of memory or threads ({text}). Use fewer environments, or raise the limits "
+                "(ulimit)."
             )
+            error = UserError(text)
         elif not isinstance(error, (MjlabError, ValueError, OSError)):
             raise
         if os.environ.get(TRACEBACK_VARIABLE):
@@ -414,15 +416,10 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         # Only the failed process and rank 0 report.
         if rank == "0" or not isinstance(error, OtherProcessError):
             process = "" if rank == "0" else f" in process {rank}"
-            print(f"error{process}: {_message(error)}", file=sys.stderr)
+            print(f"error{process}: {text}", file=sys.stderr)
             print(f"(Set {TRACEBACK_VARIABLE}=1 for the traceback.)", file=sys.stderr)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     sys.exit(0)
-
-
-def _message(error: BaseException) -> str:
-    text = str(error).strip()
-    return shorten(text) if text else type(error).__name__
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint, load_che
 from mjlab.rl.distributed import STORE_VARIABLE
 from mjlab.rl.learners import learner_of
 from mjlab.scripts.flags import profile_of_run
-from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, run_folders
+from mjlab.scripts.run_folder import read_params, read_run_info, run_folders
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
@@ -158,7 +158,7 @@ def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
         return
     # Runs of other tools lack the training state, but may have saved their config.
     state = load_checkpoint(checkpoint).get("training_state")
-    saved: Any = [state, read_env_params(checkpoint.parent).get("scene")]
+    saved: Any = [state, read_params(checkpoint.parent, "env").get("scene")]
     counts = [holder.get("num_envs") for holder in saved if isinstance(holder, dict)]
     count = next((n for n in counts if isinstance(n, int) and n >= 1), None)
     if count is None:
@@ -174,7 +174,7 @@ def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
 def choose_seed(checkpoint: Path | None) -> int:
     """Return and print the seed of the resumed run, or a random seed."""
     if checkpoint is not None:
-        seed: Any = read_agent_params(checkpoint.parent).get("seed")
+        seed: Any = read_params(checkpoint.parent, "agent").get("seed")
         if isinstance(seed, int) and seed >= 0:
             print(f"Seed:    {seed}, as before; --agent.seed overrides")
             return seed

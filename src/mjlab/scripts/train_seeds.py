@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from types import FrameType
 
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.flags import is_given
-from mjlab.scripts.run_folder import read_run_info, run_folders
+from mjlab.scripts.run_folder import read_run_info, runs_named
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
 from mjlab.utils.signals import FORWARDED, handled_signals
@@ -31,10 +30,12 @@ def command(argv: list[str], prog: str) -> None:
         arguments = [sys.executable, "-m", "mjlab.scripts.train", argv[0]]
         arguments += ["--agent.evaluation.stop-when-solved", "False"]
         arguments += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
-        before = set(run_folders(experiment))
+        before = runs_named(experiment, f"seed_{seed}")
         status, stopped = run_forwarding_signals(arguments)
         # A training process interrupted by a signal also exits with 0.
-        if stopped or (status == 0 and _interrupted(experiment, before, seed)):
+        new = [run for run in runs_named(experiment, f"seed_{seed}") if run not in before]
+        interrupted = any(read_run_info(run).get("ended") == "interrupted" for run in new)
+        if stopped or (status == 0 and interrupted):
             print(f"Stopped during seed {seed} of {count}; no other seed is trained.")
             return
         if status != 0:
@@ -66,13 +67,6 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
                 "use --seeds N for the number of seeds, or `train` for one run."
             )
     return int(args.seeds), flags, cfg.experiment_folder
-
-
-def _interrupted(experiment: Path, before: set[Path], seed: int) -> bool:
-    """Return True if the new run of `seed`, not in `before`, was interrupted."""
-    name = re.compile(rf".*_seed_{seed}(-\d+)?")
-    new = (run for run in run_folders(experiment) if run not in before and name.fullmatch(run.name))
-    return any(read_run_info(run).get("ended") == "interrupted" for run in new)
 
 
 def run_forwarding_signals(command: list[str], seconds: float | None = None) -> tuple[int, bool]:
