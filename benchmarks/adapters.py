@@ -10,8 +10,7 @@ import argparse
 from collections.abc import Callable
 
 import torch
-from report import Row, show
-from timing import alternate
+from measure import Row, alternate, show
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import gymnasium_env

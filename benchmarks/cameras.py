@@ -23,9 +23,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from measure import Row, alternate, show
 from mujoco.batch import Batch
-from report import Row, show
-from timing import alternate
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.sim import Simulation

@@ -10,8 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from commands import output_of
-from report import Row, show
+from measure import Row, output_of, show
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 POLICY = Path(__file__).parents[1] / "src/mjlab/demo/go1_velocity.onnx"

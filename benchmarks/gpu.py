@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
 
 from gpu_parts.options import Options  # noqa: E402 - found by the lines above.
-from report import Row, show  # noqa: E402
+from measure import Row, show  # noqa: E402
 
 MINUTES = 9.5
 """Time for all parts together, by default."""

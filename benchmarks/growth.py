@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from report import Row, show
+from measure import Row, show
 from stepping import NUM_THREADS, Stepper, median_times
 
 BASE = 1024

@@ -10,7 +10,7 @@ import statistics
 from dataclasses import asdict
 from typing import Any
 
-from report import Row, show
+from measure import Row, show
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper

@@ -25,8 +25,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import viser
-from commands import output_of
-from report import Row
+from measure import Row, output_of
 from websockets.sync.client import connect
 
 from mjlab.rl.config import EvaluationCfg

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import mujoco
 import torch
-from report import Row, show
+from measure import Row, show
 
 from mjlab.asset_zoo.robots import get_yam_robot_cfg
 from mjlab.entity import EntityCfg

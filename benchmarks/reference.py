@@ -32,9 +32,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
 
-from commands import output_of  # noqa: E402 - found by the lines above.
-from report import processor  # noqa: E402
-from solving import EVALUATION_SEED  # noqa: E402
+from learning import EVALUATION_SEED  # noqa: E402
+from measure import output_of, processor  # noqa: E402
 
 from mjlab.rl.plot import plot_curves  # noqa: E402
 from mjlab.scripts.devices import resolve_device  # noqa: E402

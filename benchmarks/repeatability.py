@@ -10,7 +10,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from report import Row, show
+from measure import Row, show
 
 TASK = "Mjlab-Cartpole-Swingup"
 ITERATIONS = 10

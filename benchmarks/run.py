@@ -21,8 +21,7 @@ import side_by_side
 import startup
 import tasks
 import throughput
-import walking
-from report import RESULTS, Row, show, write
+from measure import RESULTS, Row, show, write
 
 
 def main() -> None:
@@ -34,7 +33,7 @@ def main() -> None:
         rows += side_by_side.measure(before.resolve())
         write(rows)
     quick = (throughput, tasks, adapters, growth, cameras, reach, startup, repeatability)
-    for benchmark in (*quick, learning, live_view, walking, engines_agree):
+    for benchmark in (*quick, learning, live_view, engines_agree):
         print(f"{benchmark.__name__} ...", flush=True)
         rows += benchmark.measure()
         # Write after each benchmark, so that a stopped run keeps its results.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from report import Row, show
+from measure import Row, show
 from stepping import HERE, NUM_THREADS, Stepper, median_times
 
 CASES = (

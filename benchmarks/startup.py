@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 
-from report import Row, show
+from measure import Row, show
 
 REPEATS = 5
 

@@ -61,7 +61,7 @@ def median_times(steppers: list[Stepper], samples: int, repeats: int = 15) -> li
     Each turn makes about `samples` steps of single environments.
     """
     # Here, because an earlier checkout serves this file without MuJoCo's batch engine.
-    from timing import alternate
+    from measure import alternate
 
     counts = [max(1, samples // stepper.num_envs) for stepper in steppers]
     turns = [

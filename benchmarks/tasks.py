@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from report import Row, show
-from timing import BareLoop, alternate
+from bare import BareLoop
+from measure import Row, alternate, show
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.sim.engine import RayQuery

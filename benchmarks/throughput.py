@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from report import Row, show
-from timing import BareLoop, Sample, alternate
+from bare import BareLoop
+from measure import Row, Sample, alternate, show
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.registry import load_env_cfg

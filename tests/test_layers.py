@@ -22,7 +22,7 @@ STANDS_WITH = {
     "mjlab.utils.wrappers": "mjlab.viewer.base",
 }
 # Imported by name when an older name is used.
-ABOVE_ALL = ("mjlab.compat.older", "mjlab.compat.older_terms")
+ABOVE_ALL = tuple(f"mjlab.compat.{name}" for name in ("older", "older_scripts", "older_terms"))
 # Packages of several layers; their names are loaded on first use.
 OF_SEVERAL_LAYERS = {"mjlab", "mjlab.viewer", "mjlab.viewer.native"}
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import mujoco_warp
 import warp
-from report import Row
-from timing import alternate
+from measure import Row, alternate
 
 from gpu_parts.device import wait
 from gpu_parts.options import Options

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from report import Row
+from measure import Row
 
 from gpu_parts.options import Options
 from gpu_parts.tasks import (

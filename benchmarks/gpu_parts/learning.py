@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from report import Row
+from measure import Row
 
 from gpu_parts.options import Options
 from gpu_parts.tasks import GO1_FLAT

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from report import Row
+from measure import Row
 
 from gpu_parts.options import Options
 from gpu_parts.tasks import (

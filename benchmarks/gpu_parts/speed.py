@@ -13,8 +13,7 @@ from typing import Any
 import mujoco_warp
 import torch
 import warp
-from report import Row
-from timing import alternate
+from measure import Row, alternate
 
 from gpu_parts.device import Memory, counted_waits, wait
 from gpu_parts.options import Options

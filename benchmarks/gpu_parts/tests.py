@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 
-from report import Row
+from measure import Row
 
 from gpu_parts.options import Options
 

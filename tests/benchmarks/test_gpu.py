@@ -21,7 +21,7 @@ PARTS = ("kernels", "tests", "parity", "speed", "learning", "cameras")
 # A part of an own making, in place of those that need torch.
 STUB = """
 import os, signal, subprocess, sys, time
-from report import Row
+from measure import Row
 
 
 def measure(options):
@@ -97,7 +97,7 @@ def stubs(tmp_path: Path) -> Path:
     """The script, with parts that end in every way there is."""
     folder = tmp_path / "benchmarks"
     (folder / "gpu_parts").mkdir(parents=True)
-    for name in ("gpu.py", "report.py", "gpu_parts/__init__.py", "gpu_parts/options.py"):
+    for name in ("gpu.py", "measure.py", "gpu_parts/__init__.py", "gpu_parts/options.py"):
         shutil.copy(BENCHMARKS / name, folder / name)
     (folder / "gpu_parts/machine.py").write_text("def described(device): return {'device': device}")
     for part, rest in ENDS.items():

@@ -252,7 +252,7 @@ def test_the_default_initial_state_of_an_entity_without_joints_is_not_reported(c
 
 
 def test_a_vector_of_the_wrong_length_is_reported(kit):
-    with pytest.raises(ValueError, match="init_state.rot: expected 4 values, got 3"):
+    with pytest.raises(ValueError, match="init_state.rot: expected 4 values"):
         kit.cfg(kit.ARM, init_state=InitialState(rot=(0.0, 0.0, 0.0))).build()
 
 
@@ -305,7 +305,7 @@ def test_joint_pos_none_without_a_keyframe_says_what_to_do(kit):
 
 def test_joint_pos_none_with_a_keyframe_that_does_not_fit(kit):
     xml = WITH_KEY.replace("9 9 9 0 1 0 0 .7 -.7", "1 2 3")
-    with pytest.raises(ValueError, match="'home' to have 9 values.*got 3"):
+    with pytest.raises(ValueError, match="9 values in qpos.*'home' with 3"):
         kit.cfg(xml, init_state=InitialState(joint_pos=None)).build()
 
 

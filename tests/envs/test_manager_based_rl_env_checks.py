@@ -12,7 +12,8 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.envs import manager_based_rl_env as env_checks
 from mjlab.envs import manager_based_rl_env as env_module
-from mjlab.envs.manager_based_rl_env import as_action, as_reset_ids, check_device
+from mjlab.envs.manager_based_rl_env import as_reset_ids, check_device
+from mjlab.managers.action_manager import as_action
 from mjlab.tasks.registry import load_env_cfg
 
 NUM_ENVS = 6

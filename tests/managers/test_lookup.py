@@ -67,3 +67,12 @@ def test_without_a_look_up_there_are_no_ids():
     lookup = planned(timer, 0.2)
     lookup.plan(timer <= 0.0, timer, 0.2)
     assert lookup.take(timer, 0.2) is None
+
+
+def test_ids_of_a_changed_mask_are_found_at_once():
+    mask = torch.tensor([True, False, True])
+    lookup = Lookup().plan(mask, mask)
+    lookup.ids = torch.tensor([7])
+    assert lookup.ids_of(mask).tolist() == [7]
+    mask[0] = False
+    assert lookup.ids_of(mask).tolist() == [2]

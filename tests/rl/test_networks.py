@@ -1,4 +1,4 @@
-"""Checks of mini-batches and image encoders before training."""
+"""Checks of mini-batches before training."""
 
 from __future__ import annotations
 
@@ -29,9 +29,3 @@ def test_more_mini_batches_than_data_are_refused(make_runner, networks, most):
 
 def test_a_runner_that_only_acts_takes_any_number_of_environments(make_runner):
     make_runner(num_envs=1, algorithm=algorithm(4), critic=RECURRENT)
-
-
-def test_an_image_encoder_of_a_network_without_images_is_refused(make_runner):
-    critic = asdict(RslRlModelCfg(hidden_dims=(8,), cnn_cfg={"output_channels": [4]}))
-    with pytest.raises(ValueError, match=r"agent.critic cnn_cfg.*CNNModel"):
-        make_runner(critic=critic)

@@ -86,21 +86,21 @@ def test_all_sensors_on_all_allowed_objects_agree_with_mujoco():
 def test_wrong_objects_are_refused(sensor):
     for kind in KINDS:
         if kind not in OBJECTS[sensor]:
-            with pytest.raises(ValueError, match=f"'x' obj: .*'{sensor}', got type '{kind}'"):
+            with pytest.raises(ValueError, match=f"'x' obj.type .*'{sensor}': .*got '{kind}'"):
                 BuiltinSensorCfg(name="x", sensor_type=sensor, obj=ref(kind))
     if OBJECTS[sensor]:
         with pytest.raises(ValueError, match="got None"):
             BuiltinSensorCfg(name="x", sensor_type=sensor)
     if sensor not in FRAME:
         obj = ref(OBJECTS[sensor][0]) if OBJECTS[sensor] else None
-        with pytest.raises(ValueError, match=f"'x' ref: .*'{sensor}', got type 'site'"):
+        with pytest.raises(ValueError, match=f"'x' ref.type .*'{sensor}': .*got 'site'"):
             BuiltinSensorCfg(name="x", sensor_type=sensor, obj=obj, ref=ref("site"))
 
 
 def test_unknown_kinds_and_reference_objects_are_refused():
     with pytest.raises(ValueError, match="sensor_type.*'accelerometer'.*'gyroo'"):
         BuiltinSensorCfg(name="x", sensor_type="gyroo", obj=ref("site"))
-    with pytest.raises(ValueError, match="'x' ref: .*body or.*'framepos'.*'joint'"):
+    with pytest.raises(ValueError, match="'x' ref.type .*'framepos'.*'body', .*'joint'"):
         BuiltinSensorCfg(name="x", sensor_type="framepos", obj=ref("site"), ref=ref("joint"))
 
 

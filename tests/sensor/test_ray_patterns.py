@@ -135,7 +135,6 @@ def test_an_intrinsic_matrix_gives_the_vertical_field_of_view():
         (GridPatternCfg(resolution=math.nan), "resolution.* nan"),
         (GridPatternCfg(size=(1.0, -1.0)), r"size.*\(1.0, -1.0\)"),
         (GridPatternCfg(direction=(0.0, 0.0, 0.0)), "not all 0"),
-        (RingPatternCfg((), include_center=False), "at least one ring"),
         (RingPatternCfg.single_ring(num_samples=0), "num_samples >= 1.* 0 "),
         (RingPatternCfg.single_ring(radius=-0.1), "radius >= 0.* -0.1"),
         (PinholeCameraPatternCfg(width=0), "pixels.* 0 x 12"),

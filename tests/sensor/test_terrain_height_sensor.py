@@ -209,7 +209,7 @@ def test_ground_is_found_around_a_point_and_not_among_all_of_it():
     expected = (inside & (local[..., 2] < 0)).any(dim=-1)
     assert 0.2 < expected.float().mean() < 0.8
     assert torch.equal(ground.is_above(points, torch.zeros(2000, dtype=torch.long)), expected)
-    assert ground._around(points).shape[1] <= 10
+    assert ground._grid.shape[1] <= 10
 
 
 def test_level_planes_cover_what_they_cover_as_any_other_ground():

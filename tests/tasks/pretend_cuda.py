@@ -21,7 +21,6 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 import mjlab
-from mjlab.envs import manager_based_rl_env
 from mjlab.sim import simulation
 from mjlab.sim.engine import Engine
 from mjlab.sim.simulation import SharedField
@@ -324,7 +323,6 @@ def install(monkeypatch: pytest.MonkeyPatch, mode: PretendCuda) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "Event", _Event)
-    monkeypatch.setattr(manager_based_rl_env, "resolve_engine_name", lambda *_: "native")
     monkeypatch.setattr(simulation, "resolve_engine_name", lambda *_: "native")
     create_engine, make = simulation.create_engine, SharedField.make
 

@@ -17,8 +17,8 @@ import pytest
 import torch
 
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from mjlab.envs.manager_based_rl_env import as_action
 from mjlab.managers import EventTermCfg
+from mjlab.managers.action_manager import as_action
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.tasks.tracking.mdp import MotionCommand, MotionCommandCfg

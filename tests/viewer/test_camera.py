@@ -54,16 +54,18 @@ def test_asset_root_and_body_are_found_by_entity_and_unprefixed_name() -> None:
 def test_the_entity_may_be_left_out_where_the_scene_has_exactly_one() -> None:
     assert resolve(origin_type=OriginType.ASSET_ROOT).body_id == CART
     two = {**ENV.scene.entities, "ball": SimpleNamespace()}
-    with pytest.raises(ValueError, match=r"entity_name.*ASSET_ROOT.*\['cartpole', 'ball'\]"):
+    with pytest.raises(
+        ValueError, match=r"entity_name.*ASSET_ROOT.*'cartpole', 'ball'\], got None"
+    ):
         resolve(two, origin_type=OriginType.ASSET_ROOT)
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"entity_name": "robot"}, r"entity_name 'robot'.*'cartpole'"),
-        ({"body_name": "leg"}, r"body_name 'leg'.*'cartpole'.*'pole'"),
-        ({}, r"body_name.*ASSET_BODY.*'cart', 'pole'"),
+        ({"entity_name": "robot"}, r"entity_name .*'cartpole'.*got 'robot'"),
+        ({"body_name": "leg"}, r"body_name .*'cartpole'.*'pole'.*got 'leg'"),
+        ({}, r"body_name.*ASSET_BODY.*'cart', 'pole'.*got None"),
     ],
 )
 def test_unknown_names_raise_with_the_available_names(fields, message) -> None:

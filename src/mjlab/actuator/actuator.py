@@ -15,6 +15,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mujoco
@@ -127,7 +128,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     """Converts commands for its targets to controls of MuJoCo actuators.
 
     Custom actuators: in `edit_spec`, add one element per target and append it to
-    `self._mjs_actuators`; in `compute`, return the controls, (N, number of controls). Keep run-time
+    `self._mjs_actuators`, in the order of controls; in `compute`, return the controls, (N, number of controls). Keep run-time
     state in tensor attributes, so that checkpoints contain it. If `compute` keeps state between
     calls, also override `compute_after_reset`.
     """
@@ -232,8 +233,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         Raises:
             RuntimeError: `edit_spec` added no elements.
         """
-        elements = self._ordered_elements()
-        if not elements:
+        if not self._mjs_actuators:
             raise WrongStateError(
                 f"{type(self).__name__} for {self._target_names} has no MuJoCo actuators; edit_spec "
                 "must append the elements it adds to self._mjs_actuators, and run before the model "
@@ -241,18 +241,15 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
             )
         # Unnamed actuators can only be identified by their position in the spec.
         own = [actuator.id for actuator in self.entity.spec.actuators]
-        element_ids = [actuator.id for actuator in elements]
+        element_ids = [actuator.id for actuator in self._mjs_actuators]
+        own_ids = [own.index(i) for i in element_ids]
         by_element = [control_columns(mj_model, (i,)) for i in element_ids]
-        columns = [
-            ctrl[k]
-            for k in range(max(map(len, by_element)))
-            for ctrl in by_element
-            if k < len(ctrl)
-        ]
-        self._target_ids = _int_tensor(self._target_ids_list, device)
-        self._global_element_ids = _int_tensor(element_ids, device)
-        self._global_ctrl_ids = _int_tensor(columns, device)
-        self._ctrl_ids = _int_tensor([own.index(i) for i in element_ids], device)
+        # All first controls, then all second controls, and so on.
+        columns = [c for row in zip_longest(*by_element) for c in row if c is not None]
+        self._target_ids = torch.tensor(self._target_ids_list, dtype=torch.int64, device=device)
+        self._global_element_ids = torch.tensor(element_ids, dtype=torch.int64, device=device)
+        self._global_ctrl_ids = torch.tensor(columns, dtype=torch.int64, device=device)
+        self._ctrl_ids = torch.tensor(own_ids, dtype=torch.int64, device=device)
         self._in_group, self._resets_delay, self._delay_buffer = False, True, None
         if self.has_delay:
             self._delay_buffer = self.make_delay_buffer(data.nworld, device)
@@ -278,10 +275,6 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         self._in_group = True
         self._resets_delay = resets_delay
         self._delay_buffer = delay_buffer
-
-    def _ordered_elements(self) -> list[mujoco.MjsActuator]:
-        """Return the elements in the column order of `compute`."""
-        return self._mjs_actuators
 
     # Control.
 
@@ -393,6 +386,10 @@ class DirectActuator(Actuator[ActuatorCfgT]):
     `command_fields`, and `_add_element` or `edit_spec`.
     """
 
+    # Function that adds an element, and the config fields that are its keyword arguments.
+    _create: ClassVar[Callable[..., mujoco.MjsActuator] | None] = None
+    _create_fields: ClassVar[tuple[str, ...]] = ()
+
     shares_delay: ClassVar[bool] = False
     """Share one lag per environment among actuators of this class with equal delay settings."""
 
@@ -409,9 +406,12 @@ class DirectActuator(Actuator[ActuatorCfgT]):
 
     def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
         """Add an element for one target to `spec` and return it."""
-        raise NotImplementedError(
-            f"{type(self).__name__} must define _add_element(spec, target_name), or edit_spec."
-        )
+        if self._create is None:
+            raise NotImplementedError(
+                f"{type(self).__name__} must define _add_element(spec, target_name), or edit_spec."
+            )
+        values = {name: getattr(self.cfg, name) for name in self._create_fields}
+        return self._create(spec, target_name, transmission_type=self.transmission_type, **values)
 
     @constant_within_step
     def compute(self, cmd: ActuatorCmd) -> torch.Tensor:
@@ -550,7 +550,3 @@ def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> Delay
     for k, actuator in enumerate(members):
         actuator.join_group(line, resets_delay=k == 0)
     return line
-
-
-def _int_tensor(values: list[int], device: str) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.int64, device=device)

@@ -54,21 +54,13 @@ class BuiltinPositionActuator(DirectActuator[BuiltinPositionActuatorCfg]):
     """MuJoCo position servo: force = clamp(kp (u - l) - kd l', -E, E), position target u."""
 
     shares_delay: ClassVar[bool] = True
+    _create = staticmethod(create_position_actuator)
+    _create_fields: ClassVar[tuple[str, ...]] = ("stiffness", "damping", "effort_limit")
 
     @property
     def command_fields(self) -> tuple[CommandField, ...]:
         """The position target."""
         return ("position",)
-
-    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
-        return create_position_actuator(
-            spec,
-            target_name,
-            stiffness=self.cfg.stiffness,
-            damping=self.cfg.damping,
-            effort_limit=self.cfg.effort_limit,
-            transmission_type=self.transmission_type,
-        )
 
 
 @dataclass(kw_only=True)
@@ -94,20 +86,13 @@ class BuiltinVelocityActuator(DirectActuator[BuiltinVelocityActuatorCfg]):
     """MuJoCo velocity servo: force = clamp(kd (u - l'), -E, E), velocity target u."""
 
     shares_delay: ClassVar[bool] = True
+    _create = staticmethod(create_velocity_actuator)
+    _create_fields: ClassVar[tuple[str, ...]] = ("damping", "effort_limit")
 
     @property
     def command_fields(self) -> tuple[CommandField, ...]:
         """The velocity target."""
         return ("velocity",)
-
-    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
-        return create_velocity_actuator(
-            spec,
-            target_name,
-            damping=self.cfg.damping,
-            effort_limit=self.cfg.effort_limit,
-            transmission_type=self.transmission_type,
-        )
 
 
 @dataclass(kw_only=True)
@@ -135,20 +120,13 @@ class BuiltinMotorActuator(DirectActuator[BuiltinMotorActuatorCfg]):
     """
 
     shares_delay: ClassVar[bool] = True
+    _create = staticmethod(create_motor_actuator)
+    _create_fields: ClassVar[tuple[str, ...]] = ("effort_limit", "gear")
 
     @property
     def command_fields(self) -> tuple[CommandField, ...]:
         """The effort target."""
         return ("effort",)
-
-    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
-        return create_motor_actuator(
-            spec,
-            target_name,
-            effort_limit=self.cfg.effort_limit,
-            gear=self.cfg.gear,
-            transmission_type=self.transmission_type,
-        )
 
 
 @dataclass(kw_only=True)
@@ -180,7 +158,7 @@ class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
     sum of all actuators on the target.
     """
 
-    # Same elements as in _mjs_actuators, where the order is that of adding.
+    # Same elements as in _mjs_actuators.
     _transient = {"_position_elements", "_velocity_elements"}
 
     def __init__(
@@ -232,11 +210,7 @@ class BuiltinPdActuator(DirectActuator[BuiltinPdActuatorCfg]):
                 actuator_name=f"{name}_pd_vel",
             )
             self._velocity_elements.append(element)
-        self._mjs_actuators += self._position_elements[-len(target_names) :]
-        self._mjs_actuators += self._velocity_elements[-len(target_names) :]
-
-    def _ordered_elements(self) -> list[mujoco.MjsActuator]:
-        return [*self._position_elements, *self._velocity_elements]
+        self._mjs_actuators = [*self._position_elements, *self._velocity_elements]
 
 
 @dataclass(kw_only=True)
@@ -281,31 +255,16 @@ class BuiltinMuscleActuator(DirectActuator[BuiltinMuscleActuatorCfg]):
     """MuJoCo muscle. The effort target is its excitation, in [0, 1]."""
 
     shares_delay: ClassVar[bool] = True
+    _create = staticmethod(create_muscle_actuator)
+    _create_fields: ClassVar[tuple[str, ...]] = (
+        *("length_range", "gear", "timeconst", "tausmooth", "range", "force", "scale"),
+        *("lmin", "lmax", "vmax", "fpmax", "fvmax"),
+    )
 
     @property
     def command_fields(self) -> tuple[CommandField, ...]:
         """The effort target, as excitation."""
         return ("effort",)
-
-    def _add_element(self, spec: mujoco.MjSpec, target_name: str) -> mujoco.MjsActuator:
-        cfg = self.cfg
-        return create_muscle_actuator(
-            spec,
-            target_name,
-            length_range=cfg.length_range,
-            gear=cfg.gear,
-            timeconst=cfg.timeconst,
-            tausmooth=cfg.tausmooth,
-            range=cfg.range,
-            force=cfg.force,
-            scale=cfg.scale,
-            lmin=cfg.lmin,
-            lmax=cfg.lmax,
-            vmax=cfg.vmax,
-            fpmax=cfg.fpmax,
-            fvmax=cfg.fvmax,
-            transmission_type=self.transmission_type,
-        )
 
 
 class DcMotorInputMode(IntEnum):

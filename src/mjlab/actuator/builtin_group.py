@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 from mjlab.actuator.actuator import (
     Actuator,
@@ -53,9 +53,20 @@ class BuiltinActuatorGroup:
         actuators: Sequence[Actuator],
     ) -> tuple[BuiltinActuatorGroup, tuple[Actuator, ...]]:
         """Return a group of the actuators without computation, and all other actuators in order."""
-        members = [actuator for actuator in actuators if _passes_commands(actuator)]
-        others = tuple(actuator for actuator in actuators if not _passes_commands(actuator))
-        return BuiltinActuatorGroup(_actuators=members), others
+        members, others = [], []
+        for actuator in actuators:
+            # Sites have no position or velocity targets; `compute` returns zeros for these.
+            if (
+                isinstance(actuator, DirectActuator)
+                and acts_like(actuator, DirectActuator)
+                and all(
+                    target_field(actuator.transmission_type, f) for f in actuator.command_fields
+                )
+            ):
+                members.append(actuator)
+            else:
+                others.append(actuator)
+        return BuiltinActuatorGroup(_actuators=members), tuple(others)
 
     def initialize(self, num_envs: int, device: str) -> None:
         """Plan the copies and create delay buffers. The actuators must be initialized."""
@@ -109,15 +120,6 @@ class _DelayedRoutes:
 
     routes: list[_Route]
     line: DelayBuffer
-
-
-def _passes_commands(actuator: Actuator) -> TypeGuard[DirectActuator]:
-    # Sites have no position or velocity targets; `compute` returns zeros for these.
-    return (
-        isinstance(actuator, DirectActuator)
-        and acts_like(actuator, DirectActuator)
-        and all(target_field(actuator.transmission_type, name) for name in actuator.command_fields)
-    )
 
 
 def _plan(actuators: Sequence[DirectActuator], device: str) -> list[_Route]:

@@ -89,7 +89,7 @@ class _FusedGroup:
         self.source = as_columns(sources.tolist(), device)
         self.ctrl = as_columns(ctrl_ids.tolist(), device)
         self.params = {
-            name: torch.cat([_parameter(actuator, name) for actuator in self.actuators], dim=1)
+            name: torch.cat([getattr(actuator, name) for actuator in self.actuators], dim=1)
             for name in self.actuators[0].param_names
         }
         widths = [len(actuator.target_ids) for actuator in self.actuators]
@@ -110,15 +110,3 @@ class _FusedGroup:
             cmd = ActuatorCmd(*delay_rows(self.line, targets, env_ids), cmd.pos, cmd.vel)
         ctrl = first.control_law(self.params, cmd)
         write_columns(data.data.ctrl, self.ctrl, ctrl, env_ids)
-
-
-def _parameter(actuator: IdealPdActuator, name: str) -> torch.Tensor:
-    """Return a parameter; raise `ValueError` unless it is a tensor, (N, n)."""
-    value, shape = getattr(actuator, name, None), actuator.stiffness.shape
-    if not isinstance(value, torch.Tensor) or value.shape != shape:
-        found = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
-        raise ValueError(
-            f"{type(actuator).__name__} for {actuator.target_names}: expected parameter {name!r} (of "
-            f"param_names) to be a tensor of shape {tuple(shape)} after initialize, got {found}."
-        )
-    return value

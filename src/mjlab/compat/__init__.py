@@ -8,15 +8,15 @@ Deprecation policy: each use warns once and names the replacement. Legacy names 
 are removed in 2.0.
 
 Implementations are imported on first access. Legacy names without a replacement are in
-`mjlab.compat.older`.
+`mjlab.compat.older` and `mjlab.compat.older_scripts`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib
 import inspect
+import pkgutil
 import warnings
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -163,9 +163,9 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.envs.mdp.events": _EVENTS,
     "mjlab.envs.mdp.dr": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
     "mjlab.envs.mdp.dr.actuator": {"sync_actuator_delays": _EVENTS["sync_actuator_delays"]},
-    "mjlab.scripts.csv_to_npz": {"run_sim": "mjlab.compat.older:run_sim"},
+    "mjlab.scripts.csv_to_npz": {"run_sim": "mjlab.compat.older_scripts:run_sim"},
     "mjlab.scripts.gcs": {
-        name: f"mjlab.compat.older:{name}"
+        name: f"mjlab.compat.older_scripts:{name}"
         for name in (
             "ensure_asset_downloaded",
             "ensure_default_checkpoint",
@@ -174,7 +174,7 @@ _NAMES: dict[str, dict[str, str]] = {
     },
     "mjlab.tasks.manipulation.mdp": {**_EVENTS, **_REWARD_WEIGHT},
     "mjlab.tasks.manipulation.mdp.curriculums": _REWARD_WEIGHT,
-    "mjlab.tasks.registry": {"_REGISTRY": "mjlab.compat.older:REGISTRY"},
+    "mjlab.tasks.registry": {"_REGISTRY": "mjlab.compat.older_scripts:REGISTRY"},
     "mjlab.tasks.tracking.mdp": _EVENTS,
     "mjlab.tasks.velocity.mdp": {**_EVENTS, **_REWARD_WEIGHT, **_FLAT_ORIENTATION},
     "mjlab.tasks.velocity.mdp.curriculums": _REWARD_WEIGHT,
@@ -224,16 +224,13 @@ _REQUIRED_BEFORE_1_6 = {"contype": 1, "conaffinity": 1, "condim": 3, "priority":
 _GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "scalar"}
 
 
-def _set_std(value: Any, fields: dict[str, Any], key: str) -> None:
+def _set_distribution(value: Any, fields: dict[str, Any], key: str) -> None:
+    present = fields.get("distribution_cfg")
+    if key == "stochastic":
+        fields["distribution_cfg"] = dict(present or _GAUSSIAN) if value else None
     # Models without `stochastic` were deterministic and ignored their noise settings.
-    if fields.get("distribution_cfg"):
-        fields["distribution_cfg"] = {**fields["distribution_cfg"], key: value}
-
-
-def _set_stochastic(value: Any, fields: dict[str, Any]) -> None:
-    fields["distribution_cfg"] = (
-        dict(fields.get("distribution_cfg") or _GAUSSIAN) if value else None
-    )
+    elif present:
+        fields["distribution_cfg"] = {**present, key: value}
 
 
 def _scale_deltas(value: Any, fields: dict[str, Any]) -> None:
@@ -247,14 +244,17 @@ _DROPPED_FIELDS: dict[str, dict[str, tuple[str, _Translation | None]]] = {
         "domain_randomization": ("nothing: fields are expanded as the function declares", None)
     },
     "RslRlModelCfg": {
-        "stochastic": ("distribution_cfg (None for a deterministic model)", _set_stochastic),
+        "stochastic": (
+            "distribution_cfg (None for a deterministic model)",
+            functools.partial(_set_distribution, key="stochastic"),
+        ),
         "init_noise_std": (
             "distribution_cfg={'init_std': ...}",
-            functools.partial(_set_std, key="init_std"),
+            functools.partial(_set_distribution, key="init_std"),
         ),
         "noise_std_type": (
             "distribution_cfg={'std_type': ...}",
-            functools.partial(_set_std, key="std_type"),
+            functools.partial(_set_distribution, key="std_type"),
         ),
     },
     "MujocoCfg": {
@@ -304,9 +304,9 @@ def older_names(module_name: str) -> Callable[[str], Any]:
     def __getattr__(name: str) -> Any:
         if name not in table:
             raise AttributeError(f"module {module_name!r} has no attribute {name!r}")
-        value = _load(table[name])
+        value = pkgutil.resolve_name(table[name])
         message = f"{module_name}.{name} is deprecated; use {table[name].replace(':', '.')}."
-        if table[name].startswith(f"{_OLDER}:"):
+        if table[name].startswith(_OLDER):
             message = f"{module_name}.{name} is deprecated and will be removed in mjlab 2.0."
         if inspect.isfunction(value):
             return _warning_when_called(value, module_name, name, message)
@@ -328,14 +328,17 @@ def older_exports(module_name: str) -> list[str]:
 def offers_older_static_methods(cls: C) -> C:
     """Class decorator: add legacy static methods."""
     for name, path in _STATIC_METHODS[cls.__name__].items():
-        setattr(cls, name, staticmethod(_calling(f"{cls.__name__}.{name}", path)))
+        message = f"{cls.__name__}.{name} is deprecated; use {path.replace(':', '.')}."
+        setattr(cls, name, staticmethod(_forwarding(message, path)))
     return cls
 
 
-def _calling(older_name: str, path: str) -> Callable[..., Any]:
+def _forwarding(message: str, path: str, *first: Any) -> Callable[..., Any]:
+    """Return a function that warns and calls the one at `path`, with `first` before its arguments."""
+
     def older(*args: Any, **kwargs: Any) -> Any:
-        _warn_once(f"{older_name} is deprecated; use {path.replace(':', '.')}.")
-        return _load(path)(*args, **kwargs)
+        _warn_once(message)
+        return pkgutil.resolve_name(path)(*first, *args, **kwargs)
 
     return older
 
@@ -367,7 +370,7 @@ class _OlderAttribute:
         if instance is None:
             return self
         _warn_once(self._message)
-        return _load(self._path)(instance)
+        return pkgutil.resolve_name(self._path)(instance)
 
 
 def offers_older_attributes(cls: C) -> C:
@@ -441,32 +444,22 @@ def accept_older_methods(base: type, subclass: type) -> None:
     """
     for name, (argument, caller) in _OLDER_METHODS[base.__name__].items():
         method = getattr(subclass, name)
+        if not inspect.isfunction(method):
+            continue
         position = list(inspect.signature(getattr(base, name)).parameters).index(argument)
-        if inspect.isfunction(method) and not _takes(method, argument, position):
-            setattr(subclass, name, _called_as_today(method, argument, caller))
-
-
-def _takes(method: Callable[..., Any], argument: str, position: int) -> bool:
-    """Return True if a method takes `argument` at `position`, by name or as a required argument."""
-    parameters = inspect.signature(method).parameters.values()
-    if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
-        return True
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    required = [p for p in positional if p.default is p.empty]
-    return len(required) > position or argument in [p.name for p in positional[position:][:1]]
-
-
-def _called_as_today(method: Any, argument: str, caller: str) -> Callable[..., Any]:
-    message = f"{method.__qualname__} without argument {argument} is deprecated; add {argument}."
-
-    @functools.wraps(method)
-    def older(*args: Any, **kwargs: Any) -> Any:
-        _warn_once(message)
-        return _load(caller)(method, *args, **kwargs)
-
-    # `inspect.signature` follows `__wrapped__`, but subclasses must see the adapter's signature.
-    del older.__wrapped__
-    return older
+        parameters = inspect.signature(method).parameters.values()
+        takes_any = any(p.kind is p.VAR_POSITIONAL for p in parameters)
+        ordered = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+        by_name = argument in [p.name for p in ordered[position:][:1]]
+        if takes_any or by_name or sum(p.default is p.empty for p in ordered) > position:
+            continue
+        message = (
+            f"{method.__qualname__} without argument {argument} is deprecated; add {argument}."
+        )
+        older = functools.update_wrapper(_forwarding(message, caller, method), method)
+        # `inspect.signature` follows `__wrapped__`, but subclasses must see the adapter's signature.
+        del older.__wrapped__
+        setattr(subclass, name, older)
 
 
 def accepts_older_params(term: T) -> T:
@@ -479,55 +472,46 @@ def accepts_older_params(term: T) -> T:
     sensor, path = _OLDER_PARAMS[name]
 
     def is_older(params: dict[str, Any]) -> bool:
-        older = not isinstance(params.get(sensor), str) and bool(
-            {"asset_cfg", sensor} & params.keys()
+        if isinstance(params.get(sensor), str) or not {"asset_cfg", sensor} & params.keys():
+            return False
+        _warn_once(
+            f"{name} without {sensor} is deprecated (site heights above z = 0, as in releases 1.1 and "
+            f"1.2); set {sensor}."
         )
-        if older:
-            _warn_once(
-                f"{name} without {sensor} is deprecated (site heights above z = 0, as in releases "
-                f"1.1 and 1.2); set {sensor}."
-            )
-        return older
+        return True
 
     if inspect.isclass(term):
         # The legacy term is a subclass, so Python calls its `__init__` after `__new__`. Copies call
         # `__new__` without arguments, on the class of the copied object.
         def __new__(today: type, cfg: Any = None, env: Any = None) -> Any:
             older = today is cls and cfg is not None and is_older(cfg.params)
-            return object.__new__(_load(path) if older else today)
+            return object.__new__(pkgutil.resolve_name(path) if older else today)
 
         cls.__new__ = __new__
         return term
-    either: Any = _either(cls, lambda: _load(path), is_older)
-    either.__signature__ = _with_either(inspect.signature(cls), sensor)
+    either: Any = _either(cls, path, is_older)
+    signature = inspect.signature(cls)
+    parameters = dict(signature.parameters)
+    parameters[sensor] = parameters[sensor].replace(default=None)
+    asset_cfg = inspect.Parameter("asset_cfg", inspect.Parameter.KEYWORD_ONLY, default=None)
+    parameters.setdefault("asset_cfg", asset_cfg)
+    either.__signature__ = signature.replace(parameters=list(parameters.values()))
     return either
 
 
-def _either(
-    today: Any, load_older: Callable[[], Any], is_older: Callable[[dict[str, Any]], bool]
-) -> Any:
+def _either(today: Any, path: str, is_older: Callable[[dict[str, Any]], bool]) -> Any:
     """Return a function that calls the current or legacy term, with their `check_when_built`."""
     signature = inspect.signature(today)
 
     @functools.wraps(today)
     def term(*args: Any, **kwargs: Any) -> Any:
         params = dict(zip(signature.parameters, args, strict=False)) | kwargs
-        return (load_older() if is_older(params) else today)(*args, **kwargs)
+        return (pkgutil.resolve_name(path) if is_older(params) else today)(*args, **kwargs)
 
     if hasattr(today, "check_when_built"):
-        term.check_when_built = _either(  # ty: ignore
-            today.check_when_built, lambda: load_older().check_when_built, is_older
-        )
+        older_check = f"{path}.check_when_built"
+        term.check_when_built = _either(today.check_when_built, older_check, is_older)  # ty: ignore
     return term
-
-
-def _with_either(signature: inspect.Signature, sensor: str) -> inspect.Signature:
-    """Return a signature that takes `sensor` or `asset_cfg`."""
-    parameters = dict(signature.parameters)
-    parameters[sensor] = parameters[sensor].replace(default=None)
-    keyword_only = inspect.Parameter.KEYWORD_ONLY
-    parameters.setdefault("asset_cfg", inspect.Parameter("asset_cfg", keyword_only, default=None))
-    return signature.replace(parameters=list(parameters.values()))
 
 
 def offers_older_sites(make_cfg: T) -> T:
@@ -537,16 +521,10 @@ def offers_older_sites(make_cfg: T) -> T:
     @functools.wraps(make)
     def template() -> Any:
         cfg = make()
-        _load("mjlab.compat.older_terms:offer_sites")(cfg)
+        pkgutil.resolve_name("mjlab.compat.older_terms:offer_sites")(cfg)
         return cfg
 
     return cast(T, template)
-
-
-def _load(path: str) -> Any:
-    """Import and return the object at "module:name"."""
-    home, _, name = path.partition(":")
-    return getattr(importlib.import_module(home), name)
 
 
 def set_array_field(field: Any, values: Any) -> None:

@@ -22,7 +22,7 @@ import torch
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp import rewards as feet_rewards
-from mjlab.tasks.velocity.mdp.observations import Source, site_columns
+from mjlab.tasks.velocity.mdp.observations import Source, check_same_feet, site_columns
 from mjlab.tasks.velocity.mdp.rewards import if_commanded
 from mjlab.utils.indexing import as_columns, as_ids
 from mjlab.utils.state import capture_state, restore_state
@@ -105,9 +105,8 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
     step counters and running means, is restored completely, because a reset takes no simulation time.
     Generators are not restored, so that later samples differ.
     """
-    if env_ids is not None:
-        env_ids = as_ids(env_ids, term.num_envs, term.device)
-    if env_ids is None or len(env_ids) == term.num_envs:
+    env_ids = as_ids(env_ids, term.num_envs, term.device)
+    if len(env_ids) == term.num_envs:
         yield
         return
     data = term._env.sim.data
@@ -210,20 +209,17 @@ class feet_swing_height(feet_rewards.feet_swing_height):
         cost = self.landing_cost(env, sensor_name, foot_height(env, asset_cfg), target_height)
         return if_commanded(cost, env, command_name, command_threshold)
 
-    def _check_feet(self, env: ManagerBasedRlEnv, contacts: Source, heights: Source) -> None:
+    def _check_heights(
+        self, env: ManagerBasedRlEnv, params: dict[str, Any], contacts: Source
+    ) -> None:
+        sites = site_columns(env, params["asset_cfg"])
         try:
-            super()._check_feet(env, contacts, heights)
+            check_same_feet(env, contacts, sites)
         except ValueError as error:
-            if len(contacts[1]) != len(heights[1]):
+            if len(contacts.columns) != len(sites.columns):
                 raise
             # Releases 1.1 and 1.2 accept any order.
             warnings.warn(str(error), UserWarning, stacklevel=2)
-
-    @staticmethod
-    def _height_columns(
-        env: ManagerBasedRlEnv, params: dict[str, Any]
-    ) -> tuple[str, list[tuple[str, int]]]:
-        return "the selection of sites", site_columns(env, params["asset_cfg"])
 
 
 def offer_sites(template: ManagerBasedRlEnvCfg) -> None:

@@ -5,8 +5,7 @@ Functions on specs and values; `Entity` calls them in the order of this file.
 
 from __future__ import annotations
 
-import math
-import re
+import itertools
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +18,8 @@ from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
 from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS, XmlActuatorCfg
 from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.mujoco import control_inputs, qpos_width
-from mjlab.utils.string import resolve_expr
+from mjlab.utils.spec import authored_position
+from mjlab.utils.string import compile_pattern, resolve_expr
 
 KEY_NAME = "init_state"
 BIT_FIELDS = ("disableflags", "enableflags", "disableactuator")
@@ -266,6 +266,12 @@ def _find_targets(
 ) -> tuple[list[int], list[str]]:
     """Return ids and names of a config's targets; warn if elements of other kinds match too."""
     patterns, kind = cfg.target_names_expr, cfg.transmission_type
+    compiled = [compile_pattern(pattern) for pattern in patterns]
+    elsewhere = {
+        other: [name for name in own if any(pattern.fullmatch(name) for pattern in compiled)]
+        for other, own in names.items()
+        if other != kind
+    }
     label = (
         f"{type(cfg).__name__}(target_names_expr={patterns!r}, transmission_type={kind.value!r})"
     )
@@ -274,7 +280,8 @@ def _find_targets(
     except ValueError as error:
         hints = [
             f"{other.value}s {also} (transmission_type=TransmissionType.{other.name})"
-            for other, also in _matches_elsewhere(cfg, names).items()
+            for other, also in elsewhere.items()
+            if also
         ]
         hint = f"\nThe patterns match: {'; '.join(hints)}." if hints else ""
         raise ValueError(f"{label}: {error}{hint}") from None
@@ -285,8 +292,8 @@ def _find_targets(
             f"{label} matches an unnamed {kind.value}; name it in the XML, so that an actuator can "
             "refer to it."
         )
-    for other, also in _matches_elsewhere(cfg, names).items():
-        if all(any(re.fullmatch(pattern, name) for name in also) for pattern in patterns):
+    for other, also in elsewhere.items():
+        if all(any(pattern.fullmatch(name) for name in also) for pattern in compiled):
             warnings.warn(
                 f"{label} acts on {kind.value}s, but its patterns also match the {other.value}s "
                 f"{also}. Make the patterns unambiguous, or set transmission_type.",
@@ -294,18 +301,6 @@ def _find_targets(
                 stacklevel=2,
             )
     return ids, found
-
-
-def _matches_elsewhere(
-    cfg: ActuatorCfg, names: dict[TransmissionType, tuple[str, ...]]
-) -> dict[TransmissionType, list[str]]:
-    """Return elements of other kinds matched by a config's patterns."""
-    found = {
-        kind: [name for name in own if any(re.fullmatch(p, name) for p in cfg.target_names_expr)]
-        for kind, own in names.items()
-        if kind != cfg.transmission_type
-    }
-    return {kind: own for kind, own in found.items() if own}
 
 
 def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, list[str]]]) -> None:
@@ -327,21 +322,20 @@ def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, lis
         label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
         # XmlActuator skips targets without an actuator.
         names = [name for name in targets if (kind, name) in in_xml or not wraps]
-        taken = {
-            n: f"one by {claimed[wraps, kind, n]}" for n in names if (wraps, kind, n) in claimed
-        }
-        beside = {
-            name: " and ".join(
-                f"the XML actuator {other or '(unnamed)'!r}" for other in in_xml[kind, name]
-            )
-            for name in names
-            if not wraps and (kind, name) in in_xml
-        }
-        taken |= {name: by for name, by in beside.items() if name in in_xml[kind, name]}
+        taken, beside = [], []
+        for name in names:
+            others = [] if wraps else in_xml.get((kind, name), [])
+            by_xml = " and ".join(f"the XML actuator {other or '(unnamed)'!r}" for other in others)
+            if name in others:
+                taken.append(f"{short_name(name)!r} has {by_xml}")
+            elif (wraps, kind, name) in claimed:
+                taken.append(f"{short_name(name)!r} has one by {claimed[wraps, kind, name]}")
+            elif others:
+                beside.append(f"{short_name(name)!r} has {by_xml}")
         message = f"{label} acts on {kind.value}s that already have an actuator: "
         if taken:
             raise ValueError(
-                f"{message}{_list_taken(taken)}. Narrow the patterns, remove the actuator from the XML, "
+                f"{message}{', '.join(taken)}. Narrow the patterns, remove the actuator from the XML, "
                 "or use only XmlActuatorCfg, which takes over the XML actuator."
             )
         # New actuators are named after their targets.
@@ -353,17 +347,12 @@ def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, lis
             )
         if beside:
             warnings.warn(
-                f"{message}{_list_taken(beside)}. Both are active and their forces add up; if this is "
+                f"{message}{', '.join(beside)}. Both are active and their forces add up; if this is "
                 "not intended, remove the actuator from the XML.",
                 UserWarning,
                 stacklevel=2,
             )
         claimed |= dict.fromkeys(((wraps, kind, name) for name in names), label)
-
-
-def _list_taken(taken: dict[str, str]) -> str:
-    """Return "'hip' has one by X, 'knee' has one by Y"."""
-    return ", ".join(f"{short_name(name)!r} has {by}" for name, by in taken.items())
 
 
 # Initial state.
@@ -420,34 +409,34 @@ def resolve_initial_state(
     free_joint: mujoco.MjsJoint | None,
     joints: tuple[mujoco.MjsJoint, ...],
     xml_key: XmlKey | None,
-    *,
-    pos: tuple[float, ...],
-    rot: tuple[float, ...],
-    lin_vel: tuple[float, ...],
-    ang_vel: tuple[float, ...],
-    joint_pos: dict[str, float] | None,
-    joint_vel: dict[str, float],
+    init: Any,
 ) -> InitialState:
-    """Resolve the fields of an `InitialStateCfg` for the joints and actuators of `spec`.
+    """Resolve `init`, an `EntityCfg.InitialStateCfg`, for the joints and actuators of `spec`.
 
     Raises:
         ValueError: a vector has the wrong length; `joint_pos` is None and the XML has no keyframe
             that fits.
     """
-    pose = (*_vector(pos, 3, "pos"), *_vector(rot, 4, "rot"))
-    velocity = (*_vector(lin_vel, 3, "lin_vel"), *_vector(ang_vel, 3, "ang_vel"))
+    for name, length in (("pos", 3), ("rot", 4), ("lin_vel", 3), ("ang_vel", 3)):
+        if len(getattr(init, name)) != length:
+            raise ValueError(
+                f"init_state.{name}: expected {length} values, got {tuple(getattr(init, name))}."
+            )
+    pose = tuple(map(float, (*init.pos, *init.rot)))
+    velocity = tuple(map(float, (*init.lin_vel, *init.ang_vel)))
     names = short_names(joints)
-    if joint_pos is None:
+    if init.joint_pos is None:
         positions = _joint_pos_of_key(xml_key, spec, joints)
     else:
-        positions = _floats(resolve_expr(joint_pos, names, 0.0))
+        xml_key = None
+        positions = tuple(map(float, resolve_expr(init.joint_pos, names, 0.0)))
     values = {joint: (value,) for joint, value in zip(joints, positions, strict=True)}
     return InitialState(
         root_state=pose if free_joint is None else (*pose, *velocity),
         joint_pos=positions,
-        joint_vel=_floats(resolve_expr(joint_vel, names, 0.0)),
+        joint_vel=tuple(map(float, resolve_expr(init.joint_vel, names, 0.0))),
         qpos={joint: values.get(joint, pose) for joint in spec.joints},
-        ctrl=_initial_ctrl(spec, joints, positions, xml_key if joint_pos is None else None),
+        ctrl=_initial_ctrl(spec, joints, positions, xml_key),
     )
 
 
@@ -460,8 +449,14 @@ def add_key(spec: mujoco.MjSpec, states: list[InitialState]) -> None:
     known_ctrl = {actuator: u for state in states for actuator, u in state.ctrl.items()}
     qpos: list[float] = []
     for joint in spec.joints:
-        values = known_joints.get(joint)
-        qpos.extend(_reference(joint) if values is None else values)
+        if joint in known_joints:
+            qpos += known_joints[joint]
+        elif joint.type == _FREE:
+            qpos += [*joint.parent.pos, *joint.parent.quat]
+        elif joint.type == _BALL:
+            qpos += [1.0, 0.0, 0.0, 0.0]
+        else:
+            qpos.append(authored_position(joint, joint.ref))
     ctrl = [
         value
         for actuator in spec.actuators
@@ -474,22 +469,16 @@ def _joint_pos_of_key(
     key: XmlKey | None, spec: mujoco.MjSpec, joints: tuple[mujoco.MjsJoint, ...]
 ) -> tuple[float, ...]:
     """Return the joint positions of the keyframe; raise `ValueError` if it does not fit."""
-    if key is None:
+    widths = [qpos_width(joint.type) for joint in spec.joints]
+    if key is None or len(key.qpos) != sum(widths):
+        found = "no keyframe" if key is None else f"keyframe {key.name!r} with {len(key.qpos)}"
         raise ValueError(
-            f"init_state.joint_pos: None requires a keyframe in the XML, but spec {spec.modelname!r} "
-            "has no keyframe; add one, or set joint_pos to a dict of joint name pattern to position."
+            f"init_state.joint_pos None: expected a keyframe with {sum(widths)} values in qpos, but "
+            f"spec {spec.modelname!r} has {found}; add one, or set joint_pos to a dict of joint name "
+            "pattern to position."
         )
-    expected = sum(qpos_width(joint.type) for joint in spec.joints)
-    if len(key.qpos) != expected:
-        raise ValueError(
-            f"init_state.joint_pos is None: expected keyframe {key.name!r} to have {expected} values "
-            f"in qpos for spec {spec.modelname!r}, got {len(key.qpos)}."
-        )
-    start, values = 0, {}
-    for joint in spec.joints:
-        values[joint] = key.qpos[start]
-        start += qpos_width(joint.type)
-    return _floats(values[joint] for joint in joints)
+    starts = dict(zip(spec.joints, itertools.accumulate(widths, initial=0), strict=False))
+    return tuple(float(key.qpos[starts[joint]]) for joint in joints)
 
 
 def _initial_ctrl(
@@ -515,25 +504,3 @@ def _initial_ctrl(
             ctrl[actuator] = tuple(held if kind == "position" else 0.0 for kind in inputs)
         start = stop
     return ctrl
-
-
-def _reference(joint: mujoco.MjsJoint) -> list[float]:
-    """Return the compiled `qpos0` of a joint."""
-    if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-        return [*joint.parent.pos, *joint.parent.quat]
-    if joint.type == mujoco.mjtJoint.mjJNT_BALL:
-        return [1.0, 0.0, 0.0, 0.0]
-    in_degrees = joint.type == mujoco.mjtJoint.mjJNT_HINGE and joint.compiler.degree
-    return [math.radians(joint.ref) if in_degrees else float(joint.ref)]
-
-
-def _vector(values: tuple[float, ...], length: int, name: str) -> tuple[float, ...]:
-    if len(values) != length:
-        raise ValueError(
-            f"init_state.{name}: expected {length} values, got {len(values)}: {tuple(values)}."
-        )
-    return _floats(values)
-
-
-def _floats(values: Iterable[float]) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)

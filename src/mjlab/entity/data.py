@@ -245,7 +245,7 @@ class EntityData:
     @property
     def body_link_lin_vel_w(self) -> torch.Tensor:
         """(N, nb, 3) linear velocities of the links' origins."""
-        return self._body_linear("xpos")
+        return self._linear_at(self.body_link_pos_w, self._body_trees, self._bodies)
 
     @property
     def body_link_ang_vel_w(self) -> torch.Tensor:
@@ -275,7 +275,7 @@ class EntityData:
     @property
     def body_com_lin_vel_w(self) -> torch.Tensor:
         """(N, nb, 3) linear velocities of the bodies' centers of mass."""
-        return self._body_linear("xipos")
+        return self._linear_at(self.body_com_pos_w, self._body_trees, self._bodies)
 
     @property
     def body_com_ang_vel_w(self) -> torch.Tensor:
@@ -304,12 +304,9 @@ class EntityData:
         """Return angular velocities of links `bodies`, (N, n, 3)."""
         return self.data.cvel.index_select(1, self._bodies.tensor[bodies])[..., :3]
 
-    def _body_linear(self, position: str) -> torch.Tensor:
-        return _linear_velocity(
-            self._columns(position, self._bodies),
-            self._tree_com(self._body_trees),
-            self._columns("cvel", self._bodies),
-        )
+    def _linear_at(self, pos: torch.Tensor, trees: Addresses, bodies: Addresses) -> torch.Tensor:
+        """Return the linear velocities of points `pos`, (N, n, 3), of `bodies` in `trees`."""
+        return _linear_velocity(pos, self._tree_com(trees), self._columns("cvel", bodies))
 
     @property
     def body_external_wrench(self) -> torch.Tensor:
@@ -346,11 +343,7 @@ class EntityData:
     @property
     def geom_lin_vel_w(self) -> torch.Tensor:
         """(N, number of geoms, 3) linear velocities of the geoms' centers."""
-        return _linear_velocity(
-            self.geom_pos_w,
-            self._tree_com(self._geom_trees),
-            self._columns("cvel", self._geom_bodies),
-        )
+        return self._linear_at(self.geom_pos_w, self._geom_trees, self._geom_bodies)
 
     @property
     def geom_ang_vel_w(self) -> torch.Tensor:
@@ -380,11 +373,7 @@ class EntityData:
     @property
     def site_lin_vel_w(self) -> torch.Tensor:
         """(N, number of sites, 3) linear velocities of the sites."""
-        return _linear_velocity(
-            self.site_pos_w,
-            self._tree_com(self._site_trees),
-            self._columns("cvel", self._site_bodies),
-        )
+        return self._linear_at(self.site_pos_w, self._site_trees, self._site_bodies)
 
     @property
     def site_ang_vel_w(self) -> torch.Tensor:
@@ -478,12 +467,8 @@ class EntityData:
             self.tendon_effort_target,
             self.site_effort_target,
         ):
-            if target.shape[1] == 0:
-                continue
-            if env_ids is None:
-                target.zero_()
-            else:
-                target[env_ids] = 0.0
+            if target.shape[1] > 0:
+                target[as_index(env_ids)] = 0.0
 
     # Writers.
 

@@ -151,18 +151,8 @@ class Entity:
             lambda actuator, ids, names: actuator.build(self, ids, names),
             cfg.sort_actuators,
         )
-        init = cfg.init_state
         self.initial_state = resolve_initial_state(
-            self._spec,
-            self._free_joint,
-            self._joints,
-            xml_key,
-            pos=init.pos,
-            rot=init.rot,
-            lin_vel=init.lin_vel,
-            ang_vel=init.ang_vel,
-            joint_pos=init.joint_pos,
-            joint_vel=init.joint_vel,
+            self._spec, self._free_joint, self._joints, xml_key, cfg.init_state
         )
         """Configured initial state, resolved for this entity's joints and actuators."""
         if self._free_joint is None:
@@ -747,7 +737,13 @@ def _make_data(
     limits, limited = model.jnt_range[:, ids].clone().float(), model.jnt_limited[..., ids].bool()
     limits[..., 0].masked_fill_(~limited, -torch.inf)
     limits[..., 1].masked_fill_(~limited, torch.inf)
+    middle, half = limits.mean(dim=-1), 0.5 * factor * (limits[..., 1] - limits[..., 0])
+    shrunk = torch.stack((middle - half, middle + half), dim=-1)
     num_tendons = len(indexing.tendons) if entity.has_tendon_actuators else 0
+    targets: dict[str, Any] = {
+        **{f"joint_{kind}_target": zeros(num_joints) for kind in ("pos", "vel", "effort")},
+        **{f"tendon_{kind}_target": zeros(num_tendons) for kind in ("len", "vel", "effort")},
+    }
     return EntityData(
         indexing=indexing,
         data=data,
@@ -758,26 +754,13 @@ def _make_data(
         default_joint_vel=row(entity.initial_state.joint_vel),
         default_joint_pos_limits=limits,
         joint_pos_limits=limits.clone(),
-        soft_joint_pos_limits=_shrunk(limits, factor),
+        soft_joint_pos_limits=torch.where(torch.isinf(limits), limits, shrunk),
         gravity_vec_w=row((0.0, 0.0, -1.0)),
         forward_vec_b=row((1.0, 0.0, 0.0)),
         is_fixed_base=entity.is_fixed_base,
         is_articulated=entity.is_articulated,
         is_actuated=entity.is_actuated,
-        joint_pos_target=zeros(num_joints),
-        joint_vel_target=zeros(num_joints),
-        joint_effort_target=zeros(num_joints),
-        tendon_len_target=zeros(num_tendons),
-        tendon_vel_target=zeros(num_tendons),
-        tendon_effort_target=zeros(num_tendons),
+        **targets,
         site_effort_target=zeros(len(indexing.sites) if entity.has_site_actuators else 0),
         encoder_bias=zeros(num_joints),
     )
-
-
-def _shrunk(limits: torch.Tensor, factor: float) -> torch.Tensor:
-    """Return limits scaled by `factor` about their center. Infinite limits are unchanged."""
-    middle = limits.mean(dim=-1)
-    half = 0.5 * factor * (limits[..., 1] - limits[..., 0])
-    shrunk = torch.stack((middle - half, middle + half), dim=-1)
-    return torch.where(torch.isinf(limits), limits, shrunk)

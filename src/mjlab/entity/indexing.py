@@ -12,6 +12,7 @@ import torch
 
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.mujoco import (
+    OBJECT_TYPES,
     control_columns,
     dof_width,
     force_columns,
@@ -24,26 +25,19 @@ Ids: TypeAlias = torch.Tensor | slice | Sequence[int] | None
 
 IdsT = TypeVar("IdsT", bound="Ids | int")
 
-_OBJECT_TYPES = {
-    "bodies": mujoco.mjtObj.mjOBJ_BODY,
-    "joints": mujoco.mjtObj.mjOBJ_JOINT,
-    "geoms": mujoco.mjtObj.mjOBJ_GEOM,
-    "sites": mujoco.mjtObj.mjOBJ_SITE,
-    "tendons": mujoco.mjtObj.mjOBJ_TENDON,
-    "cameras": mujoco.mjtObj.mjOBJ_CAMERA,
-    "lights": mujoco.mjtObj.mjOBJ_LIGHT,
-    "meshes": mujoco.mjtObj.mjOBJ_MESH,
-    "materials": mujoco.mjtObj.mjOBJ_MATERIAL,
-    "textures": mujoco.mjtObj.mjOBJ_TEXTURE,
-    "pairs": mujoco.mjtObj.mjOBJ_PAIR,
-    "actuators": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "equalities": mujoco.mjtObj.mjOBJ_EQUALITY,
-    "sensors": mujoco.mjtObj.mjOBJ_SENSOR,
+# Fields of `EntityIndexing` with elements, and with their ids.
+_ID_FIELDS = {
+    "bodies": "body_ids",
+    "joints": "joint_ids",
+    "geoms": "geom_ids",
+    "sites": "site_ids",
+    "tendons": "tendon_ids",
+    "cameras": "cam_ids",
+    "lights": "light_ids",
+    "materials": "mat_ids",
+    "textures": "tex_ids",
+    "pairs": "pair_ids",
 }
-# Element fields of `EntityIndexing` other than bodies and joints.
-_FURTHER_KINDS = (
-    "geoms", "sites", "tendons", "cameras", "lights", "materials", "textures", "pairs", "actuators",
-)  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -170,14 +164,12 @@ def build_indexing(
     def tensor(values: Iterable[int]) -> torch.Tensor:
         return torch.tensor([int(v) for v in values], dtype=torch.int32, device=device)
 
-    elements: dict[str, tuple[Any, ...]] = {
-        "bodies": tuple(spec.bodies[1:]),
-        "joints": tuple(joint for joint in spec.joints if joint is not free_joint),
-        **{kind: tuple(getattr(spec, kind)) for kind in _FURTHER_KINDS},
-    }
-    actuators = elements.pop("actuators")
-    ids = {kind: element_ids(model, kind, found) for kind, found in elements.items()}
-    actuator_ids = element_ids(model, "actuators", actuators) if is_actuated else []
+    elements: dict[str, Any] = {kind: tuple(getattr(spec, kind)) for kind in _ID_FIELDS}
+    elements["bodies"] = elements["bodies"][1:]
+    elements["joints"] = tuple(joint for joint in spec.joints if joint is not free_joint)
+    elements["actuators"] = tuple(spec.actuators) if is_actuated else None
+    ids = {kind: element_ids(model, kind, found or ()) for kind, found in elements.items()}
+    actuator_ids = ids["actuators"]
     joints = [(int(model.jnt_type[i]), i) for i in ids["joints"]]
     dofs = [model.jnt_dofadr[i] + k for kind, i in joints for k in range(dof_width(kind))]
     moved = moving_dofs(model)[ids["bodies"]][:, dofs].T
@@ -188,20 +180,10 @@ def build_indexing(
     mocap_id = int(model.body_mocapid[root])
     return EntityIndexing(
         **elements,
-        actuators=actuators if is_actuated else None,
-        body_ids=tensor(ids["bodies"]),
-        geom_ids=tensor(ids["geoms"]),
-        site_ids=tensor(ids["sites"]),
-        tendon_ids=tensor(ids["tendons"]),
-        cam_ids=tensor(ids["cameras"]),
-        light_ids=tensor(ids["lights"]),
-        mat_ids=tensor(ids["materials"]),
-        tex_ids=tensor(ids["textures"]),
-        pair_ids=tensor(ids["pairs"]),
+        **{field: tensor(ids[kind]) for kind, field in _ID_FIELDS.items()},
         actuator_ids=tensor(actuator_ids),
         ctrl_ids=tensor(control_columns(model, actuator_ids)),
         force_ids=tensor(force_columns(model, actuator_ids)),
-        joint_ids=tensor(ids["joints"]),
         mocap_id=mocap_id if mocap_id >= 0 else None,
         joint_q_adr=tensor(
             model.jnt_qposadr[i] + k for kind, i in joints for k in range(qpos_width(kind))
@@ -227,22 +209,16 @@ def element_ids(model: mujoco.MjModel, kind: str, elements: Iterable[Any]) -> li
     Raises:
         ValueError: an element is not in the model, or is unnamed in a spec that was not compiled.
     """
-    object_type = _OBJECT_TYPES[kind]
+    object_type = OBJECT_TYPES[kind]
     name = object_type.name.removeprefix("mjOBJ_").lower()
     ids = []
     for element in elements:
-        found = element.id
-        if element.name:
-            found = mujoco.mj_name2id(model, object_type, element.name)
-            if found < 0:
-                raise ValueError(
-                    f"The compiled model has no {name} {element.name!r}; initialize an entity with the "
-                    "model compiled from the entity's spec."
-                )
-        elif found < 0:
+        # Unnamed elements are known by their number, which only compiling the spec itself gives.
+        found = mujoco.mj_name2id(model, object_type, element.name) if element.name else element.id
+        if found < 0:
             raise ValueError(
-                f"Unnamed {name} not found in the model, because its spec changed after it was "
-                "compiled; compile that spec, not a copy of it."
+                f"The compiled model has no {name} {element.name or '(unnamed)'!r}; initialize an entity "
+                "with the model compiled from its current spec, not from a copy."
             )
         ids.append(found)
     return ids

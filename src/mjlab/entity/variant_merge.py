@@ -8,12 +8,13 @@ the slot, so geoms share a slot only if they agree in these.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 from pathlib import PurePosixPath
 from typing import Any, Literal
 
 import mujoco
+import numpy as np
 
 from mjlab.utils.mujoco import control_inputs
 from mjlab.utils.spec import (
@@ -108,7 +109,12 @@ def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None
         own = _structure(spec)
         for kind, expected in first.items():
             if own[kind] != expected:
-                raise ValueError(_difference(kind, names[0], expected, name, own[kind]))
+                raise ValueError(
+                    f"Variants {names[0]!r} and {name!r}: expected the same {kind}, by name and order, "
+                    f"got a difference: {name!r} has {_differing(own[kind], expected)}, {names[0]!r} has "
+                    f"{_differing(expected, own[kind])}. Variants may differ only in geoms and model "
+                    f"parameters; make {name!r} a separate entity if the difference is intended."
+                )
 
 
 def _check_variant(name: str, spec: mujoco.MjSpec) -> None:
@@ -154,19 +160,21 @@ def _structure(spec: mujoco.MjSpec) -> dict[str, list[Any]]:
         "bodies": [path for path, _ in bodies],
         "joints": of_bodies(lambda b: [(j.name, j.type.name) for j in b.joints]),
         "kinds of inertial": of_bodies(_inertial_kind),
-        "sites": of_bodies(lambda b: [site.name for site in b.sites]),
-        "cameras": of_bodies(lambda b: [camera.name for camera in b.cameras]),
-        "lights": of_bodies(lambda b: [light.name for light in b.lights]),
+        **{
+            kind: of_bodies(lambda b, kind=kind: [element.name for element in getattr(b, kind)])
+            for kind in ("sites", "cameras", "lights")
+        },
         "actuators": [
             (a.name, a.trntype.name, a.target, len(control_inputs(a))) for a in spec.actuators
         ],
         "sensors": [(s.name, s.type.name, s.objname) for s in spec.sensors],
-        "tendons": [tendon.name for tendon in spec.tendons],
         "equalities": [(e.name, e.type.name, e.name1, e.name2) for e in spec.equalities],
         "contact pairs": [(p.name, p.geomname1, p.geomname2) for p in spec.pairs],
         "contact exclusions": [(e.bodyname1, e.bodyname2) for e in spec.excludes],
-        "flexes": [flex.name for flex in spec.flexes],
-        "skins": [skin.name for skin in spec.skins],
+        **{
+            kind: [element.name for element in getattr(spec, kind)]
+            for kind in ("tendons", "flexes", "skins")
+        },
     }
 
 
@@ -177,22 +185,11 @@ def _inertial_kind(body: mujoco.MjsBody) -> str:
     return "fullinertia" if is_full else "diaginertia"
 
 
-def _difference(kind: str, first: str, expected: list[Any], name: str, found: list[Any]) -> str:
-    """Return a message that names the first entries that differ."""
-    missing = [entry for entry in expected if entry not in found]
-    extra = [entry for entry in found if entry not in expected]
-    if missing or extra:
-        detail = f"{name!r} has {_shown(extra)}, {first!r} has {_shown(missing)}"
-    else:
-        detail = f"order in {name!r}: {_shown(found)}; in {first!r}: {_shown(expected)}"
-    return (
-        f"Variants {first!r} and {name!r}: expected the same {kind}, by name and order, got a "
-        f"difference: {detail}. Variants may differ only in geoms and model parameters; make "
-        f"{name!r} a separate entity if the difference is intended."
-    )
-
-
-def _shown(entries: list[Any], most: int = 4) -> str:
+def _differing(own: list[Any], others: list[Any], most: int = 4) -> str:
+    """Return the first entries of `own` that are not in `others`; all if only the order differs."""
+    entries = [entry for entry in own if entry not in others]
+    if not entries and all(entry in own for entry in others):
+        entries = own
     texts = [
         f"{entry[0]}: {entry[1]}"
         if isinstance(entry, tuple) and len(entry) == 2 and isinstance(entry[1], list | str)
@@ -252,23 +249,18 @@ class VariantGeomSpec:
     @classmethod
     def of(cls, geom: mujoco.MjsGeom) -> VariantGeomSpec:
         """Return the attributes of a spec geom."""
+        names = [
+            f.name for f in fields(cls) if f.name not in ("mesh_name", "geom_name", "material")
+        ]
+        values: dict[str, Any] = {}
+        for name in names:
+            value = np.asarray(getattr(geom, name)).tolist()
+            values[name] = tuple(value) if isinstance(value, list) else value
         return cls(
             mesh_name=geom.meshname,
             geom_name=geom.name or None,
-            contype=int(geom.contype),
-            conaffinity=int(geom.conaffinity),
-            condim=int(geom.condim),
-            group=int(geom.group),
-            priority=int(geom.priority),
             material=geom.material or None,
-            rgba=_floats(geom.rgba),
-            friction=_floats(geom.friction),
-            margin=float(geom.margin),
-            gap=float(geom.gap),
-            solref=_floats(geom.solref),
-            solimp=_floats(geom.solimp),
-            mass=float(geom.mass),
-            density=float(geom.density),
+            **values,
         )
 
 
@@ -542,7 +534,3 @@ def _make_hulls(
         compile_composed(merged)
     for user in users:
         merged.delete(user)
-
-
-def _floats(values: Iterable[float]) -> Any:
-    return tuple(float(value) for value in values)

@@ -35,15 +35,14 @@ from mjlab.entity.variant_merge import (
 from mjlab.entity.variant_merge import SlotKey as SlotKey
 from mjlab.entity.variant_merge import VariantSlot as VariantSlot
 from mjlab.entity.variant_merge import validate_variant_specs as validate_variant_specs
+from mjlab.sim.engine import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
+from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
 from mjlab.sim.randomization import (
-    CONSTANTS_AT_QPOS0,
-    FIXED_CONSTANTS,
     VariantColumns,
     VariantInfo,
     VariantValues,
     put_variant_model,
 )
-from mjlab.sim.randomization import VARIANT_DEPENDENT_FIELDS as VARIANT_DEPENDENT_FIELDS
 from mjlab.utils.errors import check_exists
 from mjlab.utils.mujoco import control_columns, dof_width, force_columns, qpos_width
 from mjlab.utils.spec import compile_composed, compile_spec
@@ -82,9 +81,6 @@ class VariantEntityCfg(EntityCfg):
     environments to the variant index of each environment."""
 
     def __post_init__(self) -> None:
-        self._check()
-
-    def _check(self) -> None:
         if self.spec_fn is not _variant_spec_fn_unset:
             raise ValueError(
                 "VariantEntityCfg.spec_fn: expected it to be unset, because specs come from "
@@ -161,7 +157,8 @@ class VariantEntity(Entity):
 
     def __init__(self, cfg: VariantEntityCfg) -> None:
         """Build and merge all variants. Raises as `VariantEntityCfg.build`."""
-        cfg._check()
+        # The config may have changed since construction.
+        cfg.__post_init__()
         names = tuple(cfg.variants)
         if not names:
             raise ValueError(
@@ -173,24 +170,22 @@ class VariantEntity(Entity):
             for name, make in cfg.variants.items()
         ]
         validate_variant_specs(list(names), sources)
-        self._first = sources[0]
-        settings = {f.name: getattr(cfg, f.name) for f in fields(EntityCfg)}
+        settings: dict[str, Any] = {f.name: getattr(cfg, f.name) for f in fields(EntityCfg)}
         specs = []
         for name, spec in zip(names, sources, strict=True):
             try:
-                if spec is self._first:
-                    super().__init__(cfg)
+                settings["spec_fn"] = lambda spec=spec: spec
+                single = EntityCfg(**settings)
+                if spec is sources[0]:
+                    super().__init__(single)
                     specs.append(self._spec)
                 else:
-                    settings["spec_fn"] = lambda spec=spec: spec
-                    specs.append(EntityCfg(**settings).build().spec)
+                    specs.append(single.build().spec)
             except ValueError as error:
                 raise ValueError(f"Variant {name!r}: {error}") from error
+        self.cfg = cfg
         weights = resolve_assignment(names, cfg.assignment)
         self._metadata = _merge(list(names), specs, weights)
-
-    def _make_spec(self) -> mujoco.MjSpec:
-        return self._first
 
     @property
     def variant_metadata(self) -> VariantMetadata:

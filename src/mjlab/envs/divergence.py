@@ -39,22 +39,11 @@ class DivergenceLog:
         """Log the first environment of the mask `diverged`, (N,), if any. Called before resets."""
         if self.is_done:
             return
-        ids = self._found.take(diverged)
-        if ids is None:
-            ids = diverged.nonzero().flatten()
+        ids = self._found.ids_of(diverged)
         if len(ids) == 0:
             return
         self.is_done = True
         env = int(ids[0])
-        joint, cure = self._find_joint(env)
-        logger.warning(
-            "The physics of environment %d diverged in step %d: %s. The episode ended with zero reward "
-            "for that step. Later divergences are counted as Simulation/nan_resets. %s",
-            env, step, joint, cure,
-        )  # fmt: skip
-
-    def _find_joint(self, env: int) -> tuple[str, str]:
-        """Return a description of the joint's fault, and the cure."""
         model = self._sim.mj_model
         velocity = self._sim.data.qvel[env]
         if not bool(torch.isfinite(velocity).any()):
@@ -63,13 +52,19 @@ class DivergenceLog:
         speeds = velocity.abs().tolist()
         dof, motion = fastest_dof(model, speeds)
         if motion > 1.0:
-            return describe_dof(model, dof, speeds[dof]), cure_of(model, dof)
+            joint, cure = describe_dof(model, dof, speeds[dof]), cure_of(model, dof)
         # The divergence began within the step, or a term or event wrote the bad state.
-        found = self._sim.bad_dof(env)
-        if found is not None:
+        elif (found := self._sim.bad_dof(env)) is not None:
             name = model.joint(int(model.dof_jntid[found])).name
-            return f"MuJoCo found the state of joint {name!r} bad", cure_of(model, found)
-        return "its state is not finite", (
-            f"Use a smaller sim.mujoco.timestep (now {float(model.opt.timestep):g} s) unless a term or "
-            "an event wrote this state."
-        )
+            joint, cure = f"MuJoCo found the state of joint {name!r} bad", cure_of(model, found)
+        else:
+            joint = "its state is not finite"
+            cure = (
+                f"Use a smaller sim.mujoco.timestep (now {float(model.opt.timestep):g} s) unless a "
+                "term or an event wrote this state."
+            )
+        logger.warning(
+            "The physics of environment %d diverged in step %d: %s. The episode ended with zero reward "
+            "for that step. Later divergences are counted as Simulation/nan_resets. %s",
+            env, step, joint, cure,
+        )  # fmt: skip

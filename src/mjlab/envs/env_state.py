@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -30,7 +31,8 @@ def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
     """Return counters, buffers, physics, scene and managers of `env`."""
     return {
         "num_envs": env.num_envs,
-        "terms": _terms(env),
+        # Copies of lists of names, or of dicts of such lists.
+        "terms": {name: copy.copy(getattr(env, name).active_terms) for name in _managers(env)},
         "terrain": _terrain_fingerprint(env),
         "counters": {name: getattr(env, name) for name in _COUNTERS},
         "buffers": {name: getattr(env, name).clone() for name in _BUFFERS},
@@ -108,18 +110,6 @@ def _terrain_fingerprint(env: ManagerBasedRlEnv) -> torch.Tensor | None:
     weights = [torch.linspace(1.0, 2.0, len(part), dtype=torch.float64) for part in flat]
     sums = [part @ weight for part, weight in zip(flat, weights, strict=True)]
     return torch.stack([*sums, *(torch.tensor(float(len(part))) for part in flat)])
-
-
-def _terms(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return the names of the terms of each manager, in order."""
-    terms = {}
-    for name in _managers(env):
-        active = getattr(env, name).active_terms
-        if isinstance(active, dict):
-            terms[name] = {str(key): list(names) for key, names in active.items()}
-        else:
-            terms[name] = list(active)
-    return terms
 
 
 def _managers(env: ManagerBasedRlEnv) -> list[str]:

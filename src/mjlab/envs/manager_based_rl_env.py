@@ -10,13 +10,11 @@ from dataclasses import dataclass, field
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
 from mjlab.envs import env_state
 from mjlab.envs.divergence import DivergenceLog
 from mjlab.envs.mdp.events import reset_scene_to_default
-from mjlab.envs.mdp.terminations import time_out
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
     ActionManager,
@@ -27,6 +25,7 @@ from mjlab.managers import (
     CurriculumTermCfg,
     EventManager,
     EventTermCfg,
+    Lookup,
     MetricsManager,
     MetricsTermCfg,
     NullCommandManager,
@@ -39,26 +38,22 @@ from mjlab.managers import (
     RecorderTermCfg,
     RewardManager,
     RewardTermCfg,
+    SensorSwitches,
     TerminationManager,
     TerminationTermCfg,
+    look_up,
 )
-from mjlab.managers.lookup import Lookup, look_up
-from mjlab.managers.manager_base import SensorSwitches
-from mjlab.managers.term_checks import check_real
 from mjlab.scene import Scene, SceneCfg
-from mjlab.sim.config import SimulationCfg
-from mjlab.sim.engine import resolve_engine_name
-from mjlab.sim.memory import LEAST_BYTES, check_memory
-from mjlab.sim.simulation import Simulation
-from mjlab.utils import spaces
+from mjlab.sim import Simulation, SimulationCfg
 from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
 from mjlab.viewer.viewer_config import ViewerConfig
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from mjlab.viewer.debug_visualizer import DebugVisualizer
-    from mjlab.viewer.offscreen_renderer import OffscreenRenderer
 
 
 @dataclass(kw_only=True)
@@ -143,8 +138,8 @@ class ManagerBasedRlEnv:
         """
         check_env_cfg(cfg)
         check_device(device)
-        # Checked before tensors are created on a device that the engine does not support.
-        resolve_engine_name(cfg.sim.engine, device)
+        # Checked before the scene creates tensors on a device that the engine does not support.
+        Simulation.check(cfg.scene.num_envs, cfg.sim, device)
         self.cfg = cfg
         cfg.seed = self.seed(-1 if cfg.seed is None else cfg.seed)
         self.render_mode = render_mode
@@ -152,8 +147,6 @@ class ManagerBasedRlEnv:
         self.extras: dict[str, Any] = {}
         self.obs_buf: VecEnvObs = {}
         self._device = device
-        # The scene allocates origins before the model sizes are known.
-        check_memory(cfg.scene.num_envs, LEAST_BYTES, device)
         self.scene = Scene(cfg.scene, device=device)
         self.scene.report_overruled_options(cfg.sim.mujoco)
         self.sim = Simulation(
@@ -182,10 +175,18 @@ class ManagerBasedRlEnv:
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
         self._ended, self._observed = Lookup(), Lookup()
         self._looks_ahead = torch.device(device).type == "cuda"
-        self._renderer: OffscreenRenderer | None = None
+        self._renderer = None
         self._renderer_is_open = False
         if render_mode == "rgb_array":
-            self._renderer = self._create_renderer()
+            from mjlab.viewer.offscreen_renderer import OffscreenRenderer
+
+            self._renderer = OffscreenRenderer(
+                model=self.sim.mj_model,
+                cfg=cfg.viewer,
+                scene=self.scene,
+                sim_model=self.sim.model,
+                expanded_fields=self.sim.expanded_fields,
+            )
         self.metadata["render_fps"] = 1.0 / self.step_dt
         self.load_managers()
         # Expanding model fields invalidated the simulation's graphs.
@@ -239,17 +240,6 @@ class ManagerBasedRlEnv:
 
     # Construction.
 
-    def _create_renderer(self) -> OffscreenRenderer:
-        from mjlab.viewer.offscreen_renderer import OffscreenRenderer
-
-        return OffscreenRenderer(
-            model=self.sim.mj_model,
-            cfg=self.cfg.viewer,
-            scene=self.scene,
-            sim_model=self.sim.model,
-            expanded_fields=self.sim.expanded_fields,
-        )
-
     def load_managers(self) -> None:
         """Build all managers, in the order of their dependencies."""
         cfg = self.cfg
@@ -274,7 +264,10 @@ class ManagerBasedRlEnv:
         self.recorder_manager = (
             RecorderManager(cfg.recorders, self) if cfg.recorders else NullRecorderManager()
         )
-        self._configure_spaces()
+        self.single_observation_space = self.observation_manager.single_space
+        self.observation_space = self.observation_manager.space
+        self.single_action_space = self.action_manager.single_space
+        self.action_space = self.action_manager.space
         # Targets that are constant within a step are written once.
         self._acts_between_substeps = self.action_manager.needs_substep or any(
             entity.needs_substep for entity in self.scene.entities.values()
@@ -296,20 +289,6 @@ class ManagerBasedRlEnv:
             self.manager_visualizers["command_manager"] = self.command_manager
         self.manager_visualizers["event_manager"] = self.event_manager
         self.manager_visualizers["reward_manager"] = self.reward_manager
-
-    def _configure_spaces(self) -> None:
-        groups: dict[str, spaces.Space] = {}
-        for name, term_names in self.observation_manager.active_terms.items():
-            dims: Any = self.observation_manager.group_obs_dim[name]
-            if self.observation_manager.group_obs_concatenate[name]:
-                groups[name] = spaces.Box(shape=tuple(dims))
-            else:
-                boxes: list[spaces.Space] = [spaces.Box(shape=tuple(dim)) for dim in dims]
-                groups[name] = spaces.Dict(spaces=dict(zip(term_names, boxes, strict=True)))
-        self.single_observation_space = spaces.Dict(spaces=groups)
-        self.single_action_space = spaces.Box(shape=(self.action_manager.total_action_dim,))
-        self.observation_space = spaces.batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = spaces.batch_space(self.single_action_space, self.num_envs)
 
     # The loop.
 
@@ -341,7 +320,8 @@ class ManagerBasedRlEnv:
         self._reset_idx(env_ids)
         self.scene.write_data_to_sim(env_ids)
         self._forward(env_ids, moved)
-        self._compute_commands(dt=0.0, env_ids=env_ids)
+        self.command_manager.compute(dt=0.0, env_ids=env_ids)
+        self.scene.take_moved_envs()
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
         self.recorder_manager.record_post_reset(env_ids)
@@ -401,32 +381,43 @@ class ManagerBasedRlEnv:
                 "not reset; call env.reset(env_ids=...) first, or set auto_reset=True in the config."
             )
         self._clear_extras()
-        self.action_manager.process_action(as_action(action, self.device))
+        self.action_manager.process_action(action)
         self._run_physics()
         self.episode_length_buf += 1
         if not self._holds_common_steps:
             self.common_step_counter += 1
-
         self._evaluate_step()
+
+        # Events.
         self._look_ahead()
         self._divergence_log.end_step(self.diverged, self.common_step_counter)
         for mode in ("step", "interval"):
             if mode in self.event_manager.available_modes:
                 self.event_manager.apply(mode=mode, dt=self.step_dt)
 
+        # Resets.
         moved = self.scene.take_moved_envs()
         if self.observes_ends and self.cfg.auto_reset:
             self._observe_ends(moved)
-        reset_ids = self._reset_done_envs()
+        reset_ids = self.reset_buf.new_empty(0, dtype=torch.long)
+        if self.cfg.auto_reset:
+            reset_ids = self._ended.ids_of(self.reset_buf)
         command_dt: float | torch.Tensor = self.step_dt
         if len(reset_ids) > 0:
+            self.recorder_manager.record_pre_reset(reset_ids)
+            self._reset_idx(reset_ids)
+            self.scene.write_data_to_sim(reset_ids)
             # Commands of new episodes do not advance in time.
             command_dt = self._command_dts.fill_(command_dt).index_fill_(0, reset_ids, 0.0)
             if self._looks_ahead:
                 # Resets resampled the timers. Synchronizing here is shorter than after `forward`.
                 look_up(self.command_manager.plan_lookups(command_dt))
+
+        # Commands and observations.
         self._forward(reset_ids, moved)
-        self._compute_commands(dt=command_dt)
+        self.command_manager.compute(dt=command_dt)
+        # Moves by resets are up to date after `forward`; commands update their own moves.
+        self.scene.take_moved_envs()
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True)
         if self.cfg.auto_reset:
@@ -557,19 +548,6 @@ class ManagerBasedRlEnv:
             return self.reset_buf, self.diverged
         return self.reset_time_outs, self.reset_terminated
 
-    def _reset_done_envs(self) -> torch.Tensor:
-        """Reset environments that are done if `auto_reset`; return their ids."""
-        if not self.cfg.auto_reset:
-            return self.reset_buf.new_empty(0, dtype=torch.long)
-        reset_ids = self._ended.take(self.reset_buf)
-        if reset_ids is None:
-            reset_ids = self.reset_buf.nonzero().flatten()
-        if len(reset_ids) > 0:
-            self.recorder_manager.record_pre_reset(reset_ids)
-            self._reset_idx(reset_ids)
-            self.scene.write_data_to_sim(reset_ids)
-        return reset_ids
-
     def _forward(self, reset_ids: torch.Tensor, moved: torch.Tensor | None) -> None:
         """Update derived quantities to the stage described in `step`.
 
@@ -588,13 +566,6 @@ class ManagerBasedRlEnv:
             self.sim.forward_after_reset(full)
         else:
             self.sim.forward(stage="vel")
-
-    def _compute_commands(
-        self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None
-    ) -> None:
-        self.command_manager.compute(dt=dt, env_ids=env_ids)
-        # Moves by resets are up to date after `forward`; commands update their own moves.
-        self.scene.take_moved_envs()
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         # The curriculum runs first, because it reads the final state of the episode.
@@ -698,12 +669,6 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     length = cfg.episode_length_s
     if not (isinstance(length, Real) and math.isfinite(length) and length >= 0):
         raise ValueError(f"episode_length_s: expected a finite number >= 0 (s), got {length!r}.")
-    for name, term in cfg.terminations.items():
-        if length == 0 and term is not None and term.func is time_out:
-            raise ValueError(
-                f"episode_length_s: expected a number > 0 (s), got 0; the termination {name!r} would "
-                "fire at every step. Set episode_length_s, or remove the term."
-            )
 
 
 def check_device(device: Any) -> None:
@@ -728,26 +693,6 @@ def check_device(device: Any) -> None:
     count = torch.cuda.device_count()
     if (parsed.index or 0) >= count:
         raise ValueError(f"device: expected a GPU index from 0 to {count - 1}, got {device!r}.")
-
-
-def as_action(action: Any, device: str) -> torch.Tensor:
-    """Return an action as a tensor on `device`; arrays and lists of numbers become float32.
-
-    Raises:
-        ValueError: `action` is neither a tensor nor an array of numbers.
-        TypeError: `action` is a complex tensor, or a tensor without data.
-    """
-    if isinstance(action, torch.Tensor):
-        check_real(action, str, "action")
-        return action.to(device)
-    try:
-        # Copied, because torch warns about read-only arrays.
-        return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"action: expected a float tensor, array or list of shape (environments, components), "
-            f"got {type(action).__name__} ({error})."
-        ) from error
 
 
 def as_reset_ids(env_ids: Any, num_envs: int, device: str) -> torch.Tensor:

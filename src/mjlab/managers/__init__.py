@@ -13,7 +13,13 @@ from mjlab.managers.curriculum_manager import (
     NullCurriculumManager,
 )
 from mjlab.managers.event_manager import EventManager, EventMode, EventTermCfg
-from mjlab.managers.manager_base import ManagerBase, ManagerTermBase, ManagerTermBaseCfg
+from mjlab.managers.lookup import Lookup, look_up
+from mjlab.managers.manager_base import (
+    ManagerBase,
+    ManagerTermBase,
+    ManagerTermBaseCfg,
+    SensorSwitches,
+)
 from mjlab.managers.metrics_manager import MetricsManager, MetricsTermCfg, NullMetricsManager
 from mjlab.managers.observation_manager import (
     ObservationGroupCfg,
@@ -42,6 +48,7 @@ __all__ = [
     "EventManager",
     "EventMode",
     "EventTermCfg",
+    "Lookup",
     "ManagerBase",
     "ManagerTermBase",
     "ManagerTermBaseCfg",
@@ -60,6 +67,8 @@ __all__ = [
     "RewardManager",
     "RewardTermCfg",
     "SceneEntityCfg",
+    "SensorSwitches",
     "TerminationManager",
     "TerminationTermCfg",
+    "look_up",
 ]

@@ -8,12 +8,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from mjlab.actuator.actuator import is_constant_within_step
-from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase
+from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase, term_table
+from mjlab.managers.term_checks import check_real
 from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import as_index
+from mjlab.utils.spaces import Box, Space, batch_space
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -97,6 +100,11 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
             event = torch.cuda.Event()
             self._check_finite = DeferredCheck(*self._action.shape, self.device, event)
 
+    def __str__(self) -> str:
+        """Return a table of the active terms."""
+        rows = [(name, term.action_dim) for name, term in self._terms.items()]
+        return term_table(self, ["name", "dimension"], rows)
+
     @property
     def action_term_dim(self) -> list[int]:
         """Number of action components of each term."""
@@ -106,6 +114,16 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
     def total_action_dim(self) -> int:
         """Number of action components."""
         return sum(self.action_term_dim)
+
+    @property
+    def single_space(self) -> Box:
+        """Space of the action of one environment."""
+        return Box(shape=(self.total_action_dim,))
+
+    @property
+    def space(self) -> Space:
+        """Space of the actions of all environments."""
+        return batch_space(self.single_space, self.num_envs)
 
     @property
     def action(self) -> torch.Tensor:
@@ -133,10 +151,13 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
     def process_action(self, action: torch.Tensor) -> None:
         """Split the action of this step, (num_envs, total_action_dim), among the terms.
 
+        Arrays and lists are converted by `as_action`.
+
         Raises `ValueError` for a wrong shape, and for NaN or infinite values: on a CPU immediately,
         before any state changes; on a GPU at the next step, after the bad action has acted for one
         step, because checking immediately would synchronize with the GPU.
         """
+        action = as_action(action, self.device)
         if action.shape != self._action.shape:
             raise ValueError(
                 f"action: expected shape {tuple(self._action.shape)} (environments, components), "
@@ -167,9 +188,25 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         """Return the raw action of each term in one environment."""
         return [(name, term.raw_action[env_idx].tolist()) for name, term in self._terms.items()]
 
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        rows = [(name, term.action_dim) for name, term in self._terms.items()]
-        return ["name", "dimension"], rows
+
+def as_action(action: Any, device: str) -> torch.Tensor:
+    """Return an action as a tensor on `device`; arrays and lists of numbers become float32.
+
+    Raises:
+        ValueError: `action` is neither a tensor nor an array of numbers.
+        TypeError: `action` is a complex tensor, or a tensor without data.
+    """
+    if isinstance(action, torch.Tensor):
+        check_real(action, str, "action")
+        return action.to(device)
+    try:
+        # Copied, because torch warns about read-only arrays.
+        return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"action: expected a float tensor, array or list of shape (environments, components), "
+            f"got {type(action).__name__} ({error})."
+        ) from error
 
 
 def check_now(action: torch.Tensor) -> None:

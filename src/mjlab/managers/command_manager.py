@@ -16,10 +16,12 @@ from mjlab.managers.manager_base import (
     DebugVisSwitches,
     ManagerTermBase,
     NullManager,
+    term_table,
 )
 from mjlab.managers.nonfinite import finite_mean
-from mjlab.utils.errors import UnsupportedError
+from mjlab.utils.errors import UnsupportedError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
+from mjlab.utils.lab_api.math import sample_uniform
 
 if TYPE_CHECKING:
     import viser
@@ -99,8 +101,6 @@ class CommandTerm(ManagerTermBase):
         Args:
             dt: Elapsed time (s): one number, or (num_envs,) if `env_ids` is None.
             env_ids: Environments to advance; the others keep time, command and metrics. None: all.
-
-        Raises `ValueError` for a `dt` with several elements together with `env_ids`.
         """
         if env_ids is None:
             self._update_metrics()
@@ -109,11 +109,6 @@ class CommandTerm(ManagerTermBase):
             if due is None:
                 due = (self.time_left <= 0.0).nonzero().flatten()
         else:
-            if isinstance(dt, torch.Tensor) and dt.numel() != 1:
-                raise ValueError(
-                    f"{self.name}.compute dt: expected one number together with env_ids, got shape "
-                    f"{tuple(dt.shape)}."
-                )
             # `_update_metrics` updates all environments. Metrics that accumulate would count a step
             # that the other environments have not made, so their values are restored.
             before = {name: (values, values.clone()) for name, values in self.metrics.items()}
@@ -188,11 +183,8 @@ class CommandTerm(ManagerTermBase):
         return False
 
     def _resample(self, env_ids: torch.Tensor) -> None:
-        low, high = self.cfg.resampling_time_range
-        times = (
-            torch.rand(len(env_ids), dtype=torch.float32, device=self.device) * (high - low) + low
-        )
-        self.time_left[env_ids] = times
+        bounds = self.cfg.resampling_time_range
+        self.time_left[env_ids] = sample_uniform(*bounds, len(env_ids), self.device)
         self._resample_command(env_ids)
         self.command_counter[env_ids] += 1
 
@@ -223,6 +215,11 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
     def __init__(self, cfg: Mapping[str, CommandTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
 
+    def __str__(self) -> str:
+        """Return a table of the active terms."""
+        rows = [(name, type(term).__name__) for name, term in self._terms.items()]
+        return term_table(self, ["name", "type"], rows)
+
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Advance all commands by `dt` seconds; see `CommandTerm.compute`."""
         for term in self._terms.values():
@@ -246,7 +243,7 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
 
     def get_term_cfg(self, name: str) -> CommandTermCfg:
         """Return the live config of a command. Raises `ValueError` if unknown."""
-        self._check_known(name, self.active_terms)
+        check_exists("CommandManager term", name, self._terms)
         return self._terms[name].cfg
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
@@ -279,10 +276,6 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         """Call `apply_gui_reset` of all commands; return True if one of them wrote a state."""
         wrote = [term.apply_gui_reset(env_ids) for term in self._terms.values()]
         return any(wrote)
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        rows = [(name, type(term).__name__) for name, term in self._terms.items()]
-        return ["name", "type"], rows
 
 
 class NullCommandManager(NullManager, CommandManager):

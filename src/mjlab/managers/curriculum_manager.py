@@ -60,11 +60,11 @@ class CurriculumManager(TermListManager):
             else:
                 items = {name: state}
             log |= {
-                f"Curriculum/{key}": _number(value)
+                f"Curriculum/{key}": value.item() if isinstance(value, torch.Tensor) else value
                 for key, value in items.items()
                 if value is not None
             }
-        self._reset_class_terms(env_ids)
+        super().reset(env_ids)
         return log
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
@@ -72,13 +72,9 @@ class CurriculumManager(TermListManager):
         terms = []
         for name, state in self._state.items():
             values = list(state.values()) if isinstance(state, dict) else [state]
-            terms.append((name, [float(_number(v)) for v in values if v is not None]))
+            terms.append((name, [float(v) for v in values if v is not None]))
         return terms
 
 
 class NullCurriculumManager(NullManager, CurriculumManager):
     """Curriculum manager without terms."""
-
-
-def _number(value: Any) -> Any:
-    return value.item() if isinstance(value, torch.Tensor) else value

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
@@ -13,12 +13,18 @@ import torch
 
 from mjlab.compat import accepts_older_fields
 from mjlab.managers.lookup import Lookup
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermFunctionSwitches, TermListManager
+from mjlab.managers.manager_base import (
+    ManagerTermBaseCfg,
+    TermFunctionSwitches,
+    TermListManager,
+    term_table,
+)
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import is_interval
 from mjlab.sim.randomization import RecomputeLevel
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_ids, is_empty
+from mjlab.utils.lab_api.math import sample_uniform
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -93,6 +99,13 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 else:
                     self._timers[name] = self._sample_interval(term, self.num_envs)
 
+    def __str__(self) -> str:
+        """Return a table of the active terms."""
+        rows = [
+            (cfg.mode, name, cfg.interval_range_s or "") for name, cfg in self._live_cfgs.items()
+        ]
+        return term_table(self, ["mode", "name", "interval (s)"], rows)
+
     @property
     def active_terms(self) -> dict[str, list[str]]:  # ty: ignore[incompatible-property-override]
         """Names of the events by mode. Modes without events are left out."""
@@ -150,14 +163,16 @@ class EventManager(TermFunctionSwitches, TermListManager):
         if mode == "reset":
             reset_ids = as_ids(env_ids, self.num_envs, self.device)
         for name, cfg in self._terms_by_mode.get(mode, ()):
+            due = env_ids
             if mode == "interval":
-                is_due = self._apply_interval(name, cfg, dt or 0.0)
+                due = self._advance_timer(name, cfg, dt or 0.0)
             elif reset_ids is not None:
-                is_due = self._apply_reset(name, cfg, reset_ids, global_env_step_count or 0)
-            else:
-                cfg.func(self._env, env_ids, **cfg.params)
-                is_due = True
-            if is_due:
+                due, last, step = reset_ids, self._last_reset_step[name], global_env_step_count or 0
+                if cfg.min_step_count_between_reset > 0:
+                    due = due[step - last[due] >= cfg.min_step_count_between_reset]
+                last[due] = step
+            if not is_empty(due):
+                cfg.func(self._env, due, **cfg.params)
                 fired.append(cfg)
         level = combined_level(fired)
         if level != RecomputeLevel.none:
@@ -173,7 +188,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
         """Reset terms of all modes and resample the timers of `env_ids`. Logs nothing."""
-        self._reset_class_terms(env_ids)
+        super().reset(env_ids)
         if self._timers and not is_empty(env_ids):
             ids = as_ids(env_ids, self.num_envs, self.device)
             for name, cfg in self._terms_by_mode["interval"]:
@@ -182,34 +197,23 @@ class EventManager(TermFunctionSwitches, TermListManager):
                     timer[ids] = self._sample_interval(cfg, len(ids))
         return {}
 
-    def _apply_interval(self, name: str, cfg: EventTermCfg, dt: float) -> bool:
+    def _advance_timer(self, name: str, cfg: EventTermCfg, dt: float) -> torch.Tensor | None:
+        """Return the environments with an event due, and restart their timers. None: all."""
         timer = self._timers[name]
         if not isinstance(timer, torch.Tensor):
             timer -= dt
-            due = timer < _TIMER_TOLERANCE
-            self._timers[name] = self._sample_interval(cfg, 1, "cpu").item() if due else timer
-            if due:
-                cfg.func(self._env, None, **cfg.params)
-            return due
+            if timer >= _TIMER_TOLERANCE:
+                self._timers[name] = timer
+                return torch.empty(0, dtype=torch.long)
+            self._timers[name] = self._sample_interval(cfg, 1, "cpu").item()
+            return None
         ids = self._lookups[name].take(timer, dt)
         timer.sub_(dt)
         if ids is None:
             ids = (timer < _TIMER_TOLERANCE).nonzero().flatten()
-        if len(ids) == 0:
-            return False
-        timer[ids] = self._sample_interval(cfg, len(ids))
-        cfg.func(self._env, ids, **cfg.params)
-        return True
-
-    def _apply_reset(self, name: str, cfg: EventTermCfg, ids: torch.Tensor, step: int) -> bool:
-        last = self._last_reset_step[name]
-        if cfg.min_step_count_between_reset > 0:
-            ids = ids[step - last[ids] >= cfg.min_step_count_between_reset]
-        if len(ids) == 0:
-            return False
-        last[ids] = step
-        cfg.func(self._env, ids, **cfg.params)
-        return True
+        if len(ids) > 0:
+            timer[ids] = self._sample_interval(cfg, len(ids))
+        return ids
 
     def _prepare_terms(self) -> None:
         for name, cfg in self.cfg.items():
@@ -230,14 +234,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
     def _sample_interval(
         self, cfg: EventTermCfg, count: int, device: str | None = None
     ) -> torch.Tensor:
-        low, high = cfg.interval_range_s or (0.0, 0.0)
-        samples = torch.rand(count, dtype=torch.float32, device=device or self.device)
-        return samples * (high - low) + low
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        rows = [(cfg.mode, name, cfg.interval_range_s or "") for name, cfg in terms]
-        return ["mode", "name", "interval (s)"], rows
+        return sample_uniform(*(cfg.interval_range_s or (0.0, 0.0)), count, device or self.device)
 
 
 # Model fields that events declare.

@@ -45,6 +45,11 @@ class Lookup:
             return None
         return self.ids
 
+    def ids_of(self, mask: torch.Tensor) -> torch.Tensor:
+        """Return the ids of `mask`, its only input: those looked up, else by `nonzero`."""
+        ids = self.take(mask)
+        return mask.nonzero().flatten() if ids is None else ids
+
 
 def look_up(lookups: Sequence[Lookup]) -> None:
     """Find the ids of planned lookups with one GPU synchronization. All masks are on a GPU."""

@@ -23,7 +23,7 @@ import torch
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
-from mjlab.utils.indexing import EnvIds, as_index
+from mjlab.utils.indexing import as_index
 from mjlab.utils.state import SKIP, plain_scalar, stateful
 
 if TYPE_CHECKING:
@@ -87,29 +87,21 @@ class ManagerTermBase:
 class ManagerBase(ABC):
     """Base class of managers. Subclasses build their terms in `_prepare_terms`."""
 
-    _transient = {"cfg", "_term_names", "_value_shape", "_built_values"}
+    _transient = {"cfg", "_term_names", "_value_shape", "_live_cfgs", "_built_values"}
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         self._env = env
         self._value_shape = torch.Size((env.num_envs,))
         # Instances of class-based terms by label, referenced so that checkpoints save their state.
         self._class_terms: dict[str, Any] = {}
+        # Config read by each term, by label.
+        self._live_cfgs: dict[str, Any] = {}
         self._prepare_terms()
-        self._built_values = {label: plain_values(cfg) for label, cfg in self._live_cfgs().items()}
+        self._built_values = {label: plain_values(cfg) for label, cfg in self._live_cfgs.items()}
 
     def __str__(self) -> str:
         """Return a table of the active terms."""
-        header, rows = self._table()
-        cells = [["#", *header]]
-        cells += [[str(i), *(str(cell) for cell in row)] for i, row in enumerate(rows)]
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        rule = "+" + "+".join("-" * (width + 2) for width in widths) + "+"
-        head, *body = (
-            "|" + "|".join(f" {cell:<{w}} " for cell, w in zip(row, widths, strict=True)) + "|"
-            for row in cells
-        )
-        title = f"<{type(self).__name__}> with {len(rows)} active terms"
-        return "\n".join([title, rule, head, rule, *body, rule])
+        return term_table(self, ["name"], [[name] for name in self.active_terms])
 
     @property
     def num_envs(self) -> int:
@@ -127,8 +119,14 @@ class ManagerBase(ABC):
         """Names of the enabled terms, in order."""
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
-        """Start a new episode in `env_ids` (None: all) and return values to log."""
-        self._reset_class_terms(env_ids)
+        """Start a new episode in `env_ids` (None: all) and return values to log.
+
+        Resets class-based terms; the log is empty.
+        """
+        for term in self._class_terms.values():
+            reset = getattr(term, "reset", None)
+            if callable(reset):
+                reset(env_ids=as_index(env_ids))
         return {}
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
@@ -144,7 +142,7 @@ class ManagerBase(ABC):
         """
         edits = {
             label: changes(self._built_values[label], plain_values(cfg))
-            for label, cfg in self._live_cfgs().items()
+            for label, cfg in self._live_cfgs.items()
         }
         return {label: edit for label, edit in edits.items() if edit}
 
@@ -154,7 +152,7 @@ class ManagerBase(ABC):
         Values not in `edits` are restored to their values at build time, because later edits (e.g.
         by a first reset) may have changed them. Edits of terms that no longer exist are skipped.
         """
-        for label, cfg in self._live_cfgs().items():
+        for label, cfg in self._live_cfgs.items():
             undone = changes(plain_values(cfg), self._built_values[label])
             write_changes(cfg, copy.deepcopy(undone))
             write_changes(cfg, edits.get(label, {}))
@@ -163,15 +161,7 @@ class ManagerBase(ABC):
 
     @abstractmethod
     def _prepare_terms(self) -> None:
-        """Build the terms from the config."""
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        """Return the config read by each term, by label."""
-        return {}
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        """Return the header and the rows of the printed table."""
-        return ["name"], [[name] for name in self.active_terms]
+        """Build the terms from the config, and set `_live_cfgs`."""
 
     def _label(self, name: str) -> str:
         return f"{type(self).__name__} term {name!r}"
@@ -245,14 +235,9 @@ class ManagerBase(ABC):
                 stateful(type(cfg.func))
             self._class_terms[name] = cfg.func
 
-    def _reset_class_terms(self, env_ids: EnvIds) -> None:
-        for term in self._class_terms.values():
-            reset = getattr(term, "reset", None)
-            if callable(reset):
-                reset(env_ids=as_index(env_ids))
-
-    def _check_value(self, name: str, value: Any) -> None:
-        """Raise unless `value` is a real tensor with one value per environment."""
+    def _evaluate(self, name: str, cfg: ManagerTermBaseCfg) -> torch.Tensor:
+        """Call a term. Raises unless it returns a real tensor with one value per environment."""
+        value = cfg.func(self._env, **cfg.params)
         if not isinstance(value, torch.Tensor):
             raise WrongTypeError(
                 f"{self._label(name)}: expected a tensor of shape {tuple(self._value_shape)}, got "
@@ -265,12 +250,7 @@ class ManagerBase(ABC):
                 "squeeze) in the term."
             )
         check_real(value, self._label, name)
-
-    def _check_known(
-        self, name: str, known: Sequence[str], error: type[Exception] = ValueError
-    ) -> None:
-        """Raise `error`, listing the known names, unless `name` is in `known`."""
-        check_exists(f"{type(self).__name__} term", name, known, error)
+        return value
 
 
 class TermListManager(ManagerBase):
@@ -287,6 +267,15 @@ class TermListManager(ManagerBase):
         self.cfg = {name: copy.deepcopy(term_cfg) for name, term_cfg in cfg.items()}
         super().__init__(env)
 
+    def __str__(self) -> str:
+        """Return a table of the active terms."""
+        header = ["name", *(field.replace("_", " ") for field in self._shown)]
+        rows = [
+            (name, *(getattr(cfg, field) for field in self._shown))
+            for name, cfg in self._live_cfgs.items()
+        ]
+        return term_table(self, header, rows)
+
     @property
     def active_terms(self) -> list[str]:
         """Names of the enabled terms, in order."""
@@ -297,19 +286,8 @@ class TermListManager(ManagerBase):
 
         Raises `ValueError`, listing the valid names, if the term is unknown.
         """
-        self._check_known(term_name, self._term_names)
+        check_exists(f"{type(self).__name__} term", term_name, self._term_names)
         return self._term_cfgs[self._term_names.index(term_name)]
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        return dict(zip(self._term_names, self._term_cfgs, strict=True))
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        header = ["name", *(field.replace("_", " ") for field in self._shown)]
-        rows = [
-            (name, *(getattr(cfg, field) for field in self._shown))
-            for name, cfg in self._live_cfgs().items()
-        ]
-        return header, rows
 
     def _prepare_terms(self) -> None:
         self._term_names: list[str] = []
@@ -318,6 +296,7 @@ class TermListManager(ManagerBase):
             self._resolve_term(name, term_cfg, self._leading)
             self._term_names.append(name)
             self._term_cfgs.append(term_cfg)
+            self._live_cfgs[name] = term_cfg
 
 
 class BuiltTermsManager(ManagerBase, Generic[TermT]):
@@ -338,7 +317,7 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
 
     def get_term(self, name: str) -> TermT:
         """Return the term `name`. Raises `KeyError`, listing the valid names, if unknown."""
-        self._check_known(name, self.active_terms, UnknownNameError)
+        check_exists(f"{type(self).__name__} term", name, self._terms, UnknownNameError)
         return self._terms[name]
 
     def _prepare_terms(self) -> None:
@@ -351,10 +330,7 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
                     f"{self._term_type.__name__}, got {type(term).__name__}."
                 )
             self._terms[name] = term
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        terms: dict[str, Any] = dict(self._terms)
-        return {name: term.cfg for name, term in terms.items()}
+            self._live_cfgs[name] = term.cfg
 
 
 class NullManager:
@@ -367,6 +343,20 @@ class NullManager:
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return an empty list."""
         return []
+
+
+def term_table(manager: ManagerBase, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return a printable table of a manager's terms, one row each."""
+    cells = [["#", *header]]
+    cells += [[str(i), *(str(cell) for cell in row)] for i, row in enumerate(rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    rule = "+" + "+".join("-" * (width + 2) for width in widths) + "+"
+    head, *body = (
+        "|" + "|".join(f" {cell:<{w}} " for cell, w in zip(row, widths, strict=True)) + "|"
+        for row in cells
+    )
+    title = f"<{type(manager).__name__}> with {len(rows)} active terms"
+    return "\n".join([title, rule, head, rule, *body, rule])
 
 
 @contextlib.contextmanager
@@ -400,10 +390,10 @@ def plain_values(cfg: Any) -> dict[str, Any]:
     Plain values: numbers, strings, None, tensors, and lists and tuples of plain values.
     """
     values: dict[str, Any] = {}
-    for key, value in _items(cfg):
+    for key, value in _items(cfg) or ():
         if callable(value):
             continue
-        plain = plain_values(value) if _is_branch(value) else _plain(value)
+        plain = _plain(value) if _items(value) is None else plain_values(value)
         if plain is not SKIP:
             values[key] = plain
     return values
@@ -425,9 +415,9 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]
 
 def write_changes(cfg: Any, changed: Mapping[str, Any]) -> None:
     """Write a result of `changes` into a config."""
-    current = dict(_items(cfg))
+    current = dict(_items(cfg) or ())
     for key, value in changed.items():
-        if isinstance(value, Mapping) and _is_branch(current.get(key)):
+        if isinstance(value, Mapping) and _items(current.get(key)) is not None:
             write_changes(current[key], value)
         elif isinstance(cfg, dict):
             cfg[key] = value
@@ -435,15 +425,13 @@ def write_changes(cfg: Any, changed: Mapping[str, Any]) -> None:
             setattr(cfg, key, value)
 
 
-def _items(cfg: Any) -> list[tuple[str, Any]]:
+def _items(cfg: Any) -> list[tuple[str, Any]] | None:
+    """Return the string keys of a dict or the fields of a config, with values; else None."""
     if isinstance(cfg, dict):
         return [(key, value) for key, value in cfg.items() if isinstance(key, str)]
-    return [(field.name, getattr(cfg, field.name)) for field in dataclasses.fields(cfg)]
-
-
-def _is_branch(value: Any) -> bool:
-    is_instance = dataclasses.is_dataclass(value) and not isinstance(value, type)
-    return isinstance(value, dict) or is_instance
+    if dataclasses.is_dataclass(cfg) and not isinstance(cfg, type):
+        return [(field.name, getattr(cfg, field.name)) for field in dataclasses.fields(cfg)]
+    return None
 
 
 def _plain(value: Any) -> Any:

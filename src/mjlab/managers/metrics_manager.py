@@ -74,7 +74,7 @@ class MetricsManager(TermListManager):
             return
         self._substeps += 1
         for k, row in self._substep_rows.items():
-            row.add_(self._evaluate(k))
+            row.add_(self._evaluate(self._term_names[k], self._term_cfgs[k]))
 
     def compute(self) -> None:
         """Evaluate the other terms and accumulate the values of the step. Called after rewards.
@@ -87,7 +87,7 @@ class MetricsManager(TermListManager):
             if k in self._substep_rows:
                 torch.div(self._substep_rows[k], max(self._substeps, 1), out=row)
             else:
-                row.copy_(self._evaluate(k))
+                row.copy_(self._evaluate(self._term_names[k], self._term_cfgs[k]))
         if self._substep_rows:
             self._substep_sums.zero_()
             self._substeps = 0
@@ -105,7 +105,7 @@ class MetricsManager(TermListManager):
         The mean of a term leaves out environments with a NaN or infinite value; the mean of a
         maximum also leaves out environments without a step. 0 if no environment remains.
         """
-        self._reset_class_terms(env_ids)
+        super().reset(env_ids)
         if is_empty(env_ids) or not self._term_names:
             return {}
         index = as_index(env_ids)
@@ -127,12 +127,6 @@ class MetricsManager(TermListManager):
         """Return the value of each term in the last step of one environment."""
         values = self._last[:, env_idx].tolist()
         return [(name, [value]) for name, value in zip(self._term_names, values, strict=True)]
-
-    def _evaluate(self, k: int) -> torch.Tensor:
-        cfg = self._term_cfgs[k]
-        value = cfg.func(self._env, **cfg.params)
-        self._check_value(self._term_names[k], value)
-        return value
 
 
 class NullMetricsManager(NullManager, MetricsManager):

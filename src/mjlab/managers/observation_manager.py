@@ -12,13 +12,19 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
+from mjlab.managers.manager_base import (
+    ManagerBase,
+    ManagerTermBaseCfg,
+    label_errors,
+    term_table,
+)
 from mjlab.managers.term_checks import check_real, is_interval
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.errors import WrongTypeError, check_count, check_exists, check_one_of
 from mjlab.utils.indexing import is_empty
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
+from mjlab.utils.spaces import Box, Dict, Space, batch_space
 from mjlab.utils.state import capture_state, is_stateful, restore_state, stateful
 
 if TYPE_CHECKING:
@@ -128,6 +134,15 @@ class ObservationManager(ManagerBase):
         terms = (term for group in self._groups.values() for term in group.terms.values())
         self._stateful_terms = [term for term in terms if term.has_state]
 
+    def __str__(self) -> str:
+        """Return a table of the active terms."""
+        rows = [
+            (group_name, term_name, term.shape)
+            for group_name, group in self._groups.items()
+            for term_name, term in group.terms.items()
+        ]
+        return term_table(self, ["group", "name", "shape"], rows)
+
     @property
     def active_terms(self) -> dict[str, list[str]]:
         """Names of the terms of each group."""
@@ -156,6 +171,20 @@ class ObservationManager(ManagerBase):
     def group_obs_concatenate(self) -> dict[str, bool]:
         """True for each group whose terms are concatenated into one tensor."""
         return {name: group.cfg.concatenate_terms for name, group in self._groups.items()}
+
+    @property
+    def single_space(self) -> Dict:
+        """Space of the observations of one environment; groups that are dicts by term are `Dict`."""
+        groups: dict[str, Space] = {}
+        for name, group in self._groups.items():
+            boxes: dict[str, Space] = {key: Box(t.shape) for key, t in group.terms.items()}
+            groups[name] = Dict(spaces=boxes) if group.shape is None else Box(group.shape)
+        return Dict(spaces=groups)
+
+    @property
+    def space(self) -> Space:
+        """Space of the observations of all environments."""
+        return batch_space(self.single_space, self.num_envs)
 
     def compute(
         self, update_history: bool = False, env_ids: torch.Tensor | None = None
@@ -206,12 +235,13 @@ class ObservationManager(ManagerBase):
 
         Raises `ValueError`, listing the valid names, if the group is unknown.
         """
-        return self._group(group_name).compute(update_history, env_ids)
+        check_exists("observation group", group_name, self._groups)
+        return self._groups[group_name].compute(update_history, env_ids)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
         """Reset terms, delays, histories and noise models of `env_ids` (None: all). Logs nothing."""
         self._obs_buffer = None
-        self._reset_class_terms(env_ids)
+        super().reset(env_ids)
         if not is_empty(env_ids):
             for term in self._stateful_terms:
                 term.reset(env_ids)
@@ -222,7 +252,8 @@ class ObservationManager(ManagerBase):
 
         Raises `ValueError`, listing the valid names, if the group or term is unknown.
         """
-        terms = self._group(group_name).terms
+        check_exists("observation group", group_name, self._groups)
+        terms = self._groups[group_name].terms
         check_exists(f"term of observation group {group_name!r}", term_name, terms)
         return terms[term_name].cfg
 
@@ -247,6 +278,7 @@ class ObservationManager(ManagerBase):
             }
             if terms:
                 self._groups[name] = ObservationGroup(name, group_cfg, terms)
+                self._live_cfgs |= {term.label: term.cfg for term in terms.values()}
 
     def _build_term(
         self, label: str, cfg: ObservationTermCfg, group_cfg: ObservationGroupCfg
@@ -265,23 +297,6 @@ class ObservationManager(ManagerBase):
         self._resolve_term(label, cfg, ("env",))
         policy = group_cfg.nan_policy if group_cfg.nan_check_per_term else "disabled"
         return ObservationTerm(label, cfg, self._env, policy)
-
-    def _group(self, name: str) -> ObservationGroup:
-        check_exists("observation group", name, self._groups)
-        return self._groups[name]
-
-    def _live_cfgs(self) -> dict[str, Any]:
-        return {
-            term.label: term.cfg for group in self._groups.values() for term in group.terms.values()
-        }
-
-    def _table(self) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
-        rows = [
-            (group_name, term_name, term.shape)
-            for group_name, group in self._groups.items()
-            for term_name, term in group.terms.items()
-        ]
-        return ["group", "name", "shape"], rows
 
 
 @stateful
@@ -310,7 +325,18 @@ class ObservationGroup:
         dim = cfg.concatenate_dim
         self._dim = dim + 1 if dim >= 0 else dim
         self._nan_policy: NanPolicy = "disabled" if cfg.nan_check_per_term else cfg.nan_policy
-        self.shape = self._joined_shape() if cfg.concatenate_terms else None
+        self.shape: tuple[int, ...] | None = None
+        if cfg.concatenate_terms:
+            shapes = {key: term.shape for key, term in terms.items()}
+            try:
+                parts = [torch.empty(shape, device="meta") for shape in shapes.values()]
+                self.shape = tuple(torch.cat(parts, dim=dim).shape)
+            except (IndexError, RuntimeError) as error:
+                raise ValueError(
+                    f"Observation group {name!r}: expected shapes that concatenate along "
+                    f"concatenate_dim={dim}, got {shapes} (without the environment dimension); "
+                    "flatten the terms, or set concatenate_terms=False."
+                ) from error
 
     def compute(
         self, update_history: bool, env_ids: torch.Tensor | None
@@ -329,31 +355,9 @@ class ObservationGroup:
         """Split a result of `compute` by term."""
         if isinstance(observation, dict):
             return observation
-        dim = self._axis() + 1
-        parts = observation.split([term.shape[dim - 1] for term in self.terms.values()], dim=dim)
+        sizes = [term.shape[self.cfg.concatenate_dim] for term in self.terms.values()]
+        parts = observation.split(sizes, dim=self._dim)
         return dict(zip(self.terms, parts, strict=True))
-
-    def _axis(self) -> int:
-        """Return the dimension of concatenation, not counting the environment dimension."""
-        dim = self.cfg.concatenate_dim
-        return dim if dim >= 0 else dim + len(next(iter(self.terms.values())).shape)
-
-    def _joined_shape(self) -> tuple[int, ...]:
-        shapes = {name: term.shape for name, term in self.terms.items()}
-        first, axis = next(iter(shapes.values())), self._axis()
-        for shape in shapes.values():
-            others_agree = (
-                len(shape) == len(first)
-                and 0 <= axis < len(first)
-                and shape[:axis] + shape[axis + 1 :] == first[:axis] + first[axis + 1 :]
-            )
-            if not others_agree:
-                raise ValueError(
-                    f"Observation group {self.name!r}: expected shapes that concatenate along "
-                    f"concatenate_dim={self.cfg.concatenate_dim}, got {shapes} (without the "
-                    "environment dimension); flatten the terms, or set concatenate_terms=False."
-                )
-        return (*first[:axis], sum(shape[axis] for shape in shapes.values()), *first[axis + 1 :])
 
 
 @stateful

@@ -16,7 +16,7 @@ from mjlab.managers.manager_base import (
     TermListManager,
     label_errors,
 )
-from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError
+from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -71,7 +71,7 @@ class RecorderManager(TermListManager):
 
     def get_term(self, name: str) -> RecorderTerm:
         """Return the recorder `name`. Raises `KeyError`, listing the valid names, if unknown."""
-        self._check_known(name, self._term_names, UnknownNameError)
+        check_exists("RecorderManager term", name, self._terms, UnknownNameError)
         return self._terms[name]
 
     def record_pre_reset(self, env_ids: torch.Tensor) -> None:
@@ -109,6 +109,7 @@ class RecorderManager(TermListManager):
             self._terms[name] = term
             self._term_names.append(name)
             self._term_cfgs.append(cfg)
+            self._live_cfgs[name] = cfg
 
 
 class NullRecorderManager(NullManager, RecorderManager):

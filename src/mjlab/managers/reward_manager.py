@@ -59,6 +59,13 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     ) -> None:
         self._scale_by_dt = scale_by_dt
         super().__init__(cfg, env)
+        for name, term in zip(self._term_names, self._term_cfgs, strict=True):
+            # A NaN weight would silently disable the term: NaN rewards count as 0.
+            if not (isinstance(term.weight, Real) and math.isfinite(term.weight)):
+                raise ValueError(
+                    f"{self._label(name)} weight: expected a finite number, got {term.weight!r}; to "
+                    "disable the term, set its weight to 0 or the term to None."
+                )
         size = (len(self._term_names), self.num_envs)
         # Terms first: each term writes to contiguous memory.
         self._rates = torch.zeros(size, dtype=torch.float32, device=self.device)
@@ -81,9 +88,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             if cfg.weight == 0.0:
                 row.zero_()
                 continue
-            value = cfg.func(self._env, **cfg.params)
-            self._check_value(name, value)
-            torch.mul(value, cfg.weight, out=row)
+            torch.mul(self._evaluate(name, cfg), cfg.weight, out=row)
         self._rates.masked_fill_(self.nonfinite.excluded, 0.0)
         bad = self.nonfinite.check(self._rates)
         if bad is not None:
@@ -110,7 +115,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         The value is the mean of the term's sum over `env_ids`, divided by the maximum episode
         length in seconds (undivided if that length is 0).
         """
-        self._reset_class_terms(env_ids)
+        super().reset(env_ids)
         if is_empty(env_ids) or not self._term_names:
             return {}
         index = as_index(env_ids)
@@ -123,18 +128,6 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             f"Episode_Reward/{name}": mean
             for name, mean in zip(self._term_names, means, strict=True)
         }
-
-    def _prepare_terms(self) -> None:
-        for name, cfg in self.cfg.items():
-            # A NaN weight would silently disable the term: NaN rewards count as 0.
-            if isinstance(cfg, RewardTermCfg) and not (
-                isinstance(cfg.weight, Real) and math.isfinite(cfg.weight)
-            ):
-                raise ValueError(
-                    f"{self._label(name)} weight: expected a finite number, got {cfg.weight!r}; to "
-                    "disable the term, set its weight to 0 or the term to None."
-                )
-        super()._prepare_terms()
 
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
         """Build a term; defer errors of a term with weight 0 until a curriculum sets its weight."""

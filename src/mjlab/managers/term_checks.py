@@ -20,7 +20,7 @@ S = TypeVar("S")
 _ATTRIBUTE = "check_when_built"
 
 
-def checked_when_built(check: Callable[..., None]) -> Callable[[F], F]:
+def checked_when_built(check: Callable[..., object]) -> Callable[[F], F]:
     """Decorate a term function: managers call `check(env, **params)` when they are built.
 
     `check` receives the resolved parameters of the term's config and raises `ValueError`,

@@ -12,7 +12,7 @@ import torch
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.nonfinite import NonFiniteWatch
-from mjlab.utils.errors import UnknownNameError
+from mjlab.utils.errors import UnknownNameError, check_exists
 from mjlab.utils.indexing import as_index, is_empty
 
 if TYPE_CHECKING:
@@ -81,8 +81,7 @@ class TerminationManager(TermListManager):
         self._time_outs.zero_()
         terms = zip(self._term_names, self._term_cfgs, self._rows, strict=True)
         for k, (name, cfg, row) in enumerate(terms):
-            value = cfg.func(self._env, **cfg.params)
-            self._check_value(name, value)
+            value = self._evaluate(name, cfg)
             if value.is_floating_point():
                 if k not in self._numeric:
                     logger.warning(
@@ -104,12 +103,12 @@ class TerminationManager(TermListManager):
 
         Raises `KeyError`, listing the valid names, if the term is unknown.
         """
-        self._check_known(name, self._term_names, UnknownNameError)
+        check_exists("TerminationManager term", name, self._term_names, UnknownNameError)
         return self._rows[self._term_names.index(name)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
         """Return `Episode_Termination/<term>`, the number of `env_ids` where the term fired."""
-        self._reset_class_terms(env_ids)
+        super().reset(env_ids)
         if is_empty(env_ids) or not self._term_names:
             return {}
         counts = self._values[:, as_index(env_ids)].sum(dim=1).tolist()

@@ -30,7 +30,7 @@ import torch
 from tensordict import TensorDict
 
 from mjlab.rl.learners import Learner
-from mjlab.utils.errors import MjlabError
+from mjlab.utils.errors import MjlabError, check_count
 from mjlab.utils.os import replacing
 from mjlab.utils.random import rng_state, set_rng_state
 
@@ -401,38 +401,28 @@ def check_optimizer_fits(
     Raises:
         CheckpointError: the state does not fit.
     """
+    states: Any = saved
+    fits = True
     try:
-        fits = saved is not None and _optimizer_fits(optimizer, saved)
-    except (KeyError, TypeError, AttributeError):
+        for group, own in zip(states["param_groups"], optimizer.param_groups, strict=True):
+            fits &= isinstance(group["lr"], float)
+            # Boolean settings of torch's optimizers differ between releases.
+            switches = [name for name, value in own.items() if isinstance(value, bool)]
+            fits &= all(isinstance(group.get(name, False), bool) for name in switches)
+            for number, parameter in zip(group["params"], own["params"], strict=True):
+                state = states["state"].get(number)
+                # torch would start with new moments for an empty state, without a warning.
+                fits &= state is None or len(state) > 0
+                for value in (state or {}).values():
+                    is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
+                    fits &= not is_moment or value.shape == parameter.shape
+    except (KeyError, TypeError, AttributeError, ValueError):
         fits = False
     if not fits:
         raise CheckpointError(
             f"Checkpoint {path!r}: expected an optimizer state that fits these networks. To load only "
             "its policy, use load_cfg={'actor': True}. Nothing was changed."
         )
-
-
-def _optimizer_fits(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> bool:
-    groups = saved["param_groups"]
-    if len(groups) != len(optimizer.param_groups):
-        return False
-    for group, own in zip(groups, optimizer.param_groups, strict=True):
-        if len(group["params"]) != len(own["params"]) or not isinstance(group["lr"], float):
-            return False
-        # Boolean settings of torch's optimizers differ between releases.
-        switches = [name for name, value in own.items() if isinstance(value, bool)]
-        if not all(isinstance(group.get(name, False), bool) for name in switches):
-            return False
-        for number, parameter in zip(group["params"], own["params"], strict=True):
-            state = saved["state"].get(number)
-            if state is not None and not state:
-                # torch would start with new moments, without a warning.
-                return False
-            for value in (state or {}).values():
-                is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
-                if is_moment and value.shape != parameter.shape:
-                    return False
-    return True
 
 
 def not_finite(value: Any, name: str = "") -> list[str]:
@@ -464,13 +454,14 @@ def capture_training_state(
         "version": VERSION,
         "num_envs": env.num_envs,
         "rng": rng_state(),
-        "observations": {key: value.clone() for key, value in _flat(observations).items()},
+        # Keys of nested groups are joined by a newline.
+        "observations": dict(observations.flatten_keys("\n").clone().items()),
         "logger": logger_state,
         "hidden_states": [list(one) if isinstance(one, tuple) else one for one in hidden],
         "rnd": None,
     }
     if (rnd := getattr(algorithm, "rnd", None)) is not None:
-        average = _reward_average(rnd)
+        average = getattr(rnd.reward_normalizer, "disc_avg", None)
         state["rnd"] = {
             "update_counter": rnd.update_counter,
             "discounted_average": None if average is None else average.avg,
@@ -518,7 +509,7 @@ def restore_training_state(
         rnd = getattr(algorithm, "rnd", None)
         if rnd is not None and state["rnd"] is not None:
             rnd.update_counter = state["rnd"]["update_counter"]
-            if (average := _reward_average(rnd)) is not None:
+            if (average := getattr(rnd.reward_normalizer, "disc_avg", None)) is not None:
                 average.avg = _to(state["rnd"]["discounted_average"], device)
         observations = observations.to(device)
         # Last, because restoring may draw random numbers.
@@ -542,34 +533,19 @@ def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
             f"training_state num_envs: expected {env.num_envs}, got {state['num_envs']}; use --num-envs "
             f"{state['num_envs']}."
         )
-    observations = TensorDict({}, batch_size=[env.num_envs])
-    for key, value in state["observations"].items():
-        observations.set(tuple(key.split("\n")), value)
+    observations = state["observations"]
     found, expected = (
-        {key: tuple(value.shape) for key, value in _flat(one).items()}
-        for one in (observations, env.get_observations())
+        {key: tuple(value.shape) for key, value in one.items()}
+        for one in (observations, env.get_observations().flatten_keys("\n"))
     )
     if found != expected:
         raise ValueError(f"training_state observations: expected {expected}, got {found}.")
-    return observations
-
-
-def _flat(observations: TensorDict) -> dict[str, torch.Tensor]:
-    """Return the tensors by name; keys of nested tensors are joined by a newline."""
-    return {
-        "\n".join(key) if isinstance(key, tuple) else key: observations.get(key)
-        for key in observations.keys(include_nested=True, leaves_only=True)
-    }
+    return TensorDict(observations, batch_size=[env.num_envs]).unflatten_keys("\n")
 
 
 def _models(algorithm: Any) -> list[Any]:
     names = ("actor", "critic", "student", "teacher")
     return [getattr(algorithm, name) for name in names if hasattr(algorithm, name)]
-
-
-def _reward_average(rnd: Any) -> Any:
-    """Return the discounted average of RND's reward normalizer, None without a normalizer."""
-    return getattr(getattr(rnd, "reward_normalizer", None), "disc_avg", None)
 
 
 def _to(value: Any, device: Any) -> Any:
@@ -595,7 +571,23 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     Raises:
         CheckpointError: an entry has the wrong type.
     """
-    _check_types(checkpoint, path)
+    infos = checkpoint.get("infos")
+    env_state = infos.get("env_state") if isinstance(infos, dict) else None
+    dicts = {name: checkpoint.get(name) for name in _DICT_ENTRIES}
+    counts = {name: checkpoint.get(name, least) for name, least in _COUNT_ENTRIES.items()}
+    if isinstance(env_state, dict):
+        counts["common_step_counter"] = env_state.get("common_step_counter", 0)
+    try:
+        # None is a missing entry: rsl_rl writes `infos` as None.
+        for name, value in {**dicts, "infos.env_state": env_state}.items():
+            if not isinstance(value, dict | None):
+                raise ValueError(f"{name}: expected a dict, got a {type(value).__name__}.")
+        for name, value in counts.items():
+            check_count(name, value, _COUNT_ENTRIES.get(name, 0))
+    except ValueError as error:
+        raise CheckpointError(
+            f"Checkpoint {path!r} is malformed: {error} Use another checkpoint. Nothing was changed."
+        ) from error
     migrated = dict(checkpoint)
     if migrated.get("model_state_dict") is not None:
         parts: dict[str, dict[str, Any]] = {"actor_state_dict": {}, "critic_state_dict": {}}
@@ -612,46 +604,6 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
             for name, value in migrated["actor_state_dict"].items()
         }
     return migrated
-
-
-def _check_types(checkpoint: Mapping[str, Any], path: str) -> None:
-    for name in _DICT_ENTRIES:
-        value = checkpoint.get(name)
-        # None is a missing entry: rsl_rl writes `infos` as None.
-        if value is not None and not isinstance(value, dict):
-            raise _malformed(path, name, "a dict", value)
-        if value is not None and name.endswith("_state_dict"):
-            for key in value:
-                if not isinstance(key, str):
-                    raise _malformed(path, f"a key of {name}", "a string", key)
-    for name, minimum in _COUNT_ENTRIES.items():
-        if name in checkpoint and not _is_count(checkpoint[name], minimum):
-            raise _malformed(path, name, f"an integer >= {minimum}", checkpoint[name])
-    owes = checkpoint.get("owes_evaluation", False)
-    if not isinstance(owes, bool):
-        raise _malformed(path, "owes_evaluation", "a bool", owes)
-    env_state = (checkpoint.get("infos") or {}).get("env_state")
-    if env_state is None:
-        return
-    if not isinstance(env_state, dict):
-        raise _malformed(path, "infos.env_state", "a dict", env_state)
-    counter = env_state.get("common_step_counter", 0)
-    if not _is_count(counter, 0):
-        name = "infos.env_state.common_step_counter"
-        raise _malformed(path, name, "an integer >= 0", counter)
-
-
-def _is_count(value: Any, minimum: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= minimum
-
-
-def _malformed(path: str, name: str, expected: str, value: Any) -> CheckpointError:
-    shown = repr(value)
-    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
-    return CheckpointError(
-        f"Checkpoint {path!r} is malformed: {name}: expected {expected}, got {shown} "
-        f"({type(value).__name__}); use another checkpoint. Nothing was changed."
-    )
 
 
 # Plain data.

@@ -84,7 +84,7 @@ def launch_workers(
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
     workers: list[subprocess.Popen[bytes]] = []
     received: list[signal.Signals] = []
-    killed = set()
+    killed: set[subprocess.Popen[bytes]] = set()
 
     def forward(number: int, frame: FrameType | None) -> None:
         received.append(FORWARDED[number])
@@ -100,25 +100,25 @@ def launch_workers(
             for number in received:
                 workers[-1].send_signal(number)
         try:
-            while not (ended := _failed(workers)) and _running(workers):
+            while None in (codes := [worker.poll() for worker in workers]) and not any(codes):
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
         finally:
             end = time.monotonic() + _PATIENCE
-            while _running(workers) and time.monotonic() < end:
+            while None in [w.poll() for w in workers] and time.monotonic() < end:
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
-            for rank in _running(workers):
-                workers[rank].kill()
-                killed.add(rank)
+            killed |= {worker for worker in workers if worker.poll() is None}
+            for worker in killed:
+                worker.kill()
             for worker in workers:
                 worker.wait()
-    if not ended:
+    failed = [rank for rank, code in enumerate(codes) if code]
+    if not failed:
         return
     # The process that failed first, not one that failed because of it or was killed here.
-    candidates = [rank for rank in (*ended, *_failed(workers)) if rank not in killed]
-    rank = next(
-        (rank for rank in candidates if workers[rank].returncode != OtherProcessError.exit_status),
-        ended[0],
-    )
+    later = [rank for rank in range(count) if workers[rank] not in killed]
+    others = (0, OtherProcessError.exit_status)
+    candidates = (rank for rank in (*failed, *later) if workers[rank].returncode not in others)
+    rank = next(candidates, failed[0])
     code = workers[rank].returncode
     if received and code in (130, -signal.SIGINT):
         raise KeyboardInterrupt
@@ -299,15 +299,7 @@ class ProcessOutput(io.TextIOBase):
             self._target = None
 
 
-# Helpers of the launcher and the process group.
-
-
-def _running(workers: list[subprocess.Popen[bytes]]) -> list[int]:
-    return [rank for rank, worker in enumerate(workers) if worker.poll() is None]
-
-
-def _failed(workers: list[subprocess.Popen[bytes]]) -> list[int]:
-    return [rank for rank, worker in enumerate(workers) if worker.poll() not in (None, 0)]
+# Rendezvous.
 
 
 def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
@@ -359,6 +351,6 @@ def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
         if waited > _SECONDS_OF_SILENCE and not warned:
             logger.warning("%s waits for the others %s. %s", names, progress, hint)
             warned = True
-        time.sleep(0.05)
+        time.sleep(_SECONDS_BETWEEN_LOOKS)
         joined = store.add("mjlab/joined", 0)
     return store

@@ -19,7 +19,7 @@ import operator
 import re
 import time
 from collections.abc import Callable, Generator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -281,6 +281,7 @@ class SolvedCheck:
         self._has_target = target is not None or bool(self._below or self._above)
         self._min_interval = int(cfg.get("min_interval", 3))
         self._num_episodes = int(cfg.get("num_episodes", 256))
+        self._prepare_env = cfg.get("prepare_env")
         known = {*(cfg.get("metrics") or {}), *RESULT_FIELDS}
         defining_success = ("success_func", "success_return", "solved_return")
         is_defined = any(cfg.get(name) is not None for name in defining_success)
@@ -348,7 +349,9 @@ class SolvedCheck:
         The episodes are the same at each call.
         """
         if self._eval_env is None:
-            self._eval_env = self._make_env(evaluation_seed(self._seed))
+            self._eval_env = make_evaluation_env(
+                self._env, self._num_episodes, evaluation_seed(self._seed), self._prepare_env
+            )
         return self._score(self._eval_env, evaluation_seed(self._seed))
 
     def confirm(self, iteration: int) -> EvaluationResult:
@@ -358,16 +361,9 @@ class SolvedCheck:
         episodes.
         """
         seed = evaluation_seed(self._seed, iteration)
-        env = self._make_env(seed)
-        try:
+        env = make_evaluation_env(self._env, self._num_episodes, seed, self._prepare_env)
+        with closing(env):
             return self._score(env, seed)
-        finally:
-            env.close()
-
-    def _make_env(self, seed: int) -> Any:
-        return make_evaluation_env(
-            self._env, self._num_episodes, seed, self._cfg.get("prepare_env")
-        )
 
     def _score(self, env: Any, seed: int) -> EvaluationResult:
         # Curricula count the steps of training.

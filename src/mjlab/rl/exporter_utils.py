@@ -47,7 +47,7 @@ import numpy as np
 import torch
 
 from mjlab.rl.checkpoint import CheckpointError
-from mjlab.utils.os import replacing
+from mjlab.utils.os import write_atomically
 from mjlab.utils.torch import torch_threads
 
 if TYPE_CHECKING:
@@ -174,13 +174,6 @@ def _memories(inputs: Iterable[str], outputs: Iterable[str]) -> dict[str, str]:
     return {before: after for before, after in pairs.items() if after in known}
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write `content` to `path` through a temporary file in the same folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
-        file.write(content)
-
-
 # Metadata.
 
 
@@ -242,7 +235,7 @@ def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:
         "joint_names": list(entity.joint_names),
         "joint_stiffness": [gains[name][0] for name in actuated],
         "joint_damping": [gains[name][1] for name in actuated],
-        "default_joint_pos": _numbers(default[0]) if default is not None else [],
+        "default_joint_pos": _shortest(default[0]) if default is not None else [],
     }
 
 
@@ -255,9 +248,12 @@ def _observation_metadata(env: ManagerBasedRlEnv, groups: Sequence[str] | None) 
     terms = [(group, name) for group in groups for name in manager.active_terms[group]]
     cfgs = [manager.get_term_cfg(group, name) for group, name in terms]
     dims = [dim for group in groups for dim in manager.group_obs_term_dim[group]]
+    scales = [torch.as_tensor(1.0 if cfg.scale is None else cfg.scale) for cfg in cfgs]
     return {
         "observation_names": [name for _, name in terms],
-        "observation_terms_scale": [_scale(cfg.scale) for cfg in cfgs],
+        "observation_terms_scale": [
+            _shortest(scale.flatten() if scale.ndim > 0 else scale) for scale in scales
+        ],
         "observation_terms_flatten_history_dim": [cfg.flatten_history_dim for cfg in cfgs],
         "observation_terms_history_length": [cfg.history_length for cfg in cfgs],
         "observation_terms_clip": [
@@ -267,14 +263,6 @@ def _observation_metadata(env: ManagerBasedRlEnv, groups: Sequence[str] | None) 
         "observation_dims": [int(np.prod(dim)) for dim in dims],
         "observation_delay": [[cfg.delay_min_lag, cfg.delay_max_lag] for cfg in cfgs],
     }
-
-
-def _scale(scale: Any) -> float | list[float]:
-    if scale is None:
-        return 1.0
-    if isinstance(scale, torch.Tensor):
-        return _numbers(scale) if scale.ndim > 0 else _shortest(scale.item())
-    return list(scale) if isinstance(scale, (list, tuple)) else float(scale)
 
 
 def _action_metadata(terms: Mapping[str, Any]) -> Metadata:
@@ -292,7 +280,7 @@ def _action_metadata(terms: Mapping[str, Any]) -> Metadata:
         components["scale"] += _per_component(term, "_scale", 1.0)
         components["offset"] += _per_component(term, "_offset", 0.0)
         components["clip"] += (
-            [_numbers(bounds) for bounds in clip[0]]
+            _shortest(clip[0])
             if isinstance(clip, torch.Tensor)
             else [[-np.inf, np.inf]] * term.action_dim
         )
@@ -314,17 +302,15 @@ def _per_component(term: Any, attribute: str, default: float) -> list[float]:
     value = getattr(term, attribute, default)
     if isinstance(value, torch.Tensor):
         row = value[0] if value.ndim > 1 else value
-        return _numbers(row.expand(term.action_dim))
+        return _shortest(row.expand(term.action_dim))
     return [float(value)] * term.action_dim
 
 
-def _numbers(values: torch.Tensor) -> list[float]:
-    return [_shortest(value) for value in values.flatten().tolist()]
-
-
-def _shortest(value: float) -> float:
-    """Return the shortest decimal that equals `value` in float32: 0.1, not 0.100000001."""
-    return float(str(np.float32(value)))
+def _shortest(value: Any) -> Any:
+    """Return the shortest decimals that equal `value` in float32: 0.1, not 0.100000001."""
+    if isinstance(value, torch.Tensor):
+        value = value.tolist()
+    return [*map(_shortest, value)] if isinstance(value, list) else float(str(np.float32(value)))
 
 
 def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | float]) -> None:
@@ -345,9 +331,7 @@ def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | 
 def metadata_texts(metadata: Mapping[str, list | str | float]) -> dict[str, str]:
     """Return `metadata` as strings, in the format of the ONNX file."""
     return {
-        key: list_to_csv_str(value, decimals=None)
-        if isinstance(value, (list, tuple))
-        else _text(value, None)
+        key: list_to_csv_str(value if isinstance(value, (list, tuple)) else [value], decimals=None)
         for key, value in metadata.items()
     }
 
@@ -360,22 +344,16 @@ def list_to_csv_str(
     Numbers have `decimals` decimals, booleans as 1 and 0; None: the shortest decimal that reads back
     as the same number. Other items are converted by `str`.
     """
-    return delimiter.join(
-        list_to_csv_str(item, decimals=decimals, delimiter=sub_delimiter)
-        if isinstance(item, (list, tuple))
-        else _text(item, decimals)
-        for item in (arr.tolist() if hasattr(arr, "tolist") else arr)
-    )
-
-
-def _text(item: Any, decimals: int | None) -> str:
-    if not isinstance(item, (bool, int, float, np.bool_, np.number)):
-        return str(item)
-    if decimals is not None:
-        return f"{item:.{decimals}f}"
-    if isinstance(item, (bool, np.bool_)):
-        return str(int(item))
-    return str(item)
+    texts = []
+    for item in arr.tolist() if hasattr(arr, "tolist") else arr:
+        if isinstance(item, (list, tuple)):
+            item = list_to_csv_str(item, decimals=decimals, delimiter=sub_delimiter)
+        elif isinstance(item, (bool, int, float, np.bool_, np.number)) and decimals is not None:
+            item = f"{item:.{decimals}f}"
+        elif isinstance(item, (bool, np.bool_)):
+            item = int(item)
+        texts.append(str(item))
+    return delimiter.join(texts)
 
 
 def initializers_digest(model: str | Path | Any) -> str:
@@ -422,8 +400,9 @@ def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
         raise
     except Exception as error:
         raise OnnxPolicyError(
-            f"Policy {path} cannot be run: {_first_line(error)}. The file is damaged, or not a policy "
-            "of this environment."
+            f"Policy {path} cannot be run: {_first_line(error)}. The file is damaged, not a policy of "
+            "this environment, or not supported by onnxruntime; play the checkpoint "
+            "(model_<iteration>.pt) instead."
         ) from error
     return policy
 
@@ -460,6 +439,8 @@ class OnnxPolicy:
                 named `actions`; or the actions depend on inputs other than a flat observation,
                 images and a hidden state.
         """
+        import onnxruntime
+
         self.path = Path(path)
         self.device = device
         model = _read_model(self.path)
@@ -485,7 +466,16 @@ class OnnxPolicy:
         self._flat_groups = ["actor"] if self._named_groups is None else self._named_groups
         self.groups = [*self.image_shapes, *self._flat_groups]
         self._memory: dict[str, np.ndarray] = {}
-        self._session = _make_session(self.path, model, 1 if self._is_for_one else num_envs)
+        options = onnxruntime.SessionOptions()
+        weights = sum(math.prod(tensor.dims) for tensor in model.graph.initializer)
+        options.intra_op_num_threads = torch_threads(weights, 1 if self._is_for_one else num_envs)
+        # Spinning threads would take cores from the physics.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        # Fatal errors only: errors are raised as exceptions.
+        options.log_severity_level = 4
+        self._session = onnxruntime.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
 
     def __call__(self, observations: Any) -> torch.Tensor:
         """Return actions (N, num_actions).
@@ -494,27 +484,32 @@ class OnnxPolicy:
             observations: Observation groups of the environment, a superset of `groups`; or, for a
                 policy without images, a tensor (N, num_observations).
         """
-        inputs = {name: _array(observations[name]) for name in self.image_shapes}
+        shown = {name: observations[name] for name in self.image_shapes}
         if self._state is not None:
-            inputs[self._state] = _array(
+            shown[self._state] = (
                 observations
                 if isinstance(observations, torch.Tensor)
                 else torch.cat([observations[name] for name in self._flat_groups], dim=-1)
             )
+        inputs = {
+            name: value.detach().to("cpu", torch.float32).numpy() for name, value in shown.items()
+        }
         count = len(next(iter(inputs.values())))
         if not self._memory:
             self._memory = {
                 name: np.zeros((layers, count, *rest), np.float32)
                 for name, (layers, _, *rest) in self._memory_shapes.items()
             }
-        if self._is_for_one:
-            rows = [self._run(inputs, slice(row, row + 1)) for row in range(count)]
-            actions, *memories = (
-                np.concatenate(parts, axis=0 if k == 0 else 1)
-                for k, parts in enumerate(zip(*rows, strict=True))
-            )
-        else:
-            actions, *memories = self._run(inputs, slice(None))
+        results = []
+        for row in range(count) if self._is_for_one else (None,):
+            rows = slice(None) if row is None else slice(row, row + 1)
+            feed = {name: value[rows] for name, value in inputs.items()}
+            feed |= {name: value[:, rows] for name, value in self._memory.items()}
+            results.append(self._session.run(self._outputs, feed))
+        actions, *memories = (
+            np.concatenate(parts, axis=0 if k == 0 else 1)
+            for k, parts in enumerate(zip(*results, strict=True))
+        )
         self._memory = dict(zip(self._memories, memories, strict=True))
         return torch.from_numpy(actions).to(self.device)
 
@@ -533,7 +528,13 @@ class OnnxPolicy:
         Raises:
             OnnxPolicyError: observations or actions differ; the message lists all differences.
         """
-        differences = self._group_differences(env)
+        shapes: dict[str, Any] = env.observation_manager.group_obs_dim
+        differences = [
+            f"observations {name!r}: the policy has {shape or 'a flat group'}, the environment "
+            f"{shapes.get(name, 'no such group')}"
+            for name, shape in (dict.fromkeys(self._named_groups or ()) | self.image_shapes).items()
+            if name not in shapes or shape not in (None, tuple(shapes[name]))
+        ]
         if not differences:
             expected = metadata_texts(get_base_metadata(env, "", self._named_groups))
             own = {key: self.metadata[key] for key in _INTERFACE if key in self.metadata}
@@ -552,25 +553,6 @@ class OnnxPolicy:
                 + "; ".join(differences)
                 + "."
             )
-
-    def _group_differences(self, env: ManagerBasedRlEnv) -> list[str]:
-        """Return a message for each observation group that the environment lacks."""
-        groups = self._named_groups or []
-        if not groups and not self.image_shapes:
-            return []
-        shapes: dict[str, Any] = env.observation_manager.group_obs_dim
-        differences = [
-            f"observations {name!r}: the environment has no such group"
-            for name in groups
-            if name not in shapes
-        ]
-        for name, shape in self.image_shapes.items():
-            found = tuple(shapes[name]) if name in shapes else "no such group"
-            if found != shape:
-                differences.append(
-                    f"images {name!r}: the policy has {shape}, the environment {found}"
-                )
-        return differences
 
     def _read_inputs(self, graph: Any) -> None:
         inputs = {item.name: _dims(item) for item in graph.input}
@@ -594,28 +576,18 @@ class OnnxPolicy:
         # The size of a dynamic dimension reads 0.
         self._is_for_one = max(batches) == 1
 
-    def _run(self, inputs: dict[str, np.ndarray], rows: slice) -> list[np.ndarray]:
-        """Return the actions and the next hidden state of environments `rows`."""
-        feed = {name: value[rows] for name, value in inputs.items()}
-        feed |= {name: value[:, rows] for name, value in self._memory.items()}
-        return self._session.run(self._outputs, feed)
-
 
 def _read_model(path: Path) -> Any:
     import onnx
 
     try:
         model = onnx.load(str(path))
-    except FileNotFoundError as error:
-        raise OnnxPolicyError(f"Policy {path} not found.") from error
+        if not model.graph.node:
+            raise ValueError("it has no graph.")
     except Exception as error:
         raise OnnxPolicyError(
             f"Policy {path} is not an ONNX file that can be read: {_first_line(error)}"
         ) from error
-    if not model.graph.node:
-        raise OnnxPolicyError(
-            f"Policy {path} is not an ONNX file that can be read: it has no graph."
-        )
     # A warning only, because users optimize graphs.
     written = {item.key: item.value for item in model.metadata_props}.get(DIGEST_KEY)
     if written is not None and written != initializers_digest(model):
@@ -624,28 +596,6 @@ def _read_model(path: Path) -> Any:
             path, DIGEST_KEY,
         )  # fmt: skip
     return model
-
-
-def _make_session(path: Path, model: Any, num_envs: int) -> Any:
-    """Return an onnxruntime session; its number of threads depends on the size of the policy."""
-    import onnxruntime
-
-    weights = sum(math.prod(tensor.dims) for tensor in model.graph.initializer)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch_threads(weights, num_envs)
-    # Spinning threads would take cores from the physics.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Fatal errors only: errors are raised as exceptions.
-    options.log_severity_level = 4
-    try:
-        return onnxruntime.InferenceSession(
-            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-        )
-    except Exception as error:
-        raise OnnxPolicyError(
-            f"Policy {path} cannot be run: {_first_line(error)}. The file is damaged, or not supported "
-            "by onnxruntime; play the checkpoint (model_<iteration>.pt) instead."
-        ) from error
 
 
 def _keep_only(graph: Any, outputs: Sequence[str]) -> None:
@@ -669,10 +619,6 @@ def _keep_only(graph: Any, outputs: Sequence[str]) -> None:
             del graph.output[index]
 
 
-def _array(value: torch.Tensor) -> np.ndarray:
-    return value.detach().to("cpu", torch.float32).numpy()
-
-
 def _dims(value: Any) -> list[int]:
     return [int(dim.dim_value) for dim in value.type.tensor_type.shape.dim]
 
@@ -687,12 +633,10 @@ def _alike(one: str, other: str) -> bool:
     if len(ours) == 1 and len(theirs) > 1:
         # A scalar applies to all components.
         ours *= len(theirs)
-    return len(ours) == len(theirs) and all(map(_same, ours, theirs))
-
-
-def _same(one: str, other: str) -> bool:
     try:
-        first, second = float(one), float(other)
+        return len(ours) == len(theirs) and all(
+            math.isclose(a, b, rel_tol=_RELATIVE_TOLERANCE, abs_tol=_ABSOLUTE_TOLERANCE)
+            for a, b in zip(map(float, ours), map(float, theirs), strict=True)
+        )
     except ValueError:
-        return one == other
-    return math.isclose(first, second, rel_tol=_RELATIVE_TOLERANCE, abs_tol=_ABSOLUTE_TOLERANCE)
+        return ours == theirs

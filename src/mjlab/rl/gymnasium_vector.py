@@ -12,9 +12,9 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import batch_space, iterate
 
-from mjlab.envs.manager_based_rl_env import as_action
+from mjlab.managers.action_manager import as_action
 from mjlab.utils.errors import WrongStateError, check_one_of, check_positive
 
 if TYPE_CHECKING:
@@ -175,20 +175,20 @@ class GymnasiumVectorEnv(VectorEnv):
         extras: dict[str, Any],
     ) -> None:
         """Add final observations, returns and lengths of environments `ended` (N,) to `infos`."""
-        final = np.full(self.num_envs, None, dtype=object)
+        final, space = np.full(self.num_envs, None, dtype=object), self.observation_space
         rows = ended.nonzero().flatten()
         ids = rows[:0]
         if "final_ids" in extras:
             ids = extras["final_ids"]
             shown = self._shown(extras["final_observations"])
-            for position, row in enumerate(ids.tolist()):
-                final[row] = _row(shown, position)
+            for row, one in zip(ids.tolist(), iterate(space, shown), strict=True):
+                final[row] = one
         # Environments without a final observation diverged.
         diverged = rows[~torch.isin(rows, ids)]
         if len(diverged) > 0:
-            shown = self._shown(_row(before, diverged))
-            for position, row in enumerate(diverged.tolist()):
-                final[row] = _row(shown, position)
+            shown = self._shown(before, diverged)
+            for row, one in zip(diverged.tolist(), iterate(space, shown), strict=True):
+                final[row] = one
         mask = self._arrays(ended)
         infos |= {
             "final_obs": final,
@@ -202,14 +202,15 @@ class GymnasiumVectorEnv(VectorEnv):
             "_final_info": mask,
         }
 
-    def _shown(self, observations: dict[str, Any]) -> Any:
+    def _shown(self, observations: dict[str, Any], rows: Any = slice(None)) -> Any:
         """Return the observations of the group, as arrays for the caller."""
-        return self._arrays(observations if self._group is None else observations[self._group])
+        shown = observations if self._group is None else observations[self._group]
+        return self._arrays(shown, rows)
 
-    def _arrays(self, values: Any) -> Any:
+    def _arrays(self, values: Any, rows: Any = slice(None)) -> Any:
         if isinstance(values, dict):
-            return {name: self._arrays(value) for name, value in values.items()}
-        return values if self._tensors else values.cpu().numpy()
+            return {name: self._arrays(value, rows) for name, value in values.items()}
+        return values[rows] if self._tensors else values[rows].cpu().numpy()
 
 
 def step_env(
@@ -306,10 +307,3 @@ def _term_bounds(
         for end in cfg.clip
     ]
     return np.minimum(*ends), np.maximum(*ends)
-
-
-def _row(values: Any, row: Any) -> Any:
-    """Return one or more rows of nested arrays."""
-    if isinstance(values, dict):
-        return {name: _row(value, row) for name, value in values.items()}
-    return values[row]

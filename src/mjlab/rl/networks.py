@@ -1,6 +1,7 @@
 """Checks of networks against observations, completion of their settings, shared image encoders.
 
 rsl_rl also fails on most of the errors checked here, but later and without naming the setting.
+Unknown groups, and encoders without images, are errors of rsl_rl.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import CNNModel, MLPModel, RNNModel
+from rsl_rl.models import CNNModel, MLPModel
 from rsl_rl.modules import CNN
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
@@ -49,17 +50,24 @@ def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
     Raises:
         ValueError: see `check_networks` and `check_symmetry`.
     """
-    # rsl_rl's constructors accept these keys only if they are used.
-    for name in _MODELS:
-        model = cfg.get(name)
-        if isinstance(model, dict):
-            unused = [key for key in ("cnn_cfg", "distribution_cfg") if model.get(key, ...) is None]
-            unused += _RECURRENT_KEYS if model.get("rnn_type", ...) is None else ()
-            for key in unused:
-                model.pop(key, None)
     observations = env.get_observations()
+    for name in _MODELS:
+        if not isinstance(model := cfg.get(name), dict):
+            continue
+        # rsl_rl's constructors accept these keys only if they are used.
+        unused = [key for key in ("cnn_cfg", "distribution_cfg") if model.get(key, ...) is None]
+        unused += _RECURRENT_KEYS if model.get("rnn_type", ...) is None else ()
+        for key in unused:
+            model.pop(key, None)
+        # Images are never normalized; without other observations, rsl_rl fails.
+        groups = (cfg.get("obs_groups") or {}).get(name, ())
+        known = [observations[group] for group in groups if group in observations]
+        if known and all(value.ndim == 4 for value in known):
+            model["obs_normalization"] = False
     check_networks(observations, cfg)
-    _complete_image_settings(observations, cfg)
+    if cfg["algorithm"].get("share_cnn_encoders"):
+        # Required by rsl_rl, but without effect.
+        cfg["critic"].setdefault("cnn_cfg", cfg["actor"].get("cnn_cfg"))
     check_symmetry(env, observations, cfg)
 
 
@@ -71,10 +79,8 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
         cfg: Runner config as a dict.
 
     Raises:
-        ValueError: a network does not fit; the message names network, observation group and remedy.
+        ValueError: a network does not fit; the message names the setting and a remedy.
     """
-    if "replay_steps" in cfg["algorithm"]:
-        _check_sac_models(observations, cfg)
     student = cfg.get("student")
     if isinstance(student, dict) and student.get("distribution_cfg") is None:
         raise ValueError(
@@ -83,26 +89,17 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
         )
     shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
     images = {
-        model: _check_model(observations, cfg, model, shared)
+        model: _check_model(observations, cfg, model)
         for model in _MODELS
         if isinstance(cfg.get(model), dict)
     }
-    actor, critic = images.get("actor"), images.get("critic")
-    if shared and (actor is None or critic is None or set(actor) != set(critic)):
+    actor, critic = images.get("actor", []), images.get("critic", [])
+    if shared and (not actor or set(actor) != set(critic)):
         raise ValueError(
             "algorithm.share_cnn_encoders: expected actor and critic with image encoders for the same "
-            f"groups, got {list(actor or ()) or 'none'} for the actor and "
-            f"{list(critic or ()) or 'none'} for the critic; use the same image groups in obs_groups "
-            "and a CNN class for both, or share_cnn_encoders=False."
+            f"groups, got {actor or 'none'} for the actor and {critic or 'none'} for the critic; use "
+            "the same image groups in obs_groups and a CNN class for both, or share_cnn_encoders=False."
         )
-    for model in images:
-        settings = cfg[model]
-        is_blind = resolve_callable(settings["class_name"]) in (MLPModel, RNNModel)
-        if is_blind and settings.get("cnn_cfg") is not None:
-            raise ValueError(
-                f"agent.{model} cnn_cfg: expected None for class_name {settings['class_name']!r}, which "
-                f"has no image encoder, got {settings['cnn_cfg']}; use class_name='CNNModel'."
-            )
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
@@ -186,122 +183,63 @@ def deduplicate_parameters(optimizer: torch.optim.Optimizer) -> None:
         group["params"] = list(dict.fromkeys(group["params"]))
 
 
-def _check_sac_models(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
-    for model, base in _SAC_MODELS.items():
-        name = cfg[model]["class_name"]
-        kind = resolve_callable(name)
-        if not (isinstance(kind, type) and issubclass(kind, base)):
-            raise ValueError(
-                f"agent.{model} class_name: expected {base.__module__}:{base.__name__} or a "
-                f"subclass for the learner 'sac', got {name!r}; omit it, or use --learner ppo."
-            )
-        for group in (cfg.get("obs_groups") or {}).get(model, (model,)):
-            value = observations.get(group, None)
-            if isinstance(value, torch.Tensor) and value.ndim == 4:
-                raise ValueError(
-                    f"agent.obs_groups[{model!r}]: expected flat observations for the learner "
-                    f"'sac', got {group!r}, which holds images of shape {tuple(value.shape[1:])}; "
-                    "use --learner ppo."
-                )
-
-
-def _check_model(
-    observations: TensorDict, cfg: Mapping[str, Any], model: str, shared: bool
-) -> tuple[str, ...] | None:
-    """Check one network; return the image groups it encodes, None without encoders."""
-    names = (cfg.get("obs_groups") or {}).get(model, (model,))
-    missing = [name for name in names if name not in observations]
-    if missing and model in (cfg.get("obs_groups") or {}):
+def _check_model(observations: TensorDict, cfg: Mapping[str, Any], model: str) -> list[str]:
+    """Check one network; return the image groups that it encodes."""
+    settings, algorithm = cfg[model], cfg["algorithm"]
+    name, is_sac = settings["class_name"], "replay_steps" in algorithm
+    kind = resolve_callable(name)
+    base = _SAC_MODELS[model] if is_sac else object
+    if isinstance(kind, type) and not issubclass(kind, base):
         raise ValueError(
-            f"obs_groups[{model!r}]: unknown observation groups {missing}. Available: "
-            f"{sorted(observations.keys())}."
+            f"agent.{model} class_name: expected {base.__module__}:{base.__name__} or a subclass for "
+            f"the learner 'sac', got {name!r}; omit it, or use --learner ppo."
         )
-    groups = {name: observations[name] for name in names if name in observations}
-    for name, value in groups.items():
-        _check_group(name, value)
-    images = {name: value for name, value in groups.items() if value.ndim == 4}
-    kind = resolve_callable(cfg[model]["class_name"])
-    if isinstance(kind, type) and issubclass(kind, CNNModel):
-        if groups and not images:
+    images = []
+    for group in (cfg.get("obs_groups") or {}).get(model, (model,)):
+        value = observations.get(group, None)
+        if value is not None and not (torch.is_tensor(value) and value.is_floating_point()):
+            got = value.dtype if torch.is_tensor(value) else f"a dict of {sorted(value.keys())}"
             raise ValueError(
-                f"agent.{model} class_name {cfg[model]['class_name']!r}: expected images (channels, "
-                f"height, width), got the observation groups {list(groups)} without images; use "
-                f"class_name='MLPModel', or add an image group to obs_groups[{model!r}]."
+                f"Observation group {group!r}: expected a tensor of floating-point numbers, got {got}; "
+                "use concatenate_terms=True, or convert the values in the observation term."
             )
-        if model != "critic" or not shared:
-            _check_encoders(model, kind, cfg[model].get("cnn_cfg"), images)
-        return tuple(images)
+        if value is not None and value.ndim == 4:
+            images.append(group)
+    if isinstance(kind, type) and issubclass(kind, CNNModel):
+        if model != "critic" or not algorithm.get("share_cnn_encoders"):
+            shapes = {group: tuple(observations[group].shape[1:]) for group in images}
+            _check_encoders(model, kind, settings.get("cnn_cfg"), shapes)
+        return images
     # Models of other packages may accept images.
     if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
-        first = next(iter(images))
+        encoder = "--learner ppo" if is_sac else f"an image encoder ({_CNN_EXAMPLE})"
         raise ValueError(
-            f"agent.{model} class_name {cfg[model]['class_name']!r}: expected flat observations, got "
-            f"the observation group {first!r}, which holds images of shape "
-            f"{tuple(images[first].shape[1:])}; use an image encoder ({_CNN_EXAMPLE}), or remove "
-            f"{first!r} from obs_groups[{model!r}]."
+            f"agent.{model} class_name {name!r}: expected flat observations, got the observation group "
+            f"{images[0]!r}, which holds images of shape {tuple(observations[images[0]].shape[1:])}; "
+            f"use {encoder}, or remove {images[0]!r} from obs_groups[{model!r}]."
         )
-    return None
+    return []
 
 
-def _check_group(name: str, value: Any) -> None:
-    if not isinstance(value, torch.Tensor):
-        raise ValueError(
-            f"Observation group {name!r}: expected a tensor, got a dict of {sorted(value.keys())}; use "
-            "concatenate_terms=True, or one group per term."
-        )
-    if value.ndim not in (2, 4):
-        raise ValueError(
-            f"Observation group {name!r}: expected flat observations (size,) or images (channels, "
-            f"height, width), got shape {tuple(value.shape[1:])} per environment; flatten it "
-            "(flatten_history_dim=True for a history)."
-        )
-    if not value.is_floating_point():
-        raise ValueError(
-            f"Observation group {name!r}: expected floating-point numbers, got {value.dtype}; convert "
-            "them in the observation term."
-        )
-
-
-def _check_encoders(model: str, kind: type, cnn_cfg: Any, images: dict[str, torch.Tensor]) -> None:
+def _check_encoders(model: str, kind: type, cnn_cfg: Any, shapes: dict[str, Any]) -> None:
     """Check each encoder of `model` by building it once, without allocating memory."""
-    name = f"agent.{model} cnn_cfg"
+    name, groups = f"agent.{model} cnn_cfg", list(shapes)
     if not cnn_cfg or not isinstance(cnn_cfg, dict):
         raise ValueError(
-            f"{name}: expected a dict for the images {list(images)}, got {cnn_cfg!r}. {_CNN_EXAMPLE}"
+            f"{name}: expected a dict for the images {groups}, got {cnn_cfg!r}. {_CNN_EXAMPLE}"
         )
-    for group, settings in cnn_cfg_by_group(cnn_cfg, list(images), name).items():
-        extra = [key for key in SPATIAL_SOFTMAX_KEYS if key in settings]
-        if extra and kind is CNNModel:
-            raise ValueError(
-                f"{name}: {extra} not supported by class_name='CNNModel'; remove them, or use "
-                "class_name='mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel'."
-            )
+    for group, settings in cnn_cfg_by_group(cnn_cfg, groups, name).items():
         temperature = settings.get("spatial_softmax_temperature", 1.0)
         check_positive(f"{name} spatial_softmax_temperature", temperature)
-        settings = {k: v for k, v in settings.items() if k not in SPATIAL_SOFTMAX_KEYS}
-        shape = tuple(images[group].shape[1:])
+        if kind is not CNNModel:
+            settings = {k: v for k, v in settings.items() if k not in SPATIAL_SOFTMAX_KEYS}
         try:
             # The meta device neither computes nor draws random numbers.
             with torch.device("meta"):
-                channels, height, width = shape
-                CNN((height, width), channels, **settings)(torch.empty(1, *shape))
+                channels, height, width = shapes[group]
+                CNN((height, width), channels, **settings)(torch.empty(1, *shapes[group]))
         except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
             raise ValueError(
-                f"{name}: expected settings of an encoder for the images {group!r} of shape {shape}, "
+                f"{name}: expected settings of an encoder for the images {group!r} of shape {shapes[group]}, "
                 f"large enough for all layers, got {settings}: {str(error).splitlines()[0]}."
             ) from error
-
-
-def _complete_image_settings(observations: TensorDict, cfg: dict[str, Any]) -> None:
-    """Edit settings without effect that make rsl_rl fail, in place.
-
-    Images are never normalized, so networks with images only do not normalize observations. A
-    critic that shares the actor's encoders needs no encoder settings.
-    """
-    for model in _MODELS:
-        groups = (cfg.get("obs_groups") or {}).get(model, ())
-        known = [observations[name] for name in groups if name in observations]
-        if cfg.get(model) and known and all(value.ndim == 4 for value in known):
-            cfg[model]["obs_normalization"] = False
-    if cfg["algorithm"].get("share_cnn_encoders"):
-        cfg["critic"].setdefault("cnn_cfg", cfg["actor"].get("cnn_cfg"))

@@ -115,15 +115,14 @@ def plot_run(
         ValueError: see `read_scalars`.
     """
     run_dir = Path(run_dir)
-    curve = read_scalars(run_dir, tag)
-    output = run_dir / "learning_curve.png" if output is None else Path(output)
-
-    def draw(axes: Axes) -> None:
-        axes.plot(curve[0] + 1, curve[1])
-
-    title = run_dir.resolve().name if title is None else title
-    _draw_figure(draw, output, title, "Iteration", _LABELS.get(tag, tag))
-    return output
+    iterations, values = read_scalars(run_dir, tag)
+    return plot_curves(
+        {},
+        run_dir / "learning_curve.png" if output is None else output,
+        title=run_dir.resolve().name if title is None else title,
+        ylabel=_LABELS.get(tag, tag),
+        draw=lambda axes: axes.plot(iterations + 1, values),
+    )
 
 
 def plot_seeds(
@@ -174,7 +173,7 @@ def plot_curves(
     title: str,
     xlabel: str = "Iteration",
     ylabel: str,
-    draw: Callable[[Axes], None] | None = None,
+    draw: Callable[[Axes], Any] | None = None,
 ) -> Path:
     """Plot the mean over the curves of each group, with one sample standard deviation shaded.
 
@@ -189,19 +188,34 @@ def plot_curves(
     Returns:
         Path of the PNG file.
     """
+    # pyplot would choose a window system and keep the figure.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    def draw_all(axes: Axes) -> None:
-        for name, curves in groups.items():
-            x, mean, std = mean_and_std(curves)
-            (line,) = axes.plot(x, mean, label=name or None)
-            axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=line.get_color(), lw=0)
-        if draw is not None:
-            draw(axes)
-        if axes.get_legend_handles_labels()[1]:
-            axes.legend()
-
+    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for name, curves in groups.items():
+        x, mean, std = mean_and_std(curves)
+        (line,) = axes.plot(x, mean, label=name or None)
+        axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=line.get_color(), lw=0)
+    if draw is not None:
+        draw(axes)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend()
+    values = np.concatenate(
+        [np.asarray(line.get_ydata(), float) for line in axes.lines] or [np.zeros(0)]
+    )
+    if (limits := visible_range(values)) is not None:
+        axes.set_ylim(limits)
+        beyond = int(((values < limits[0]) | (values > limits[1])).sum())
+        axes.set_title(f"{beyond} beyond the axis", loc="right", fontsize="small")
+    axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
     output = Path(output)
-    _draw_figure(draw_all, output, title, xlabel, ylabel)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(output, dpi=150)
     return output
 
 
@@ -233,30 +247,3 @@ def visible_range(values: np.ndarray) -> tuple[float, float] | None:
         return None
     margin = 0.05 * (high - low)
     return low - margin, high + margin
-
-
-def _draw_figure(
-    draw: Callable[[Axes], None], output: Path, title: str, xlabel: str, ylabel: str
-) -> None:
-    # pyplot would choose a window system and keep the figure.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    draw(axes)
-    values = np.concatenate(
-        [np.asarray(line.get_ydata(), float) for line in axes.lines] or [np.zeros(0)]
-    )
-    if (limits := visible_range(values)) is not None:
-        axes.set_ylim(limits)
-        beyond = int(((values < limits[0]) | (values > limits[1])).sum())
-        axes.set_title(f"{beyond} beyond the axis", loc="right", fontsize="small")
-    axes.set_xlabel(xlabel)
-    axes.set_ylabel(ylabel)
-    axes.set_title(title)
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=150)

@@ -114,6 +114,7 @@ class RunLogger(Logger):
         of `process_env_step` (the step's duration if rewards are scaled by it)."""
         super().__init__(*args, **kwargs)
         self._reward_unit = reward_unit
+        self._uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
         # rsl_rl's default is the repository around the virtual environment.
         self.git_status_repos = []
         self._session_time = 0.0
@@ -145,10 +146,6 @@ class RunLogger(Logger):
         name = service if isinstance(service, str) else service["class_name"]
         return _LOGGER_TYPES.get(name, name)
 
-    @property
-    def _uses_rnd(self) -> bool:
-        return bool(self.cfg["algorithm"].get("rnd_cfg"))
-
     def init_logging_writer(self) -> None:
         """Open the event file, and write the git diffs of `git_status_repos`.
 
@@ -160,7 +157,15 @@ class RunLogger(Logger):
         service = self.cfg.get("logger", "tensorboard")
         if self.log_dir is not None and not self.disable_logs:
             ensure_writable_folder(self.log_dir)
-            self.cfg["logger"] = _writer_config(service, self.cfg)
+            writer = service
+            if service == "wandb":
+                project = self.cfg.get("wandb_project")
+                writer = {"class_name": "WandbLogWriter", "project_name": project}
+            self.cfg["logger"] = writer
+            is_wandb = isinstance(writer, dict) and writer.get("class_name") == "WandbLogWriter"
+            if is_wandb and not self.cfg.get("upload_git_diff", False):
+                # wandb would upload a separate diff, of the repository around the working folder.
+                os.environ.setdefault("WANDB_DISABLE_CODE", "true")
         # Hidden from rsl_rl: it would upload the diffs to any logging service.
         sources, self.git_status_repos = self.git_status_repos, []
         with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -224,9 +229,9 @@ class RunLogger(Logger):
 
         The arguments are those of rsl_rl's `Logger.log`.
         """
-        self._collect_finished_episodes()
+        mean_step_reward = self._collect_rewards()
         super().log(it, *args, **kwargs)
-        self.write_scalars({"Train/mean_step_reward": self._mean_step_reward()}, it)
+        self.write_scalars({"Train/mean_step_reward": mean_step_reward}, it)
 
     def finish_iteration(
         self,
@@ -248,7 +253,7 @@ class RunLogger(Logger):
         self.tot_time += duration
         self._session_time += duration
         per_iteration = self._session_time / (iteration + 1 - first_iteration)
-        self._collect_finished_episodes()
+        mean_step_reward = self._collect_rewards()
         stats = IterationStats(
             iteration=iteration + 1,
             total_iterations=total_iterations,
@@ -259,7 +264,7 @@ class RunLogger(Logger):
             time_left=per_iteration * (total_iterations - iteration - 1),
             mean_reward=statistics.fmean(self.rewbuffer) if self.rewbuffer else None,
             mean_episode_length=statistics.fmean(self.lenbuffer) if self.lenbuffer else None,
-            mean_step_reward=self._mean_step_reward(),
+            mean_step_reward=mean_step_reward,
             learning_rate=learning_rate,
             action_std=action_std.mean().item(),
             losses=losses,
@@ -361,18 +366,15 @@ class RunLogger(Logger):
         self.rewbuffer.extend(state["rewards"])
         self.lenbuffer.extend(state["lengths"])
 
-    def _collect_finished_episodes(self) -> None:
+    def _collect_rewards(self) -> float:
+        """Read the step data: add the finished episodes, and return the mean weighted reward."""
         if not self._finished:
-            return
+            return 0.0
         done, *sums = (torch.stack(column) for column in zip(*self._finished, strict=True))
-        self._finished.clear()
         for (_, last), of_steps in zip(self._episode_sums, sums, strict=True):
             last.extend(of_steps[done].tolist())
-
-    def _mean_step_reward(self) -> float:
-        if not self._step_rewards:
-            return 0.0
         mean = torch.stack(self._step_rewards).mean().item()
+        self._finished.clear()
         self._step_rewards.clear()
         return mean / self._reward_unit
 
@@ -458,17 +460,6 @@ def write_git_diff(run_dir: Path, source: Path) -> Path | None:
             path,
         )
     return path
-
-
-def _writer_config(service: str | dict[str, Any], cfg: dict[str, Any]) -> str | dict[str, Any]:
-    """Return rsl_rl's config of the log writer."""
-    if service == "wandb":
-        service = {"class_name": "WandbLogWriter", "project_name": cfg.get("wandb_project")}
-    is_wandb = isinstance(service, dict) and service.get("class_name") == "WandbLogWriter"
-    if is_wandb and not cfg.get("upload_git_diff", False):
-        # wandb would upload a separate diff, of the repository around the working folder.
-        os.environ.setdefault("WANDB_DISABLE_CODE", "true")
-    return service
 
 
 def _git(folder: Path, *arguments: str) -> str:

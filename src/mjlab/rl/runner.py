@@ -401,12 +401,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         checkpoint["training_state"] = capture_training_state(
             self.env, self.alg, self.logger.state_dict(), observations
         )
-        replay = self._replay if self.cfg["algorithm"].get("save_replay") else None
-        if replay is not None:
+        saves_replay = self.cfg["algorithm"].get("save_replay", False)
+        if saves_replay:
             # First, so that the newest checkpoint has a replay even if writing is interrupted.
-            ReplayFiles(path).write(replay)
+            storage: Any = self.alg.storage
+            ReplayFiles(path).write(storage)
         save_checkpoint(checkpoint, path)
-        if replay is not None:
+        if saves_replay:
             ReplayFiles(path).remove_others()
         if self.cfg.get("upload_model", True):
             self.logger.save_model(path, max(self.current_learning_iteration - 1, 0))
@@ -447,8 +448,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
-        if load_cfg is None and self._replay is not None:
-            ReplayFiles(path).read(self._replay)
+        storage = getattr(self.alg, "storage", None)
+        if load_cfg is None and isinstance(storage, ReplayStorage):
+            ReplayFiles(path).read(storage)
         self._observations = None
         return infos
 
@@ -569,11 +571,6 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _run_folder(self) -> str | None:
         """Run folder; None in processes that do not write files."""
         return self.logger.log_dir if self._is_main_process else None
-
-    @property
-    def _replay(self) -> ReplayStorage | None:
-        storage: Any = getattr(self.alg, "storage", None)
-        return storage if isinstance(storage, ReplayStorage) else None
 
     def _resolve_threads(self) -> int:
         if torch.device(self.device).type != "cpu":

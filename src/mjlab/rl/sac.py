@@ -32,6 +32,7 @@ from torch import nn
 from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
+from mjlab.utils.errors import check_field
 
 # Range of scaled returns if `value_range` is None.
 _SCALED_RANGE = (-5.0, 5.0)
@@ -89,11 +90,8 @@ class SAC:
         self._teacher = _Teacher(cfg)
         symmetry, self._env = cfg.symmetry_cfg, env
         self._mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
-        if self._mirror is not None and cfg.batch_size % 2:
-            raise ValueError(
-                f"SAC batch_size: expected an even number, because half of the batch is mirrored, got "
-                f"{cfg.batch_size}."
-            )
+        is_whole = not symmetry or cfg.batch_size % 2 == 0
+        check_field(cfg, "batch_size", is_whole, "an even number, because half is mirrored")
         self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb
 
         self._generator = torch.Generator(device=device)
@@ -110,9 +108,8 @@ class SAC:
         self._thread: ThreadPoolExecutor | None = None
         self._running: Future[None] | None = None
         self._is_concurrent = multi_gpu_cfg is None and torch.device(device).type == "cpu"
-        if self._is_concurrent:
-            # For the acting thread. More threads would wait for those of the physics.
-            self.num_threads = 1
+        # For the acting thread. More threads would wait for those of the physics.
+        self.num_threads = 1 if self._is_concurrent else None
 
     @staticmethod
     def construct_algorithm(obs: TensorDict, env: VecEnv, cfg: dict, device: str) -> SAC:
@@ -505,10 +502,8 @@ class _Teacher:
 
     def __init__(self, cfg: RslRlSacAlgorithmCfg) -> None:
         steps = [step for step, _ in cfg.imitation]
-        if not steps or steps != sorted(set(steps)):
-            raise ValueError(
-                f"SAC imitation: expected points with increasing steps, got {cfg.imitation}."
-            )
+        increases = len(steps) > 0 and steps == sorted(set(steps))
+        check_field(cfg, "imitation", increases, "points with increasing steps")
         has_weight = any(weight for _, weight in cfg.imitation)
         if cfg.teacher is None and (cfg.teacher_steps > 0 or has_weight):
             raise ValueError(

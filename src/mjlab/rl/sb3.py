@@ -6,7 +6,7 @@ Needs Stable-Baselines3 (`pip install "mjlab[sb3]"`). `examples/sb3_swing_up.py`
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -94,7 +94,7 @@ class Sb3VecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environment, once for each of `indices`."""
-        return [getattr(self.env, attr_name)] * self._count(indices)
+        return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the environment, shared by all `indices`."""
@@ -105,11 +105,11 @@ class Sb3VecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of the environment once; return the result for each of `indices`."""
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)
-        return [result] * self._count(indices)
+        return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Return False for each of `indices`."""
-        return [False] * self._count(indices)
+        return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> list[np.ndarray | None]:
         """Return one image of all environments, in a list."""
@@ -118,6 +118,3 @@ class Sb3VecEnv(VecEnv):
     def close(self) -> None:
         """Close the environment."""
         self._envs.close()
-
-    def _count(self, indices: None | int | Iterable[int]) -> int:
-        return len(self._get_indices(indices))

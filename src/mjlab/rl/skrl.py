@@ -138,20 +138,15 @@ def with_final_observations(agent: type[Agent]) -> type[Agent]:
                     f"environments, got {len(next_observations)} of them; do not use scopes."
                 )
             if "final_ids" in infos:
-                ids = infos["final_ids"]
-                next_observations = _replaced(next_observations, ids, infos["final_observations"])
-                next_states = _replaced(next_states, ids, infos["final_states"])
+                ids, states = infos["final_ids"], infos["final_states"]
+                next_observations = next_observations.index_copy(
+                    0, ids, infos["final_observations"]
+                )
+                if next_states is not None and states is not None:
+                    next_states = next_states.index_copy(0, ids, states)
             super().record_transition(
                 next_observations=next_observations, next_states=next_states, infos=infos, **rest
             )
 
     WithFinalObservations.__name__ = agent.__name__
     return WithFinalObservations
-
-
-def _replaced(values: Any, ids: torch.Tensor, rows: Any) -> Any:
-    if values is None or rows is None:
-        return values
-    values = values.clone()
-    values[ids] = rows
-    return values

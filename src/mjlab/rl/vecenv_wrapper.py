@@ -116,11 +116,11 @@ class RslRlVecEnvWrapper(VecEnv):
     def reset(self) -> tuple[TensorDict, dict]:
         """Start new episodes in all environments."""
         observations, extras = self.env.reset()
-        return self._as_tensordict(observations), extras
+        return TensorDict(observations, batch_size=[self.num_envs]), extras
 
     def get_observations(self) -> TensorDict:
         """Return the observations of the last step or reset."""
-        return self._as_tensordict(self.unwrapped.get_observations())
+        return TensorDict(self.unwrapped.get_observations(), batch_size=[self.num_envs])
 
     def step(
         self, actions: torch.Tensor
@@ -145,11 +145,8 @@ class RslRlVecEnvWrapper(VecEnv):
             extras["final_observations"] = TensorDict(
                 extras["final_observations"], batch_size=[len(extras["final_ids"])]
             )
-        return self._as_tensordict(observations), rewards, dones, extras
+        return TensorDict(observations, batch_size=[self.num_envs]), rewards, dones, extras
 
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
-
-    def _as_tensordict(self, observations: dict[str, Any]) -> TensorDict:
-        return TensorDict(observations, batch_size=[self.num_envs])

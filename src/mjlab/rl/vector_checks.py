@@ -6,6 +6,8 @@ only those of mjlab.
 
 from __future__ import annotations
 
+import copy
+from collections import defaultdict
 from collections.abc import Iterator
 from typing import Any
 
@@ -67,22 +69,42 @@ class _Check:
         self.faults: dict[str, str] = {}
         self.ends: list[np.ndarray] = []
         self._limit = action_limit
-        self._mode: AutoresetMode | None = None
         # First four results of the last step, copies of them, and mask of ended episodes.
         self._returned: Any = None
         self._copies: Any = None
         self._ended = np.zeros(0, dtype=bool)
-        self._stale, self._unreset, self._still = _Always(), _Always(), False
+        # True for each end with equal observations, by kind: terminations and time-outs.
+        self._stale: dict[bool, list[bool]] = defaultdict(list)
+        self._unreset: dict[bool, list[bool]] = defaultdict(list)
+        self._still = False
+        self._mode = env.metadata.get("autoreset_mode")
+        if not isinstance(self._mode, AutoresetMode):
+            self.fault(
+                "autoreset_mode",
+                f"expected metadata['autoreset_mode'] of {list(AutoresetMode)}, got {self._mode!r}",
+            )
+        for name in ("observation_space", "action_space"):
+            expected = batch_space(getattr(env, f"single_{name}"), env.num_envs)
+            if (found := getattr(env, name)) != expected:
+                self.fault(
+                    name, f"expected batch_space(single_{name}, {env.num_envs}), got {found}"
+                )
 
     def fault(self, kind: str, text: str) -> None:
         self.faults.setdefault(kind, text)
 
     def run(self, steps: int, seed: int) -> list[Any]:
         """Reset and step; return copies of all results, an empty list after a fault."""
-        self._check_attributes()
         if self.faults:
             return []
-        actions = _bounded(self.env.action_space, self._limit)
+        actions = self.env.action_space
+        if isinstance(actions, gymnasium.spaces.Box):
+            # Samples of unbounded spaces are too large for a robot.
+            low, high = (
+                np.clip(end, actions.low, actions.high).astype(actions.dtype)
+                for end in (-self._limit, self._limit)
+            )
+            actions = gymnasium.spaces.Box(low, high, dtype=actions.dtype)
         actions.seed(seed)
         self.ends = []
         returned = [self._reset(seed=seed)]
@@ -93,9 +115,9 @@ class _Check:
                 self._reset_ended()
             returned.append(self._step(actions.sample()))
         # Equal observations are faults only if observations change from step to step.
-        if self._stale and not self._still:
+        if any(map(all, self._stale.values())) and not self._still:
             self.fault("stale final_obs", "it is the observation before the last step")
-        if self._unreset and not self._still:
+        if any(map(all, self._unreset.values())) and not self._still:
             self.fault("reset", "observations after an end are those before the reset")
         return returned
 
@@ -105,10 +127,11 @@ class _Check:
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
             self.fault("reset", f"expected (observations, infos), got {_kind(result)}")
             return None
-        self._check_observations("reset", result[0])
+        for text in _mismatches(self.env.observation_space, result[0], "observations"):
+            self.fault("observations", f"{text}, in reset")
         self._check_masks(result[1])
         self._returned = result[:1]
-        self._copies = _copied(self._returned)
+        self._copies = copy.deepcopy(self._returned)
         self._ended = np.zeros(self.env.num_envs, dtype=bool)
         return self._copies[0]
 
@@ -122,7 +145,7 @@ class _Check:
         for row in range(self.env.num_envs):
             same = _same(before[row], after[row])
             if ended[row]:
-                self._unreset.see(True, same)
+                self._unreset[True].append(same)
             elif not same:
                 self.fault(
                     "reset_mask",
@@ -142,11 +165,11 @@ class _Check:
             return None
         before, ended_before = self._rows(self._copies[0]), self._ended
         self._returned, infos = result[:4], result[4]
-        self._copies = _copied(self._returned)
-        after, rewards, terminated, truncated = self._copies
+        self._copies = copy.deepcopy(self._returned)
+        after = self._rows(self._copies[0])
+        rewards, terminated, truncated = map(_array, self._copies[1:])
         self._ended = ended = terminated | truncated
         self.ends.append(ended)
-        after = self._rows(after)
         untouched = np.flatnonzero(~(ended | ended_before))
         self._still |= any(_same(before[row], after[row]) for row in untouched)
         if self._mode is AutoresetMode.SAME_STEP:
@@ -167,35 +190,10 @@ class _Check:
         """Return the observation of each environment."""
         return list(iterate(self.env.observation_space, observations))
 
-    def _check_attributes(self) -> None:
-        env = self.env
-        mode = env.metadata.get("autoreset_mode")
-        if not isinstance(mode, AutoresetMode):
-            self.fault(
-                "autoreset_mode",
-                f"expected metadata['autoreset_mode'] of {list(AutoresetMode)}, got {mode!r}",
-            )
-        else:
-            self._mode = mode
-        if not isinstance(env.num_envs, int) or env.num_envs < 1:
-            self.fault("num_envs", f"expected a positive integer, got {env.num_envs!r}")
-            return
-        for name in ("observation_space", "action_space"):
-            single, batched = getattr(env, f"single_{name}"), getattr(env, name)
-            if not isinstance(single, gymnasium.Space):
-                self.fault(f"single_{name}", f"expected a gymnasium Space, got {_kind(single)}")
-            elif batched != batch_space(single, env.num_envs):
-                self.fault(
-                    name, f"expected batch_space(single_{name}, {env.num_envs}), got {batched}"
-                )
-
-    def _check_observations(self, where: str, observations: Any) -> None:
-        for text in _mismatches(self.env.observation_space, observations, "observations"):
-            self.fault("observations", f"{text}, in {where}")
-
     def _check_step(self, result: tuple[Any, ...]) -> None:
         observations, rewards, terminated, truncated, infos = result
-        self._check_observations("step", observations)
+        for text in _mismatches(self.env.observation_space, observations, "observations"):
+            self.fault("observations", f"{text}, in step")
         shape = (self.env.num_envs,)
         for name, value, kinds in (
             ("rewards", rewards, "f"),
@@ -270,33 +268,8 @@ class _Check:
             for text in _mismatches(single, final[row], "final_obs"):
                 self.fault("final_obs", text)
                 return
-            self._stale.see(terminated[row], _same(final[row], before[row]))
-            self._unreset.see(terminated[row], _same(final[row], after[row]))
-
-
-class _Always:
-    """Property that holds for all ends of one kind: terminations or time-outs."""
-
-    def __init__(self) -> None:
-        self._seen: dict[bool, list[bool]] = {}
-
-    def see(self, terminated: bool, value: bool) -> None:
-        self._seen.setdefault(terminated, []).append(value)
-
-    def __bool__(self) -> bool:
-        return any(map(all, self._seen.values()))
-
-
-def _bounded(space: gymnasium.Space, limit: float) -> gymnasium.Space:
-    """Return `space` with finite bounds: samples of unbounded spaces are too large for a robot."""
-    if not isinstance(space, gymnasium.spaces.Box):
-        return space
-    low, high = np.maximum(space.low, -limit), np.minimum(space.high, limit)
-    outside = low > high
-    low, high = np.where(outside, space.low, low), np.where(outside, space.high, high)
-    return gymnasium.spaces.Box(
-        low.astype(space.dtype), high.astype(space.dtype), dtype=space.dtype
-    )
+            self._stale[bool(terminated[row])].append(_same(final[row], before[row]))
+            self._unreset[bool(terminated[row])].append(_same(final[row], after[row]))
 
 
 def _mismatches(space: gymnasium.Space, value: Any, name: str) -> Iterator[str]:
@@ -325,14 +298,6 @@ def _mismatches(space: gymnasium.Space, value: Any, name: str) -> Iterator[str]:
 
 def _array(value: Any) -> np.ndarray:
     return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _copied(inner) for name, inner in value.items()}
-    if isinstance(value, tuple):
-        return tuple(_copied(inner) for inner in value)
-    return np.array(_array(value))
 
 
 def _same(one: Any, other: Any) -> bool:

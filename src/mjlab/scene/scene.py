@@ -71,7 +71,7 @@ class SceneCfg:
 class Scene:
     """Terrain, entities and sensors composed into one `MjSpec`. `initialize` binds a simulation."""
 
-    _transient = {"_env_origins", "_device", "_updated_sensors", "_sensors_by_stage"}
+    _transient = {"_env_origins", "_device", "_updated_sensors"}
 
     def __init__(self, scene_cfg: SceneCfg, device: str) -> None:
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
@@ -93,7 +93,24 @@ class Scene:
         )
         """Simulation options requested by entities without conflict in the scene."""
         write_requests(self._spec.option, self.entity_options)
-        self._add_sensors()
+        for cfg in scene_cfg.sensors:
+            name = cfg.prefixed_name
+            if name in self._sensors:
+                raise ValueError(
+                    f"SceneCfg.sensors: expected unique names, got {name!r} twice; rename one of "
+                    "the sensors."
+                )
+            sensor = cfg.build()
+            sensor.edit_spec(self._spec, self._entities)
+            self._sensors[name] = sensor
+        for mj_sensor in self._spec.sensors:
+            # A sensor without a name cannot be looked up.
+            if mj_sensor.name and mj_sensor.name not in self._sensors:
+                self._sensors[mj_sensor.name] = BuiltinSensor.from_existing(mj_sensor.name)
+        # Data of built-in sensors is a live view of the simulation, without a cache to update.
+        self._updated_sensors = [
+            sensor for sensor in self._sensors.values() if type(sensor) is not BuiltinSensor
+        ]
         if scene_cfg.spec_fn is not None:
             scene_cfg.spec_fn(self._spec)
             self.entity_options = drop_overridden(self._spec.option, self.entity_options)
@@ -131,35 +148,6 @@ class Scene:
             entity.spec.delete(key)
         make_asset_paths_absolute(entity.spec)
         attach(self._spec, entity.spec, prefix, self._spec.worldbody.add_frame())
-
-    def _add_sensors(self) -> None:
-        for cfg in self._cfg.sensors:
-            name = cfg.prefixed_name
-            if name in self._sensors:
-                raise ValueError(
-                    f"SceneCfg.sensors: expected unique names, got {name!r} twice; rename one of "
-                    "the sensors."
-                )
-            sensor = cfg.build()
-            sensor.edit_spec(self._spec, self._entities)
-            self._sensors[name] = sensor
-        for mj_sensor in self._spec.sensors:
-            # A sensor without a name cannot be looked up.
-            if mj_sensor.name and mj_sensor.name not in self._sensors:
-                self._sensors[mj_sensor.name] = BuiltinSensor.from_existing(mj_sensor.name)
-        # Data of built-in sensors is a live view of the simulation, without a cache to update.
-        self._updated_sensors = [
-            sensor for sensor in self._sensors.values() if type(sensor) is not BuiltinSensor
-        ]
-        stages = get_args(Stage)
-        self._sensors_by_stage = {
-            stage: [
-                sensor
-                for sensor in self._updated_sensors
-                if stages.index(sensor.earliest_stage) <= index
-            ]
-            for index, stage in enumerate(stages)
-        }
 
     # Access.
 
@@ -326,8 +314,10 @@ class Scene:
 
     def invalidate_sensor_caches(self, stage: Stage = "acc") -> None:
         """Invalidate cached data of sensors that a forward pass up to `stage` has changed."""
-        for sensor in self._sensors_by_stage[stage]:
-            sensor.invalidate_cache()
+        stages = get_args(Stage)
+        for sensor in self._updated_sensors:
+            if stages.index(sensor.earliest_stage) <= stages.index(stage):
+                sensor.invalidate_cache()
 
     # Files.
 
@@ -406,7 +396,19 @@ def merge_entity_options(options: dict[str, EntityOptions]) -> dict[str, OptionR
             values = ", ".join(f"{show(name, v)} ({entity})" for entity, v in requested.items())
             conflicts.append(f"  {name}: {values}")
     for name in BIT_FIELDS:
-        _merge_switches(name, options, merged, conflicts)
+        flags = {e: own.switches[name] for e, own in options.items() if name in own.switches}
+        enabled = disabled = 0
+        for bits, stated in flags.values():
+            enabled |= bits
+            disabled |= stated & ~bits
+        contested = enabled & disabled
+        for entity, (bits, stated) in flags.items():
+            if stated & contested:
+                yes, no = show(name, bits & contested), show(name, stated & ~bits & contested)
+                conflicts.append(f"  {name}: {entity} sets {yes} and clears {no}")
+        if enabled & ~contested:
+            entities = tuple(e for e, (bits, _) in flags.items() if bits & ~contested)
+            merged[name] = OptionRequest(enabled & ~contested, entities)
     if conflicts:
         warnings.warn(
             "Conflicting simulation options in the XML of entities are not applied:\n"
@@ -416,27 +418,6 @@ def merge_entity_options(options: dict[str, EntityOptions]) -> dict[str, OptionR
             stacklevel=3,
         )
     return merged
-
-
-def _merge_switches(
-    name: str,
-    options: dict[str, EntityOptions],
-    merged: dict[str, OptionRequest],
-    conflicts: list[str],
-) -> None:
-    requested = {e: own.switches[name] for e, own in options.items() if name in own.switches}
-    enabled = disabled = 0
-    for bits, stated in requested.values():
-        enabled |= bits
-        disabled |= stated & ~bits
-    contested = enabled & disabled
-    for entity, (bits, stated) in requested.items():
-        if stated & contested:
-            yes, no = show(name, bits & contested), show(name, stated & ~bits & contested)
-            conflicts.append(f"  {name}: {entity} sets {yes} and clears {no}")
-    if enabled & ~contested:
-        entities = tuple(e for e, (bits, _) in requested.items() if bits & ~contested)
-        merged[name] = OptionRequest(enabled & ~contested, entities)
 
 
 def write_requests(option: Any, requests: dict[str, OptionRequest]) -> None:

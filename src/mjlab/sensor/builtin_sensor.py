@@ -87,25 +87,11 @@ class BuiltinSensorCfg(SensorCfg):
     def __post_init__(self) -> None:
         check_one_of(f"Sensor {self.name!r} sensor_type", self.sensor_type, get_args(SensorType))
         allowed = next(v for start, v in _OBJECTS.items() if self.sensor_type.startswith(start))
-        self._check(self.obj, "obj", allowed)
-        if self.ref is not None:
-            if not self.sensor_type.startswith("frame"):
-                raise ValueError(
-                    f"Sensor {self.name!r} ref: expected None for sensor_type "
-                    f"{self.sensor_type!r}, got type {self.ref.type!r}; only frame sensors "
-                    "(framepos, framequat, ...) have a reference frame."
-                )
-            self._check(self.ref, "ref", _FRAME)
-
-    def _check(self, obj: ObjRef | None, field: str, allowed: tuple[str, ...]) -> None:
-        value = None if obj is None else obj.type
-        if value in allowed or (not allowed and obj is None):
-            return
-        expected = f"an ObjRef of type {' or '.join(allowed)}" if allowed else "None"
-        raise ValueError(
-            f"Sensor {self.name!r} {field}: expected {expected} for sensor_type "
-            f"{self.sensor_type!r}, got {'None' if obj is None else f'type {value!r}'}."
-        )
+        # Only frame sensors have a reference frame, and it is optional.
+        frames = (*_FRAME, None) if self.sensor_type.startswith("frame") else (None,)
+        for field, ref, types in (("obj", self.obj, allowed or (None,)), ("ref", self.ref, frames)):
+            owner = f"Sensor {self.name!r} {field}.type for sensor_type {self.sensor_type!r}"
+            check_one_of(owner, None if ref is None else ref.type, types)
 
     @property
     def prefixed_name(self) -> str:

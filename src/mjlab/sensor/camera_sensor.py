@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -108,49 +107,24 @@ class CameraSensor(Sensor[CameraSensorData]):
         """
         super().__init__()
         self.cfg = cfg
-        self._check_cfg()
+        owner = f"Camera sensor {cfg.name!r}"
+        check_count(f"{owner} width", cfg.width)
+        check_count(f"{owner} height", cfg.height)
+        for field, allowed in (
+            ("data_types", CAMERA_DATA_TYPES), ("enabled_geom_groups", range(NUM_GEOM_GROUPS)),
+        ):  # fmt: skip
+            # An empty tuple, with nothing to render, is not allowed either.
+            for value in getattr(cfg, field) or ((),):
+                check_one_of(f"{owner} {field}", value, allowed)
+        is_perspective = not cfg.orthographic and cfg.camera_name is None
+        limit = _MAX_FOVY if is_perspective else math.inf
+        if cfg.fovy is not None and not 0.0 < cfg.fovy < limit:
+            raise ValueError(f"{owner} fovy: expected a number in (0, {limit:g}), got {cfg.fovy}.")
         self._camera_idx = -1
         self._view: CameraView | None = None
         self._rgb: torch.Tensor | None = None
         self._depth: torch.Tensor | None = None
         self._segmentation: torch.Tensor | None = None
-
-    def _check_cfg(self) -> None:
-        cfg, owner = self.cfg, f"Camera sensor {self.cfg.name!r}"
-        check_count(f"{owner} width", cfg.width)
-        check_count(f"{owner} height", cfg.height)
-        if isinstance(cfg.data_types, str) or not cfg.data_types:
-            raise ValueError(
-                f"{owner} data_types: expected a tuple of {', '.join(CAMERA_DATA_TYPES)}, got "
-                f"{cfg.data_types!r}."
-            )
-        for kind in cfg.data_types:
-            check_one_of(f"{owner} data_types", kind, CAMERA_DATA_TYPES)
-        if len(set(cfg.data_types)) < len(cfg.data_types):
-            raise ValueError(
-                f"{owner} data_types: expected distinct names, got {cfg.data_types!r}."
-            )
-        groups = range(NUM_GEOM_GROUPS)
-        if not cfg.enabled_geom_groups:
-            raise ValueError(
-                f"{owner} enabled_geom_groups: expected at least one of {list(groups)}, got "
-                f"{cfg.enabled_geom_groups!r}."
-            )
-        for group in cfg.enabled_geom_groups:
-            check_one_of(f"{owner} enabled_geom_groups", group, groups)
-        is_perspective = not cfg.orthographic and cfg.camera_name is None
-        limit = _MAX_FOVY if is_perspective else math.inf
-        if cfg.fovy is not None and not 0.0 < cfg.fovy < limit:
-            raise ValueError(f"{owner} fovy: expected a number in (0, {limit:g}), got {cfg.fovy}.")
-
-    def _error(self, message: str) -> ValueError:
-        return ValueError(f"Camera sensor {self.cfg.name!r}: {message}")
-
-    def _unknown_camera(self, name: str, cameras: Iterable[str]) -> ValueError:
-        return self._error(
-            f"unknown camera {name!r} (names include the entity prefix, e.g. 'robot/wrist'); "
-            f"{suggest(name, filter(None, cameras))}"
-        )
 
     # Construction.
 
@@ -158,45 +132,50 @@ class CameraSensor(Sensor[CameraSensorData]):
         """Add the camera, or apply `fovy` and `orthographic` to the existing one.
 
         Raises:
-            ValueError: unknown body or camera (with the available names), or duplicate name of an
-                added camera.
+            ValueError: unknown body (with the available names), duplicate name of an added camera,
+                or a body for an existing camera.
         """
         cfg = self.cfg
+        camera = scene_spec.camera(self.camera_name)
         if cfg.camera_name is None:
-            self._add_camera(scene_spec)
-            return
-        if cfg.parent_body is not None:
-            raise self._error(
-                f"parent_body={cfg.parent_body!r} applies to added cameras only, but "
-                f"camera_name={cfg.camera_name!r} selects an existing one; leave out one of them."
-            )
-        if cfg.fovy is not None or cfg.orthographic:
-            camera = scene_spec.camera(cfg.camera_name)
-            if camera is None:
-                names = [camera.name for camera in scene_spec.cameras]
-                raise self._unknown_camera(cfg.camera_name, names)
-            _set_projection(camera, cfg.fovy, orthographic=cfg.orthographic)
-
-    def _add_camera(self, scene_spec: mujoco.MjSpec) -> None:
-        cfg = self.cfg
-        body = scene_spec.worldbody
-        if cfg.parent_body is not None:
-            body = scene_spec.body(cfg.parent_body)
-            if body is None:
-                names = [body.name for body in scene_spec.bodies]
-                raise self._error(
-                    f"unknown body {cfg.parent_body!r} (names include the entity prefix); "
-                    f"{suggest(cfg.parent_body, names)}"
+            if camera is not None:
+                raise ValueError(
+                    f"Camera sensor {cfg.name!r}: the scene already has a camera {cfg.name!r}; rename "
+                    f"the sensor, or use the existing camera with camera_name={cfg.name!r}."
                 )
-        if scene_spec.camera(cfg.name) is not None:
-            raise self._error(
-                f"the scene already has a camera {cfg.name!r}; rename the sensor, or use the "
-                f"existing camera with camera_name={cfg.name!r}."
+            camera = self._add_camera(scene_spec)
+        elif cfg.parent_body is not None:
+            raise ValueError(
+                f"Camera sensor {cfg.name!r}: parent_body={cfg.parent_body!r} applies to added cameras "
+                f"only, but camera_name={cfg.camera_name!r} selects an existing one; leave out one of "
+                "them."
+            )
+        if camera is None:
+            # Another sensor may add it; `initialize` raises otherwise.
+            return
+        if cfg.orthographic:
+            camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
+        fovy = _DEFAULT_FOVY if cfg.camera_name is None and cfg.fovy is None else cfg.fovy
+        if fovy is not None:
+            camera.fovy = fovy
+            # The compiler ignores the field of view of a camera that has a sensor.
+            camera.sensor_size = [0.0, 0.0]
+            camera.focal_length, camera.focal_pixel = [0.0, 0.0], [0.0, 0.0]
+            camera.principal_length, camera.principal_pixel = [0.0, 0.0], [0.0, 0.0]
+
+    def _add_camera(self, scene_spec: mujoco.MjSpec) -> mujoco.MjsCamera:
+        cfg = self.cfg
+        parent = "world" if cfg.parent_body is None else cfg.parent_body
+        body = scene_spec.body(parent)
+        if body is None:
+            names = [body.name for body in scene_spec.bodies]
+            raise ValueError(
+                f"Camera sensor {cfg.name!r}: unknown body {parent!r} (names include the entity "
+                f"prefix); {suggest(parent, names)}"
             )
         camera = body.add_camera(name=cfg.name, pos=cfg.pos, quat=cfg.quat)
         camera.resolution = [cfg.width, cfg.height]
-        fovy = _DEFAULT_FOVY if cfg.fovy is None else cfg.fovy
-        _set_projection(camera, fovy, orthographic=cfg.orthographic)
+        return camera
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
         """Look up the camera in the compiled model. Images are empty until `sim.sense()`.
@@ -207,8 +186,12 @@ class CameraSensor(Sensor[CameraSensorData]):
         kind = mujoco.mjtObj.mjOBJ_CAMERA
         self._camera_idx = mujoco.mj_name2id(mj_model, kind, self.camera_name)
         if self._camera_idx < 0:
-            names = [mujoco.mj_id2name(mj_model, kind, i) or "" for i in range(mj_model.ncam)]
-            raise self._unknown_camera(self.camera_name, names)
+            names = [mujoco.mj_id2name(mj_model, kind, i) for i in range(mj_model.ncam)]
+            raise ValueError(
+                f"Camera sensor {self.cfg.name!r}: unknown camera {self.camera_name!r} (names "
+                "include the entity prefix, e.g. 'robot/wrist'); "
+                f"{suggest(self.camera_name, filter(None, names))}"
+            )
         cfg = self.cfg
         groups = tuple(sorted(set(cfg.enabled_geom_groups)))
         if not rendered_geoms(mj_model, groups):
@@ -279,15 +262,3 @@ class CameraSensor(Sensor[CameraSensorData]):
         if self.cfg.clone_data:
             images = tuple(None if image is None else image.clone() for image in images)
         return CameraSensorData(*images)
-
-
-def _set_projection(camera: mujoco.MjsCamera, fovy: float | None, *, orthographic: bool) -> None:
-    """Set the projection of a camera. `fovy=None` and `orthographic=False` change nothing."""
-    if orthographic:
-        camera.proj = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
-    if fovy is not None:
-        camera.fovy = fovy
-        # The compiler ignores the field of view of a camera that has a sensor.
-        camera.sensor_size = [0.0, 0.0]
-        camera.focal_length, camera.focal_pixel = [0.0, 0.0], [0.0, 0.0]
-        camera.principal_length, camera.principal_pixel = [0.0, 0.0], [0.0, 0.0]

@@ -19,6 +19,7 @@ import torch
 from mjlab.compat import offers_older_attributes
 from mjlab.sensor.sensor import Sensor, SensorCfg
 from mjlab.utils.errors import WrongStateError, check_count, check_one_of
+from mjlab.utils.mujoco import OBJECT_TYPES
 from mjlab.utils.state import stateful
 from mjlab.utils.string import compile_pattern, name_list, suggest
 
@@ -44,13 +45,8 @@ FIELD_SIZES = {
 _HISTORY_FIELDS = ("force", "torque", "dist")
 _DEBUG_FIELDS = ("found", "force", "pos", "normal", "tangent")
 
-# Element type of each mode: MuJoCo's constant, and plural for messages.
-_OBJECT_TYPES = {
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "subtree": mujoco.mjtObj.mjOBJ_XBODY,
-}
-_PLURALS = {"geom": "geoms", "body": "bodies", "subtree": "bodies"}
+# List of spec elements of each mode.
+_ELEMENTS = {"geom": "geoms", "body": "bodies", "subtree": "bodies"}
 
 # Entries of `exclude` with one of these characters are regular expressions.
 _REGEX_CHARACTERS = frozenset(r".*+?[]{}()\|^$")
@@ -193,7 +189,8 @@ class ContactSensor(Sensor[ContactData]):
 
     earliest_stage = "acc"
     _transient = {
-        "_primary_names", "_fields", "_offsets", "_slot_width", "_start", "_records", "_source",
+        "_primary_names", "_fields", "_offsets", "_slot_width", "_width", "_start", "_records",
+        "_source",
     }  # fmt: skip
 
     def __init__(self, cfg: ContactSensorCfg) -> None:
@@ -206,7 +203,7 @@ class ContactSensor(Sensor[ContactData]):
         self._slot_width = sum(sizes)
         self._records = cfg.history_length > 0 and any(f in cfg.fields for f in _HISTORY_FIELDS)
         self._primary_names: list[str] = []
-        self._start = 0
+        self._start = self._width = 0
         self._sim_data: Any = None
         self._source: torch.Tensor | None = None
         self._history: _SubstepHistory | None = None
@@ -243,8 +240,8 @@ class ContactSensor(Sensor[ContactData]):
         secondary = self._resolve_secondary(owner, scene_spec, entities)
         self._primary_names = [primary.name for primary in primaries]
         taken = {sensor.name for sensor in scene_spec.sensors}
-        names = (cfg.name, *map(self._element_name, self._primary_names))
-        if clashes := sorted(taken.intersection(names)):
+        names = [f"{cfg.name}_{primary}" for primary in self._primary_names]
+        if clashes := sorted(taken.intersection((cfg.name, *names))):
             raise ValueError(
                 f"{owner}: the scene already has MuJoCo sensors named {clashes}; rename this "
                 "sensor."
@@ -252,15 +249,16 @@ class ContactSensor(Sensor[ContactData]):
         field_bits = sum(1 << i for i, name in enumerate(FIELD_SIZES) if name in self._fields)
         # MuJoCo numbers its reductions in this order.
         reduction = get_args(Reduction).index(cfg.reduce)
-        for primary in primaries:
-            element = scene_spec.add_sensor(
-                name=self._element_name(primary.name), type=mujoco.mjtSensor.mjSENS_CONTACT
-            )
-            element.objtype = _OBJECT_TYPES[cfg.primary.mode]
-            element.objname = primary.full_name
-            if secondary is not None and cfg.secondary is not None:
-                element.reftype = _OBJECT_TYPES[cfg.secondary.mode]
-                element.refname = secondary.full_name
+        for name, primary in zip(names, primaries, strict=True):
+            element = scene_spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
+            for side, match, found in (
+                ("obj", cfg.primary, primary), ("ref", cfg.secondary, secondary),
+            ):  # fmt: skip
+                if match is not None and found is not None:
+                    kind = OBJECT_TYPES[_ELEMENTS[match.mode]]
+                    kind = mujoco.mjtObj.mjOBJ_XBODY if match.mode == "subtree" else kind
+                    setattr(element, f"{side}type", kind)
+                    setattr(element, f"{side}name", found.full_name)
             element.intprm[:3] = [field_bits, reduction, cfg.num_slots]
 
     def _resolve_secondary(
@@ -278,14 +276,13 @@ class ContactSensor(Sensor[ContactData]):
             )
         return found[0]
 
-    def _element_name(self, primary: str) -> str:
-        return f"{self.cfg.name}_{primary}"
-
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
         """Locate the sensor block in `sensordata` and allocate history and timers."""
         cfg = self.cfg
-        first = mj_model.sensor(self._element_name(self._primary_names[0]))
+        first = mj_model.sensor(f"{cfg.name}_{self._primary_names[0]}")
         self._start = int(first.adr[0])
+        # Columns of the block: primary by primary, slot by slot.
+        self._width = len(self._primary_names) * cfg.num_slots * self._slot_width
         self._sim_data = data
         self._source = None
         num_envs = data.qpos.shape[0]
@@ -334,11 +331,6 @@ class ContactSensor(Sensor[ContactData]):
 
     # Reading.
 
-    @property
-    def _width(self) -> int:
-        """Number of columns of the block."""
-        return len(self._primary_names) * self.cfg.num_slots * self._slot_width
-
     def _block(self) -> torch.Tensor:
         """Return the live (N, width) view of the sensor's part of `sensordata`."""
         if self._source is None:
@@ -346,21 +338,29 @@ class ContactSensor(Sensor[ContactData]):
             self._source = self._sim_data.sensordata.narrow(1, self._start, self._width)
         return self._source
 
-    def _split(self, block: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return views of the fields of a block (..., width): (..., P*S) or (..., P*S, 3) each."""
+    def _split(self, block: torch.Tensor, *, to_world: bool) -> dict[str, torch.Tensor]:
+        """Return the fields of a block (..., width): (..., P*S) or (..., P*S, 3) each.
+
+        With `to_world`, force and torque F are rotated into the world frame: [n, t, n x t] F.
+        """
         slots = block.unflatten(-1, (-1, self._slot_width))
         views = {}
         for name, offset in zip(self._fields, self._offsets, strict=True):
             size = FIELD_SIZES[name]
             views[name] = slots.select(-1, offset) if size == 1 else slots.narrow(-1, offset, size)
+        for name in views.keys() & {"force", "torque"} if to_world else ():
+            normal, tangent = views["normal"], views["tangent"]
+            x, y, z = views[name].unsqueeze(-1).unbind(-2)
+            views[name] = x * normal + y * tangent + z * torch.linalg.cross(normal, tangent)
         return views
 
     def _compute_data(self) -> ContactData:
         # A copy, so that values kept by a term do not change in the next step.
-        values = self._in_configured_frame(self._split(self._block().clone()))
+        to_world = self.cfg.global_frame
+        values = self._split(self._block().clone(), to_world=to_world)
         data = ContactData(**{name: values[name] for name in self.cfg.fields})
         if self._history is not None:
-            recorded = self._in_configured_frame(self._split(self._history.newest_first()))
+            recorded = self._split(self._history.newest_first(), to_world=to_world)
             for name in _HISTORY_FIELDS:
                 if name in self.cfg.fields:
                     setattr(data, f"{name}_history", recorded[name].movedim(0, 2))
@@ -372,12 +372,6 @@ class ContactSensor(Sensor[ContactData]):
                 data.last_contact_time,
             ) = self._clocks.as_float32()
         return data
-
-    def _in_configured_frame(self, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        if self.cfg.global_frame:
-            for name in values.keys() & {"force", "torque"}:
-                values[name] = _contact_to_world(values[name], values["normal"], values["tangent"])
-        return values
 
     def compute_first_contact(self, dt: float, abs_tol: float = 1e-6) -> torch.Tensor:
         """Return primaries that made contact within the last `dt` seconds, (N, P) bool.
@@ -419,10 +413,9 @@ class ContactSensor(Sensor[ContactData]):
         """Draw contact points, and the force acting on each primary, if `cfg.debug`."""
         if not self.cfg.debug:
             return
-        fields = self._split(self._block())
+        # A net force is in the world frame already.
+        fields = self._split(self._block(), to_world=self.cfg.reduce != "netforce")
         force = fields["force"]
-        if self.cfg.reduce != "netforce":
-            force = _contact_to_world(force, fields["normal"], fields["tangent"])
         size = visualizer.meansize
         for env in visualizer.get_env_indices(force.shape[0]):
             points = fields["pos"][env].double().cpu().numpy()
@@ -529,6 +522,15 @@ class _MatchedElement:
         """Names that a pattern may match: in the entity, and in the attached part."""
         return self.name, self.name.rsplit("/", 1)[-1]
 
+    def is_excluded_by(self, exclude: tuple[str, ...]) -> bool:
+        """Return True if an entry of `ContactMatch.exclude` matches the element."""
+        return any(
+            compile_pattern(entry).search(self.name) is not None
+            if _REGEX_CHARACTERS.intersection(entry)
+            else entry in self.candidate_names
+            for entry in exclude
+        )
+
 
 def _resolve_match(
     owner: str, match: ContactMatch, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]
@@ -554,12 +556,12 @@ def _resolve_match(
         logger.warning(
             "%s: contacts of %d unnamed %s of entity %r are not sensed; name the elements, or use "
             "mode 'body'.",
-            owner, unnamed, _PLURALS[match.mode], match.entity,
+            owner, unnamed, _ELEMENTS[match.mode], match.entity,
         )  # fmt: skip
     prefix = f"{match.entity}/"
     named = [_MatchedElement(e.name, e.name.removeprefix(prefix)) for e in elements if e.name]
     found = _match_patterns(owner, match, named)
-    kept = [one for one in found if not _is_excluded(one, match.exclude)]
+    kept = [one for one in found if not one.is_excluded_by(match.exclude)]
     if not kept:
         raise ValueError(
             f"{owner}: exclude={match.exclude!r} removes all matches of {match.pattern!r}: "
@@ -599,7 +601,7 @@ def _match_patterns(
             matching = [one for one in elements if any(map(fullmatch, one.candidate_names))]
         if not matching:
             raise ValueError(
-                f"{owner} pattern {pattern!r} matches none of the {_PLURALS[match.mode]} of entity "
+                f"{owner} pattern {pattern!r} matches none of the {_ELEMENTS[match.mode]} of entity "
                 f"{match.entity!r} (patterns must match whole names); "
                 f"{suggest(pattern, [one.name for one in elements])}"
             )
@@ -611,20 +613,3 @@ def _match_patterns(
                 )
             owners[one] = pattern
     return [one for one in elements if one in owners]
-
-
-def _is_excluded(element: _MatchedElement, exclude: tuple[str, ...]) -> bool:
-    return any(
-        compile_pattern(entry).search(element.name) is not None
-        if _REGEX_CHARACTERS.intersection(entry)
-        else entry in element.candidate_names
-        for entry in exclude
-    )
-
-
-def _contact_to_world(
-    vector: torch.Tensor, normal: torch.Tensor, tangent: torch.Tensor
-) -> torch.Tensor:
-    """Rotate (..., 3) from contact to world frame: F_w = [n, t, n x t] F_c."""
-    x, y, z = vector.unsqueeze(-1).unbind(-2)
-    return x * normal + y * tangent + z * torch.linalg.cross(normal, tangent)

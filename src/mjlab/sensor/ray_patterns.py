@@ -119,26 +119,24 @@ class PinholeCameraPatternCfg:
         self, mj_model: mujoco.MjModel | None
     ) -> tuple[int, int, float, float, tuple[float, float]]:
         """Return image width and height (pixels), half extents and center at distance 1."""
-        if self._camera_name is None:
-            half_y = _tan_half(self.fovy)
-            return self.width, self.height, half_y * self.width / self.height, half_y, (0.0, 0.0)
-        if mj_model is None:
-            raise ValueError(
-                f"PinholeCameraPatternCfg of camera {self._camera_name!r}: expected the compiled "
-                "mj_model, got None."
-            )
-        names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
-        check_exists("camera", self._camera_name, names)
-        camera = names.index(self._camera_name)
-        width, height = (int(value) for value in mj_model.cam_resolution[camera])
-        sensor = mj_model.cam_sensorsize[camera]
-        if sensor[1] == 0.0:
-            half_y = _tan_half(float(mj_model.cam_fovy[camera]))
-            return width, height, half_y * width / height, half_y, (0.0, 0.0)
-        fx, fy, cx, cy = (float(value) for value in mj_model.cam_intrinsic[camera])
-        # Sign convention of the principal point: MuJoCo's camera frustum.
-        center = (cx / fx, -cy / fy)
-        return width, height, float(sensor[0]) / (2 * fx), float(sensor[1]) / (2 * fy), center
+        width, height, fovy = self.width, self.height, self.fovy
+        if self._camera_name is not None:
+            assert mj_model is not None
+            names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
+            check_exists("camera", self._camera_name, names)
+            camera = names.index(self._camera_name)
+            width, height = mj_model.cam_resolution[camera].tolist()
+            fovy = float(mj_model.cam_fovy[camera])
+            sensor_x, sensor_y = mj_model.cam_sensorsize[camera].tolist()
+            if sensor_y != 0.0:
+                fx, fy, cx, cy = mj_model.cam_intrinsic[camera].tolist()
+                # Sign convention of the principal point: MuJoCo's camera frustum.
+                center = (cx / fx, -cy / fy)
+                return width, height, sensor_x / (2 * fx), sensor_y / (2 * fy), center
+        if not 0.0 < fovy < 180.0:
+            raise ValueError(f"Field of view: expected degrees in (0, 180), got {fovy}.")
+        half_y = math.tan(math.radians(fovy) / 2.0)
+        return width, height, half_y * width / height, half_y, (0.0, 0.0)
 
 
 @dataclass
@@ -179,7 +177,7 @@ class RingPatternCfg:
         """Return offsets and directions: center, then ring by ring.
 
         Raises:
-            ValueError: negative radius, ring without rays, pattern without rays, or zero direction.
+            ValueError: negative radius, ring without rays, or zero direction.
         """
         points = [(0.0, 0.0, 0.0)] if self.include_center else []
         for ring in self.rings:
@@ -191,11 +189,6 @@ class RingPatternCfg:
             for k in range(ring.num_samples):
                 angle = 2.0 * math.pi * k / ring.num_samples
                 points.append((ring.radius * math.cos(angle), ring.radius * math.sin(angle), 0.0))
-        if not points:
-            raise ValueError(
-                f"RingPatternCfg rings: expected at least one ring, got {self.rings!r}; use "
-                "include_center=True for a single ray."
-            )
         offsets = torch.tensor(points, dtype=torch.float32, device=device)
         return offsets, _parallel(self.direction, len(points), "RingPatternCfg", device)
 
@@ -212,9 +205,3 @@ def _parallel(direction: tuple[float, ...], count: int, owner: str, device: str)
         )
     # One row per ray, the layout of patterns of diverging rays.
     return (vector / length).to(device, torch.float32).repeat(count, 1)
-
-
-def _tan_half(fovy: float) -> float:
-    if not 0.0 < fovy < 180.0:
-        raise ValueError(f"Field of view: expected degrees in (0, 180), got {fovy}.")
-    return math.tan(math.radians(fovy) / 2.0)

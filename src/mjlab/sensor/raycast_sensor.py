@@ -47,11 +47,11 @@ RayAlignment = Literal["base", "yaw", "world"]
 Color = tuple[float, float, float, float]
 _RAY_WIDTH = 0.1
 
-# Frame types: fields of MjData with position and orientation, and MuJoCo's object type.
+# Frame types: fields of MjData with position and orientation.
 _FRAMES = {
-    "body": ("xpos", "xmat", mujoco.mjtObj.mjOBJ_BODY),
-    "site": ("site_xpos", "site_xmat", mujoco.mjtObj.mjOBJ_SITE),
-    "geom": ("geom_xpos", "geom_xmat", mujoco.mjtObj.mjOBJ_GEOM),
+    "body": ("xpos", "xmat"),
+    "site": ("site_xpos", "site_xmat"),
+    "geom": ("geom_xpos", "geom_xmat"),
 }
 
 # Horizontal length of the frame's x axis below which the y axis defines the heading.
@@ -184,9 +184,6 @@ class RayCastSensor(Sensor[RayCastData]):
         self._frame_refs = (frame,) if isinstance(frame, ObjRef) else tuple(frame)
         self._num_rays_per_frame = 0
 
-    def _error(self, message: str) -> ValueError:
-        return ValueError(f"Ray sensor {self.cfg.name!r}: {message}")
-
     # Construction.
 
     def edit_spec(self, scene_spec: mujoco.MjSpec, entities: dict[str, Entity]) -> None:
@@ -196,7 +193,9 @@ class RayCastSensor(Sensor[RayCastData]):
             ValueError: `frame` is empty, is not a body, site or geom, or has an unknown entity.
         """
         if not self._frame_refs:
-            raise self._error("frame: expected at least one ObjRef, got ().")
+            raise ValueError(
+                f"Ray sensor {self.cfg.name!r} frame: expected at least one ObjRef, got ()."
+            )
         for frame in self._frame_refs:
             owner = f"Ray sensor {self.cfg.name!r} frame {frame.name!r}"
             check_one_of(f"{owner} type", frame.type, _FRAMES)
@@ -212,9 +211,11 @@ class RayCastSensor(Sensor[RayCastData]):
             offsets, directions = self.cfg.pattern.generate_rays(mj_model, device)
             self._frames = _Frames(self._frame_refs, mj_model, data, device)
         except ValueError as error:
-            raise self._error(str(error)) from error
+            raise ValueError(f"Ray sensor {self.cfg.name!r}: {error}") from error
         if len(offsets) == 0:
-            raise self._error("pattern: expected at least one ray, got 0.")
+            raise ValueError(
+                f"Ray sensor {self.cfg.name!r} pattern: expected at least one ray, got 0."
+            )
         self._offsets, self._local_directions = offsets, directions
         self._num_rays_per_frame = len(offsets)
         # Vertical rays keep their directions under a rotation about the vertical.
@@ -384,9 +385,8 @@ class _Frames:
         ids = []
         owners = {"site": mj_model.site_bodyid, "geom": mj_model.geom_bodyid}
         for frame in frames:
-            count = getattr(mj_model, f"n{frame.type}")
-            kind = _FRAMES[frame.type][2]
-            names = [mujoco.mj_id2name(mj_model, kind, i) or "" for i in range(count)]
+            count, element = (getattr(mj_model, name) for name in (f"n{frame.type}", frame.type))
+            names = [element(i).name for i in range(count)]
             index = names.index(find_in_scene("frame", frame, names))
             ids.append(index)
             self.body_ids.append(index if frame.type == "body" else int(owners[frame.type][index]))
@@ -394,7 +394,7 @@ class _Frames:
             places = [i for i, frame in enumerate(frames) if frame.type == kind]
             self._parts.append(
                 (
-                    *_FRAMES[kind][:2],
+                    *_FRAMES[kind],
                     torch.tensor(places, device=device),
                     torch.tensor([ids[i] for i in places], device=device),
                 )

@@ -54,7 +54,18 @@ class SensorContext:
         Raises:
             ValueError: conflicting projections of a shared camera.
         """
-        _check_shared_cameras(camera_sensors)
+        first: dict[str, CameraSensor] = {}
+        for sensor in camera_sensors:
+            other = first.setdefault(sensor.camera_name, sensor)
+            for field in ("fovy", "orthographic"):
+                values = getattr(other.cfg, field), getattr(sensor.cfg, field)
+                if values[0] != values[1]:
+                    raise ValueError(
+                        f"Camera sensors {other.cfg.name!r} and {sensor.cfg.name!r} share camera "
+                        f"{sensor.camera_name!r}: expected equal {field}, got {values[0]!r} and "
+                        f"{values[1]!r}; use the same value, or a separate camera for one sensor "
+                        "(camera_name=None, with parent_body, pos and quat)."
+                    )
         self._model, self._data, self._device = model, data, device
         self._camera_sensors = list(camera_sensors)
         self._find_render_context: Callable[..., Any] | None = None
@@ -202,19 +213,3 @@ class _RayQuery:
         )
         for sensor, part in zip(self._sensors, self._parts, strict=True):
             sensor.set_results(distances[:, part], normals[:, part])
-
-
-def _check_shared_cameras(sensors: Sequence[CameraSensor]) -> None:
-    """Raise `ValueError` if sensors that share a camera have different projections."""
-    first: dict[str, CameraSensor] = {}
-    for sensor in sensors:
-        other = first.setdefault(sensor.camera_name, sensor)
-        for field in ("fovy", "orthographic"):
-            values = getattr(other.cfg, field), getattr(sensor.cfg, field)
-            if values[0] != values[1]:
-                raise ValueError(
-                    f"Camera sensors {other.cfg.name!r} and {sensor.cfg.name!r} share camera "
-                    f"{sensor.camera_name!r}: expected equal {field}, got {values[0]!r} and "
-                    f"{values[1]!r}; use the same value, or a separate camera for one sensor "
-                    "(camera_name=None, with parent_body, pos and quat)."
-                )

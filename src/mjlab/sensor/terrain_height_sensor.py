@@ -204,14 +204,6 @@ class OneSidedGround:
         self._grid_start, self._grid_size = _tensor(start, device), _tensor(size, device)
         self._grid_count = torch.from_numpy(count).to(device)
 
-    def _around(self, points: torch.Tensor) -> torch.Tensor:
-        """Return candidate surfaces (M, K) above or below points (M, 3). Padding: -1."""
-        cell = ((points[:, :2] - self._grid_start) / self._grid_size).nan_to_num(-1.0).floor()
-        is_outside = ((cell < 0) | (cell >= self._grid_count)).any(dim=-1)
-        x, y = cell.clamp(min=0.0, max=float(_MAX_CELLS)).long().unbind(-1)
-        rows = torch.where(is_outside, len(self._grid) - 1, x * self._grid_count[1] + y)
-        return self._grid[rows]
-
     def __len__(self) -> int:
         return len(self._geoms)
 
@@ -220,7 +212,12 @@ class OneSidedGround:
 
         `envs`: environment of each point, (M,).
         """
-        found = self._around(points)
+        cell = ((points[:, :2] - self._grid_start) / self._grid_size).nan_to_num(-1.0).floor()
+        is_outside = ((cell < 0) | (cell >= self._grid_count)).any(dim=-1)
+        x, y = cell.clamp(min=0.0, max=float(_MAX_CELLS)).long().unbind(-1)
+        rows = torch.where(is_outside, len(self._grid) - 1, x * self._grid_count[1] + y)
+        # Candidate surfaces above or below the points, (M, K). Padding: -1.
+        found = self._grid[rows]
         geoms = found.clamp(min=0)
         pos = self._pos[geoms]
         if self._is_placed_by_env:

@@ -57,6 +57,14 @@ ACCELERATION_FIELDS = frozenset(
     | {"solver", "solver_niter", "solver_nnz", "solver_fwdinv"}
 )
 
+# Fields that `mj_setConst` writes: sums over the tree, and values that depend on qpos0.
+FIXED_CONSTANTS = ("body_subtreemass",)
+CONSTANTS_AT_QPOS0 = (
+    *("dof_invweight0", "body_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
+    *("actuator_biasprm", "eq_data"),
+    *("cam_pos0", "cam_poscom0", "cam_mat0", "light_pos0", "light_poscom0", "light_dir0"),
+)
+
 # Collision filters of geoms.
 COLLISION_MASKS = ("geom_contype", "geom_conaffinity")
 

@@ -31,14 +31,6 @@ class RecomputeLevel(IntEnum):
     """Both."""
 
 
-# Fields that `mj_setConst` writes: sums over the tree, and values that depend on qpos0.
-FIXED_CONSTANTS = ("body_subtreemass",)
-CONSTANTS_AT_QPOS0 = (
-    *("dof_invweight0", "body_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
-    *("actuator_biasprm", "eq_data"),
-    *("cam_pos0", "cam_poscom0", "cam_mat0", "light_pos0", "light_poscom0", "light_dir0"),
-)
-
 VARIANT_DEPENDENT_FIELDS = (
     *("geom_size", "geom_rbound", "geom_aabb", "geom_pos", "geom_quat"),
     *("body_mass", "body_subtreemass", "body_inertia", "body_invweight0", "body_ipos"),
@@ -92,9 +84,10 @@ def expand_model_fields(model: Any, nworld: int, fields_to_expand: list[str]) ->
 
 def put_variant_model(model: mujoco.MjModel, nworld: int, values: VariantValues) -> Any:
     """Return a `mujoco_warp.Model` with per-world values, on Warp's current device."""
-    from mjlab.sim.warp import engine
+    from mjlab.sim.warp.engine import put_variant_model
 
-    return engine.put_variant_model(model, nworld, values)
+    fields = {name: values.get(name) for name in values.fields}
+    return put_variant_model(model, nworld, fields, values.absent_geoms)
 
 
 # Variants.

@@ -8,6 +8,7 @@ load Warp.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -102,7 +103,7 @@ class WarpBridge(FieldView, Generic[T]):
 
     def __init__(self, struct: T, nworld: int | None = None) -> None:
         nworld = getattr(struct, "nworld", None) if nworld is None else nworld
-        super().__init__(self._wrap, nworld, type(struct).__name__)
+        super().__init__(partial(getattr, struct), nworld, type(struct).__name__)
         self.__dict__["_struct"] = struct
 
     @property
@@ -115,17 +116,13 @@ class WarpBridge(FieldView, Generic[T]):
         held = [name for name, value in self.__dict__.items() if isinstance(value, TorchArray)]
         self.forget(held)
 
-    def _wrap(self, name: str) -> Any:
-        value = getattr(self.struct, name)
+    def __getattr__(self, name: str) -> Any:
+        value = super().__getattr__(name)
         if not (hasattr(value, "ptr") and hasattr(value, "dtype")):
+            # Not stored: the struct's value may change.
+            self.forget([name])
             return value
         # MuJoCo Warp marks arrays with a leading world dimension.
         is_batched = getattr(value, "_is_batched", False)
-        return TorchArray(value, self.nworld if is_batched else None)
-
-    def __getattr__(self, name: str) -> Any:
-        value = super().__getattr__(name)
-        if not isinstance(value, TorchArray):
-            # Not stored: the struct's value may change.
-            self.forget([name])
-        return value
+        self.__dict__[name] = TorchArray(value, self.nworld if is_batched else None)
+        return self.__dict__[name]

@@ -26,7 +26,7 @@ from mjlab.sim.engine import (
     create_engine,
     resolve_engine_name,
 )
-from mjlab.sim.memory import bytes_per_environment, check_memory
+from mjlab.sim.memory import LEAST_BYTES, bytes_per_environment, check_memory
 from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
 from mjlab.sim.sim_data import FieldView
 from mjlab.sim.warning_log import collect_mujoco_warnings
@@ -108,6 +108,9 @@ class Simulation:
         self.model = FieldView(self._read_model_field, num_envs, "model")
         """Live `MjModel` fields. Fields that are not expanded are shared and read-only."""
         self._options = FieldView(self._read_option, num_envs, "model.opt")
+        # Root of each body, (nbody,), and mask of degrees of freedom that move it, (nbody, nv).
+        self._body_roots = torch.as_tensor(self.mj_model.body_rootid, device=device).long()
+        self._moving_dofs = torch.as_tensor(moving_dofs(self.mj_model), device=device).float()
         if variant_info:
             self._apply_variants(variant_info)
         self._forward_callbacks: list[Callable[[Stage], None]] = []
@@ -119,6 +122,12 @@ class Simulation:
             model_fields=lambda: {name: getattr(self.model, name) for name in self.expanded_fields},
         )
         logger.debug("Physics: %s, %d environments.", self.capabilities.description, num_envs)
+
+    @staticmethod
+    def check(num_envs: int, cfg: SimulationCfg, device: str) -> None:
+        """Check engine, device and memory before a model exists. Raises as the constructor does."""
+        resolve_engine_name(cfg.engine, device)
+        check_memory(num_envs, LEAST_BYTES, device)
 
     # Properties.
 
@@ -459,22 +468,14 @@ class Simulation:
         """
         # Not computed by the engine from the current qpos: within a step, qpos is one substep newer
         # than the positions of the points.
-        roots, moves = self._body_motion
         body_ids = body_ids.long()
         envs = torch.arange(self.num_envs, device=self.device)
-        centers = self.data.subtree_com[envs, roots[body_ids]]
-        axes = self.data.cdof * moves[body_ids][..., None]
+        centers = self.data.subtree_com[envs, self._body_roots[body_ids]]
+        axes = self.data.cdof * self._moving_dofs[body_ids][..., None]
         rotational, translational = axes.split(3, dim=-1)
         arms = (points.float() - centers)[:, None].expand_as(rotational)
         translational = translational + torch.linalg.cross(rotational, arms)
         return translational.mT, rotational.mT
-
-    @cached_property
-    def _body_motion(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Root of each body, (nbody,), and mask of degrees of freedom that move it, (nbody, nv)."""
-        roots = torch.as_tensor(self.mj_model.body_rootid, dtype=torch.int64, device=self.device)
-        moves = torch.as_tensor(moving_dofs(self.mj_model), dtype=torch.float32, device=self.device)
-        return roots, moves
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData | None = None) -> mujoco.MjData:
         """Copy the state of one environment to host data, for viewers, without a forward pass."""

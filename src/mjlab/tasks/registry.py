@@ -159,14 +159,12 @@ def load_rl_cfg(
 
 def load_runner_cls(task_name: str) -> type | None:
     """Return the runner class of a task, or None for the default. Raises as `load_env_cfg`."""
-    runner_cls = _find(task_name).runner_cls
-    return _import_name(task_name, runner_cls) if isinstance(runner_cls, str) else runner_cls
+    return _resolve(task_name, _find(task_name).runner_cls)
 
 
 def load_options_cls(task_name: str) -> type[TaskOptions] | None:
     """Return the options class of a task, or None. Raises as `load_env_cfg`."""
-    options = _find(task_name).options
-    return _import_name(task_name, options) if isinstance(options, str) else options
+    return _resolve(task_name, _find(task_name).options)
 
 
 def require_profile(task_name: str, profile: str) -> Profile | str:
@@ -271,9 +269,7 @@ def _with_profile(
     """
     from mjlab.rl.config import RslRlBaseRunnerCfg
 
-    edit = require_profile(task_name, profile)
-    if isinstance(edit, str):
-        edit = _import_name(task_name, edit)
+    edit = _resolve(task_name, require_profile(task_name, profile))
     env_cfg, task_cfg = load_env_cfg(task_name, play), load_rl_cfg(task_name)
     experiment = task_cfg.experiment_name
     returned = edit(env_cfg, task_cfg)
@@ -305,8 +301,7 @@ def _find(task_name: str) -> _Task:
 
 def _make_cfg(task_name: str, source: Any, **kwargs: Any) -> Any:
     """Return a new config from a config, a function, or the name of a function."""
-    if isinstance(source, str):
-        source = _import_name(task_name, source)
+    source = _resolve(task_name, source)
     if callable(source):
         accepted = inspect.signature(source).parameters
         kwargs = {name: value for name, value in kwargs.items() if name in accepted}
@@ -314,15 +309,17 @@ def _make_cfg(task_name: str, source: Any, **kwargs: Any) -> Any:
     return copy.deepcopy(source(**kwargs) if callable(source) else source)
 
 
-def _import_name(task_name: str, name: str) -> Any:
-    """Import `module:attribute`. Raises `TaskImportError`."""
-    module, _, attribute = name.partition(":")
+def _resolve(task_name: str, value: Any) -> Any:
+    """Return `value`, imported if it is a name `module:attribute`. Raises `TaskImportError`."""
+    if not isinstance(value, str):
+        return value
+    module, _, attribute = value.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
     # Modules of other packages may raise any exception.
     except (Exception, SystemExit) as error:
         raise TaskImportError(
-            f"Task {task_name!r} cannot be used: importing {name!r} failed: "
+            f"Task {task_name!r} cannot be used: importing {value!r} failed: "
             f"{type(error).__name__}: {error}{_missing_extra(error)}"
         ) from error
 

@@ -92,23 +92,18 @@ def pyramid_stairs_inv(**overrides: Any) -> BoxInvertedPyramidStairsTerrainCfg:
     return BoxInvertedPyramidStairsTerrainCfg(**_stairs(overrides))
 
 
-def _slope(overrides: dict[str, Any], inverted: bool) -> HfPyramidSlopedTerrainCfg:
-    return HfPyramidSlopedTerrainCfg(**_override(
-        overrides,
-        slope_range=(0.0, 0.7), platform_width=2.0, border_width=0.25, inverted=inverted,
-    ))  # fmt: skip
-
-
 @terrain_preset
 def hf_pyramid_slope(**overrides: Any) -> HfPyramidSlopedTerrainCfg:
     """Hill with a platform."""
-    return _slope(overrides, inverted=False)
+    return HfPyramidSlopedTerrainCfg(
+        **_override(overrides, slope_range=(0.0, 0.7), platform_width=2.0, border_width=0.25)
+    )
 
 
 @terrain_preset
 def hf_pyramid_slope_inv(**overrides: Any) -> HfPyramidSlopedTerrainCfg:
     """Hollow with a platform."""
-    return _slope(overrides, inverted=True)
+    return hf_pyramid_slope(**_override(overrides, inverted=True))
 
 
 @terrain_preset

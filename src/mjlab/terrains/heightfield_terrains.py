@@ -197,7 +197,13 @@ class HfRandomUniformTerrainCfg(SubTerrainCfg):
         step = int(self.noise_step / self.vertical_scale)
         expected = f"a length >= vertical_scale = {self.vertical_scale:g} m"
         check_field(self, "noise_step", step >= 1, expected)
-        spacing = self._spacing(pixels.inner_size)
+        # At least two heights along each side.
+        coarse, most = self.downsampled_scale, min(pixels.inner_size) / 2
+        check_field(
+            self, "downsampled_scale", coarse is None or self.horizontal_scale <= coarse <= most,
+            f"a length from horizontal_scale = {self.horizontal_scale:g} to {most:g} m",
+        )  # fmt: skip
+        spacing = self.horizontal_scale if coarse is None else coarse
         factor = difficulty if self.scale_with_difficulty else 1.0
         low, high = (int(factor * end / self.vertical_scale) for end in self.noise_range)
         # The first axis is the row (y).
@@ -206,16 +212,6 @@ class HfRandomUniformTerrainCfg(SubTerrainCfg):
         noise = pixels.with_border(interpolate_cubic(drawn, pixels.inner))
         field = add_noise(self, spec, noise)
         return finish(self, field, field.max_height_near_center(), rng)
-
-    def _spacing(self, inner_size: tuple[float, float]) -> float:
-        """Return the distance between sampled heights (m): at least two heights along each side."""
-        if self.downsampled_scale is None:
-            return self.horizontal_scale
-        low, high = self.horizontal_scale, min(inner_size) / 2
-        holds = low <= self.downsampled_scale <= high
-        expected = f"a length from horizontal_scale = {low:g} to {high:g} m"
-        check_field(self, "downsampled_scale", holds, expected)
-        return self.downsampled_scale
 
 
 @dataclass(kw_only=True)

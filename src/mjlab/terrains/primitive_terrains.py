@@ -327,39 +327,25 @@ class BoxTiltedGridTerrainCfg(SubTerrainCfg):
         platform = (self.platform_width, self.platform_width)
         boxes.add_platform(platform, _TILTED_HEIGHT, dark, bottom=bottom)
         name = asset_name(spec, "tilted_column")
-        for i, j in grid.cells():
-            if not grid.is_under_platform(i, j):
-                self._add_column(boxes, spec, grid, (i, j), f"{name}_{i}_{j}", difficulty, rng)
-        return boxes.output(_TILTED_HEIGHT)
-
-    def _add_column(
-        self,
-        boxes: Boxes,
-        spec: mujoco.MjSpec,
-        grid: _Grid,
-        cell: tuple[int, int],
-        name: str,
-        difficulty: float,
-        rng: np.random.Generator,
-    ) -> None:
-        tilt = math.radians(self.tilt_range_deg * difficulty)
-        rise = rng.uniform(-self.height_range / 2, self.height_range / 2) * difficulty
-        slopes = rng.uniform(-tilt, tilt, 2)
-        shade = float(rng.uniform(0.3, 0.7))
+        tilt, rise = math.radians(self.tilt_range_deg * difficulty), self.height_range / 2
         corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * grid.width
-        tops = _TILTED_HEIGHT + rise + corners @ slopes
-        if grid.touches_platform(*cell):
-            # A column that extends under the platform must not protrude through the platform.
-            tops -= max(tops.max() - _TILTED_HEIGHT, 0.0)
-        bottoms = np.full(4, -self.floor_depth)
-        points = np.concatenate(
-            (np.column_stack((corners, bottoms)), np.column_stack((corners, tops)))
-        )
-        spec.add_mesh(name=name, uservert=points.ravel())
-        geom = boxes.body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, pos=(*grid.place(*cell), 0.0)
-        )
-        boxes.keep(geom, brand_ramp(GREEN, shade))
+        for i, j in grid.cells():
+            if grid.is_under_platform(i, j):
+                continue
+            middle = _TILTED_HEIGHT + rng.uniform(-rise, rise) * difficulty
+            tops = middle + corners @ rng.uniform(-tilt, tilt, 2)
+            shade = float(rng.uniform(0.3, 0.7))
+            if grid.touches_platform(i, j):
+                # A column that extends under the platform must not protrude through the platform.
+                tops -= max(tops.max() - _TILTED_HEIGHT, 0.0)
+            heights = np.concatenate((np.full(4, bottom), tops))
+            points = np.column_stack((np.tile(corners, (2, 1)), heights))
+            column = spec.add_mesh(name=f"{name}_{i}_{j}", uservert=points.ravel())
+            geom = boxes.body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_MESH, meshname=column.name, pos=(*grid.place(i, j), 0.0)
+            )
+            boxes.keep(geom, brand_ramp(GREEN, shade))
+        return boxes.output(_TILTED_HEIGHT)
 
 
 @dataclass(frozen=True)
@@ -484,16 +470,13 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         reach = _rotated_extent(length, yaw) / 2
         limit = np.maximum(np.array(inner) / 2 - reach, 0.0)
         place = np.clip(place, -limit, limit)
-        if (reach > np.array(inner) / 2).any():
-            return
-        if _touches_square(place, length, yaw, self.platform_width):
+        fits = (reach <= np.array(inner) / 2).all()
+        if not fits or _touches_square(place, length, yaw, self.platform_width):
             return
         color = brand_ramp(BLUE, float(rng.uniform(0.3, 0.8)))
-        x, y = np.array(boxes.center) + place
-        boxes.add(
-            (float(x), float(y)), (float(length[0]), float(length[1])), top, color,
-            bottom=0.0, yaw=yaw,
-        )  # fmt: skip
+        x, y = (np.array(boxes.center) + place).tolist()
+        length_x, length_y = length.tolist()
+        boxes.add((x, y), (length_x, length_y), top, color, bottom=0.0, yaw=yaw)
 
 
 def _rotated_extent(length: np.ndarray, yaw: float) -> np.ndarray:
@@ -597,19 +580,15 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
         shift, vary = self.displacement_range * difficulty, self.stone_size_variation * difficulty
         place = place + rng.uniform(-shift, shift, 2)
         half = (side + rng.uniform(-vary, vary, 2)) / 2
-        if (abs(place) <= reach).all():
-            return
         low, high = np.maximum(place - half, -room), np.minimum(place + half, room)
-        if (high - low < _MIN_STONE).any():
+        if (abs(place) <= reach).all() or (high - low < _MIN_STONE).any():
             return
         rise = self.stone_height_variation * difficulty
         top = self.stone_height + float(rng.uniform(-rise, rise))
         color = brand_ramp(GREEN, float(rng.uniform(0.4, 0.7)))
-        x, y = np.array(boxes.center) + (low + high) / 2
-        boxes.add(
-            (float(x), float(y)), (float(high[0] - low[0]), float(high[1] - low[1])), top, color,
-            bottom=-self.floor_depth,
-        )  # fmt: skip
+        x, y = (np.array(boxes.center) + (low + high) / 2).tolist()
+        length_x, length_y = (high - low).tolist()
+        boxes.add((x, y), (length_x, length_y), top, color, bottom=-self.floor_depth)
 
 
 @dataclass(kw_only=True)

@@ -16,7 +16,7 @@ import torch
 from mjlab.entity import Entity, EntityCfg
 from mjlab.terrains.terrain_generator import TerrainGenerator, TerrainGeneratorCfg
 from mjlab.utils import spec_config as spec_cfg
-from mjlab.utils.errors import WrongTypeError, check_one_of
+from mjlab.utils.errors import WrongTypeError, check_field, check_one_of
 
 # Debug sites.
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
@@ -121,11 +121,8 @@ class TerrainEntity(Entity):
 
     def _make_spec(self) -> mujoco.MjSpec:
         top = self.cfg.max_init_terrain_level
-        if top is not None and top < 0:
-            raise ValueError(
-                f"TerrainEntityCfg.max_init_terrain_level: expected an integer >= 0, or None for "
-                f"all levels, got {top}."
-            )
+        expected = "an integer >= 0, or None for all levels"
+        check_field(self.cfg, "max_init_terrain_level", top is None or top >= 0, expected)
         check_one_of("TerrainEntityCfg.terrain_type", self.cfg.terrain_type, ("plane", "generator"))
         spec = mujoco.MjSpec()
         if self.cfg.terrain_type == "plane":
@@ -166,21 +163,17 @@ class TerrainEntity(Entity):
                 name=f"env_origin_{index}", type=_SPHERE, size=(0.3, 0.0, 0.0), pos=place, group=4,
                 rgba=_GREEN,
             )  # fmt: skip
-        origins = [] if self.terrain_origins is None else self.terrain_origins.tolist()
-        for row, places in enumerate(origins):
-            for col, place in enumerate(places):
-                body.add_site(
-                    name=f"terrain_origin_{row}_{col}", type=_SPHERE, size=(0.5, 0.0, 0.0), pos=place,
-                    group=5, rgba=_BLUE,
-                )  # fmt: skip
+        origins = torch.zeros(0, 0, 3) if self.terrain_origins is None else self.terrain_origins
+        for row, col in np.ndindex(origins.shape[:2]):
+            body.add_site(
+                name=f"terrain_origin_{row}_{col}", type=_SPHERE, size=(0.5, 0.0, 0.0),
+                pos=origins[row, col].tolist(), group=5, rgba=_BLUE,
+            )  # fmt: skip
         for name, patches in self._flat_patches.items():
             # MuJoCo rejects sites of size 0, and a patch may be a single point.
             radius = max(self._flat_patch_radii[name], _PATCH_HALF_HEIGHT)
             size = (radius, radius, _PATCH_HALF_HEIGHT)
-            for index in torch.cartesian_prod(
-                *(torch.arange(n) for n in patches.shape[:3])
-            ).tolist():
-                row, col, k = index
+            for row, col, k in np.ndindex(patches.shape[:3]):
                 body.add_site(
                     name=f"flat_patch_{name}_{row}_{col}_{k}", type=_BOX, size=size,
                     pos=patches[row, col, k].tolist(), group=3, rgba=_YELLOW,
@@ -234,12 +227,11 @@ class TerrainEntity(Entity):
                 f"origins: expected shape (levels, columns, 3), got {tuple(grid.shape)}."
             )
         num_rows, num_cols = grid.shape[:2]
-        top = num_rows - 1
-        if self.cfg.max_init_terrain_level is not None:
-            top = min(self.cfg.max_init_terrain_level, top)
+        top = self.cfg.max_init_terrain_level
+        num_initial = num_rows if top is None else min(top + 1, num_rows)
         self.terrain_origins = grid
         self.max_terrain_level = num_rows
-        self.terrain_levels = torch.randint(0, top + 1, (num_envs,), device=self._device)
+        self.terrain_levels = torch.randint(0, num_initial, (num_envs,), device=self._device)
         self.terrain_types = assign_columns(num_envs, num_cols, proportions, self._device)
         self.env_origins = grid[self.terrain_levels, self.terrain_types]
 

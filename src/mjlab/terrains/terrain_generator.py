@@ -184,8 +184,13 @@ class TerrainGenerator:
                     name = names[self.np_rng.choice(len(names), p=shares)]
                     self._fill_cell(spec, row, col, name, float(self.np_rng.uniform(low, high)))
         extent = (self.num_rows * self.cfg.size[0], self.num_cols * self.cfg.size[1])
-        if self.cfg.border_width > 0.0:
-            self._add_border(body, extent)
+        width, height = self.cfg.border_width, self.cfg.border_height
+        if width > 0.0:
+            outer = (extent[0] + 2.0 * width, extent[1] + 2.0 * width)
+            is_random = self.cfg.color_scheme == "random"
+            color = self.np_rng.random(3) if is_random else _DARK_GRAY
+            for geom in make_border(body, outer, extent, abs(height), (0.0, 0.0, -height / 2)):
+                geom.rgba = (*color, 1.0)
         if self.cfg.add_lights:
             body.add_light(
                 type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -216,16 +221,20 @@ class TerrainGenerator:
             [(row - self.num_rows / 2) * size_x, (col - self.num_cols / 2) * size_y, 0.0]
         )
         for geometry in output.geometries:
-            if geometry.geom is not None:
-                geometry.geom.pos = np.asarray(geometry.geom.pos) + corner
-                self._paint(geometry.geom, geometry.color)
+            if geometry.geom is None:
+                continue
+            geometry.geom.pos = np.asarray(geometry.geom.pos) + corner
+            color = _PLAIN if self.cfg.color_scheme == "none" else geometry.color
+            if self.cfg.color_scheme == "random":
+                color = (*self.np_rng.uniform(0.3, 0.8, 3).tolist(), 1.0)
+            if color is not None:
+                geometry.geom.rgba = np.array(color)
         self.terrain_origins[row, col] = output.origin + corner
         for patch, kept in self.flat_patches.items():
             # Unused entries hold the spawn point.
             kept[row, col] = self.terrain_origins[row, col]
-            found = (output.flat_patches or {}).get(patch, ())
-            if len(found):
-                kept[row, col, : len(found)] = found + corner
+            found = (output.flat_patches or {}).get(patch, np.zeros((0, 3)))
+            kept[row, col, : len(found)] = found + corner
 
     def _check_memory(self, output: TerrainOutput) -> None:
         """Raise `ValueError` if the height fields so far exceed the available memory."""
@@ -237,24 +246,6 @@ class TerrainGenerator:
                 f"({self._memory / 1e9:.1f} GB of memory), got {self._num_pixels:,} so far; use a "
                 "larger horizontal_scale, or fewer sub-terrains."
             )
-
-    def _paint(self, geom: mujoco.MjsGeom, color: tuple[float, float, float, float] | None) -> None:
-        """Color a geom by the color scheme. `color`: color given by the sub-terrain."""
-        if self.cfg.color_scheme == "random":
-            color = (*self.np_rng.uniform(0.3, 0.8, 3).tolist(), 1.0)
-        elif self.cfg.color_scheme == "none":
-            color = _PLAIN
-        if color is not None:
-            geom.rgba = np.array(color)
-
-    def _add_border(self, body: mujoco.MjsBody, extent: tuple[float, float]) -> None:
-        """Add a border around the grid, centered on the origin. `extent`: size of the grid (m)."""
-        width, height = self.cfg.border_width, self.cfg.border_height
-        is_random = self.cfg.color_scheme == "random"
-        color = self.np_rng.random(3) if is_random else _DARK_GRAY
-        outer = (extent[0] + 2.0 * width, extent[1] + 2.0 * width)
-        for geom in make_border(body, outer, extent, abs(height), (0.0, 0.0, -height / 2)):
-            geom.rgba = (*color, 1.0)
 
 
 @contextmanager
@@ -286,8 +277,9 @@ def asset_name(spec: mujoco.MjSpec, kind: str) -> str:
 
 def check_generator(cfg: TerrainGeneratorCfg) -> None:
     """Raise `ValueError` for an invalid config."""
-    expected = "at least one sub-terrain, e.g. {'flat': BoxFlatTerrainCfg()}"
-    check_field(cfg, "sub_terrains", bool(cfg.sub_terrains), expected)
+    expected = "at least one sub-terrain with proportion > 0, e.g. {'flat': BoxFlatTerrainCfg()}"
+    has_share = any(sub.proportion for sub in cfg.sub_terrains.values())
+    check_field(cfg, "sub_terrains", has_share, expected)
     is_size = len(cfg.size) == 2 and all(0.0 < side < math.inf for side in cfg.size)
     check_field(cfg, "size", is_size, "two finite lengths > 0 m")
     check_count("TerrainGeneratorCfg.num_rows", cfg.num_rows)
@@ -309,15 +301,6 @@ def check_generator(cfg: TerrainGeneratorCfg) -> None:
                 f"{owner} border_width: expected a length in [0, {side / 2}) m (less than half the "
                 f"sub-terrain), got {border}."
             )
-        for key, patch in (sub.flat_patch_sampling or {}).items():
-            check_count(f"{owner} flat_patch_sampling[{key!r}] num_patches", patch.num_patches)
-            radius = f"{owner} flat_patch_sampling[{key!r}] patch_radius"
-            check_in_range(radius, patch.patch_radius, 0.0, math.inf)
-    if not any(sub.proportion for sub in cfg.sub_terrains.values()):
-        raise ValueError(
-            "SubTerrainCfg.proportion: expected a value > 0 for at least one sub-terrain, got 0 "
-            f"for all of {sorted(cfg.sub_terrains)}."
-        )
 
 
 def check_output(output: TerrainOutput, patches: dict[str, np.ndarray]) -> None:

@@ -138,10 +138,10 @@ def find_flat_patches_from_heightfield(
         for extent, count in zip(size[::-1], heights.shape, strict=True)
     )
     # Radius of a patch in vertices along y and along x.
-    row_radius, col_radius = (
-        math.ceil(cfg.patch_radius / (axis[1] - axis[0]) - 1e-9) for axis in (y, x)
-    )
-    flat = _flat_vertices(heights, (row_radius, col_radius), cfg.max_height_diff)
+    r, c = (math.ceil(cfg.patch_radius / (axis[1] - axis[0]) - 1e-9) for axis in (y, x))
+    spread = _disc_max(heights, r, c) + _disc_max(-heights, r, c)
+    # Differences of multiples of a vertical step have rounding errors in the last bits.
+    flat = spread <= cfg.max_height_diff + 1e-9
     z = heights + z_offset
     valid = (
         flat & _within(y, cfg.y_range)[:, None] & _within(x, cfg.x_range) & _within(z, cfg.z_range)
@@ -217,38 +217,30 @@ def lerp(ends: tuple[float, float], difficulty: float) -> float:
     return ends[0] + difficulty * (ends[1] - ends[0])
 
 
-def _flat_vertices(heights: np.ndarray, radii: tuple[int, int], limit: float) -> np.ndarray:
-    """Return vertices with height differences <= `limit` over their disc, (rows, cols) bool."""
-    flat = np.zeros(heights.shape, dtype=bool)
-    r, c = radii
-    rows, cols = heights.shape
-    if rows > 2 * r and cols > 2 * c:
-        spread = _disc_max(heights, radii) + _disc_max(-heights, radii)
-        # Differences of multiples of a vertical step have rounding errors in the last bits.
-        flat[r : rows - r, c : cols - c] = spread <= limit + 1e-9
-    return flat
-
-
-def _disc_max(values: np.ndarray, radii: tuple[int, int]) -> np.ndarray:
-    """Return the maximum over the disc around each vertex with a disc inside the field.
+def _disc_max(values: np.ndarray, r: int, c: int) -> np.ndarray:
+    """Return the maximum over the disc around each vertex; NaN if the disc leaves the field.
 
     A disc is a stack of rows, and the maximum of any run of columns is the maximum of two covering
     runs of power-of-two length. So the cost is linear, not quadratic, in the radius.
 
     Args:
         values: (rows, cols).
-        radii: Half-axes (r, c) of the disc `(i / r)^2 + (j / c)^2 <= 1`, in vertices.
+        r: Half-axis of the disc `(i / r)^2 + (j / c)^2 <= 1` along the rows, in vertices.
+        c: Half-axis along the columns, in vertices.
 
     Returns:
-        (rows - 2 r, cols - 2 c).
+        (rows, cols).
     """
-    r, c = radii
     rows, cols = values.shape
+    result = np.full(values.shape, np.nan)
+    if rows <= 2 * r or cols <= 2 * c:
+        return result
     runs = [values]
     while 2 ** len(runs) <= 2 * c + 1:
         shorter, step = runs[-1], 2 ** (len(runs) - 1)
         runs.append(np.maximum(shorter[:, : shorter.shape[1] - step], shorter[:, step:]))
-    highest = np.full((rows - 2 * r, cols - 2 * c), -np.inf)
+    highest = result[r : rows - r, c : cols - c]
+    highest[:] = -np.inf
     for i in range(-r, r + 1):
         half = int(c * math.sqrt(1.0 - (i / r) ** 2) + 1e-9) if r else c
         length = 2 * half + 1
@@ -256,7 +248,7 @@ def _disc_max(values: np.ndarray, radii: tuple[int, int]) -> np.ndarray:
         strip = runs[power][r + i : rows - r + i]
         for start in (c - half, c + half + 1 - 2**power):
             np.maximum(highest, strip[:, start : start + cols - 2 * c], out=highest)
-    return highest
+    return result
 
 
 def _within(values: np.ndarray, ends: tuple[float, float]) -> np.ndarray:

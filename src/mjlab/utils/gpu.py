@@ -22,7 +22,7 @@ def select_gpus(
     Without a GPU, returns the CPU for any `gpu_ids`. Raises `ValueError`, listing the valid
     indices, for an index out of range.
     """
-    if gpu_ids is None:
+    if not gpu_ids:
         return None, 0
     available = _available_devices()
     if not available:
@@ -36,8 +36,6 @@ def select_gpus(
             f"Unknown GPU {invalid}. Available: {list(range(len(available)))} "
             f"(visible GPUs {available})."
         )
-    if not gpu_ids:
-        return None, 0
     return [available[index] for index in gpu_ids], len(gpu_ids)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 
+from mjlab.utils.errors import check_one_of
+
 _CODES = {
     "red": 31,
     "green": 32,
@@ -22,8 +24,7 @@ def print_info(message: str, color: str = "green") -> None:
 
     Raises `ValueError` for an unknown color.
     """
-    if color not in _CODES:
-        raise ValueError(f"Unknown color {color!r}. Available: {list(_CODES)}.")
+    check_one_of("color", color, _CODES)
     if sys.stdout.isatty():
         message = f"\033[{_CODES[color]}m{message}\033[0m"
     print(message)

@@ -40,6 +40,24 @@ _DEFAULT_INPUTS = {
     int(mujoco.mjtGain.mjGAIN_DCMOTOR): mujoco.mjtCtrlInput.mjINPUT_VOLTAGE.value,
 }
 
+OBJECT_TYPES = {
+    "bodies": mujoco.mjtObj.mjOBJ_BODY,
+    "joints": mujoco.mjtObj.mjOBJ_JOINT,
+    "geoms": mujoco.mjtObj.mjOBJ_GEOM,
+    "sites": mujoco.mjtObj.mjOBJ_SITE,
+    "tendons": mujoco.mjtObj.mjOBJ_TENDON,
+    "cameras": mujoco.mjtObj.mjOBJ_CAMERA,
+    "lights": mujoco.mjtObj.mjOBJ_LIGHT,
+    "meshes": mujoco.mjtObj.mjOBJ_MESH,
+    "materials": mujoco.mjtObj.mjOBJ_MATERIAL,
+    "textures": mujoco.mjtObj.mjOBJ_TEXTURE,
+    "pairs": mujoco.mjtObj.mjOBJ_PAIR,
+    "actuators": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "equalities": mujoco.mjtObj.mjOBJ_EQUALITY,
+    "sensors": mujoco.mjtObj.mjOBJ_SENSOR,
+}
+"""Type of the elements in each list of `MjSpec`."""
+
 OPTION_ENUMS = {
     "jacobian": (mujoco.mjtJacobian, "mjJAC_"),
     "cone": (mujoco.mjtCone, "mjCONE_"),

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.utils.errors import check_count
-from mjlab.utils.os import own_folder, replacing
+from mjlab.utils.os import own_folder, replacing, write_atomically
 
 if TYPE_CHECKING:
     import mujoco
@@ -123,12 +123,8 @@ class NanGuard:
             self.dump_path = self._dump(ids)
         except OSError as error:
             # A full disk must not end the run.
-            logger.error(
-                "NaN in environments %s, but the dump could not be written to %s: %s.",
-                ids[:10],
-                self.cfg.output_dir,
-                error,
-            )
+            message = f"but the dump could not be written to {self.cfg.output_dir}: {error}"
+            logger.error("NaN in environments %s, %s.", ids[:10], message)
         else:
             logger.warning(
                 "NaN in environments %s at substep %d; previous states are in %s (view with viz-nan).",
@@ -171,21 +167,14 @@ class NanGuard:
         ids = nan_ids[: self.cfg.max_envs_to_dump]
         stamp = datetime.now().strftime("%Y%m%d_%H%M%S")
         folder = own_folder(Path(self.cfg.output_dir))
-        path, model_path = (
-            folder / f"nan_dump_{stamp}.npz",
-            folder / f"model_{stamp}.mjb",
-        )
+        path, model_path = folder / f"nan_dump_{stamp}.npz", folder / f"model_{stamp}.mjb"
         arrays = self._recorded(ids)
-        if self.model_fields is not None:
-            for name, values in self.model_fields().items():
-                arrays[f"model_{name}"] = values[ids].cpu().numpy()
         model = np.empty(mujoco.mj_sizeModel(self.mj_model), np.uint8)
         mujoco.mj_saveModel(self.mj_model, None, model)
         metadata = self._metadata(nan_ids, ids, stamp, model_path)
         metadata["model_sha256"] = hashlib.sha256(model.tobytes()).hexdigest()
         arrays["_metadata"] = np.array(json.dumps(metadata))
-        with replacing(model_path) as file:
-            file.write(model.tobytes())
+        write_atomically(model_path, model.tobytes())
         with replacing(path) as file:
             np.savez_compressed(file, **arrays)
         _link(folder / "nan_dump_latest.npz", path)
@@ -193,7 +182,7 @@ class NanGuard:
         return path
 
     def _recorded(self, ids: list[int]) -> dict[str, Any]:
-        """Return the arrays of the recorded substeps; states are in `mj_setState` order."""
+        """Return the recorded substeps and the model fields; states are in `mj_setState` order."""
         import numpy as np
 
         arrays: dict[str, Any] = {}
@@ -206,7 +195,8 @@ class NanGuard:
             arrays[f"states_step_{step:06d}"] = np.concatenate(rows, axis=1)
             for name in self._input_fields:
                 arrays[f"{name}_step_{step:06d}"] = kept[name][ids].cpu().numpy()
-        return arrays
+        fields = {} if self.model_fields is None else self.model_fields()
+        return arrays | {f"model_{name}": v[ids].cpu().numpy() for name, v in fields.items()}
 
     def _metadata(
         self, nan_ids: list[int], ids: list[int], stamp: str, model_path: Path
@@ -273,12 +263,13 @@ class NanDump:
                 raise ValueError("not an .npz file")
             arrays = _read_arrays(path)
             metadata = json.loads(str(arrays.pop("_metadata")))
-            missing = [name for name in _METADATA if name not in metadata]
-            if missing:
+            if missing := [name for name in _METADATA if name not in metadata]:
                 raise ValueError(f"metadata {missing} not found")
             for name, kind in _METADATA.items():
                 if not isinstance(metadata[name], kind):
-                    raise ValueError(f"metadata {name}: expected {kind}, got {metadata[name]!r}")
+                    raise ValueError(
+                        f"metadata {name}: expected {kind.__name__}, got {metadata[name]!r}"
+                    )
             rows = metadata["num_envs_dumped"]
             if rows != len(metadata["dumped_env_ids"]) or rows < 1:
                 raise ValueError(f"num_envs_dumped={rows} does not match dumped_env_ids")
@@ -344,9 +335,6 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
                         f"{name}: Python objects are not allowed in dumps; nothing was executed"
                     ) from error
                 raise
-            # NumPy returns the raw bytes of entries that are not arrays.
-            if not isinstance(arrays[name], np.ndarray):
-                raise ValueError(f"{name} is not an array")
     return arrays
 
 
@@ -356,5 +344,4 @@ def _link(link: Path, target: Path) -> None:
     try:
         os.symlink(target.name, link)
     except OSError:
-        with replacing(link) as file:
-            file.write(target.read_bytes())
+        write_atomically(link, target.read_bytes())

@@ -49,7 +49,6 @@ def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> 
     filename = Path(filename)
     if filename.suffix not in (".yaml", ".yml"):
         filename = filename.with_name(filename.name + ".yaml")
-    filename.parent.mkdir(parents=True, exist_ok=True)
 
     class PlainDumper(yaml.SafeDumper):
         # Repeat objects, because YAML anchors are hard to read.
@@ -57,13 +56,9 @@ def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> 
             return True
 
     text = yaml.dump(
-        to_plain(data),
-        Dumper=PlainDumper,
-        sort_keys=sort_keys,
-        default_flow_style=False,
+        to_plain(data), Dumper=PlainDumper, sort_keys=sort_keys, default_flow_style=False
     )
-    with replacing(filename) as file:
-        file.write(text.encode())
+    write_atomically(filename, text.encode())
 
 
 def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
@@ -94,11 +89,8 @@ def to_plain(value: Any, _parents: tuple[int, ...] = ()) -> Any:
     if isinstance(value, (list, tuple)):
         return [to_plain(item, inner) for item in value]
     if isinstance(value, functools.partial):
-        return {
-            "func": to_plain(value.func, inner),
-            "args": to_plain(value.args, inner),
-            "keywords": to_plain(value.keywords, inner),
-        }
+        parts = ("func", "args", "keywords")
+        return {part: to_plain(getattr(value, part), inner) for part in parts}
     return _plain_object(value)
 
 
@@ -217,6 +209,13 @@ def _asking_wandb(run_path: Path) -> Generator[None]:
         ) from error
 
 
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file by `replacing`. Creates missing folders."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(content)
+
+
 @contextlib.contextmanager
 def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
     """Yield a binary file that replaces `path` atomically if the block succeeds.
@@ -311,19 +310,14 @@ def own_folder(folder: Path) -> Path:
         if not os.path.lexists(part):
             with contextlib.suppress(FileExistsError):
                 part.mkdir()
-        if _is_foreign(part):
+        is_shared = hasattr(os, "geteuid") and part.parent.stat().st_mode & stat.S_IWOTH
+        if is_shared and part.lstat().st_uid not in (os.geteuid(), 0):
             cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
             own = cache / "mjlab" / path.name
             own.mkdir(parents=True, exist_ok=True)
             logger.warning("%s belongs to another user; using %s.", part, own)
             return own
     return folder
-
-
-def _is_foreign(path: Path) -> bool:
-    if not hasattr(os, "geteuid") or not path.parent.stat().st_mode & stat.S_IWOTH:
-        return False
-    return path.lstat().st_uid not in (os.geteuid(), 0)
 
 
 __getattr__ = older_names(__name__)

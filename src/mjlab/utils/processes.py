@@ -6,13 +6,14 @@ LOCAL_WORLD_SIZE. Without these variables, the run has one process.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,10 @@ PARENT_VARIABLE = "MJLAB_PARENT_PID"
 _SECONDS_BETWEEN_LOOKS = 0.5
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 _CGROUP_ROOT = Path("/sys/fs/cgroup")
+# Files with quota and period in microseconds, by version of control groups. Without a limit, the
+# quota is "max" or -1.
+_QUOTA_V2 = ("cpu.max",)
+_QUOTA_V1 = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
 
 
 @dataclass(frozen=True)
@@ -59,10 +64,10 @@ def process_rank() -> ProcessRank:
     Raises:
         ValueError: the environment variables are inconsistent or not integers.
     """
-    world_size = _number("WORLD_SIZE", 1)
-    rank = _number("RANK", 0)
-    local_rank = _number("LOCAL_RANK", rank)
-    local_world_size = _number("LOCAL_WORLD_SIZE", world_size)
+    world_size = environment_integer("WORLD_SIZE", 1)
+    rank = environment_integer("RANK", 0, minimum=0)
+    local_rank = environment_integer("LOCAL_RANK", rank, minimum=0)
+    local_world_size = environment_integer("LOCAL_WORLD_SIZE", world_size)
     if not (rank < world_size and local_rank < local_world_size <= world_size):
         raise ValueError(
             "Expected RANK < WORLD_SIZE and LOCAL_RANK < LOCAL_WORLD_SIZE <= WORLD_SIZE, got "
@@ -73,15 +78,17 @@ def process_rank() -> ProcessRank:
     return ProcessRank(rank, world_size, local_rank, local_world_size)
 
 
-def _number(variable: str, default: int) -> int:
-    text = os.environ.get(variable, "")
-    if text == "":
-        return default
-    least = 1 if variable.endswith("WORLD_SIZE") else 0
-    if not text.isdigit() or int(text) < least:
+def environment_integer(variable: str, default: int, minimum: int = 1) -> int:
+    """Return an integer from an environment variable; `default` if unset or empty.
+
+    Raises:
+        ValueError: the value is not an integer >= `minimum`.
+    """
+    text = os.environ.get(variable) or str(default)
+    if not text.isdigit() or int(text) < minimum:
         raise ValueError(
-            f"Environment variable {variable}: expected an integer >= {least}, got {text!r}. "
-            "torchrun sets this variable; unset it to train in one process."
+            f"Environment variable {variable}: expected an integer >= {minimum}, got {text!r}; unset "
+            "it for the default (torchrun sets RANK and WORLD_SIZE)."
         )
     return int(text)
 
@@ -109,22 +116,15 @@ def end_with_launcher() -> None:
     launcher = parent if launcher_id is None else int(launcher_id)
 
     def watch() -> None:
-        while os.getppid() == parent and _is_running(launcher):
-            time.sleep(_SECONDS_BETWEEN_LOOKS)
+        with contextlib.suppress(ProcessLookupError):
+            while os.getppid() == parent:
+                # A launcher of another user is running, too.
+                with contextlib.suppress(PermissionError):
+                    os.kill(launcher, 0)
+                time.sleep(_SECONDS_BETWEEN_LOOKS)
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=watch, name="end-with-launcher", daemon=True).start()
-
-
-def _is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        # The process exists and belongs to another user.
-        pass
-    return True
 
 
 def cores_per_process() -> int:
@@ -145,15 +145,15 @@ def available_cores() -> int:
     # Quotas of this process's control group and of all its ancestors apply.
     quotas = [
         quota
-        for folder, read in _control_groups()
+        for folder, files in _control_groups()
         for group in (folder, *folder.parents)
-        if group.is_relative_to(_CGROUP_ROOT) and (quota := read(group)) is not None
+        if group.is_relative_to(_CGROUP_ROOT) and (quota := _quota(group, files)) is not None
     ]
     return max(1, min(cores, math.ceil(min(quotas, default=cores))))
 
 
-def _control_groups() -> Iterator[tuple[Path, Callable[[Path], float | None]]]:
-    """Yield folder and quota reader of each control group that may limit this process.
+def _control_groups() -> Iterator[tuple[Path, tuple[str, ...]]]:
+    """Yield folder and quota files of each control group that may limit this process.
 
     Lines of `/proc/self/cgroup` are `<number>:<controllers>:<path>`; version 2 has no controllers.
     """
@@ -165,32 +165,19 @@ def _control_groups() -> Iterator[tuple[Path, Callable[[Path], float | None]]]:
         _, controllers, path = line.split(":", 2)
         group = path.lstrip("/")
         if not controllers:
-            yield _CGROUP_ROOT / group, _quota_v2
-            yield _CGROUP_ROOT / "unified" / group, _quota_v2
+            yield _CGROUP_ROOT / group, _QUOTA_V2
+            yield _CGROUP_ROOT / "unified" / group, _QUOTA_V2
         elif "cpu" in controllers.split(","):
-            yield _CGROUP_ROOT / controllers / group, _quota_v1
-            yield _CGROUP_ROOT / "cpu" / group, _quota_v1
+            yield _CGROUP_ROOT / controllers / group, _QUOTA_V1
+            yield _CGROUP_ROOT / "cpu" / group, _QUOTA_V1
 
 
-def _quota_v2(group: Path) -> float | None:
-    # "<quota> <period>" in microseconds; quota "max": no limit.
-    return _ratio(*_words(group / "cpu.max"))
-
-
-def _quota_v1(group: Path) -> float | None:
-    # Quota -1: no limit.
-    names = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
-    return _ratio(*(word for name in names for word in _words(group / name)))
-
-
-def _words(file: Path) -> list[str]:
+def _quota(group: Path, files: tuple[str, ...]) -> float | None:
+    """Return the quota of a control group in cores. None: no limit."""
     try:
-        return file.read_text().split()
+        words = " ".join((group / file).read_text() for file in files).split()
     except OSError:
-        return []
-
-
-def _ratio(*words: str) -> float | None:
+        return None
     if len(words) != 2 or not all(word.isdigit() and int(word) > 0 for word in words):
         return None
     return int(words[0]) / int(words[1])

@@ -21,7 +21,7 @@ from mjlab.utils.errors import check_in_range
 
 _MAX_SEED = 2**32 - 1
 _PROCESS_STRIDE = 2**20
-_EVALUATIONS, _SESSIONS = 2**31, 2**31 + 2**30
+_QUARTER = 2**30
 # Odd, and close to 2**32 / golden ratio: small multiples are far apart.
 _SPREAD = 0x9E3779B1
 
@@ -117,7 +117,7 @@ def session_seed(seed: int, iteration: int) -> int:
 
     For runs whose checkpoint does not contain the generator states.
     """
-    return _SESSIONS + _spread(seed, iteration)
+    return evaluation_seed(seed, iteration) + _QUARTER
 
 
 def evaluation_seed(seed: int, iteration: int = 0) -> int:
@@ -128,8 +128,4 @@ def evaluation_seed(seed: int, iteration: int = 0) -> int:
         iteration: Each iteration gives different episodes; 0 is for episodes that are the same
             in all evaluations.
     """
-    return _EVALUATIONS + _spread(seed, iteration)
-
-
-def _spread(seed: int, iteration: int) -> int:
-    return (seed * _SPREAD + iteration) % 2**30
+    return 2 * _QUARTER + (seed * _SPREAD + iteration) % _QUARTER

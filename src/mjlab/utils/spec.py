@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import warnings
 from collections.abc import Callable, Collection
 from enum import Enum
@@ -152,6 +153,13 @@ def is_joint_limited(jnt: mujoco.MjsJoint) -> bool:
     return jnt.limited == mujoco.mjtLimited.mjLIMITED_TRUE
 
 
+def authored_position(target: Any, value: float) -> float:
+    """Return a position of a spec's joint or tendon in SI units: XML may state angles in degrees."""
+    angular = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL)
+    is_angle = isinstance(target, mujoco.MjsJoint) and target.type in angular
+    return math.radians(value) if is_angle and target.compiler.degree else float(value)
+
+
 def option_field_names() -> tuple[str, ...]:
     """Return all field names of `<option>`."""
     return tuple(name for name in dir(mujoco.MjSpec().option) if not name.startswith("_"))
@@ -232,10 +240,9 @@ def create_position_actuator(
     target = _target(spec, joint_name, transmission_type, allow_site=False)
     _override(target, armature, frictionloss, viscous_damping)
     actuator = _add(spec, actuator_name or joint_name, target)
-    _set_affine(actuator, gain=stiffness, bias=(0.0, -stiffness, -damping))
-    _set_effort_limit(actuator, effort_limit)
+    _set_affine(actuator, stiffness, (0.0, -stiffness, -damping), effort_limit)
     if effort_limit is not None:
-        lower, upper = _authored_range(target)
+        lower, upper = (authored_position(target, value) for value in target.range)
         # Without stiffness, the control has no effect.
         reach = effort_limit / stiffness if stiffness > 0 else 0.0
         actuator.ctrlrange[:] = (lower - reach, upper + reach)
@@ -261,8 +268,7 @@ def create_velocity_actuator(
     target = _target(spec, joint_name, transmission_type, allow_site=False)
     _override(target, armature, frictionloss, viscous_damping)
     actuator = _add(spec, actuator_name or joint_name, target)
-    _set_affine(actuator, gain=damping, bias=(0.0, 0.0, -damping))
-    _set_effort_limit(actuator, effort_limit)
+    _set_affine(actuator, damping, (0.0, 0.0, -damping), effort_limit)
     return actuator
 
 
@@ -289,9 +295,8 @@ def create_motor_actuator(
     actuator.gainprm[0] = 1.0
     actuator.biastype = mujoco.mjtBias.mjBIAS_NONE
     actuator.gear[0] = gear
-    _set_effort_limit(actuator, effort_limit)
-    actuator.ctrllimited = _ON
-    actuator.ctrlrange[:] = (-effort_limit, effort_limit)
+    actuator.forcelimited = actuator.ctrllimited = _ON
+    actuator.forcerange[:] = actuator.ctrlrange[:] = (-effort_limit, effort_limit)
     return actuator
 
 
@@ -393,8 +398,12 @@ def _add(spec: mujoco.MjSpec, name: str, target: Any) -> mujoco.MjsActuator:
 
 
 def _set_affine(
-    actuator: mujoco.MjsActuator, gain: float, bias: tuple[float, float, float]
+    actuator: mujoco.MjsActuator,
+    gain: float,
+    bias: tuple[float, float, float],
+    effort_limit: float | None,
 ) -> None:
+    """Set force = gain u + bias . (1, l, l'), clamped to the effort limit."""
     actuator.dyntype = mujoco.mjtDyn.mjDYN_NONE
     actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
     actuator.gainprm[0] = gain
@@ -402,26 +411,9 @@ def _set_affine(
     actuator.biasprm[:3] = bias
     actuator.ctrllimited = _OFF
     actuator.inheritrange = 0.0
-
-
-def _set_effort_limit(actuator: mujoco.MjsActuator, effort_limit: float | None) -> None:
-    if effort_limit is None:
-        actuator.forcelimited = _OFF
-        return
-    actuator.forcelimited = _ON
-    actuator.forcerange[:] = (-effort_limit, effort_limit)
-
-
-def _authored_range(target: Any) -> tuple[float, float]:
-    """Return the range in SI units. Specs loaded from XML may hold degrees."""
-    lower, upper = float(target.range[0]), float(target.range[1])
-    angular = isinstance(target, mujoco.MjsJoint) and target.type in (
-        mujoco.mjtJoint.mjJNT_HINGE,
-        mujoco.mjtJoint.mjJNT_BALL,
-    )
-    if angular and target.compiler.degree:
-        return float(np.deg2rad(lower)), float(np.deg2rad(upper))
-    return lower, upper
+    actuator.forcelimited = _OFF if effort_limit is None else _ON
+    if effort_limit is not None:
+        actuator.forcerange[:] = (-effort_limit, effort_limit)
 
 
 __getattr__ = older_names(__name__)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import mujoco
 
 from mjlab.compat import accepts_older_fields, older_defaults, set_array_field
-from mjlab.utils.errors import check_exists, check_one_of
+from mjlab.utils.errors import check_exists, check_field, check_one_of
 from mjlab.utils.mujoco import enum_value
 from mjlab.utils.string import filter_exp, resolve_field
 
@@ -119,8 +119,7 @@ class CollisionCfg(SpecCfg):
     def validate(self) -> None:
         """Raise `ValueError` for invalid values, with field, pattern and allowed values."""
         for field in _REQUIRED:
-            if getattr(self, field) is None:
-                raise ValueError(f"CollisionCfg.{field}: expected a value, got None.")
+            check_field(self, field, getattr(self, field) is not None, "a value")
         _validate_collision(self)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from mjlab.utils.processes import cores_per_process
+from mjlab.utils.processes import cores_per_process, environment_integer
 
 # Multiply-adds of one mini-batch (forward) above which several threads pay off. Measured: two
 # threads update 64x64 networks on 4096 rows (0.04e9) in 0.75 times the time of one thread on an idle
@@ -106,19 +106,12 @@ def torch_threads(num_parameters: int, batch_size: int) -> int:
     on one machine share its cores. `MJLAB_TORCH_THREADS` overrides the number; `OMP_NUM_THREADS`
     limits it.
     """
-    if override := os.environ.get("MJLAB_TORCH_THREADS"):
-        return _positive("MJLAB_TORCH_THREADS", override)
+    if os.environ.get("MJLAB_TORCH_THREADS"):
+        return environment_integer("MJLAB_TORCH_THREADS", 1)
     if num_parameters * batch_size < _WORTH_SEVERAL_THREADS:
         return 1
-    limit = os.environ.get("OMP_NUM_THREADS")
-    if limit == "1" and _TORCHRUN_VARIABLE in os.environ:
+    limit = environment_integer("OMP_NUM_THREADS", _MOST_THREADS)
+    if os.environ.get("OMP_NUM_THREADS") == "1" and _TORCHRUN_VARIABLE in os.environ:
         # torchrun always sets OMP_NUM_THREADS for its workers; cores are divided here instead.
-        limit = None
-    most = _positive("OMP_NUM_THREADS", limit) if limit else _MOST_THREADS
-    return max(1, min(cores_per_process(), most))
-
-
-def _positive(name: str, value: str) -> int:
-    if not value.isdigit() or int(value) < 1:
-        raise ValueError(f"{name}: expected an integer >= 1, got {value!r}.")
-    return int(value)
+        limit = _MOST_THREADS
+    return max(1, min(cores_per_process(), limit))

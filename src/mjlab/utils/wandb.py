@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 _VARIABLE = "WANDB_TAGS"
 
@@ -16,16 +16,12 @@ def add_wandb_tags(tags: Sequence[str]) -> None:
     """
     # An active run implies that wandb is already imported; importing it here would only cost time.
     run = getattr(sys.modules.get("wandb"), "run", None)
+    present = os.environ.get(_VARIABLE, "").split(",") if run is None else run.tags or ()
+    merged = tuple(dict.fromkeys(tag for tag in (*present, *tags) if tag))
     if run is not None:
-        run.tags = _merged(run.tags or (), tags)
-        return
-    merged = _merged(os.environ.get(_VARIABLE, "").split(","), tags)
-    if merged:
+        run.tags = merged
+    elif merged:
         os.environ[_VARIABLE] = ",".join(merged)
     else:
         # wandb reads an empty variable as one empty tag.
         os.environ.pop(_VARIABLE, None)
-
-
-def _merged(present: Iterable[str], new: Iterable[str]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(tag for tag in (*present, *new) if tag))

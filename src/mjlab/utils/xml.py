@@ -172,22 +172,18 @@ def strip_buffer_textures(spec: mujoco.MjSpec) -> None:
         geom.material = ""
     for element in (*materials.values(), *textures.values()):
         spec.delete(element)
-    if geoms and not _can_be_written(spec):
+    if not geoms:
+        return
+    try:
+        spec.to_xml()
+    except ValueError:
         # A compiled geom keeps the id of its material, and the id may now be out of bounds. An
-        # empty material name does not reset the id; another name does.
+        # empty material name does not reset the id; another name does. Other errors are raised
+        # when the spec is written.
         if spec.material(_STAND_IN) is None:
             spec.add_material(name=_STAND_IN, rgba=(0.5, 0.5, 0.5, 1.0))
         for geom in geoms:
             geom.material = _STAND_IN
-
-
-def _can_be_written(spec: mujoco.MjSpec) -> bool:
-    try:
-        spec.to_xml()
-    except ValueError:
-        # Other errors are raised when the spec is written.
-        return False
-    return True
 
 
 class _FilePlace:

@@ -167,7 +167,7 @@ class BaseViewer(ABC):
         self._total_steps = 0
         self._last_error: str | None = None
         self._interrupted = False
-        self._step_limit: int | None = None
+        self._step_limit = math.inf
         now = time.perf_counter()
         self._rates = RateMeter(now)
         self._last_tick = now
@@ -218,7 +218,7 @@ class BaseViewer(ABC):
             catch_sigint: Let the first Ctrl+C end the loop and the second one the program.
         """
         self._interrupted = False
-        self._step_limit = None if num_steps is None else self._total_steps + num_steps
+        self._step_limit = math.inf if num_steps is None else self._total_steps + num_steps
 
         def interrupt() -> None:
             self._interrupted = True
@@ -244,7 +244,11 @@ class BaseViewer(ABC):
         self._process_actions()
         if not self._paused:
             self._pacer.add(elapsed)
-            self._step_within_budget()
+            deadline = time.perf_counter() + self.frame_time
+            while not self._should_stop() and self._pacer.take_step() and self.step_simulation():
+                if time.perf_counter() >= deadline:
+                    self._pacer.out_of_time()
+                    break
         self._update_stats()
         now = time.perf_counter()
         if now < self._next_frame:
@@ -274,21 +278,8 @@ class BaseViewer(ABC):
         if self._rates.update(time.perf_counter()):
             self.log_performance()
 
-    def _limit_reached(self) -> bool:
-        return self._step_limit is not None and self._total_steps >= self._step_limit
-
     def _should_stop(self) -> bool:
-        return self._interrupted or self._limit_reached()
-
-    def _step_within_budget(self) -> None:
-        self._pacer.capped = False
-        deadline = time.perf_counter() + self.frame_time
-        while not self._should_stop() and self._pacer.take_step():
-            if not self.step_simulation():
-                return
-            if time.perf_counter() >= deadline:
-                self._pacer.out_of_time()
-                return
+        return self._interrupted or self._total_steps >= self._step_limit
 
     # Actions.
 
@@ -342,7 +333,7 @@ class BaseViewer(ABC):
                     self.log(f"Unknown viewer action {action.value!r} (payload {payload!r}).")
 
     def _single_step(self) -> None:
-        if self._paused and not self._limit_reached():
+        if self._paused and self._total_steps < self._step_limit:
             self._last_error = None
             self.step_simulation()
 
@@ -541,8 +532,9 @@ class RealtimePacer:
         self._speed_index = ratios.index(min(ratios))
 
     def add(self, elapsed: float) -> None:
-        """Add `elapsed` seconds of wall time to the budget."""
+        """Add `elapsed` seconds of wall time to the budget of a new frame."""
         self._budget += elapsed * self.speed
+        self.capped = False
 
     def take_step(self) -> bool:
         """Subtract one step from the budget; return False if the budget is too small."""

@@ -9,8 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjlab.utils.errors import check_exists
-from mjlab.utils.string import suggest
+from mjlab.utils.errors import check_exists, check_one_of
 from mjlab.viewer.viewer_config import OriginType, ViewerConfig
 
 
@@ -46,6 +45,13 @@ class CameraView:
             ]
         )
         return -self.distance * forward
+
+    def apply(self, camera: mujoco.MjvCamera, body_xpos: np.ndarray) -> None:
+        """Set the pose of a free MuJoCo camera, from body positions (nbody, 3)."""
+        camera.lookat[:] = self.target(body_xpos)
+        camera.distance = self.distance
+        camera.azimuth = self.azimuth
+        camera.elevation = self.elevation
 
 
 def resolve_camera(
@@ -130,25 +136,11 @@ def _followed_body(
     if cfg.origin_type is OriginType.AUTO:
         return first_moving_body(model)
     names = [name for name in entities if name != "terrain"]
-    if cfg.entity_name is None and len(names) != 1:
-        raise ValueError(
-            f"viewer.entity_name: expected the name of an entity for origin_type "
-            f"{cfg.origin_type.name} in a scene with {len(names)}, got None; use one of {names}."
-        )
-    name = names[0] if cfg.entity_name is None else cfg.entity_name
-    check_exists("viewer.entity_name", name, entities)
+    only = names[0] if len(names) == 1 else None
+    name: Any = only if cfg.entity_name is None else cfg.entity_name
+    use = f"for origin_type {cfg.origin_type.name}"
+    check_one_of(f"viewer.entity_name {use}", name, entities)
     if cfg.origin_type is OriginType.ASSET_ROOT:
         return int(entities[name].indexing.root_body_id)
-    bodies = list(entities[name].body_names)
-    if cfg.body_name is None:
-        raise ValueError(
-            f"viewer.body_name: expected the name of a body of {name!r} for origin_type "
-            f"{cfg.origin_type.name}, got None; use one of {bodies}."
-        )
-    body_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, f"{name}/{cfg.body_name}")
-    if body_id < 0:
-        raise ValueError(
-            f"Unknown viewer.body_name {cfg.body_name!r} of entity {name!r}; "
-            f"{suggest(cfg.body_name, bodies)}"
-        )
-    return int(body_id)
+    check_one_of(f"viewer.body_name {use} of {name!r}", cfg.body_name, entities[name].body_names)
+    return model.body(f"{name}/{cfg.body_name}").id

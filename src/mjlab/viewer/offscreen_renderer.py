@@ -18,7 +18,6 @@ import numpy as np
 
 from mjlab.utils import graphics
 from mjlab.utils.errors import MjlabError, WrongStateError, check_count
-from mjlab.utils.string import suggest
 from mjlab.viewer.camera import nearest_envs, resolve_camera
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import (
@@ -160,16 +159,16 @@ class OffscreenRenderer:
 
         Raises:
             RuntimeError: `initialize` has not been called.
-            ValueError: Unknown camera.
+            KeyError, IndexError: Unknown camera.
         """
         scene = self.renderer.scene
         origins = self._scene.env_origins
         env_idx = min(max(self._cfg.env_idx, 0), len(origins) - 1)
         self._load(data, env_idx)
         move_sun(self._model, self._data, self._view.target(self._data.xpos))
-        self.renderer.update_scene(
-            self._data, camera=self._camera_for(camera), scene_option=self._option
-        )
+        self._view.apply(self._camera, self._data.xpos)
+        shown = self._camera if camera is None else self._model.camera(camera).id
+        self.renderer.update_scene(self._data, camera=shown, scene_option=self._option)
         if debug_vis_callback is not None and self._visualizer is not None:
             self._visualizer.begin(env_idx, show_all_envs=False)
             debug_vis_callback(self._visualizer)
@@ -206,22 +205,6 @@ class OffscreenRenderer:
             sync_model_fields(self._model, model, fields, env_idx)
         copy_state(data, env_idx, self._data)
         compute_poses(self._model, self._data)
-
-    def _camera_for(self, name: str | int | None) -> mujoco.MjvCamera | int:
-        if name is None:
-            camera = self._camera
-            camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-            camera.lookat[:] = self._view.target(self._data.xpos)
-            camera.distance = self._view.distance
-            camera.azimuth = self._view.azimuth
-            camera.elevation = self._view.elevation
-            return camera
-        names = [self._model.camera(i).name for i in range(self._model.ncam)]
-        if name in names:
-            return names.index(name)
-        if isinstance(name, int) and 0 <= name < len(names):
-            return name
-        raise ValueError(f"Unknown camera {name!r}; {suggest(str(name), names)}")
 
 
 def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
@@ -342,7 +325,7 @@ def prepare_sun(model: mujoco.MjModel, distance: float) -> None:
         model: Private copy of the model, with its extent set.
         distance: Distance from the camera to its target (m).
     """
-    suns = np.flatnonzero(_is_directional(model))
+    suns = np.flatnonzero(model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     model.light_diffuse[suns] /= max(len(suns), 1)
     model.light_castshadow[suns[1:]] = False
     model.vis.map.shadowclip = max(_MIN_SHADOW_RANGE, distance) / model.stat.extent
@@ -353,9 +336,5 @@ def move_sun(model: mujoco.MjModel, data: mujoco.MjData, target: np.ndarray) -> 
 
     The position of a directional light only determines the area with shadows.
     """
-    suns = _is_directional(model)
+    suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     data.light_xpos[suns] = target - _SUN_HEIGHT * data.light_xdir[suns]
-
-
-def _is_directional(model: mujoco.MjModel) -> np.ndarray:
-    return model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL

@@ -250,7 +250,6 @@ def test_a_sphere_marks_the_goal_of_the_environment_in_view():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"entity_name": "cub"}, "entity_name 'cub'.*'cube'"),
         ({"difficulty": "hard"}, "difficulty.*'fixed', 'dynamic'.*'hard'"),
         ({"success_threshold": 0.0}, "success_threshold.* 0.0"),
         ({"success_threshold": math.nan}, "success_threshold.* nan"),

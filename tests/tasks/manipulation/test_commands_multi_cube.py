@@ -108,7 +108,7 @@ def test_placements_are_apart_and_untouched_where_they_were(seed, radii, envs):
 def test_cubes_for_which_there_is_no_room_end_the_search_and_were_warned_about(caplog):
     tight = PoseRange(x=(0.30, 0.31), y=(0.0, 0.01))
     env, term = multi_cube_command(cubes(count=3), object_pose_range=tight)
-    assert "object_pose_range is small for the 3 objects" in caplog.text
+    assert "object_pose_range is small for the objects" in caplog.text
     term.reset(None)
     assert torch.isfinite(placed(env)).all()
 
@@ -237,7 +237,6 @@ def test_viewers_show_the_goal_and_mark_the_wanted_cube():
     ("fields", "message"),
     [
         ({"entity_names": ()}, r"entity_names: .*got \(\)"),
-        ({"entity_names": ("cube_0", "cube")}, "entity_names 'cube'.*'cube_0', 'cube_1'"),
         ({"object_pose_range": PoseRange(x=(1.0, 0.0))}, "object_pose_range.x"),
         ({"difficulty": "hard"}, "difficulty"),
     ],

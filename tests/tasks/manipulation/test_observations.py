@@ -234,7 +234,8 @@ def test_hand_object_and_command_are_checked_when_the_environment_is_built(make_
     for term, params, error, message in (
         ("ee_to_cube", {"object_name": "cub"}, ValueError, "object_name.*'cub'.*'cube'"),
         ("ee_to_cube", {"asset_cfg": SceneEntityCfg("robot")}, ValueError, "asset_cfg: .*got 2"),
-        ("cube_to_goal", {"command_name": "lift"}, ValueError, "command 'lift'"),
+        ("cube_to_goal", {"object_name": "cub"}, KeyError, "'cub'.*'cube'"),
+        ("cube_to_goal", {"command_name": "lift"}, KeyError, "'lift'.*'lift_height'"),
     ):
 
         def edit(cfg, term=term, params=params):

@@ -116,7 +116,7 @@ def test_joints_cost_what_is_above_their_speed():
             "object_name.*'cuube'.*did you mean 'cube'",
         ),
         ("joint_vel_hinge", {"max_vel": -0.5}, ValueError, "max_vel.* -0.5"),
-        ("lift", {"command_name": "lift"}, ValueError, "command 'lift'"),
+        ("lift", {"command_name": "lift"}, KeyError, "'lift'.*'lift_height'"),
         (
             "lift",
             {"asset_cfg": SceneEntityCfg("robot")},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -142,13 +143,14 @@ def test_starts_are_perturbed_by_the_formula(make_env, monkeypatch):
 
 def test_pose_velocity_and_joints_are_drawn_in_this_order(make_env, monkeypatch):
     shapes = []
-    draw = start_module.sample_uniform
 
-    def spy(low, high, size, device):
-        shapes.append(tuple(size))
-        return draw(low, high, size, device)
+    def spy(draw, *args):
+        drawn = draw(*args)
+        shapes.append(tuple(drawn.shape))
+        return drawn
 
-    monkeypatch.setattr(start_module, "sample_uniform", spy)
+    for name in ("sample_ranges", "sample_uniform"):
+        monkeypatch.setattr(start_module, name, partial(spy, getattr(start_module, name)))
     make_env(motion="wave", num_envs=3).reset()
     assert shapes == [(3, 6), (3, 6), (3, 29)]
 
@@ -439,8 +441,7 @@ def test_the_state_of_a_run_on_motions_of_other_lengths_is_refused(make_env, tmp
     [
         ({"motion_file": ""}, "motion_file: expected a motion"),
         ({"motion_file": "nothing.npz"}, "motion 'nothing.npz'"),
-        ({"anchor_body_name": "head"}, "anchor_body_name: .*body_names.*'head'"),
-        ({"entity_name": "dog"}, "entity_name 'dog'.*'robot'"),
+        ({"anchor_body_name": "head"}, "anchor_body_name: .*'torso_link'.*'head'"),
         ({"body_names": ("pelvis", "torso_link", "tail")}, r"body_names: .*'robot'.*\['tail'\]"),
         ({"body_names": ("torso_link", "pelvis")}, "body_names: .*'pelvis' first, got 'torso_link'"),
         ({"body_names": ("pelvis", "torso_link", "pelvis")}, "body_names: expected distinct"),
@@ -458,6 +459,11 @@ def test_what_does_not_fit_is_refused_when_the_task_is_built(changes, message):
     with pytest.raises(ValueError, match=message) as caught:
         ManagerBasedRlEnv(task_cfg(**changes), device="cpu")
     assert "CommandManager term 'motion'" in str(caught.value)
+
+
+def test_an_unknown_entity_is_named_with_those_of_the_scene():
+    with pytest.raises(KeyError, match="CommandManager term 'motion': .*'dog'.*'robot'"):
+        ManagerBasedRlEnv(task_cfg(entity_name="dog"), device="cpu")
 
 
 def test_a_motion_of_another_rate_is_refused_when_the_task_is_built(tmp_path):

@@ -90,18 +90,33 @@ def with_long_quaternion() -> np.ndarray:
         ({"joint_vel": np.full((10, 29), 1e39)}, "float32.*got 290 .*NaN or infinite"),
         ({"fps": np.array([1e39])}, "fps: expected one .* > 0"),
         ({"body_quat_w": with_long_quaternion()}, "frame 4, body 2 .* 1.1"),
-        ({"joint_pos": SQUAT.joint_pos[:9]}, "frames, .*'joint_pos': 9, 'joint_vel': 10"),
-        ({"body_pos_w": SQUAT.body_pos_w[:10, :5]}, "columns, .*'body_pos_w': 5"),
-        ({"joint_pos": SQUAT.joint_pos[0]}, r"\(frames, joints\), got \(29,\)"),
-        ({"body_quat_w": SQUAT.body_pos_w[:10]}, r"expected shape \(frames, bodies, 4\)"),
+        (
+            {"joint_pos": SQUAT.joint_pos[:9]},
+            r"joint_vel: expected .* \(9, 29\), got float32 \(10, 29\)",
+        ),
+        (
+            {"body_pos_w": SQUAT.body_pos_w[:10, :5]},
+            r"body_quat_w: expected .* \(10, 5, 4\), got .* \(10, 30, 4\)",
+        ),
+        (
+            {"joint_pos": SQUAT.joint_pos[0]},
+            r"joint_pos: expected numbers \(29, joints\), got .* \(29,\)",
+        ),
+        (
+            {"body_quat_w": SQUAT.body_pos_w[:10]},
+            r"body_quat_w: .* \(10, 30, 4\), got .* \(10, 30, 3\)",
+        ),
         ({key: getattr(SQUAT, key)[:0] for key in ARRAYS}, "at least 2 frames, got 0"),
         ({key: getattr(SQUAT, key)[:1] for key in ARRAYS}, "at least 2 frames, got 1"),
         ({"fps": np.array([0.0])}, "fps: expected one .* > 0"),
         ({"fps": np.array([np.inf])}, "fps: expected one .* > 0"),
         ({"fps": np.array([50, 60])}, "fps: expected one .* > 0"),
-        ({"joint_pos": np.full((10, 29), "a")}, "joint_pos: expected numbers, got <U1"),
-        ({"joint_names": np.array(["a", "b"])}, "joint_names: expected 29 .*joint_pos, got 2"),
-        ({"body_names": np.arange(30)}, "body_names: expected a list of strings"),
+        ({"joint_pos": np.full((10, 29), "a")}, "joint_pos: expected numbers .* got <U1"),
+        (
+            {"joint_names": np.array(["a", "b"])},
+            r"joint_names: expected 29 .*joint_pos, got .* \(2,\)",
+        ),
+        ({"body_names": np.arange(30)}, "body_names: expected 30 strings"),
     ],
 )
 def test_what_is_no_motion_is_refused(tmp_path, changes, message):
@@ -204,5 +219,5 @@ def test_motions_that_are_not_there_are_told(text, message):
 
 
 def test_a_folder_without_motions_is_told(tmp_path):
-    with pytest.raises(MotionFileError, match="expected motions"):
+    with pytest.raises(MotionFileError, match="a folder with motions"):
         find_motions(str(tmp_path))

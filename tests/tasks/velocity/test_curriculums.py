@@ -192,10 +192,7 @@ def test_stages_change_no_config_that_others_hold(make_env):
     ("stage", "message"),
     [
         ({"lin_vel_x": (0.0, 1.0)}, "with 'step'"),
-        (
-            {"step": 7, "lin_vel": (0.0, 1.0)},
-            "'lin_vel' in the stage of step 7.*did you mean 'lin_vel",
-        ),
+        ({"step": 7, "lin_vel": (0.0, 1.0)}, "'lin_vel'; did you mean 'lin_vel"),
         ({"step": 7, "ang_vel_z": (1.0, -1.0)}, "ang_vel_z of the stage of step 7"),
     ],
 )
@@ -203,28 +200,8 @@ def test_stages_that_make_no_sense_are_refused_when_the_term_is_built(make_env, 
     def edit(cfg):
         cfg.curriculum["command_vel"].params["velocity_stages"] = [stage]
 
-    with pytest.raises(ValueError, match=f"'command_vel': velocity_stages.*{message}"):
+    with pytest.raises(ValueError, match=f"'command_vel': .*velocity_stages.*{message}"):
         make_env(edit=edit)
-
-
-def test_the_elapsed_time_needs_a_command_that_knows_it(make_env):
-    class OtherCommand(mdp.CommandTerm):
-        @property
-        def command(self):
-            return torch.zeros(self.num_envs, 3)
-
-        def _resample_command(self, env_ids):
-            pass
-
-    def edit(cfg):
-        twist = cfg.commands["twist"]
-        twist.build = lambda env: OtherCommand(twist, env)
-        cfg.curriculum["terrain_levels"].params["use_elapsed_time"] = True
-
-    with pytest.raises(
-        ValueError, match="use_elapsed_time: .*UniformVelocityCommand, got OtherCommand"
-    ):
-        make_env(GO1_ROUGH, edit=edit)
 
 
 def test_older_stages_of_reward_weights_are_still_offered():

@@ -68,14 +68,16 @@ def test_neither_sensor_nor_sites_is_an_error(env):
 def test_swing_height_has_the_values_of_release_1_1(env, monkeypatch):
     from mjlab.compat import older_terms
     from mjlab.tasks.velocity.mdp import rewards as feet_rewards
+    from mjlab.tasks.velocity.mdp.observations import Source
 
     found = torch.tensor([[0, 1.0, 0], [0, 0, 1.0]])
     sensor = contacts(found=found, landed=torch.zeros(2, 3).bool())
     env.scene["feet"] = sensor
-    for name in ("check_air_time_sensor", "check_feet_sensor", "check_same_feet"):
-        monkeypatch.setattr(feet_rewards, name, lambda *args: None)
-    monkeypatch.setattr(feet_rewards, "contact_columns", lambda *args: ["a", "b", "c"])
-    monkeypatch.setattr(older_terms, "site_columns", lambda *args: ["a", "b", "c"])
+    feet = Source("feet", [("a", 1), ("b", 2), ("c", 3)])
+    monkeypatch.setattr(feet_rewards, "check_air_time_sensor", lambda *args: None)
+    monkeypatch.setattr(feet_rewards, "contact_columns", lambda *args: feet)
+    monkeypatch.setattr(older_terms, "check_same_feet", lambda *args: None)
+    monkeypatch.setattr(older_terms, "site_columns", lambda *args: feet)
     params = {
         "sensor_name": "feet",
         "target_height": 0.1,

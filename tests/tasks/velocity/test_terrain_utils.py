@@ -96,11 +96,15 @@ def sensor(points: torch.Tensor, distances: torch.Tensor | None = None) -> Any:
     return made
 
 
+def env_of(**sensors: Any) -> Any:
+    return SimpleNamespace(scene=SimpleNamespace(sensors=sensors))
+
+
 def test_a_sensor_with_many_rays_is_thinned_out_evenly():
     # All rays but those that are taken hit a wall; of 100, 4 are rays 0, 33, 66 and 99.
     points = torch.full((1, 100, 3), 50.0)
     points[0, [0, 33, 66, 99]] = SLOPE
-    env: Any = SimpleNamespace(scene={"scan": sensor(points)})
+    env = env_of(scan=sensor(points))
     normal = terrain_normal_from_sensors(env, ("scan",), max_points=4)
     assert normal[0].tolist() == pytest.approx([-math.sqrt(0.5), 0.0, math.sqrt(0.5)], abs=1e-6)
 
@@ -108,12 +112,12 @@ def test_a_sensor_with_many_rays_is_thinned_out_evenly():
 def test_several_sensors_are_fitted_together_without_their_misses():
     missed = torch.tensor([[1.0, 1.0, -1.0]])
     one = sensor(torch.stack((SLOPE[0], SLOPE[1], torch.tensor([9.0, 9, 9]))).unsqueeze(0), missed)
-    env: Any = SimpleNamespace(scene={"one": one, "other": sensor(SLOPE[2:].unsqueeze(0))})
+    env = env_of(one=one, other=sensor(SLOPE[2:].unsqueeze(0)))
     normal = terrain_normal_from_sensors(env, ("one", "other"))
     assert normal[0].tolist() == pytest.approx([-math.sqrt(0.5), 0.0, math.sqrt(0.5)], abs=1e-6)
 
 
 def test_a_sensor_without_rays_is_refused():
-    env: Any = SimpleNamespace(scene={"imu": SimpleNamespace()})
+    env = env_of(imu=SimpleNamespace())
     with pytest.raises(TypeError, match="'imu'.*RayCastSensor.*SimpleNamespace"):
         terrain_normal_from_sensors(env, ("imu",))

@@ -337,7 +337,7 @@ def test_an_entity_that_does_not_exist_is_refused_with_those_that_do(make_env):
     def edit(cfg):
         cfg.commands["twist"].entity_name = "robto"
 
-    with pytest.raises(ValueError, match="'twist': .*entity_name 'robto'.*'terrain', 'robot'"):
+    with pytest.raises(KeyError, match="'twist': .*'robto'.*'terrain', 'robot'"):
         make_env(edit=edit)
 
 

@@ -60,7 +60,7 @@ def test_all_extra_drawing_honors_the_number_of_extra_environments() -> None:
     scene = mujoco.MjvScene(env.sim.mj_model, maxgeom=1000)
     viewer._load_selected()
     viewer._draw_neighbors(scene)
-    assert scene.ngeom == 2 * 2  # Cart and pole of two neighbors.
+    assert scene.ngeom == 1 + 2 * 2  # Marker, and cart and pole of two neighbors.
 
 
 def test_the_marker_hangs_over_the_followed_body() -> None:
@@ -70,7 +70,8 @@ def test_the_marker_hangs_over_the_followed_body() -> None:
     viewer._load_selected()
     drawn = []
     board = SimpleNamespace(add_arrow=lambda start, end, *_, **__: drawn.append((start, end)))
-    viewer._mark_selected(board)
+    viewer._visualizer_of = lambda scn: board
+    viewer._draw_neighbors(mujoco.MjvScene(env.sim.mj_model, maxgeom=100))
     np.testing.assert_allclose(drawn[0][1], [1.5, 0.0, 1.5])
 
 

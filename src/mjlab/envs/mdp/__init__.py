@@ -20,17 +20,15 @@ from mjlab.envs.mdp import (
 from mjlab.envs.mdp.actions import *  # noqa: F403
 from mjlab.envs.mdp.curriculums import *  # noqa: F403
 from mjlab.envs.mdp.events import *  # noqa: F403
+from mjlab.envs.mdp.events import sample_uniform
 from mjlab.envs.mdp.metrics import *  # noqa: F403
 from mjlab.envs.mdp.observations import *  # noqa: F403
 from mjlab.envs.mdp.rewards import *  # noqa: F403
+from mjlab.envs.mdp.rewards import resolve_matching_names_values
 from mjlab.envs.mdp.terminations import *  # noqa: F403
-from mjlab.managers.reward_manager import RewardTermCfg
-from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.sensor.builtin_sensor import BuiltinSensor
-from mjlab.sensor.raycast_sensor import RayCastSensor
-from mjlab.utils.lab_api.math import sample_uniform
-from mjlab.utils.lab_api.string import resolve_matching_names_values
-from mjlab.utils.nan_guard import NanGuard
+from mjlab.envs.mdp.terminations import NanGuard
+from mjlab.managers import RewardTermCfg, SceneEntityCfg
+from mjlab.sensor import BuiltinSensor, RayCastSensor
 
 __all__ = [
     "BuiltinSensor",

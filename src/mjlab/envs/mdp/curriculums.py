@@ -52,7 +52,8 @@ class _StagedCurriculum:
 
     def __init__(self, cfg: CurriculumTermCfg, env: ManagerBasedRlEnv) -> None:
         name, stages = cfg.params[f"{self._kind}_name"], cfg.params["stages"]
-        owner, term_cfg = f"{self._kind} {name!r}", self._live_cfg(env, name)
+        owner = f"{self._kind} {name!r}"
+        term_cfg = getattr(env, f"{self._kind}_manager").get_term_cfg(name)
         known = {field.name for field in dataclasses.fields(term_cfg)} - {"func", "params"}
         previous = None
         for stage in stages:
@@ -69,13 +70,10 @@ class _StagedCurriculum:
             for param in stage.get("params", {}):
                 check_exists(f"parameter of {owner}", param, term_cfg.params, UnknownNameError)
 
-    def _live_cfg(self, env: ManagerBasedRlEnv, name: str) -> Any:
-        return getattr(env, f"{self._kind}_manager").get_term_cfg(name)
-
     def _apply(
         self, env: ManagerBasedRlEnv, name: str, stages: Sequence[Any]
     ) -> dict[str, torch.Tensor]:
-        cfg = self._live_cfg(env, name)
+        cfg = getattr(env, f"{self._kind}_manager").get_term_cfg(name)
         logged: dict[str, torch.Tensor] = {}
         for stage in stages:
             if env.common_step_counter >= stage["step"]:

@@ -62,7 +62,8 @@ def reset_scene_to_default(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None)
     """
     ids = resolve_env_ids(env, env_ids)
     for entity in env.scene.entities.values():
-        is_mocap = _is_mocap(entity)
+        # Read from the indexing, because resets are frequent and walking the spec is slow.
+        is_mocap = entity.data.indexing.mocap_id is not None
         if is_mocap or not entity.is_fixed_base:
             root = entity.data.default_root_state[ids]
             root[:, :3] += env.scene.env_origins[ids]
@@ -289,7 +290,7 @@ class apply_body_impulse:
         expired = (self._active & (self._remaining <= _TIME_MARGIN)).nonzero().flatten()
         if len(expired) > 0:
             self._end(expired)
-            self._draw_cooldown(expired)
+            self._cooldown[expired] = sample_uniform(*self._cooldown_s, (len(expired),), env.device)
         self._cooldown -= env.step_dt
         ready = ~self._active & (self._cooldown <= _TIME_MARGIN)
         ids = ready.nonzero().flatten()
@@ -303,7 +304,7 @@ class apply_body_impulse:
             torque += torch.linalg.cross(arm, force)
         self._asset.write_external_wrench_to_sim(force, torque, env_ids=ids, body_ids=self._bodies)
         self._remaining[ids] = sample_uniform(*duration_s, (len(ids),), env.device)
-        self._draw_cooldown(ids)
+        self._cooldown[ids] = sample_uniform(*self._cooldown_s, (len(ids),), env.device)
         self._active[ids] = True
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
@@ -311,7 +312,7 @@ class apply_body_impulse:
         mask = torch.zeros_like(self._active)
         mask[slice(None) if env_ids is None else env_ids] = True
         ids = mask.nonzero().flatten()
-        self._draw_cooldown(ids)
+        self._cooldown[ids] = sample_uniform(*self._cooldown_s, (len(ids),), self._env.device)
         active = (mask & self._active).nonzero().flatten()
         if len(active) > 0:
             self._end(active)
@@ -339,9 +340,6 @@ class apply_body_impulse:
         point = torch.tensor(offset, dtype=quat.dtype, device=quat.device)
         return quat_apply(quat, point.expand(*quat.shape[:-1], 3))
 
-    def _draw_cooldown(self, ids: torch.Tensor) -> None:
-        self._cooldown[ids] = sample_uniform(*self._cooldown_s, (len(ids),), self._env.device)
-
     def _end(self, ids: torch.Tensor) -> None:
         shape = (len(ids), self._num_bodies, 3)
         zero = torch.zeros(shape, dtype=torch.float32, device=self._env.device)
@@ -356,11 +354,6 @@ def resolve_env_ids(env: ManagerBasedRlEnv, env_ids: torch.Tensor | slice | None
         env_ids: Integer ids, a bool mask, a slice, or None for all.
     """
     return as_ids(env_ids, env.num_envs, env.device)
-
-
-def _is_mocap(entity: Entity) -> bool:
-    # Read from the indexing, because resets are frequent and walking the spec is slow.
-    return entity.data.indexing.mocap_id is not None
 
 
 def _sample_se3_range(
@@ -386,7 +379,7 @@ def _write_root(
     default = asset.data.default_root_state[ids]
     rotation = quat_from_euler_xyz(pose[:, 3], pose[:, 4], pose[:, 5])
     root_pose = torch.cat((pose[:, :3], quat_mul(default[:, 3:7], rotation)), dim=1)
-    if _is_mocap(asset):
+    if asset.data.indexing.mocap_id is not None:
         asset.write_mocap_pose_to_sim(root_pose, env_ids=ids)
         return
     if asset.is_fixed_base:

@@ -112,7 +112,13 @@ def builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     Raises:
         TypeError: the sensor is not a `BuiltinSensor`.
     """
-    return _builtin(env, sensor_name).data
+    sensor = env.scene[sensor_name]
+    if not isinstance(sensor, BuiltinSensor):
+        raise WrongTypeError(
+            f"Sensor {sensor_name!r}: expected BuiltinSensor, got {type(sensor).__name__}; use a "
+            "MuJoCo sensor, such as 'robot/imu_gyro'."
+        )
+    return sensor.data
 
 
 def projected_gravity_from_sensor(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
@@ -121,7 +127,7 @@ def projected_gravity_from_sensor(env: ManagerBasedRlEnv, sensor_name: str) -> t
     Raises:
         TypeError: the sensor is not a `BuiltinSensor`.
     """
-    return -_builtin(env, sensor_name).data
+    return -builtin_sensor(env, sensor_name)
 
 
 def height_scan(
@@ -144,16 +150,6 @@ def height_scan(
     hit_z = data.hit_pos_w[..., 2].unflatten(1, (-1, sensor.num_rays_per_frame))
     heights = (data.frame_pos_w[..., 2:] - hit_z).flatten(1).sub_(offset)
     return heights.masked_fill_(data.distances < 0.0, miss_value)
-
-
-def _builtin(env: ManagerBasedRlEnv, sensor_name: str) -> BuiltinSensor:
-    sensor = env.scene[sensor_name]
-    if not isinstance(sensor, BuiltinSensor):
-        raise WrongTypeError(
-            f"Sensor {sensor_name!r}: expected BuiltinSensor, got {type(sensor).__name__}; use a "
-            "MuJoCo sensor, such as 'robot/imu_gyro'."
-        )
-    return sensor
 
 
 __getattr__ = older_names(__name__)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import functools
 import logging
 import warnings
 from collections.abc import Callable
@@ -19,11 +18,13 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 import torch
-from mujoco.batch import DATA_FIELDS, MODEL_FIELDS, Batch, SimulationError
+from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
 
 from mjlab.sim.engine import (
     ACCELERATION_FIELDS,
     COLLISION_MASKS,
+    CONSTANTS_AT_QPOS0,
+    FIXED_CONSTANTS,
     INPUTS,
     RESULTS_ZERO_ON_RESET,
     ROTATION_MATRICES,
@@ -37,7 +38,6 @@ from mjlab.sim.engine import (
 )
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
-from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.utils.errors import UnknownAttributeError, check_count
 from mjlab.utils.processes import cores_per_process
 
@@ -151,6 +151,8 @@ class NativeEngine(Engine):
         self._has_warned = False
         self._disabled = self._batch.expand("opt.disableflags")
         threads = self._batch.nthread
+        self._rays = NativeRays(self, self._model, self._batch)
+        self._renderer = NativeRenderer(self, self._model, threads, self._make_batch)
         self.capabilities = Capabilities(
             name="native",
             description=(
@@ -170,13 +172,13 @@ class NativeEngine(Engine):
                     f"The native engine does not provide sim.data.{name}; use a contact sensor "
                     "(ContactSensorCfg)."
                 )
-            if name not in DATA_FIELDS:
-                raise UnknownAttributeError(
-                    f"The native engine: {_reason(self._batch.bind, name)}."
-                )
             check_sensor_fed(self._model, name)
-            source = _as_tensor(self._batch.bind(name))
-            dtype = torch.bool if name == "eq_active" else _interface_dtype(source)
+            try:
+                source = _as_tensor(self._batch.bind(name))
+            except ValueError as error:
+                raise UnknownAttributeError(f"The native engine: {error}.") from error
+            is_float, is_bool = source.dtype == torch.float64, name == "eq_active"
+            dtype = torch.bool if is_bool else torch.float32 if is_float else source.dtype
             if name in INPUTS:
                 field = self._inputs[name] = _Input(source, dtype)
             else:
@@ -221,20 +223,14 @@ class NativeEngine(Engine):
                 if mark not in self._frame_marks:
                     self._frame_marks[mark] = self._batch.expand(mark)
                     self._frame_marks[mark][:] = 0
-            values = _as_tensor(self._batch.expand(self._model_name(name)))
-            if _interface_dtype(values) != values.dtype:
-                self._model_copies[name] = _Input(values, _interface_dtype(values))
+            option = f"opt.{name}"
+            values = _as_tensor(self._batch.expand(option if option in MODEL_FIELDS else name))
+            if values.dtype == torch.float64:
+                self._model_copies[name] = _Input(values, torch.float32)
                 values = self._model_copies[name].values
             self.model_fields[name] = _like_mujoco(name, values)
 
-    @staticmethod
-    def _model_name(name: str) -> str:
-        """Return the `Batch` name of a model field; `opt.` is optional for options."""
-        return name if name in MODEL_FIELDS else f"opt.{name}"
-
     def _check_expandable(self, name: str) -> None:
-        if self._model_name(name) not in MODEL_FIELDS:
-            raise ValueError(f"The native engine: {_reason(self._batch.expand, name)}.")
         value = getattr(self._model, name, None)
         counts = isinstance(value, np.ndarray) and value.dtype.kind in "iub"
         if (counts and name not in _FREE_INTEGERS) or name in _BOUNDING_VOLUMES:
@@ -300,7 +296,7 @@ class NativeEngine(Engine):
             with contextlib.suppress(SimulationError):
                 values = self._batch.rollout(nstep, record=tuple(items.values()))
                 for name, after in recorded.items():
-                    value = _like_mujoco(name, _as_tensor(values[items[name]]).transpose(0, 1))
+                    value = _as_tensor(values[items[name]]).transpose(0, 1)
                     after.copy_(value.reshape(after.shape))
                 again = (self._batch.warning != warnings).reshape(self.num_envs, -1).any(axis=1)
         if not again.any():
@@ -367,7 +363,7 @@ class NativeEngine(Engine):
         )
 
     def reset(self, env_ids: torch.Tensor | None) -> None:
-        self._copy_in_model()
+        self._copy_in(with_state=False)
         self._call(self._batch.reset, env_ids, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
         for field in self._inputs.values():
             field.copy_out(env_ids)
@@ -394,18 +390,14 @@ class NativeEngine(Engine):
             ids = np.arange(self.num_envs) if env_ids is None else env_ids.numpy()
             return torch.from_numpy(np.setdiff1d(ids, error.ids))
 
-    def _copy_in(self, thorough: bool = False) -> None:
-        """Copy writes to state and model fields since the last call into the batch."""
-        for field in self._inputs.values():
-            field.copy_in()
-        self._copy_in_model(thorough)
-
-    def _copy_in_model(self, thorough: bool = False) -> None:
-        """Copy writes to model fields into the batch.
+    def _copy_in(self, thorough: bool = False, with_state: bool = True) -> None:
+        """Copy writes to state and model fields since the last call into the batch.
 
         Model fields are large and rarely written. So only a `thorough` comparison, once per step,
         detects writes that torch does not count: through numpy or `.data`.
         """
+        for field in self._inputs.values() if with_state else ():
+            field.copy_in()
         moved = None
         for name, field in self._model_copies.items():
             written = field.copy_in() if thorough or field.is_versioned() else None
@@ -457,14 +449,6 @@ class NativeEngine(Engine):
         if self.capabilities.render_problem is not None:
             raise EngineUnavailableError(self.capabilities.render_problem)
         return self._renderer.render(views)
-
-    @functools.cached_property
-    def _rays(self) -> NativeRays:
-        return NativeRays(self, self._model, self._batch)
-
-    @functools.cached_property
-    def _renderer(self) -> NativeRenderer:
-        return NativeRenderer(self, self._model, self._batch.nthread, self._make_batch)
 
     def _make_batch(
         self, model: mujoco.MjModel, count: int, num_threads: int | None = None
@@ -603,10 +587,6 @@ class _Input(_Copy):
         self._version = self.values._version
 
 
-def _interface_dtype(source: torch.Tensor) -> torch.dtype:
-    return torch.float32 if source.dtype == torch.float64 else source.dtype
-
-
 def _as_tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
     """View an array as a tensor, without torch's warning about read-only arrays."""
     if array.dtype == np.uint64:
@@ -621,12 +601,3 @@ def _like_mujoco(name: str, tensor: torch.Tensor) -> torch.Tensor:
     """View rotation matrices as (N, ..., 3, 3); return other fields unchanged."""
     with torch.inference_mode(False):
         return tensor.view(*tensor.shape[:-1], 3, 3) if name in ROTATION_MATRICES else tensor
-
-
-def _reason(request: Any, name: str) -> str:
-    """Return the batch's error message for an unknown or unsupported field."""
-    try:
-        request(name)
-    except ValueError as error:
-        return str(error)
-    raise AssertionError(name)

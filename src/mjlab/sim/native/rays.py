@@ -17,6 +17,8 @@ import numpy as np
 import torch
 from mujoco.batch import Batch, SimulationError
 
+from mjlab.sim.engine import NUM_GEOM_GROUPS
+
 if TYPE_CHECKING:
     from mjlab.sim.engine import Engine, RayHits, RayQuery
 
@@ -78,32 +80,37 @@ class NativeRays:
     def _hits(self, query: RayQuery, env_ids: Array | None) -> Hits:
         """Cast rays. Row i belongs to environment `env_ids[i]`; None: i."""
         directions, table, has_others = query.directions.numpy(), None, True
+        groups = range(NUM_GEOM_GROUPS) if query.geom_groups is None else query.geom_groups
+        mask = np.isin(np.arange(NUM_GEOM_GROUPS), groups).astype(np.uint8)
+        ids = query.exclude_body_ids
+        excluded = np.array([-1]) if ids is None else ids.numpy()
+        options = {"geomgroup": mask, "bodyexclude": excluded}
         # Compare whole rows: broadcasting over a last dimension of 3 takes ten times as long.
         if (directions == np.tile(-_UP, (directions.shape[1], 1))).all():
-            excluded = np.unique(_excluded(query))
-            key = query.geom_groups, excluded.tobytes()
+            bodies = np.unique(excluded)
+            key = query.geom_groups, bodies.tobytes()
             if key not in self._tables:
-                self._tables[key] = self._ground(query.geom_groups, excluded)
+                self._tables[key] = self._ground(mask, bodies)
             table, has_others = self._tables[key]
         if table is None or not table.is_current(self._engine.model_fields):
-            hits = self._cast_in_batch(query, env_ids, static=True)
+            hits = self._cast_in_batch(query, env_ids, flg_static=True, **options)
         else:
             hits = table.cast(query.origins.numpy())
             if has_others:
-                hits.take_nearer(self._cast_in_batch(query, env_ids, static=False))
+                others = self._cast_in_batch(query, env_ids, flg_static=False, **options)
+                hits.take_nearer(others)
         if query.max_distances is not None:
             hits.forget(hits.distances > query.max_distances.numpy())
         return hits
 
-    def _ground(
-        self, groups: tuple[int, ...] | None, excluded: Array
-    ) -> tuple[GroundTable | None, bool]:
+    def _ground(self, groups: Array, excluded: Array) -> tuple[GroundTable | None, bool]:
         """Return a table of all visible static geoms, and True if other geoms are visible.
 
-        The table is None if it cannot hold all of them, or would not be faster.
+        `groups` is the mask of visible groups, (6,), `excluded` are the ids of bodies to ignore. The
+        table is None if it cannot hold all these geoms, or would not be faster.
         """
         model = self._model
-        in_groups = _group_mask(groups)[model.geom_group.clip(0, 5)].astype(bool)
+        in_groups = groups[model.geom_group.clip(0, 5)].astype(bool)
         welded = in_groups & (model.body_weldid[model.geom_bodyid] == 0)
         carried = welded & self._is_carried
         others = bool((in_groups & ~welded).any() or model.nflex)
@@ -124,8 +131,8 @@ class NativeRays:
             return None, True
         return GroundTable(model, ground, self._pos[ground], static), others
 
-    def _cast_in_batch(self, query: RayQuery, env_ids: Array | None, static: bool) -> Hits:
-        """Cast against the geoms of the model; static geoms only if `static` is True."""
+    def _cast_in_batch(self, query: RayQuery, env_ids: Array | None, **options: Any) -> Hits:
+        """Cast against the geoms of the model. `options` are arguments of `Batch.ray`."""
         origins, directions = query.origins.numpy(), query.directions.numpy()
         pos, mat = (np.broadcast_to(x, (len(origins), *x.shape)) for x in (self._pos, self._mat))
         if self._fields_are_carried:
@@ -136,25 +143,8 @@ class NativeRays:
         def passed(rows: Array, origins: Array, directions: Array, hits: Hits) -> Array:
             return self._rule.passed(origins, directions, hits, hits.geoms, rows, pos, mat)
 
-        return cast_through(
-            self._batch,
-            origins,
-            directions,
-            passed if self._rule.is_needed else None,
-            env_ids,
-            geomgroup=_group_mask(query.geom_groups),
-            bodyexclude=_excluded(query),
-            flg_static=static,
-        )
-
-
-def _excluded(query: RayQuery) -> Array:
-    ids = query.exclude_body_ids
-    return np.array([-1]) if ids is None else ids.numpy()
-
-
-def _group_mask(groups: tuple[int, ...] | None) -> Array:
-    return np.isin(np.arange(6), range(6) if groups is None else groups).astype(np.uint8)
+        rule = passed if self._rule.is_needed else None
+        return cast_through(self._batch, origins, directions, rule, env_ids, **options)
 
 
 @dataclass

@@ -28,6 +28,8 @@ import warp as wp
 from mjlab.sim.engine import (
     ACCELERATION_FIELDS,
     COLLISION_MASKS,
+    CONSTANTS_AT_QPOS0,
+    FIXED_CONSTANTS,
     INPUTS,
     RESULTS_ZERO_ON_RESET,
     STAGES,
@@ -38,7 +40,6 @@ from mjlab.sim.engine import (
     Stage,
     check_sensor_fed,
 )
-from mjlab.sim.randomization import CONSTANTS_AT_QPOS0, FIXED_CONSTANTS
 from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
@@ -49,7 +50,6 @@ from mjlab.utils.string import name_list
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
     from mjlab.sim.engine import CameraView, Images, RayHits, RayQuery
-    from mjlab.sim.randomization import VariantValues
 
 logger = logging.getLogger(__name__)
 
@@ -135,8 +135,10 @@ class WarpEngine(Engine):
         self._graphs: dict[Hashable, Any] = {}
         self._captures = True
         self._absent: torch.Tensor | None = None
-        self._rays = WarpRays(self)
-        self.renderer = WarpRenderer(self)
+        self._rays = WarpRays(model, self.wp_model, self.wp_data, self.launch)
+        self.renderer = WarpRenderer(
+            model, self.wp_model, self.wp_data, self.model_fields, self.ordered, self.launch
+        )
         # Columns of `sensordata` by the stage that computes them.
         stages = np.repeat(model.sensor_needstage, model.sensor_dim)
         self._sensor_stages = torch.as_tensor(stages, device=self.device)
@@ -144,7 +146,9 @@ class WarpEngine(Engine):
         forces = ("cacc", "cfrc_int") if self.wp_model.sensor_rne_postconstraint else ()
         for name in ("sensordata", "history", *forces):
             self.data_field(name)
-        self._overflow = OverflowWatch(self, as_torch(self.wp_data.overflow))
+        # Capacities: constraint rows and contacts per environment, matches per sensor.
+        sizes = self.wp_data.njmax, self.wp_data.naconmax // num_envs, cfg.contact_sensor_maxmatch
+        self._overflow = OverflowWatch(as_torch(self.wp_data.overflow), sizes, self.measure_sizes)
         self.capabilities = Capabilities(
             name="warp",
             description=(
@@ -681,19 +685,27 @@ def _torch_on_warps_stream(device: Any) -> AbstractContextManager[Any]:
     return stream(wp.stream_to_torch(device)) if device.is_cuda else nullcontext()
 
 
-def put_variant_model(model: mujoco.MjModel, nworld: int, values: VariantValues) -> Any:
-    """Return a `mujoco_warp.Model` with per-world values, on the current device."""
+def put_variant_model(
+    model: mujoco.MjModel, nworld: int, values: dict[str, np.ndarray], absent_geoms: np.ndarray
+) -> Any:
+    """Return a `mujoco_warp.Model` with per-world values, on the current device.
+
+    Args:
+        model: Compiled model.
+        nworld: Number of worlds.
+        values: Values of each world by field, (nworld, ...).
+        absent_geoms: Geoms to hide in each world, (nworld, ngeom) bool.
+    """
     wp_model = mjwarp.put_model(model)
     device = wp_model.geom_pos.device
-    fields = [name for name in values.fields if name not in COLLISION_MASKS]
+    fields = [name for name in values if name not in COLLISION_MASKS]
     expand_arrays(wp_model, nworld, fields)
     with _torch_on_warps_stream(device):
         for name in fields:
             own = as_torch(getattr(wp_model, name))
-            own.copy_(torch.as_tensor(values.get(name)).view(own.shape))
-        if values.absent_geoms.any():
-            absent = torch.as_tensor(values.absent_geoms, device=wp.device_to_torch(device))
-            hide_geoms(wp_model, absent)
+            own.copy_(torch.as_tensor(values[name]).view(own.shape))
+        if absent_geoms.any():
+            hide_geoms(wp_model, torch.as_tensor(absent_geoms, device=wp.device_to_torch(device)))
     return wp_model
 
 

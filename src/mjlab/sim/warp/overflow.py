@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import mujoco_warp as mjwarp
 import torch
-
-if TYPE_CHECKING:
-    from mjlab.sim.warp.engine import WarpEngine
 
 logger = logging.getLogger(__name__)
 
@@ -51,12 +49,20 @@ class OverflowWatch:
     copied to the host in the background, and read once the copy is complete.
     """
 
-    def __init__(self, engine: WarpEngine, flags: torch.Tensor) -> None:
-        """Watch `flags`, (N,) int32, of an engine. Warp sets flags and never clears them."""
-        self._engine, self._flags = engine, flags
-        data, matches = engine.wp_data, engine.wp_model.opt.contact_sensor_maxmatch
-        # Capacities: constraint rows and contacts per environment, matches per sensor.
-        sizes = data.njmax, data.naconmax // data.nworld, matches
+    def __init__(
+        self,
+        flags: torch.Tensor,
+        sizes: tuple[int, ...],
+        measure_sizes: Callable[[], torch.Tensor],
+    ) -> None:
+        """Watch the overflow flags of all environments. Warp sets flags and never clears them.
+
+        Args:
+            flags: Bits of `OverflowType`, (N,) int32.
+            sizes: Capacities of `SIZES`.
+            measure_sizes: Function that returns the current requirement of each of `SIZES`, (3,).
+        """
+        self._flags, self._measure_sizes = flags, measure_sizes
         self._sizes = dict(zip(SIZES, sizes, strict=True))
         self._kinds = [kind for kind in mjwarp.OverflowType if kind.name in _CAPACITIES | _OTHER]
         self._reported: set[str] = set()
@@ -77,7 +83,7 @@ class OverflowWatch:
         """Log exceeded capacities; without `wait`, only those already copied to the host."""
         if self._event is None or wait:
             found = (self._flags[:, None] & self._bits).amax(dim=0)
-            values = torch.cat([found, self._engine.measure_sizes().to(torch.int32)])
+            values = torch.cat([found, self._measure_sizes().to(torch.int32)])
             self._arrived.copy_(values, non_blocking=True)
             if self._flags.is_cuda:
                 self._event = torch.cuda.current_stream(self._flags.device).record_event()

@@ -6,8 +6,10 @@ only, as `Engine.raycast` requires. Without a context, rays do not, and every ra
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import mujoco
 import mujoco_warp as mjwarp
 import torch
 import warp as wp
@@ -16,30 +18,36 @@ from mjlab.sim.engine import NUM_GEOM_GROUPS, rendered_geoms
 
 if TYPE_CHECKING:
     from mjlab.sim.engine import RayHits, RayQuery
-    from mjlab.sim.warp.engine import WarpEngine
 
 
 class WarpRays:
     """Ray caster of a Warp engine. One graph per number of rays and set of geom groups."""
 
-    def __init__(self, engine: WarpEngine) -> None:
-        self._engine = engine
+    def __init__(
+        self, host: mujoco.MjModel, model: Any, data: Any, launch: Callable[..., None]
+    ) -> None:
+        """Cast rays in `data`, worlds of `model`, put from the `host` model.
+
+        `launch` is `WarpEngine.launch`.
+        """
+        self._host, self._model, self._data, self._launch = host, model, data, launch
         self._buffers: dict[Any, _Buffers] = {}
 
     def cast(self, query: RayQuery) -> RayHits:
         """Cast rays; see `Engine.raycast`."""
         key = (query.geom_groups, query.origins.shape[1])
         if key not in self._buffers:
-            model = self._engine.mj_model
             groups = range(NUM_GEOM_GROUPS) if query.geom_groups is None else query.geom_groups
-            present = {int(model.geom_group[geom]) for geom in rendered_geoms(model, groups)}
+            present = {
+                int(self._host.geom_group[geom]) for geom in rendered_geoms(self._host, groups)
+            }
             self._buffers[key] = _Buffers(query.origins, sorted(present))
         buffers = self._buffers[key]
         buffers.origins.copy_(query.origins)
         buffers.directions.copy_(query.directions)
         buffers.excluded[:] = -1 if query.exclude_body_ids is None else query.exclude_body_ids
         if buffers.groups:
-            self._engine.launch(f"rays {key}", lambda: self._run(buffers), on_cpu=False)
+            self._launch(f"rays {key}", lambda: self._run(buffers), on_cpu=False)
         missed = buffers.distances < 0.0
         if query.max_distances is not None:
             missed = missed | (buffers.distances > query.max_distances)
@@ -51,10 +59,10 @@ class WarpRays:
         )
 
     def _run(self, buffers: _Buffers) -> None:
-        model, data = self._engine.wp_model, self._engine.wp_data
+        model, data = self._model, self._data
         if buffers.context is None:
             buffers.context = mjwarp.create_render_context(
-                self._engine.mj_model,
+                self._host,
                 data.nworld,
                 cam_active=[],
                 use_textures=False,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjwarp
@@ -13,10 +15,6 @@ import warp as wp
 
 from mjlab.sim.engine import LENS_FIELDS, CameraView, Images, rendered_geoms
 from mjlab.utils.errors import WrongStateError
-
-if TYPE_CHECKING:
-    from mjlab.sim.warp.engine import WarpEngine
-
 
 # Model fields that a render context depends on when expanded.
 _CONTEXT_FIELDS = LENS_FIELDS | {"light_attenuation", "light_type", "geom_dataid"}
@@ -30,8 +28,27 @@ class WarpRenderer:
     context renders all its cameras at once. So views with equal settings share a context.
     """
 
-    def __init__(self, engine: WarpEngine) -> None:
-        self._engine = engine
+    def __init__(
+        self,
+        host: mujoco.MjModel,
+        model: Any,
+        data: Any,
+        model_fields: dict[str, torch.Tensor],
+        ordered: Callable[[], AbstractContextManager[None]],
+        launch: Callable[..., None],
+    ) -> None:
+        """Render `data`, worlds of `model`, put from the `host` model.
+
+        Args:
+            host: Compiled model.
+            model: `mujoco_warp.Model`.
+            data: `mujoco_warp.Data`.
+            model_fields: Expanded model fields (live).
+            ordered: `WarpEngine.ordered`.
+            launch: `WarpEngine.launch`.
+        """
+        self._host, self._model, self._data = host, model, data
+        self._model_fields, self._ordered, self._launch = model_fields, ordered, launch
         self._scenes: dict[Any, _Scene] = {}
 
     def render(self, views: tuple[CameraView, ...]) -> list[Images]:
@@ -41,15 +58,15 @@ class WarpRenderer:
             settings = (view.geom_groups, view.use_textures, view.use_shadows)
             by_settings.setdefault(settings, {})[i] = view
         images: dict[int, Images] = {}
-        relevant = _CONTEXT_FIELDS & self._engine.model_fields.keys()
+        relevant = _CONTEXT_FIELDS & self._model_fields.keys()
         for settings, members in by_settings.items():
             scene = self._scenes.get((views, settings))
             if scene is None or scene.expanded != relevant:
                 # Later calls, in any torch mode, write into images created here.
-                with self._engine.ordered(), torch.inference_mode(False):
-                    scene = _Scene(self._engine, members, relevant)
+                with self._ordered(), torch.inference_mode(False):
+                    scene = _Scene(self._host, self._model, self._data, members, relevant)
                 self._scenes[views, settings] = scene
-            images |= scene.render()
+            images |= scene.render(self._launch)
         return [images[i] for i in range(len(views))]
 
     def context_of(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
@@ -64,10 +81,15 @@ class _Scene:
     """Render context and the views rendered with it."""
 
     def __init__(
-        self, engine: WarpEngine, views: dict[int, CameraView], expanded: frozenset[str]
+        self,
+        host: mujoco.MjModel,
+        model: Any,
+        data: Any,
+        views: dict[int, CameraView],
+        expanded: frozenset[str],
     ) -> None:
-        self.views, self.expanded, self._engine = views, expanded, engine
-        host, cameras = engine.mj_model, list(views.values())
+        self.views, self.expanded, self._model, self._data = views, expanded, model, data
+        cameras = list(views.values())
         first = cameras[0]
         self.context: Any = None
         self._dataid: Any = None
@@ -75,7 +97,7 @@ class _Scene:
         if shown:
             self.context = mjwarp.create_render_context(
                 host,
-                engine.num_envs,
+                data.nworld,
                 cam_res=[(view.width, view.height) for view in cameras],
                 render_rgb=["rgb" in view.data_types for view in cameras],
                 render_depth=["depth" in view.data_types for view in cameras],
@@ -95,10 +117,9 @@ class _Scene:
             if "light_type" in expanded:
                 self.context.has_spot_lights = True
             if "geom_dataid" in expanded:
-                self._dataid = _without_absent_meshes(host, engine.wp_model, self.context)
-        self._images = {
-            i: Images.empty(view, engine.num_envs, engine.device) for i, view in views.items()
-        }
+                self._dataid = _without_absent_meshes(host, model, self.context)
+        device = wp.device_to_torch(model.geom_pos.device)
+        self._images = {i: Images.empty(view, data.nworld, device) for i, view in views.items()}
         # Packed colors and their target images. Other images view the context's memory.
         self._packed: list[tuple[torch.Tensor, torch.Tensor]] = []
         if shown:
@@ -122,9 +143,9 @@ class _Scene:
         if images.segmentation is not None:
             images.segmentation = pixels(rc.seg_data, rc.seg_adr)
 
-    def render(self) -> dict[int, Images]:
-        """Render all views at the current poses."""
-        model, data = self._engine.wp_model, self._engine.wp_data
+    def render(self, launch: Callable[..., None]) -> dict[int, Images]:
+        """Render all views at the current poses, by `WarpEngine.launch`."""
+        model, data = self._model, self._data
         if self.context is None:
             return self._images
         if self._dataid is not None:
@@ -134,7 +155,7 @@ class _Scene:
             mjwarp.refit_bvh(model, data, self.context)
             mjwarp.render(model, data, self.context)
 
-        self._engine.launch(self, work, on_cpu=False)
+        launch(self, work, on_cpu=False)
         for packed, rgb in self._packed:
             rgb.copy_(packed.flip(-1))
         return self._images

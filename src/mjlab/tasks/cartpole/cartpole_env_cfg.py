@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import torch
@@ -52,58 +52,19 @@ if TYPE_CHECKING:
 _CARTPOLE_XML = Path(__file__).parent / "cartpole.xml"
 
 
-def cartpole_swingup_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
-    """Return the swing-up task: the pole starts hanging down."""
-    return _make_env_cfg(swing_up=True, play=play)
-
-
 def cartpole_balance_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the balance task: the pole starts upright."""
-    return _make_env_cfg(swing_up=False, play=play)
-
-
-def cartpole_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO config of both tasks."""
-    return RslRlOnPolicyRunnerCfg(
-        actor=RslRlModelCfg(
-            hidden_dims=(64, 64),
-            distribution_cfg={
-                "class_name": "GaussianDistribution",
-                "init_std": 1.0,
-                "std_type": "scalar",
-            },
-        ),
-        critic=RslRlModelCfg(hidden_dims=(64, 64)),
-        algorithm=RslRlPpoAlgorithmCfg(entropy_coef=0.01),
-        experiment_name="cartpole",
-        num_steps_per_env=32,
-        max_iterations=500,
-        evaluation=EvaluationCfg(solved_return=900.0),
-    )
-
-
-cpu = cpu_profile(
-    num_steps_per_env=24,
-    hidden_dims=(64, 64),
-    desired_kl=0.05,
-    gamma=0.98,
-    max_iterations=500,
-)
-"""The `cpu` profile of the swing-up. `docs/guides/learning.md` has the experiments."""
-
-
-# Environment config.
-
-
-def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
     return ManagerBasedRlEnvCfg(
         scene=SceneCfg(
             terrain=TerrainEntityCfg(terrain_type="plane"),
-            entities={"cartpole": _cartpole(pole_angle=math.pi if swing_up else 0.0)},
+            entities={"cartpole": copy.deepcopy(_CARTPOLE)},
             num_envs=1,
             env_spacing=4.0,
         ),
-        observations=_observations(corrupted=not play),
+        observations={
+            "actor": ObservationGroupCfg(copy.deepcopy(_OBSERVATIONS), enable_corruption=not play),
+            "critic": ObservationGroupCfg(copy.deepcopy(_OBSERVATIONS)),
+        },
         actions={
             "effort": JointEffortActionCfg(
                 entity_name="cartpole", actuator_names=("slider",), scale=1.0
@@ -137,56 +98,50 @@ def _make_env_cfg(swing_up: bool, play: bool) -> ManagerBasedRlEnvCfg:
     )
 
 
-def _cartpole(pole_angle: float) -> EntityCfg:
-    """Return the cartpole entity with initial pole angle `pole_angle` (rad); 0 is upright."""
-    return EntityCfg(
-        spec_fn=_get_spec,
-        # Motor from the XML, unchanged.
-        articulation=EntityArticulationInfoCfg(
-            actuators=(XmlActuatorCfg(target_names_expr=("slider",)),)
+def cartpole_swingup_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the swing-up task: the pole starts hanging down."""
+    cfg = cartpole_balance_env_cfg(play)
+    cartpole: Any = cfg.scene.entities["cartpole"]
+    cartpole.init_state.joint_pos["hinge_1"] = math.pi
+    return cfg
+
+
+def cartpole_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
+    """Return the PPO config of both tasks."""
+    return RslRlOnPolicyRunnerCfg(
+        actor=RslRlModelCfg(
+            hidden_dims=(64, 64),
+            distribution_cfg={
+                "class_name": "GaussianDistribution",
+                "init_std": 1.0,
+                "std_type": "scalar",
+            },
         ),
-        init_state=EntityCfg.InitialStateCfg(
-            joint_pos={"slider": 0.0, "hinge_1": pole_angle}, joint_vel={".*": 0.0}
-        ),
+        critic=RslRlModelCfg(hidden_dims=(64, 64)),
+        algorithm=RslRlPpoAlgorithmCfg(entropy_coef=0.01),
+        experiment_name="cartpole",
+        num_steps_per_env=32,
+        max_iterations=500,
+        evaluation=EvaluationCfg(solved_return=900.0),
     )
 
 
-def _get_spec() -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_file(str(_CARTPOLE_XML))
+cpu = cpu_profile(
+    num_steps_per_env=24,
+    hidden_dims=(64, 64),
+    desired_kl=0.05,
+    gamma=0.98,
+    max_iterations=500,
+)
+"""The `cpu` profile of the swing-up. `docs/guides/learning.md` has the experiments."""
 
 
-def _observations(corrupted: bool) -> dict[str, ObservationGroupCfg | None]:
-    terms: dict[str, ObservationTermCfg | None] = {
-        "cart_pos": ObservationTermCfg(func=joint_pos_rel, params={"asset_cfg": _joint("slider")}),
-        "pole_angle": ObservationTermCfg(
-            func=pole_angle_cos_sin, params={"asset_cfg": _joint("hinge_1")}
-        ),
-        "cart_vel": ObservationTermCfg(func=joint_vel_rel, params={"asset_cfg": _joint("slider")}),
-        "pole_vel": ObservationTermCfg(func=joint_vel_rel, params={"asset_cfg": _joint("hinge_1")}),
-    }
-    return {
-        "actor": ObservationGroupCfg(terms, enable_corruption=corrupted),
-        "critic": ObservationGroupCfg(copy.deepcopy(terms)),
-    }
-
-
-def _reset(joint: str, position_range: tuple[float, float]) -> EventTermCfg:
-    return EventTermCfg(
-        func=reset_joints_by_offset,
-        mode="reset",
-        params={
-            "position_range": position_range,
-            "velocity_range": (-0.01, 0.01),
-            "asset_cfg": _joint(joint),
-        },
-    )
+# Task-specific MDP terms.
 
 
 def _joint(name: str) -> SceneEntityCfg:
     return SceneEntityCfg("cartpole", joint_names=(name,))
 
-
-# Task-specific MDP terms.
 
 _CART, _HINGE = _joint("slider"), _joint("hinge_1")
 
@@ -208,13 +163,12 @@ def cartpole_smooth_reward(
 ) -> torch.Tensor:
     """Return the control suite's smooth cartpole reward, (N,) in [0, 1].
 
-    With pole angle θ and velocity θ̇, cart position x, control u, Gaussian tolerance g and quadratic
-    tolerance q:
+    With pole angle θ and velocity θ̇, cart position x, control u and Gaussian tolerance g:
 
-        r = (cos θ + 1) / 2 * (1 + g(x)) / 2 * (4 + q(u)) / 5 * (1 + g(θ̇)) / 2
+        r = (cos θ + 1) / 2 * (1 + g(x)) / 2 * (4 + max(0, 1 - u^2)) / 5 * (1 + g(θ̇)) / 2
 
-    g is 0.1 at 2 m and at 5 rad/s; q is 0 at |u| = 1. The product is high only if the pole is upright,
-    the cart centered, the control small and the pole slow, all at the same time.
+    g is 0.1 at 2 m and at 5 rad/s. The product is high only if the pole is upright, the cart centered,
+    the control small and the pole slow, all at the same time.
     """
     data = env.scene[cart_cfg.name].data
     slider = as_columns(cart_cfg.joint_ids, env.device)
@@ -226,7 +180,7 @@ def cartpole_smooth_reward(
 
     upright = (torch.cos(theta) + 1.0) / 2.0
     centered = (1.0 + _gaussian_tolerance(x, margin=2.0)) / 2.0
-    small_control = (4.0 + _quadratic_tolerance(u, margin=1.0)) / 5.0
+    small_control = (4.0 + (1.0 - u.square()).clamp(min=0.0)) / 5.0
     small_velocity = (1.0 + _gaussian_tolerance(theta_dot, margin=5.0)) / 2.0
     return upright * centered * small_control * small_velocity
 
@@ -236,6 +190,42 @@ def _gaussian_tolerance(value: torch.Tensor, margin: float) -> torch.Tensor:
     return torch.exp(math.log(0.1) * torch.square(value / margin))
 
 
-def _quadratic_tolerance(value: torch.Tensor, margin: float) -> torch.Tensor:
-    """Return a parabola of `value`: 1 at 0, and 0 at and beyond |value| = margin."""
-    return (1.0 - torch.square(value / margin)).clamp(min=0.0)
+# Environment config. The tasks copy the entity and the observations.
+
+
+def _get_spec() -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(_CARTPOLE_XML))
+
+
+def _reset(joint: str, position_range: tuple[float, float]) -> EventTermCfg:
+    return EventTermCfg(
+        func=reset_joints_by_offset,
+        mode="reset",
+        params={
+            "position_range": position_range,
+            "velocity_range": (-0.01, 0.01),
+            "asset_cfg": _joint(joint),
+        },
+    )
+
+
+_CARTPOLE = EntityCfg(
+    spec_fn=_get_spec,
+    # Motor from the XML, unchanged.
+    articulation=EntityArticulationInfoCfg(
+        actuators=(XmlActuatorCfg(target_names_expr=("slider",)),)
+    ),
+    # Joint angle 0: upright.
+    init_state=EntityCfg.InitialStateCfg(
+        joint_pos={"slider": 0.0, "hinge_1": 0.0}, joint_vel={".*": 0.0}
+    ),
+)
+
+_OBSERVATIONS: dict[str, ObservationTermCfg | None] = {
+    "cart_pos": ObservationTermCfg(func=joint_pos_rel, params={"asset_cfg": _joint("slider")}),
+    "pole_angle": ObservationTermCfg(
+        func=pole_angle_cos_sin, params={"asset_cfg": _joint("hinge_1")}
+    ),
+    "cart_vel": ObservationTermCfg(func=joint_vel_rel, params={"asset_cfg": _joint("slider")}),
+    "pole_vel": ObservationTermCfg(func=joint_vel_rel, params={"asset_cfg": _joint("hinge_1")}),
+}

@@ -45,7 +45,7 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
     Building the environment raises for empty sites and sensors. Events without geoms change nothing
     and log a warning.
     """
-    return ManagerBasedRlEnvCfg(
+    cfg = ManagerBasedRlEnvCfg(
         decimation=4,
         episode_length_s=20.0,
         scene=SceneCfg(
@@ -65,17 +65,21 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
             num_envs=1,
             env_spacing=1.0,
         ),
-        observations=_observations(),
+        # Critic: same terms without noise, since its group has no corruption.
+        observations={
+            "actor": ObservationGroupCfg(terms=_TERMS, enable_corruption=True),
+            "critic": ObservationGroupCfg(terms=copy.deepcopy(_TERMS)),
+        },
         actions={
             "joint_pos": mdp.JointPositionActionCfg(
                 entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
             )
         },
-        commands=_commands(),
-        events=_events(),
-        rewards=_rewards(),
-        terminations=_terminations(),
-        curriculum=_curriculum(),
+        commands=_COMMANDS,
+        events=_EVENTS,
+        rewards=_REWARDS,
+        terminations=_TERMINATIONS,
+        curriculum=_CURRICULUM,
         sim=SimulationCfg(
             nconmax=55,
             njmax=600,
@@ -92,75 +96,46 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
             azimuth=120.0,
         ),
     )
+    # The sections are module constants.
+    return copy.deepcopy(cfg)
 
 
-def _hand() -> SceneEntityCfg:
-    return SceneEntityCfg("robot", site_names=_NO_NAMES)
+# Config sections. `make_lift_cube_env_cfg` copies them.
 
+_TERMS: dict[str, ObservationTermCfg | None] = {
+    "joint_pos": ObservationTermCfg(
+        func=mdp.joint_pos_rel, noise=UniformNoiseCfg(n_min=-0.01, n_max=0.01)
+    ),
+    "joint_vel": ObservationTermCfg(
+        func=mdp.joint_vel_rel, noise=UniformNoiseCfg(n_min=-1.5, n_max=1.5)
+    ),
+    "ee_to_cube": ObservationTermCfg(
+        func=mdp.ee_to_object_distance,
+        params={
+            "object_name": "cube",
+            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
+        },
+        noise=UniformNoiseCfg(n_min=-0.01, n_max=0.01),
+    ),
+    "cube_to_goal": ObservationTermCfg(
+        func=mdp.object_to_goal_distance,
+        params={"object_name": "cube", "command_name": "lift_height"},
+        noise=UniformNoiseCfg(n_min=-0.01, n_max=0.01),
+    ),
+    "actions": ObservationTermCfg(func=mdp.last_action),
+}
 
-def _noise(size: float) -> UniformNoiseCfg:
-    return UniformNoiseCfg(n_min=-size, n_max=size)
-
-
-def _observations() -> dict[str, ObservationGroupCfg | None]:
-    terms: dict[str, ObservationTermCfg | None] = {
-        "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel, noise=_noise(0.01)),
-        "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, noise=_noise(1.5)),
-        "ee_to_cube": ObservationTermCfg(
-            func=mdp.ee_to_object_distance,
-            params={"object_name": "cube", "asset_cfg": _hand()},
-            noise=_noise(0.01),
+_COMMANDS: dict[str, CommandTermCfg | None] = {
+    "lift_height": mdp.LiftingCommandCfg(
+        entity_name="cube",
+        resampling_time_range=(8.0, 12.0),
+        debug_vis=True,
+        difficulty="dynamic",
+        object_pose_range=mdp.LiftingCommandCfg.ObjectPoseRangeCfg(
+            x=(0.2, 0.4), y=(-0.2, 0.2), z=(0.02, 0.05), yaw=(-3.14, 3.14)
         ),
-        "cube_to_goal": ObservationTermCfg(
-            func=mdp.object_to_goal_distance,
-            params={"object_name": "cube", "command_name": "lift_height"},
-            noise=_noise(0.01),
-        ),
-        "actions": ObservationTermCfg(func=mdp.last_action),
-    }
-    # Critic: same terms without noise, since its group has no corruption.
-    return {
-        "actor": ObservationGroupCfg(terms=terms, enable_corruption=True),
-        "critic": ObservationGroupCfg(terms=copy.deepcopy(terms)),
-    }
-
-
-def _commands() -> dict[str, CommandTermCfg | None]:
-    return {
-        "lift_height": mdp.LiftingCommandCfg(
-            entity_name="cube",
-            resampling_time_range=(8.0, 12.0),
-            debug_vis=True,
-            difficulty="dynamic",
-            object_pose_range=mdp.LiftingCommandCfg.ObjectPoseRangeCfg(
-                x=(0.2, 0.4), y=(-0.2, 0.2), z=(0.02, 0.05), yaw=(-3.14, 3.14)
-            ),
-        )
-    }
-
-
-def _events() -> dict[str, EventTermCfg | None]:
-    return {
-        "reset_base": EventTermCfg(
-            func=mdp.reset_root_state_uniform,
-            mode="reset",
-            params={"pose_range": {}, "velocity_range": {}},
-        ),
-        "reset_robot_joints": EventTermCfg(
-            func=mdp.reset_joints_by_offset,
-            mode="reset",
-            params={
-                "position_range": (0.0, 0.0),
-                "velocity_range": (0.0, 0.0),
-                "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
-            },
-        ),
-        # Fingertips with condim 6 also have torsional and rolling friction. These coefficients span
-        # orders of magnitude, hence log-uniform. Each fingertip geom is sampled separately.
-        "fingertip_friction_slide": _fingertip_friction(0, (0.3, 1.5), "uniform"),
-        "fingertip_friction_spin": _fingertip_friction(1, (1e-4, 2e-2), "log_uniform"),
-        "fingertip_friction_roll": _fingertip_friction(2, (1e-5, 5e-3), "log_uniform"),
-    }
+    )
+}
 
 
 def _fingertip_friction(axis: int, ranges: tuple[float, float], distribution: str) -> EventTermCfg:
@@ -177,59 +152,74 @@ def _fingertip_friction(axis: int, ranges: tuple[float, float], distribution: st
     )
 
 
-def _rewards() -> dict[str, RewardTermCfg | None]:
-    def of_joints() -> SceneEntityCfg:
-        return SceneEntityCfg("robot", joint_names=(".*",))
+_EVENTS: dict[str, EventTermCfg | None] = {
+    "reset_base": EventTermCfg(
+        func=mdp.reset_root_state_uniform,
+        mode="reset",
+        params={"pose_range": {}, "velocity_range": {}},
+    ),
+    "reset_robot_joints": EventTermCfg(
+        func=mdp.reset_joints_by_offset,
+        mode="reset",
+        params={
+            "position_range": (0.0, 0.0),
+            "velocity_range": (0.0, 0.0),
+            "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
+        },
+    ),
+    # Fingertips with condim 6 also have torsional and rolling friction. These coefficients span
+    # orders of magnitude, hence log-uniform. Each fingertip geom is sampled separately.
+    "fingertip_friction_slide": _fingertip_friction(0, (0.3, 1.5), "uniform"),
+    "fingertip_friction_spin": _fingertip_friction(1, (1e-4, 2e-2), "log_uniform"),
+    "fingertip_friction_roll": _fingertip_friction(2, (1e-5, 5e-3), "log_uniform"),
+}
 
-    return {
-        "lift": RewardTermCfg(
-            func=mdp.staged_position_reward,
-            weight=1.0,
-            params={
-                "command_name": "lift_height",
-                "object_name": "cube",
-                "reaching_std": 0.2,
-                "bringing_std": 0.3,
-                "asset_cfg": _hand(),
-            },
-        ),
-        "lift_precise": RewardTermCfg(
-            func=mdp.bring_object_reward,
-            weight=1.0,
-            params={"command_name": "lift_height", "object_name": "cube", "std": 0.05},
-        ),
-        "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.01),
-        "joint_pos_limits": RewardTermCfg(
-            func=mdp.joint_pos_limits, weight=-10.0, params={"asset_cfg": of_joints()}
-        ),
-        "joint_vel_hinge": RewardTermCfg(
-            func=mdp.joint_velocity_hinge_penalty,
-            weight=-0.01,
-            params={"max_vel": 0.5, "asset_cfg": of_joints()},
-        ),
-    }
+_REWARDS: dict[str, RewardTermCfg | None] = {
+    "lift": RewardTermCfg(
+        func=mdp.staged_position_reward,
+        weight=1.0,
+        params={
+            "command_name": "lift_height",
+            "object_name": "cube",
+            "reaching_std": 0.2,
+            "bringing_std": 0.3,
+            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
+        },
+    ),
+    "lift_precise": RewardTermCfg(
+        func=mdp.bring_object_reward,
+        weight=1.0,
+        params={"command_name": "lift_height", "object_name": "cube", "std": 0.05},
+    ),
+    "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.01),
+    "joint_pos_limits": RewardTermCfg(
+        func=mdp.joint_pos_limits,
+        weight=-10.0,
+        params={"asset_cfg": SceneEntityCfg("robot", joint_names=(".*",))},
+    ),
+    "joint_vel_hinge": RewardTermCfg(
+        func=mdp.joint_velocity_hinge_penalty,
+        weight=-0.01,
+        params={"max_vel": 0.5, "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",))},
+    ),
+}
 
+_TERMINATIONS: dict[str, TerminationTermCfg | None] = {
+    "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
+    "ee_ground_collision": TerminationTermCfg(
+        func=mdp.illegal_contact,
+        params={"sensor_name": "ee_ground_collision", "force_threshold": 10.0},
+    ),
+}
 
-def _terminations() -> dict[str, TerminationTermCfg | None]:
-    return {
-        "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
-        "ee_ground_collision": TerminationTermCfg(
-            func=mdp.illegal_contact,
-            params={"sensor_name": "ee_ground_collision", "force_threshold": 10.0},
-        ),
-    }
-
-
-def _curriculum() -> dict[str, CurriculumTermCfg | None]:
-    # Learn to lift first, then to move gently. Steps are environment steps, 24 per iteration.
-    stages: list[mdp.RewardCurriculumStage] = [
-        {"step": 0, "weight": -0.01},
-        {"step": 500 * 24, "weight": -0.1},
-        {"step": 1000 * 24, "weight": -1.0},
-    ]
-    return {
-        "joint_vel_hinge_weight": CurriculumTermCfg(
-            func=mdp.reward_curriculum,
-            params={"reward_name": "joint_vel_hinge", "stages": stages},
-        )
-    }
+# Learn to lift first, then to move gently. Steps are environment steps, 24 per iteration.
+_STAGES: list[mdp.RewardCurriculumStage] = [
+    {"step": 0, "weight": -0.01},
+    {"step": 500 * 24, "weight": -0.1},
+    {"step": 1000 * 24, "weight": -1.0},
+]
+_CURRICULUM: dict[str, CurriculumTermCfg | None] = {
+    "joint_vel_hinge_weight": CurriculumTermCfg(
+        func=mdp.reward_curriculum, params={"reward_name": "joint_vel_hinge", "stages": _STAGES}
+    )
+}

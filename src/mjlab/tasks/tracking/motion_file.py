@@ -30,15 +30,15 @@ import numpy as np
 from mjlab.utils.errors import MjlabError
 from mjlab.utils.os import replacing
 
-_ARRAYS: dict[str, int | None] = {
-    "joint_pos": None,
-    "joint_vel": None,
-    "body_pos_w": 3,
-    "body_quat_w": 4,
-    "body_lin_vel_w": 3,
-    "body_ang_vel_w": 3,
+_ARRAYS: dict[str, tuple[str | int, ...]] = {
+    "joint_pos": ("frames", "joints"),
+    "joint_vel": ("frames", "joints"),
+    "body_pos_w": ("frames", "bodies", 3),
+    "body_quat_w": ("frames", "bodies", 4),
+    "body_lin_vel_w": ("frames", "bodies", 3),
+    "body_ang_vel_w": ("frames", "bodies", 3),
 }
-"""Arrays of a motion with the size of their last axis; None: number of joints."""
+"""Arrays of a motion with their shapes."""
 _MIN_FRAMES = 2
 _QUAT_TOLERANCE = 1e-3
 _RATE_TOLERANCE = 1e-3
@@ -93,8 +93,12 @@ def read_motion(path: str | Path) -> Motion:
             f"Motion {path}: missing {missing}, got {sorted(content)}; use `mjlab csv-to-npz` to "
             "make a motion from joint angles."
         )
-    arrays = {key: _checked_array(path, key, content[key], size) for key, size in _ARRAYS.items()}
-    _check_sizes(path, arrays)
+    arrays = {key: content[key] for key in _ARRAYS}
+    _check_arrays(path, arrays)
+    if len(arrays["joint_pos"]) < _MIN_FRAMES:
+        raise MotionFileError(
+            f"Motion {path}: expected at least {_MIN_FRAMES} frames, got {len(arrays['joint_pos'])}."
+        )
     arrays["body_quat_w"] = _unit_quaternions(path, arrays["body_quat_w"])
     names = {
         key: _names(path, key, content.get(key), like, arrays[like].shape[1])
@@ -156,21 +160,19 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
     Output is deterministic: equal motions give equal bytes.
 
     Raises:
-        MotionFileError: the motion has no frame rate, or values that are not finite as float32.
+        MotionFileError: the motion has no frame rate, arrays of different numbers of frames, or
+            values that are not finite as float32.
     """
     if motion.fps is None:
         raise MotionFileError(f"Motion {path} fps: expected frames per second, got None.")
     path = npz_path(path)
     entries = {"fps": np.array([motion.fps], dtype=np.float32)}
-    entries |= {
-        key: _checked_array(path, key, np.asarray(getattr(motion, key)), size).astype(np.float32)
-        for key, size in _ARRAYS.items()
-    }
-    entries |= {
-        key: np.array(names)
-        for key in ("joint_names", "body_names")
-        if (names := getattr(motion, key))
-    }
+    arrays = {key: np.asarray(getattr(motion, key)) for key in _ARRAYS}
+    _check_arrays(path, arrays)
+    entries |= {key: array.astype(np.float32) for key, array in arrays.items()}
+    for key in ("joint_names", "body_names"):
+        if getattr(motion, key):
+            entries[key] = np.array(getattr(motion, key))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for key, array in entries.items():
@@ -215,48 +217,35 @@ def _names(
     """Return the names of the `count` columns of the array `like`, or () without names."""
     if value is None:
         return ()
-    if value.ndim != 1 or value.dtype.kind != "U":
-        raise MotionFileError(f"Motion {path} {key}: expected a list of strings, got {value!r}.")
-    if len(value) not in (0, count):
+    if value.dtype.kind != "U" or value.shape not in ((0,), (count,)):
         raise MotionFileError(
-            f"Motion {path} {key}: expected {count} names, one per column of {like}, got "
-            f"{len(value)}."
+            f"Motion {path} {key}: expected {count} strings, one per column of {like}, got "
+            f"{value.dtype} of shape {value.shape}."
         )
     return tuple(str(name) for name in value)
 
 
-def _checked_array(path: Path, key: str, value: np.ndarray, size: int | None) -> np.ndarray:
-    if value.dtype.kind not in "fiu":
-        raise MotionFileError(f"Motion {path} {key}: expected numbers, got {value.dtype}.")
-    dims = 2 if size is None else 3
-    if value.ndim != dims or (size is not None and value.shape[-1] != size):
-        expected = "(frames, joints)" if size is None else f"(frames, bodies, {size})"
-        raise MotionFileError(f"Motion {path} {key}: expected shape {expected}, got {value.shape}.")
-    # Motions are stored as float32: values above 3.4e38 become infinite.
-    with np.errstate(over="ignore"):
-        is_finite = np.isfinite(value.astype(np.float32))
-    if not is_finite.all():
-        frame = int(np.argwhere(~is_finite)[0][0])
-        raise MotionFileError(
-            f"Motion {path} {key}: expected finite float32 values (up to 3.4e38), got "
-            f"{int((~is_finite).sum())} that are NaN or infinite, the first in frame {frame}."
-        )
-    return value
-
-
-def _check_sizes(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    frames = {key: len(value) for key, value in arrays.items()}
-    if len(set(frames.values())) > 1:
-        raise MotionFileError(f"Motion {path}: expected equal numbers of frames, got {frames}.")
-    if frames["joint_pos"] < _MIN_FRAMES:
-        raise MotionFileError(
-            f"Motion {path}: expected at least {_MIN_FRAMES} frames, got {frames['joint_pos']}."
-        )
-    for group in (("joint_pos", "joint_vel"), [key for key, size in _ARRAYS.items() if size]):
-        columns = {key: arrays[key].shape[1] for key in group}
-        if len(set(columns.values())) > 1:
+def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raise `MotionFileError` unless the arrays are finite numbers of equal sizes."""
+    # Sizes of axes, from the first array that has them.
+    sizes: dict[str | int, int] = {3: 3, 4: 4}
+    for key, axes in _ARRAYS.items():
+        value = arrays[key]
+        sizes = dict(zip(axes, value.shape, strict=False)) | sizes
+        expected = tuple(sizes.get(axis, axis) for axis in axes)
+        if value.dtype.kind not in "fiu" or value.shape != expected:
+            shape = ", ".join(map(str, expected))
             raise MotionFileError(
-                f"Motion {path}: expected equal numbers of columns, got {columns}."
+                f"Motion {path} {key}: expected numbers ({shape}), got {value.dtype} {value.shape}."
+            )
+        # Motions are stored as float32: values above 3.4e38 become infinite.
+        with np.errstate(over="ignore"):
+            is_finite = np.isfinite(value.astype(np.float32))
+        if not is_finite.all():
+            raise MotionFileError(
+                f"Motion {path} {key}: expected finite float32 values (up to 3.4e38), got "
+                f"{int((~is_finite).sum())} that are NaN or infinite, the first in frame "
+                f"{np.argwhere(~is_finite)[0][0]}."
             )
 
 

@@ -43,13 +43,24 @@ def find_motions(text: str) -> list[Path]:
     Raises:
         MotionFileError: `text` is empty, or a motion is not found.
     """
-    parts = [part for part in _parts_of(text) if part]
-    if not parts:
+    shipped, files = shipped_motions(), []
+    for part in filter(None, _parts_of(text)):
+        path = Path(part).expanduser()
+        found = sorted(path.glob("*.npz")) if os.path.isdir(path) else [path]
+        if not os.path.exists(path):
+            found = [shipped[part]] if part in shipped else []
+        if not found:
+            raise MotionFileError(
+                f"Unknown motion {part!r}; use a file, a folder with motions (.npz), or a bundled "
+                f"motion: {suggest(part, shipped)}"
+            )
+        files += found
+    if not files:
         raise MotionFileError(
             f"motion_file: expected a motion, got {text!r}; use a file (--motion-file, or "
-            f"motion_file of the command) or a bundled motion. Available: {', '.join(shipped_motions())}."
+            f"motion_file of the command) or a bundled motion. Available: {', '.join(shipped)}."
         )
-    return [path for part in parts for path in _files_of(part)]
+    return files
 
 
 def _parts_of(text: str) -> list[str]:
@@ -69,24 +80,6 @@ def _parts_of(text: str) -> list[str]:
 def _exists(path: str) -> bool:
     # `Path.exists` raises for strings longer than a path may be, such as long lists.
     return os.path.exists(os.path.expanduser(path))
-
-
-def _files_of(part: str) -> list[Path]:
-    path = Path(part).expanduser()
-    if os.path.isdir(path):
-        files = sorted(path.glob("*.npz"))
-        if not files:
-            raise MotionFileError(f"Folder {path}: expected motions (.npz), got none.")
-        return files
-    shipped = shipped_motions()
-    if not _exists(part) and part in shipped:
-        return [shipped[part]]
-    if not os.path.isfile(path):
-        raise MotionFileError(
-            f"Unknown motion {part!r}; use a file, a folder, or a bundled motion: "
-            f"{suggest(part, shipped)}"
-        )
-    return [path]
 
 
 def shipped_motions() -> dict[str, Path]:
@@ -133,26 +126,24 @@ def recorded_motions(run_dir: Path) -> list[Path]:
     Raises:
         MotionFileError: the record is damaged, or a copy is missing or does not match its hash.
     """
-    index = run_dir / FOLDER / INDEX
+    folder = run_dir / FOLDER
+    index = folder / INDEX
     if not index.is_file():
         return []
     try:
         entries = json.loads(index.read_text())
-        listed = [(Path(str(entry["file"])).name, str(entry["sha256"])) for entry in entries]
+        hashes = {folder / Path(str(entry["file"])).name: entry["sha256"] for entry in entries}
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise MotionFileError(
             f"{index} is damaged ({error}); select the motion with --motion-file."
         ) from error
-    paths = []
-    for name, expected in listed:
-        path = run_dir / FOLDER / name
+    for path, expected in hashes.items():
         if not path.is_file() or motion_hash(path) != expected:
             raise MotionFileError(
                 f"Run {run_dir}: the copy {path} of a training motion is missing or was changed "
                 "since; select the motion with --motion-file."
             )
-        paths.append(path)
-    return paths
+    return list(hashes)
 
 
 # Weights & Biases.

@@ -45,6 +45,8 @@ class MotionOptions(TaskOptions):
         Raises:
             MotionFileError: both flags are set, or a motion is not found.
         """
+        if self.motion_file is not None and self.registry_name is not None:
+            raise MotionFileError("Expected --motion-file or --registry-name, got both; use one.")
         command = motion_cfg(env_cfg)
         files = self._files(command, origin)
         if files is not None:
@@ -58,8 +60,6 @@ class MotionOptions(TaskOptions):
 
     def _files(self, command: MotionCommandCfg, origin: PolicyOrigin) -> Sequence[Path] | None:
         """Return the motions to imitate; None keeps the motions of the config."""
-        if self.motion_file is not None and self.registry_name is not None:
-            raise MotionFileError("Expected --motion-file or --registry-name, got both; use one.")
         if self.motion_file is not None:
             return find_motions(self.motion_file)
         if self.registry_name is not None:

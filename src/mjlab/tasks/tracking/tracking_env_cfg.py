@@ -6,6 +6,8 @@ Robot packages call `make_tracking_env_cfg()` and fill in the robot-specific fie
 
 from __future__ import annotations
 
+import copy
+
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import (
     CommandTermCfg,
@@ -51,20 +53,23 @@ def make_tracking_env_cfg() -> ManagerBasedRlEnvCfg:
 
     Building the environment raises for fields left empty.
     """
-    return ManagerBasedRlEnvCfg(
+    cfg = ManagerBasedRlEnvCfg(
         decimation=4,
         episode_length_s=10.0,
         scene=SceneCfg(terrain=TerrainEntityCfg(terrain_type="plane"), num_envs=1),
-        observations=_observations(),
+        observations={
+            "actor": ObservationGroupCfg(terms=_ACTOR_TERMS, enable_corruption=True),
+            "critic": ObservationGroupCfg(terms=_CRITIC_TERMS),
+        },
         actions={
             "joint_pos": mdp.JointPositionActionCfg(
                 entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
             )
         },
-        commands=_commands(),
-        events=_events(),
-        rewards=_rewards(),
-        terminations=_terminations(),
+        commands=_COMMANDS,
+        events=_EVENTS,
+        rewards=_REWARDS,
+        terminations=_TERMINATIONS,
         sim=SimulationCfg(
             nconmax=35,
             njmax=250,
@@ -80,166 +85,142 @@ def make_tracking_env_cfg() -> ManagerBasedRlEnvCfg:
             azimuth=120.0,
         ),
     )
+    # The sections are module constants.
+    return copy.deepcopy(cfg)
 
 
-def _noise(size: float) -> UniformNoiseCfg:
-    return UniformNoiseCfg(n_min=-size, n_max=size)
+# Config sections. `make_tracking_env_cfg` copies them.
 
 
-def _of_motion(func: object, noise: float | None = None) -> ObservationTermCfg:
-    return ObservationTermCfg(
-        func=func,
-        params={"command_name": "motion"},
-        noise=None if noise is None else _noise(noise),
+def _term(func: object, noise: float | None = None, **params: object) -> ObservationTermCfg:
+    """Return an observation term with parameters and uniform noise of half-width `noise`."""
+    uniform = None if noise is None else UniformNoiseCfg(n_min=-noise, n_max=noise)
+    return ObservationTermCfg(func=func, params=params, noise=uniform)
+
+
+_ACTOR_TERMS: dict[str, ObservationTermCfg | None] = {
+    "command": _term(mdp.generated_commands, command_name="motion"),
+    "motion_anchor_pos_b": _term(mdp.motion_anchor_pos_b, 0.25, command_name="motion"),
+    "motion_anchor_ori_b": _term(mdp.motion_anchor_ori_b, 0.05, command_name="motion"),
+    "base_lin_vel": _term(mdp.builtin_sensor, 0.5, sensor_name="robot/imu_lin_vel"),
+    "base_ang_vel": _term(mdp.builtin_sensor, 0.2, sensor_name="robot/imu_ang_vel"),
+    "joint_pos": _term(mdp.joint_pos_rel, 0.01, biased=True),
+    "joint_vel": _term(mdp.joint_vel_rel, 0.5),
+    "actions": _term(mdp.last_action),
+}
+# Privileged terms, without noise and encoder bias.
+_CRITIC_TERMS: dict[str, ObservationTermCfg | None] = {
+    "command": _term(mdp.generated_commands, command_name="motion"),
+    "motion_anchor_pos_b": _term(mdp.motion_anchor_pos_b, command_name="motion"),
+    "motion_anchor_ori_b": _term(mdp.motion_anchor_ori_b, command_name="motion"),
+    "body_pos": _term(mdp.robot_body_pos_b, command_name="motion"),
+    "body_ori": _term(mdp.robot_body_ori_b, command_name="motion"),
+    "base_lin_vel": _term(mdp.builtin_sensor, sensor_name="robot/imu_lin_vel"),
+    "base_ang_vel": _term(mdp.builtin_sensor, sensor_name="robot/imu_ang_vel"),
+    "joint_pos": _term(mdp.joint_pos_rel),
+    "joint_vel": _term(mdp.joint_vel_rel),
+    "actions": _term(mdp.last_action),
+}
+
+_COMMANDS: dict[str, CommandTermCfg | None] = {
+    "motion": mdp.MotionCommandCfg(
+        entity_name="robot",
+        resampling_time_range=(1.0e9, 1.0e9),
+        debug_vis=True,
+        motion_file="",
+        anchor_body_name="",
+        body_names=_NO_NAMES,
+        pose_range={
+            "x": (-0.05, 0.05),
+            "y": (-0.05, 0.05),
+            "z": (-0.01, 0.01),
+            "roll": (-0.1, 0.1),
+            "pitch": (-0.1, 0.1),
+            "yaw": (-0.2, 0.2),
+        },
+        velocity_range=dict(VELOCITY_RANGE),
+        joint_position_range=(-0.1, 0.1),
     )
+}
+
+_EVENTS: dict[str, EventTermCfg | None] = {
+    "push_robot": EventTermCfg(
+        func=mdp.push_by_setting_velocity,
+        mode="interval",
+        interval_range_s=(1.0, 3.0),
+        params={"velocity_range": dict(VELOCITY_RANGE)},
+    ),
+    "base_com": EventTermCfg(
+        func=mdp.dr.body_com_offset,
+        mode="startup",
+        params={
+            "asset_cfg": SceneEntityCfg("robot", body_names=_NO_NAMES),
+            "operation": "add",
+            "ranges": {0: (-0.025, 0.025), 1: (-0.05, 0.05), 2: (-0.05, 0.05)},
+        },
+    ),
+    "encoder_bias": EventTermCfg(
+        func=mdp.dr.encoder_bias,
+        mode="startup",
+        params={"asset_cfg": SceneEntityCfg("robot"), "bias_range": (-0.01, 0.01)},
+    ),
+    "foot_friction": EventTermCfg(
+        func=mdp.dr.geom_friction,
+        mode="startup",
+        params={
+            "asset_cfg": SceneEntityCfg("robot", geom_names=_NO_NAMES),
+            "operation": "abs",
+            "ranges": (0.3, 1.2),
+            # Same friction for all feet of an environment.
+            "shared_random": True,
+        },
+    ),
+}
 
 
-def _of_imu(sensor: str, noise: float | None = None) -> ObservationTermCfg:
-    return ObservationTermCfg(
-        func=mdp.builtin_sensor,
-        params={"sensor_name": f"robot/{sensor}"},
-        noise=None if noise is None else _noise(noise),
-    )
+def _tracking(func: object, weight: float, std: float) -> RewardTermCfg:
+    return RewardTermCfg(func=func, weight=weight, params={"command_name": "motion", "std": std})
 
 
-def _observations() -> dict[str, ObservationGroupCfg | None]:
-    actor: dict[str, ObservationTermCfg | None] = {
-        "command": _of_motion(mdp.generated_commands),
-        "motion_anchor_pos_b": _of_motion(mdp.motion_anchor_pos_b, noise=0.25),
-        "motion_anchor_ori_b": _of_motion(mdp.motion_anchor_ori_b, noise=0.05),
-        "base_lin_vel": _of_imu("imu_lin_vel", noise=0.5),
-        "base_ang_vel": _of_imu("imu_ang_vel", noise=0.2),
-        "joint_pos": ObservationTermCfg(
-            func=mdp.joint_pos_rel, params={"biased": True}, noise=_noise(0.01)
-        ),
-        "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, noise=_noise(0.5)),
-        "actions": ObservationTermCfg(func=mdp.last_action),
-    }
-    # Critic: privileged terms, without noise and encoder bias.
-    critic: dict[str, ObservationTermCfg | None] = {
-        "command": _of_motion(mdp.generated_commands),
-        "motion_anchor_pos_b": _of_motion(mdp.motion_anchor_pos_b),
-        "motion_anchor_ori_b": _of_motion(mdp.motion_anchor_ori_b),
-        "body_pos": _of_motion(mdp.robot_body_pos_b),
-        "body_ori": _of_motion(mdp.robot_body_ori_b),
-        "base_lin_vel": _of_imu("imu_lin_vel"),
-        "base_ang_vel": _of_imu("imu_ang_vel"),
-        "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
-        "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel),
-        "actions": ObservationTermCfg(func=mdp.last_action),
-    }
-    return {
-        "actor": ObservationGroupCfg(terms=actor, enable_corruption=True),
-        "critic": ObservationGroupCfg(terms=critic),
-    }
+_REWARDS: dict[str, RewardTermCfg | None] = {
+    "motion_global_root_pos": _tracking(mdp.motion_global_anchor_position_error_exp, 0.5, 0.3),
+    "motion_global_root_ori": _tracking(mdp.motion_global_anchor_orientation_error_exp, 0.5, 0.4),
+    "motion_body_pos": _tracking(mdp.motion_relative_body_position_error_exp, 1.0, 0.3),
+    "motion_body_ori": _tracking(mdp.motion_relative_body_orientation_error_exp, 1.0, 0.4),
+    "motion_body_lin_vel": _tracking(mdp.motion_global_body_linear_velocity_error_exp, 1.0, 1.0),
+    "motion_body_ang_vel": _tracking(mdp.motion_global_body_angular_velocity_error_exp, 1.0, 3.14),
+    "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.1),
+    "joint_limit": RewardTermCfg(
+        func=mdp.joint_pos_limits,
+        weight=-10.0,
+        params={"asset_cfg": SceneEntityCfg("robot", joint_names=(".*",))},
+    ),
+    "self_collisions": RewardTermCfg(
+        func=mdp.self_collision_cost,
+        weight=-10.0,
+        params={"sensor_name": "self_collision", "force_threshold": 10.0},
+    ),
+}
 
-
-def _commands() -> dict[str, CommandTermCfg | None]:
-    return {
-        "motion": mdp.MotionCommandCfg(
-            entity_name="robot",
-            resampling_time_range=(1.0e9, 1.0e9),
-            debug_vis=True,
-            motion_file="",
-            anchor_body_name="",
-            body_names=_NO_NAMES,
-            pose_range={
-                "x": (-0.05, 0.05),
-                "y": (-0.05, 0.05),
-                "z": (-0.01, 0.01),
-                "roll": (-0.1, 0.1),
-                "pitch": (-0.1, 0.1),
-                "yaw": (-0.2, 0.2),
-            },
-            velocity_range=dict(VELOCITY_RANGE),
-            joint_position_range=(-0.1, 0.1),
-        )
-    }
-
-
-def _events() -> dict[str, EventTermCfg | None]:
-    return {
-        "push_robot": EventTermCfg(
-            func=mdp.push_by_setting_velocity,
-            mode="interval",
-            interval_range_s=(1.0, 3.0),
-            params={"velocity_range": dict(VELOCITY_RANGE)},
-        ),
-        "base_com": EventTermCfg(
-            func=mdp.dr.body_com_offset,
-            mode="startup",
-            params={
-                "asset_cfg": SceneEntityCfg("robot", body_names=_NO_NAMES),
-                "operation": "add",
-                "ranges": {0: (-0.025, 0.025), 1: (-0.05, 0.05), 2: (-0.05, 0.05)},
-            },
-        ),
-        "encoder_bias": EventTermCfg(
-            func=mdp.dr.encoder_bias,
-            mode="startup",
-            params={"asset_cfg": SceneEntityCfg("robot"), "bias_range": (-0.01, 0.01)},
-        ),
-        "foot_friction": EventTermCfg(
-            func=mdp.dr.geom_friction,
-            mode="startup",
-            params={
-                "asset_cfg": SceneEntityCfg("robot", geom_names=_NO_NAMES),
-                "operation": "abs",
-                "ranges": (0.3, 1.2),
-                # Same friction for all feet of an environment.
-                "shared_random": True,
-            },
-        ),
-    }
-
-
-def _rewards() -> dict[str, RewardTermCfg | None]:
-    def term(func: object, weight: float, std: float) -> RewardTermCfg:
-        return RewardTermCfg(
-            func=func, weight=weight, params={"command_name": "motion", "std": std}
-        )
-
-    return {
-        "motion_global_root_pos": term(mdp.motion_global_anchor_position_error_exp, 0.5, 0.3),
-        "motion_global_root_ori": term(mdp.motion_global_anchor_orientation_error_exp, 0.5, 0.4),
-        "motion_body_pos": term(mdp.motion_relative_body_position_error_exp, 1.0, 0.3),
-        "motion_body_ori": term(mdp.motion_relative_body_orientation_error_exp, 1.0, 0.4),
-        "motion_body_lin_vel": term(mdp.motion_global_body_linear_velocity_error_exp, 1.0, 1.0),
-        "motion_body_ang_vel": term(mdp.motion_global_body_angular_velocity_error_exp, 1.0, 3.14),
-        "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.1),
-        "joint_limit": RewardTermCfg(
-            func=mdp.joint_pos_limits,
-            weight=-10.0,
-            params={"asset_cfg": SceneEntityCfg("robot", joint_names=(".*",))},
-        ),
-        "self_collisions": RewardTermCfg(
-            func=mdp.self_collision_cost,
-            weight=-10.0,
-            params={"sensor_name": "self_collision", "force_threshold": 10.0},
-        ),
-    }
-
-
-def _terminations() -> dict[str, TerminationTermCfg | None]:
-    return {
-        "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
-        "anchor_pos": TerminationTermCfg(
-            func=mdp.bad_anchor_pos_z_only, params={"command_name": "motion", "threshold": 0.25}
-        ),
-        "anchor_ori": TerminationTermCfg(
-            func=mdp.bad_anchor_ori,
-            params={
-                "asset_cfg": SceneEntityCfg("robot"),
-                "command_name": "motion",
-                "threshold": 0.8,
-            },
-        ),
-        "ee_body_pos": TerminationTermCfg(
-            func=mdp.bad_motion_body_pos_z_only,
-            params={"command_name": "motion", "threshold": 0.25, "body_names": _NO_NAMES},
-        ),
-        # The end of the motion truncates the episode; it is not a failure.
-        "motion_ended": TerminationTermCfg(
-            func=mdp.motion_ended, time_out=True, params={"command_name": "motion"}
-        ),
-    }
+_TERMINATIONS: dict[str, TerminationTermCfg | None] = {
+    "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
+    "anchor_pos": TerminationTermCfg(
+        func=mdp.bad_anchor_pos_z_only, params={"command_name": "motion", "threshold": 0.25}
+    ),
+    "anchor_ori": TerminationTermCfg(
+        func=mdp.bad_anchor_ori,
+        params={
+            "asset_cfg": SceneEntityCfg("robot"),
+            "command_name": "motion",
+            "threshold": 0.8,
+        },
+    ),
+    "ee_body_pos": TerminationTermCfg(
+        func=mdp.bad_motion_body_pos_z_only,
+        params={"command_name": "motion", "threshold": 0.25, "body_names": _NO_NAMES},
+    ),
+    # The end of the motion truncates the episode; it is not a failure.
+    "motion_ended": TerminationTermCfg(
+        func=mdp.motion_ended, time_out=True, params={"command_name": "motion"}
+    ),
+}

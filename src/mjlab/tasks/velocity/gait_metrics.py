@@ -11,7 +11,6 @@ from typing import Any
 import torch
 
 from mjlab.tasks.velocity.mdp.observations import (
-    check_feet_sensor,
     check_same_feet,
     contact_columns,
     height_columns,
@@ -79,16 +78,11 @@ def foot_slip(env: Any) -> torch.Tensor:
     Raises:
         ValueError: a sensor does not exist, or the two sensors measure different feet.
     """
-    check_feet_sensor(env, _CONTACTS)
     feet = height_columns(env, _HEIGHTS)
-    check_same_feet(
-        env,
-        (f"contact sensor {_CONTACTS!r}", contact_columns(env, _CONTACTS)),
-        (f"height sensor {_HEIGHTS!r}", feet),
-    )
+    check_same_feet(env, contact_columns(env, _CONTACTS), feet)
     in_contact = env.scene[_CONTACTS].data.found > 0
     robot = env.scene[_ROBOT]
-    sites = as_columns([robot.site_names.index(name) for name, _ in feet], env.device)
+    sites = as_columns([robot.site_names.index(name) for name, _ in feet.columns], env.device)
     speed = robot.data.site_lin_vel_w[:, sites, :2].norm(dim=-1)
     return (speed * in_contact).sum(dim=1) / in_contact.sum(dim=1).clamp(min=1)
 

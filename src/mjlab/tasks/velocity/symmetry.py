@@ -11,6 +11,7 @@ of x and z of axial vectors.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -89,19 +90,21 @@ class _Mirrors:
                     f"Observation group {group!r}: mirror_left_right expected concatenate_terms=True, got "
                     f"concatenate_terms=False. {_HINT}"
                 )
+            # Numbers of time steps in the terms.
+            instants = [max(1, manager.get_term_cfg(group, n).history_length) for n in names]
             shapes = manager.group_obs_term_dim[group]
-            terms = {
-                name: _mirror_of_term(env, group, name, shape)
-                for name, shape in zip(names, shapes, strict=True)
-            }
-            starts = accumulate(map(len, terms.values()), initial=0)
-            couplings = _lever_arms(env, group, dict(zip(terms, starts, strict=False)))
-            self.groups[group] = Mirror.concatenate(list(terms.values()), couplings)
+            terms = [
+                _mirror_of_term(env, group, name, count, shape)
+                for name, count, shape in zip(names, instants, shapes, strict=True)
+            ]
+            starts = accumulate(map(len, terms), initial=0)
+            spans = dict(zip(names, zip(starts, instants, strict=False), strict=True))
+            self.groups[group] = Mirror.concatenate(terms, _lever_arms(env, group, spans))
         self.actions = _of_actions(env)
 
 
 def _mirror_of_term(
-    env: ManagerBasedRlEnv, group: str, name: str, shape: tuple[int, ...]
+    env: ManagerBasedRlEnv, group: str, name: str, instants: int, shape: tuple[int, ...]
 ) -> Mirror:
     configs: Any = env.cfg.observations
     cfg = configs[group].terms[name]
@@ -120,18 +123,13 @@ def _mirror_of_term(
             f"{owner}: mirror_left_right expected a scalar scale and a clip (-c, c), got scale "
             f"{cfg.scale!r} and clip {clip!r}. {_HINT}"
         )
-    mirror = Mirror.concatenate([kind(env, cfg.params)] * _num_instants(env, group, name))
+    mirror = Mirror.concatenate([kind(env, cfg.params)] * instants)
     if shape != (len(mirror),):
         raise ValueError(
             f"{owner}: mirror_left_right expected shape ({len(mirror)},) per environment, got {shape}; "
             f"select all joints, and flatten the history. {_HINT}"
         )
     return mirror
-
-
-def _num_instants(env: ManagerBasedRlEnv, group: str, name: str) -> int:
-    """Return the number of time steps in a term, concatenated."""
-    return max(1, env.observation_manager.get_term_cfg(group, name).history_length)
 
 
 # Mirrors of terms.
@@ -171,9 +169,9 @@ def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
             f"Sensor {name!r}: mirror_left_right expected a gyro, velocimeter or accelerometer, got "
             f"{kind.name}. {_HINT}"
         )
-    data, root = _reference_pose(env)
+    data, origin, rotation = _reference_pose(model, env.scene[_ROBOT])
     body = int(model.site_bodyid[site])
-    if np.abs(data.site_xmat[site] - data.xmat[root]).max() > _TOLERANCE:
+    if np.abs(data.site_xmat[site] - rotation.ravel()).max() > _TOLERANCE:
         raise ValueError(
             f"Sensor {name!r}: mirror_left_right expected the orientation of the robot's root at qpos0, got "
             f"a rotated site. {_HINT}"
@@ -184,23 +182,22 @@ def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
             f"Sensor {name!r}: expected a body on the mirror plane, got {body_name!r} on one side of "
             f"the robot. {_HINT}"
         )
-    return _Sensor(name, kind, body, _lateral_offset(data, root, data.site_xpos[site]))
+    return _Sensor(name, kind, body, float((data.site_xpos[site] - origin) @ rotation[:, 1]))
 
 
-def _reference_pose(env: ManagerBasedRlEnv) -> tuple[mujoco.MjData, int]:
-    """Return the kinematics at `qpos0` and the body id of the robot's root."""
-    data = mujoco.MjData(env.sim.mj_model)
-    mujoco.mj_kinematics(env.sim.mj_model, data)
-    robot: Any = env.scene[_ROBOT]
-    return data, robot.indexing.root_body_id
+def _reference_pose(
+    model: mujoco.MjModel, robot: Any
+) -> tuple[mujoco.MjData, np.ndarray, np.ndarray]:
+    """Return the kinematics at `qpos0`, and position and rotation matrix of the robot's root."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    root = int(robot.indexing.root_body_id)
+    return data, data.xpos[root], data.xmat[root].reshape(3, 3)
 
 
-def _lateral_offset(data: mujoco.MjData, root: int, point: np.ndarray) -> float:
-    """Return the signed distance of a point from the mirror plane of body `root` (m), left positive."""
-    return float((point - data.xpos[root]) @ data.xmat[root].reshape(3, 3)[:, 1])
-
-
-def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> list[Coupling]:
+def _lever_arms(
+    env: ManagerBasedRlEnv, group: str, spans: dict[str, tuple[int, int]]
+) -> list[Coupling]:
     """Return the lever arm corrections of mirrored linear velocities.
 
     The mirror image of a sensor at distance y from the mirror plane is at -y, but the sensor of the
@@ -211,51 +208,41 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
     Args:
         env: The environment.
         group: Observation group name.
-        starts: First column of each term of the group.
+        spans: First column and number of time steps of each term of the group.
 
     Raises:
         ValueError: the group does not observe the required angular velocity.
     """
     configs: Any = env.cfg.observations
-    terms = {name: configs[group].terms[name] for name in starts}
-    instants = {name: _num_instants(env, group, name) for name in starts}
+    terms = {name: configs[group].terms[name] for name in spans}
+    factors = {name: 1.0 if cfg.scale is None else cfg.scale for name, cfg in terms.items()}
     sensors = {
         name: _sensor(env, cfg.params["sensor_name"])
         for name, cfg in terms.items()
         if cfg.func is envs_mdp.builtin_sensor
     }
     turning = {n: s.body for n, s in sensors.items() if s.kind == mujoco.mjtSensor.mjSENS_GYRO}
+    robot: Any = env.scene[_ROBOT]
     for name, cfg in terms.items():
         if cfg.func is envs_mdp.base_ang_vel:
-            turning[name] = _reference_pose(env)[1]
-
-    def has_same_lag(*names: str) -> bool:
-        lags = [(terms[name].delay_min_lag, terms[name].delay_max_lag) for name in names]
-        return len({lag for bounds in lags for lag in bounds}) == 1
-
+            turning[name] = robot.indexing.root_body_id
+    # Angular velocities by body, number of time steps and delay, which must not be random.
+    gyros: dict[tuple[int, ...], str] = {}
+    for name, body in turning.items():
+        lag = terms[name].delay_min_lag
+        if lag == terms[name].delay_max_lag and factors[name] != 0.0:
+            gyros.setdefault((body, spans[name][1], lag, lag), name)
     couplings = []
     for name, sensor in sensors.items():
         if sensor.kind != mujoco.mjtSensor.mjSENS_VELOCIMETER or abs(sensor.y) < _TOLERANCE:
             continue
-        gyro = next(
-            (
-                other
-                for other, body in turning.items()
-                if body == sensor.body
-                and _factor(terms[other]) != 0.0
-                and instants[other] == instants[name]
-                and has_same_lag(name, other)
-            ),
-            None,
-        )
+        cfg, (start, instants) = terms[name], spans[name]
+        gyro = gyros.get((sensor.body, instants, cfg.delay_min_lag, cfg.delay_max_lag))
         if gyro is not None:
-            factor = 2.0 * sensor.y * _factor(terms[name]) / _factor(terms[gyro])
-            for instant in range(instants[name]):
-                x, _, z = range(starts[name] + 3 * instant, starts[name] + 3 * instant + 3)
-                turn_x, _, turn_z = range(
-                    starts[gyro] + 3 * instant, starts[gyro] + 3 * instant + 3
-                )
-                couplings += [Coupling(x, turn_z, factor), Coupling(z, turn_x, -factor)]
+            factor = 2.0 * sensor.y * factors[name] / factors[gyro]
+            for shift in range(0, 3 * instants, 3):
+                v, w = start + shift, spans[gyro][0] + shift
+                couplings += [Coupling(v, w + 2, factor), Coupling(v + 2, w, -factor)]
         elif abs(sensor.y) > _ANCHOR_TOLERANCE:
             raise ValueError(
                 f"Observation {group}/{name}: expected a velocimeter on the mirror plane, got one "
@@ -265,11 +252,6 @@ def _lever_arms(env: ManagerBasedRlEnv, group: str, starts: dict[str, int]) -> l
                 f"base_lin_vel. {_HINT}"
             )
     return couplings
-
-
-def _factor(cfg: Any) -> float:
-    """Return the scalar scale of a term."""
-    return 1.0 if cfg.scale is None else float(cfg.scale)
 
 
 def _of_command(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
@@ -321,21 +303,15 @@ def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) ->
     return Mirror(sources, joints.signs[driven].tolist())
 
 
-def _of_feet(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
-    feet = partners(_feet(env, params["sensor_name"]))
-    return Mirror(feet, [1.0] * len(feet))
-
-
-def _of_foot_vectors(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
-    feet = partners(_feet(env, params["sensor_name"]))
-    return Mirror([3 * foot + i for foot in feet for i in range(3)], DIRECTION * len(feet))
-
-
-def _feet(env: ManagerBasedRlEnv, sensor_name: str) -> list[str]:
-    sensor: Any = env.scene[sensor_name]
-    if hasattr(sensor, "primary_names"):
-        return sensor.primary_names
-    return [frame.name for frame in sensor.cfg.frame]
+def _of_feet(
+    env: ManagerBasedRlEnv, params: dict[str, Any], signs: tuple[float, ...] = (1.0,)
+) -> Mirror:
+    """Return the mirror of foot vectors with `signs`, of a contact or height sensor."""
+    sensor: Any = env.scene[params["sensor_name"]]
+    is_contact = hasattr(sensor, "primary_names")
+    names = sensor.primary_names if is_contact else [frame.name for frame in sensor.cfg.frame]
+    size, feet = len(signs), partners(names)
+    return Mirror([size * foot + i for foot in feet for i in range(size)], signs * len(feet))
 
 
 def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
@@ -346,14 +322,14 @@ def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     distances = (
         (rays * torch.tensor(2 * DIRECTION, dtype=torch.float32))[:, None] - rays[None]
     ).norm(dim=-1)
-    data, root = _reference_pose(env)
+    data, origin, rotation = _reference_pose(env.sim.mj_model, env.scene[_ROBOT])
     frame = frames[0]
     element = getattr(env.sim.mj_model, frame.type)(frame.prefixed_name())
     points = {"body": data.xpos, "site": data.site_xpos, "geom": data.geom_xpos}[frame.type]
     is_central = (
         len(frames) == 1
         and other_side(frame.name) == frame.name
-        and abs(_lateral_offset(data, root, points[element.id])) <= _ANCHOR_TOLERANCE
+        and abs((points[element.id] - origin) @ rotation[:, 1]) <= _ANCHOR_TOLERANCE
     )
     if not is_central or (distances.min(dim=1).values > _TOLERANCE).any():
         raise ValueError(
@@ -377,7 +353,7 @@ _KINDS: dict[Any, Callable[..., Mirror]] = {
     mdp.foot_height: _of_feet,
     mdp.foot_air_time: _of_feet,
     mdp.foot_contact: _of_feet,
-    mdp.foot_contact_forces: _of_foot_vectors,
+    mdp.foot_contact_forces: partial(_of_feet, signs=DIRECTION),
 }
 
 
@@ -444,53 +420,28 @@ def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
     """
     names = robot.joint_names
     pairs = partners(names)
-    axes, anchors, is_slide = _joint_frames(model, robot)
-    reflect = torch.where(
-        is_slide[:, None],
-        torch.tensor(DIRECTION, dtype=torch.float32),
-        torch.tensor(ROTATION, dtype=torch.float32),
-    )
-    signs = ((axes * reflect)[pairs] * axes).sum(dim=1)
-    pose = robot.data.default_joint_pos[0].cpu()
-    distances = (anchors[pairs] * torch.tensor(DIRECTION, dtype=torch.float32) - anchors).norm(
-        dim=1
-    )
-    for i, partner in enumerate(pairs):
-        if (
-            abs(abs(signs[i]) - 1) > _AXIS_TOLERANCE
-            or distances[i] > _ANCHOR_TOLERANCE
-            or abs(pose[i] - signs[i] * pose[partner]) > _POSE_TOLERANCE
-        ):
-            raise ValueError(
-                f"Joint {names[i]!r} is not the mirror image of {names[partner]!r}: axes "
-                f"{_format(axes[i])} and {_format(axes[partner])}, anchors {_format(anchors[i])} and "
-                f"{_format(anchors[partner])}, default positions {pose[i]:.4g} and {pose[partner]:.4g}. "
-                f"Partners are found by these parts of names: {', '.join(_OTHER_SIDE)}. {_HINT}"
-            )
-    return Mirror(pairs, signs.round().tolist())
-
-
-def _joint_frames(
-    model: mujoco.MjModel, robot: Any
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return axes and anchors (J, 3) in the root frame at `qpos0`, and a mask of slide joints (J,)."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    root = int(robot.indexing.root_body_id)
+    data, origin, rotation = _reference_pose(model, robot)
     ids = robot.indexing.joint_ids.tolist()
-    to_root = data.xmat[root].reshape(3, 3)
-    axes = data.xaxis[ids] @ to_root
-    anchors = (data.xanchor[ids] - data.xpos[root]) @ to_root
+    axes = data.xaxis[ids] @ rotation
+    anchors = (data.xanchor[ids] - origin) @ rotation
     is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
-    return (
-        torch.tensor(axes, dtype=torch.float32),
-        torch.tensor(anchors, dtype=torch.float32),
-        torch.tensor(is_slide),
+    images = axes * np.where(is_slide[:, None], DIRECTION, ROTATION)
+    signs = (images[pairs] * axes).sum(axis=1)
+    pose = robot.data.default_joint_pos[0].cpu().numpy()
+    is_image = (
+        (np.abs(np.abs(signs) - 1) <= _AXIS_TOLERANCE)
+        & (np.linalg.norm(anchors[pairs] * DIRECTION - anchors, axis=1) <= _ANCHOR_TOLERANCE)
+        & (np.abs(pose - signs * pose[pairs]) <= _POSE_TOLERANCE)
     )
-
-
-def _format(vector: torch.Tensor) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in vector.tolist()) + ")"
+    if not is_image.all():
+        pair = [is_image.argmin(), pairs[is_image.argmin()]]
+        raise ValueError(
+            f"Joint {names[pair[0]]!r} is not the mirror image of {names[pair[1]]!r}: axes "
+            f"{axes[pair].round(3).tolist()}, anchors {anchors[pair].round(3).tolist()}, default "
+            f"positions {pose[pair].round(4).tolist()}. Partners are found by these parts of names: "
+            f"{', '.join(_OTHER_SIDE)}. {_HINT}"
+        )
+    return Mirror(pairs, signs.round().tolist())
 
 
 def partners(names: Sequence[str]) -> list[int]:

@@ -35,9 +35,6 @@ from mjlab.utils.noise import UniformNoiseCfg
 from mjlab.utils.string import suggest
 from mjlab.viewer import ViewerConfig
 
-# Placeholder that robot packages replace.
-_NO_NAMES: tuple[str, ...] = ()
-
 
 @offers_older_sites
 def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
@@ -55,30 +52,33 @@ def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
     events, and of rewards of weight 0 (here `body_ang_vel` and `angular_momentum`), only log a
     warning. Such events have no effect; such rewards raise once they get a nonzero weight.
     """
-    return ManagerBasedRlEnvCfg(
+    cfg = ManagerBasedRlEnvCfg(
         decimation=4,
         episode_length_s=20.0,
         scene=SceneCfg(
             terrain=TerrainEntityCfg(
                 terrain_type="generator",
-                terrain_generator=copy.deepcopy(ROUGH_TERRAINS_CFG),
+                terrain_generator=ROUGH_TERRAINS_CFG,
                 max_init_terrain_level=5,
             ),
-            sensors=_sensors(),
+            sensors=_SENSORS,
             num_envs=1,
             extent=2.0,
         ),
-        observations=_observations(),
+        observations={
+            "actor": ObservationGroupCfg(terms=_ACTOR_TERMS, enable_corruption=True),
+            "critic": ObservationGroupCfg(terms=_CRITIC_TERMS),
+        },
         actions={
             "joint_pos": mdp.JointPositionActionCfg(
                 entity_name="robot", actuator_names=(".*",), scale=0.5, use_default_offset=True
             )
         },
-        commands=_commands(),
-        events=_events(),
-        rewards=_rewards(),
-        terminations=_terminations(),
-        curriculum=_curriculum(),
+        commands=_COMMANDS,
+        events=_EVENTS,
+        rewards=_REWARDS,
+        terminations=_TERMINATIONS,
+        curriculum=_CURRICULUM,
         metrics={"mean_action_acc": MetricsTermCfg(func=mdp.mean_action_acc)},
         sim=SimulationCfg(
             nconmax=35,
@@ -93,6 +93,8 @@ def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
             elevation=-5.0,
         ),
     )
+    # The sections are module constants.
+    return copy.deepcopy(cfg)
 
 
 def make_flat(cfg: ManagerBasedRlEnvCfg, play: bool) -> None:
@@ -105,23 +107,18 @@ def make_flat(cfg: ManagerBasedRlEnvCfg, play: bool) -> None:
     cfg.sim.nconmax = None
     cfg.sim.contact_sensor_maxmatch = 64
     cfg.sim.mujoco.ccd_iterations = 50
-    terrain = cfg.scene.terrain
-    assert terrain is not None
-    terrain.terrain_type = "plane"
-    terrain.terrain_generator = None
+    terrain: Any = cfg.scene.terrain
+    terrain.terrain_type, terrain.terrain_generator = "plane", None
     remove_sensors(cfg, "terrain_scan")
     for group in ("actor", "critic"):
-        observations = cfg.observations[group]
-        assert observations is not None
+        observations: Any = cfg.observations[group]
         observations.terms.pop("height_scan", None)
-    upright = cfg.rewards["upright"]
-    assert upright is not None
+    upright: Any = cfg.rewards["upright"]
     upright.params.pop("terrain_sensor_names", None)
     cfg.terminations.pop("out_of_terrain_bounds", None)
     cfg.curriculum.pop("terrain_levels", None)
     if play:
-        twist = cfg.commands["twist"]
-        assert isinstance(twist, mdp.UniformVelocityCommandCfg)
+        twist: Any = cfg.commands["twist"]
         twist.ranges.lin_vel_x = (-1.5, 2.0)
         twist.ranges.ang_vel_z = (-0.7, 0.7)
 
@@ -133,8 +130,7 @@ def make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
     The robot starts on a random cell of a small terrain grid.
     """
     cfg.episode_length_s = int(1e9)
-    actor = cfg.observations["actor"]
-    assert actor is not None
+    actor: Any = cfg.observations["actor"]
     actor.enable_corruption = False
     cfg.events.pop("push_robot", None)
     cfg.terminations.pop("out_of_terrain_bounds", None)
@@ -164,295 +160,284 @@ def remove_sensors(cfg: ManagerBasedRlEnvCfg, *names: str) -> None:
     cfg.scene.sensors = tuple(s for s in cfg.scene.sensors if s.name not in names)
 
 
-# Config sections.
+# Config sections. `make_velocity_env_cfg` copies them.
 
+# Placeholder that robot packages replace.
+_NO_NAMES: tuple[str, ...] = ()
 
-def _sensors() -> tuple[SensorCfg, ...]:
-    terrain_scan = RayCastSensorCfg(
-        name="terrain_scan",
-        frame=ObjRef(type="body", name="", entity="robot"),
-        pattern=GridPatternCfg(size=(1.6, 1.0), resolution=0.1),
-        ray_alignment="yaw",
-        max_distance=5.0,
-        # Terrain only: geoms of the robot are in other groups.
-        include_geom_groups=(0,),
-        debug_vis=True,
-    )
-    foot_height_scan = TerrainHeightSensorCfg(
-        name="foot_height_scan",
-        frame=(),
-        ray_alignment="yaw",
-        max_distance=1.0,
-        include_geom_groups=(0,),
-        debug_vis=True,
-        viz=TerrainHeightSensorCfg.VizCfg(
-            hit_color=(1.0, 0.0, 1.0, 0.8), hit_sphere_color=(1.0, 0.0, 1.0, 1.0), show_rays=True
-        ),
-    )
-    return terrain_scan, foot_height_scan
-
-
-def _observations() -> dict[str, ObservationGroupCfg | None]:
-    actor: dict[str, ObservationTermCfg | None] = {
-        "base_lin_vel": ObservationTermCfg(
-            func=mdp.builtin_sensor,
-            params={"sensor_name": "robot/imu_lin_vel"},
-            noise=_noise(0.5),
-        ),
-        "base_ang_vel": ObservationTermCfg(
-            func=mdp.builtin_sensor,
-            params={"sensor_name": "robot/imu_ang_vel"},
-            noise=_noise(0.2),
-        ),
-        "projected_gravity": ObservationTermCfg(func=mdp.projected_gravity, noise=_noise(0.05)),
-        "joint_pos": ObservationTermCfg(
-            func=mdp.joint_pos_rel, params={"biased": True}, noise=_noise(0.01)
-        ),
-        "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, noise=_noise(1.5)),
-        "actions": ObservationTermCfg(func=mdp.last_action),
-        "command": ObservationTermCfg(
-            func=mdp.generated_commands, params={"command_name": "twist"}
-        ),
-        "height_scan": ObservationTermCfg(
-            func=mdp.height_scan,
-            params={"sensor_name": "terrain_scan"},
-            noise=_noise(0.1),
-            # 1 / max_distance of the rays.
-            scale=1.0 / 5.0,
-        ),
-    }
-
-    def foot_term(func: object, sensor_name: str) -> ObservationTermCfg:
-        return ObservationTermCfg(func=func, params={"sensor_name": sensor_name})
-
-    # The critic observes the actor's terms without noise (no corruption in its group) and without
-    # encoder bias, and further foot terms.
-    critic = {
-        **copy.deepcopy(actor),
-        "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
-        "height_scan": ObservationTermCfg(
-            func=mdp.height_scan, params={"sensor_name": "terrain_scan"}, scale=1.0 / 5.0
-        ),
-        "foot_height": foot_term(mdp.foot_height, "foot_height_scan"),
-        "foot_air_time": foot_term(mdp.foot_air_time, "feet_ground_contact"),
-        "foot_contact": foot_term(mdp.foot_contact, "feet_ground_contact"),
-        "foot_contact_forces": foot_term(mdp.foot_contact_forces, "feet_ground_contact"),
-    }
-    return {
-        "actor": ObservationGroupCfg(terms=actor, enable_corruption=True),
-        "critic": ObservationGroupCfg(terms=critic),
-    }
+_TERRAIN_SCAN = RayCastSensorCfg(
+    name="terrain_scan",
+    frame=ObjRef(type="body", name="", entity="robot"),
+    pattern=GridPatternCfg(size=(1.6, 1.0), resolution=0.1),
+    ray_alignment="yaw",
+    max_distance=5.0,
+    # Terrain only: geoms of the robot are in other groups.
+    include_geom_groups=(0,),
+    debug_vis=True,
+)
+_FOOT_HEIGHT_SCAN = TerrainHeightSensorCfg(
+    name="foot_height_scan",
+    frame=(),
+    ray_alignment="yaw",
+    max_distance=1.0,
+    include_geom_groups=(0,),
+    debug_vis=True,
+    viz=TerrainHeightSensorCfg.VizCfg(
+        hit_color=(1.0, 0.0, 1.0, 0.8), hit_sphere_color=(1.0, 0.0, 1.0, 1.0), show_rays=True
+    ),
+)
+_SENSORS: tuple[SensorCfg, ...] = (_TERRAIN_SCAN, _FOOT_HEIGHT_SCAN)
 
 
 def _noise(size: float) -> UniformNoiseCfg:
     return UniformNoiseCfg(n_min=-size, n_max=size)
 
 
-def _commands() -> dict[str, CommandTermCfg | None]:
-    return {
-        "twist": mdp.UniformVelocityCommandCfg(
-            entity_name="robot",
-            resampling_time_range=(3.0, 8.0),
-            rel_standing_envs=0.1,
-            rel_heading_envs=0.3,
-            rel_forward_envs=0.2,
-            heading_command=True,
-            heading_control_stiffness=0.5,
-            debug_vis=True,
-            ranges=mdp.UniformVelocityCommandCfg.Ranges(
-                lin_vel_x=(-1.0, 1.0),
-                lin_vel_y=(-1.0, 1.0),
-                ang_vel_z=(-0.5, 0.5),
-                heading=(-math.pi, math.pi),
-            ),
-        )
-    }
+_ACTOR_TERMS: dict[str, ObservationTermCfg | None] = {
+    "base_lin_vel": ObservationTermCfg(
+        func=mdp.builtin_sensor,
+        params={"sensor_name": "robot/imu_lin_vel"},
+        noise=_noise(0.5),
+    ),
+    "base_ang_vel": ObservationTermCfg(
+        func=mdp.builtin_sensor,
+        params={"sensor_name": "robot/imu_ang_vel"},
+        noise=_noise(0.2),
+    ),
+    "projected_gravity": ObservationTermCfg(func=mdp.projected_gravity, noise=_noise(0.05)),
+    "joint_pos": ObservationTermCfg(
+        func=mdp.joint_pos_rel, params={"biased": True}, noise=_noise(0.01)
+    ),
+    "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, noise=_noise(1.5)),
+    "actions": ObservationTermCfg(func=mdp.last_action),
+    "command": ObservationTermCfg(func=mdp.generated_commands, params={"command_name": "twist"}),
+    "height_scan": ObservationTermCfg(
+        func=mdp.height_scan,
+        params={"sensor_name": "terrain_scan"},
+        noise=_noise(0.1),
+        # 1 / max_distance of the rays.
+        scale=1.0 / 5.0,
+    ),
+}
+# The critic observes the actor's terms without noise (no corruption in its group) and without
+# encoder bias, and further foot terms.
+_CRITIC_TERMS: dict[str, ObservationTermCfg | None] = {
+    **copy.deepcopy(_ACTOR_TERMS),
+    "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
+    "height_scan": ObservationTermCfg(
+        func=mdp.height_scan, params={"sensor_name": "terrain_scan"}, scale=1.0 / 5.0
+    ),
+    "foot_height": ObservationTermCfg(
+        func=mdp.foot_height, params={"sensor_name": "foot_height_scan"}
+    ),
+    "foot_air_time": ObservationTermCfg(
+        func=mdp.foot_air_time, params={"sensor_name": "feet_ground_contact"}
+    ),
+    "foot_contact": ObservationTermCfg(
+        func=mdp.foot_contact, params={"sensor_name": "feet_ground_contact"}
+    ),
+    "foot_contact_forces": ObservationTermCfg(
+        func=mdp.foot_contact_forces, params={"sensor_name": "feet_ground_contact"}
+    ),
+}
 
+_COMMANDS: dict[str, CommandTermCfg | None] = {
+    "twist": mdp.UniformVelocityCommandCfg(
+        entity_name="robot",
+        resampling_time_range=(3.0, 8.0),
+        rel_standing_envs=0.1,
+        rel_heading_envs=0.3,
+        rel_forward_envs=0.2,
+        heading_command=True,
+        heading_control_stiffness=0.5,
+        debug_vis=True,
+        ranges=mdp.UniformVelocityCommandCfg.Ranges(
+            lin_vel_x=(-1.0, 1.0),
+            lin_vel_y=(-1.0, 1.0),
+            ang_vel_z=(-0.5, 0.5),
+            heading=(-math.pi, math.pi),
+        ),
+    )
+}
 
-def _events() -> dict[str, EventTermCfg | None]:
-    return {
-        "reset_base": EventTermCfg(
-            func=mdp.reset_root_state_uniform,
-            mode="reset",
-            params={
-                "pose_range": {
-                    "x": (-0.5, 0.5),
-                    "y": (-0.5, 0.5),
-                    "z": (0.01, 0.05),
-                    "yaw": (-3.14, 3.14),
-                },
-                "velocity_range": {},
+_EVENTS: dict[str, EventTermCfg | None] = {
+    "reset_base": EventTermCfg(
+        func=mdp.reset_root_state_uniform,
+        mode="reset",
+        params={
+            "pose_range": {
+                "x": (-0.5, 0.5),
+                "y": (-0.5, 0.5),
+                "z": (0.01, 0.05),
+                "yaw": (-3.14, 3.14),
             },
-        ),
-        "reset_robot_joints": EventTermCfg(
-            func=mdp.reset_joints_by_offset,
-            mode="reset",
-            params={
-                "position_range": (0.0, 0.0),
-                "velocity_range": (0.0, 0.0),
-                "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
-            },
-        ),
-        "push_robot": EventTermCfg(
-            func=mdp.push_by_setting_velocity,
-            mode="interval",
-            interval_range_s=(1.0, 3.0),
-            params={
-                "velocity_range": {
-                    "x": (-0.5, 0.5),
-                    "y": (-0.5, 0.5),
-                    "z": (-0.4, 0.4),
-                    "roll": (-0.52, 0.52),
-                    "pitch": (-0.52, 0.52),
-                    "yaw": (-0.78, 0.78),
-                }
-            },
-        ),
-        "foot_friction": EventTermCfg(
-            func=mdp.dr.geom_friction,
-            mode="startup",
-            params={
-                "asset_cfg": SceneEntityCfg("robot", geom_names=_NO_NAMES),
-                "operation": "abs",
-                "ranges": (0.3, 1.2),
-                # Same friction for all feet of an environment.
-                "shared_random": True,
-            },
-        ),
-        "encoder_bias": EventTermCfg(
-            func=mdp.dr.encoder_bias,
-            mode="startup",
-            params={"asset_cfg": SceneEntityCfg("robot"), "bias_range": (-0.015, 0.015)},
-        ),
-        "base_com": EventTermCfg(
-            func=mdp.dr.body_com_offset,
-            mode="startup",
-            params={
-                "asset_cfg": SceneEntityCfg("robot", body_names=_NO_NAMES),
-                "operation": "add",
-                "ranges": {0: (-0.025, 0.025), 1: (-0.025, 0.025), 2: (-0.03, 0.03)},
-            },
-        ),
-    }
+            "velocity_range": {},
+        },
+    ),
+    "reset_robot_joints": EventTermCfg(
+        func=mdp.reset_joints_by_offset,
+        mode="reset",
+        params={
+            "position_range": (0.0, 0.0),
+            "velocity_range": (0.0, 0.0),
+            "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
+        },
+    ),
+    "push_robot": EventTermCfg(
+        func=mdp.push_by_setting_velocity,
+        mode="interval",
+        interval_range_s=(1.0, 3.0),
+        params={
+            "velocity_range": {
+                "x": (-0.5, 0.5),
+                "y": (-0.5, 0.5),
+                "z": (-0.4, 0.4),
+                "roll": (-0.52, 0.52),
+                "pitch": (-0.52, 0.52),
+                "yaw": (-0.78, 0.78),
+            }
+        },
+    ),
+    "foot_friction": EventTermCfg(
+        func=mdp.dr.geom_friction,
+        mode="startup",
+        params={
+            "asset_cfg": SceneEntityCfg("robot", geom_names=_NO_NAMES),
+            "operation": "abs",
+            "ranges": (0.3, 1.2),
+            # Same friction for all feet of an environment.
+            "shared_random": True,
+        },
+    ),
+    "encoder_bias": EventTermCfg(
+        func=mdp.dr.encoder_bias,
+        mode="startup",
+        params={"asset_cfg": SceneEntityCfg("robot"), "bias_range": (-0.015, 0.015)},
+    ),
+    "base_com": EventTermCfg(
+        func=mdp.dr.body_com_offset,
+        mode="startup",
+        params={
+            "asset_cfg": SceneEntityCfg("robot", body_names=_NO_NAMES),
+            "operation": "add",
+            "ranges": {0: (-0.025, 0.025), 1: (-0.025, 0.025), 2: (-0.03, 0.03)},
+        },
+    ),
+}
 
+# No foot penalties for standing commands.
+_COMMANDED = {"command_name": "twist", "command_threshold": 0.05}
+_REWARDS: dict[str, RewardTermCfg | None] = {
+    # Tracking.
+    "track_linear_velocity": RewardTermCfg(
+        func=mdp.track_linear_velocity,
+        weight=2.0,
+        params={"command_name": "twist", "std": math.sqrt(0.25)},
+    ),
+    "track_angular_velocity": RewardTermCfg(
+        func=mdp.track_angular_velocity,
+        weight=2.0,
+        params={"command_name": "twist", "std": math.sqrt(0.5)},
+    ),
+    # Posture and smoothness.
+    "upright": RewardTermCfg(
+        func=mdp.upright,
+        weight=1.0,
+        params={"std": math.sqrt(0.2), "asset_cfg": SceneEntityCfg("robot", body_names=_NO_NAMES)},
+    ),
+    "pose": RewardTermCfg(
+        func=mdp.variable_posture,
+        weight=1.0,
+        params={
+            "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
+            "command_name": "twist",
+            "std_standing": {},
+            "std_walking": {},
+            "std_running": {},
+            "walking_threshold": 0.05,
+            "running_threshold": 1.5,
+        },
+    ),
+    "body_ang_vel": RewardTermCfg(
+        func=mdp.body_angular_velocity_penalty,
+        weight=0.0,
+        params={"asset_cfg": SceneEntityCfg("robot", body_names=_NO_NAMES)},
+    ),
+    "angular_momentum": RewardTermCfg(
+        func=mdp.angular_momentum_penalty,
+        weight=0.0,
+        params={"sensor_name": "robot/root_angmom"},
+    ),
+    "dof_pos_limits": RewardTermCfg(func=mdp.joint_pos_limits, weight=-1.0),
+    "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.1),
+    # Feet.
+    "air_time": RewardTermCfg(
+        func=mdp.feet_air_time,
+        weight=0.0,
+        params={
+            "sensor_name": "feet_ground_contact",
+            "threshold_min": 0.05,
+            "threshold_max": 0.5,
+            "command_name": "twist",
+            "command_threshold": 0.5,
+        },
+    ),
+    "foot_clearance": RewardTermCfg(
+        func=mdp.feet_clearance,
+        weight=-2.0,
+        params={
+            "target_height": 0.1,
+            "height_sensor_name": "foot_height_scan",
+            **_COMMANDED,
+            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
+        },
+    ),
+    "foot_swing_height": RewardTermCfg(
+        func=mdp.feet_swing_height,
+        weight=-0.25,
+        params={
+            "sensor_name": "feet_ground_contact",
+            "height_sensor_name": "foot_height_scan",
+            "target_height": 0.1,
+            **_COMMANDED,
+        },
+    ),
+    "foot_slip": RewardTermCfg(
+        func=mdp.feet_slip,
+        weight=-0.1,
+        params={
+            "sensor_name": "feet_ground_contact",
+            **_COMMANDED,
+            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
+        },
+    ),
+    "soft_landing": RewardTermCfg(
+        func=mdp.soft_landing,
+        weight=-1e-5,
+        params={"sensor_name": "feet_ground_contact", **_COMMANDED},
+    ),
+}
 
-def _rewards() -> dict[str, RewardTermCfg | None]:
-    def body_cfg() -> SceneEntityCfg:
-        return SceneEntityCfg("robot", body_names=_NO_NAMES)
+_TERMINATIONS: dict[str, TerminationTermCfg | None] = {
+    "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
+    "fell_over": TerminationTermCfg(
+        func=mdp.bad_orientation, params={"limit_angle": math.radians(70.0)}
+    ),
+    # Leaving the terrain truncates, it does not terminate.
+    "out_of_terrain_bounds": TerminationTermCfg(func=mdp.out_of_terrain_bounds, time_out=True),
+}
 
-    def feet_cfg() -> SceneEntityCfg:
-        return SceneEntityCfg("robot", site_names=_NO_NAMES)
-
-    # No foot penalties for standing commands.
-    commanded = {"command_name": "twist", "command_threshold": 0.05}
-    return {
-        "track_linear_velocity": RewardTermCfg(
-            func=mdp.track_linear_velocity,
-            weight=2.0,
-            params={"command_name": "twist", "std": math.sqrt(0.25)},
-        ),
-        "track_angular_velocity": RewardTermCfg(
-            func=mdp.track_angular_velocity,
-            weight=2.0,
-            params={"command_name": "twist", "std": math.sqrt(0.5)},
-        ),
-        "upright": RewardTermCfg(
-            func=mdp.upright,
-            weight=1.0,
-            params={"std": math.sqrt(0.2), "asset_cfg": body_cfg()},
-        ),
-        "pose": RewardTermCfg(
-            func=mdp.variable_posture,
-            weight=1.0,
-            params={
-                "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
-                "command_name": "twist",
-                "std_standing": {},
-                "std_walking": {},
-                "std_running": {},
-                "walking_threshold": 0.05,
-                "running_threshold": 1.5,
-            },
-        ),
-        "body_ang_vel": RewardTermCfg(
-            func=mdp.body_angular_velocity_penalty,
-            weight=0.0,
-            params={"asset_cfg": body_cfg()},
-        ),
-        "angular_momentum": RewardTermCfg(
-            func=mdp.angular_momentum_penalty,
-            weight=0.0,
-            params={"sensor_name": "robot/root_angmom"},
-        ),
-        "dof_pos_limits": RewardTermCfg(func=mdp.joint_pos_limits, weight=-1.0),
-        "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.1),
-        "air_time": RewardTermCfg(
-            func=mdp.feet_air_time,
-            weight=0.0,
-            params={
-                "sensor_name": "feet_ground_contact",
-                "threshold_min": 0.05,
-                "threshold_max": 0.5,
-                "command_name": "twist",
-                "command_threshold": 0.5,
-            },
-        ),
-        "foot_clearance": RewardTermCfg(
-            func=mdp.feet_clearance,
-            weight=-2.0,
-            params={
-                "target_height": 0.1,
-                "height_sensor_name": "foot_height_scan",
-                **commanded,
-                "asset_cfg": feet_cfg(),
-            },
-        ),
-        "foot_swing_height": RewardTermCfg(
-            func=mdp.feet_swing_height,
-            weight=-0.25,
-            params={
-                "sensor_name": "feet_ground_contact",
-                "height_sensor_name": "foot_height_scan",
-                "target_height": 0.1,
-                **commanded,
-            },
-        ),
-        "foot_slip": RewardTermCfg(
-            func=mdp.feet_slip,
-            weight=-0.1,
-            params={"sensor_name": "feet_ground_contact", **commanded, "asset_cfg": feet_cfg()},
-        ),
-        "soft_landing": RewardTermCfg(
-            func=mdp.soft_landing,
-            weight=-1e-5,
-            params={"sensor_name": "feet_ground_contact", **commanded},
-        ),
-    }
-
-
-def _terminations() -> dict[str, TerminationTermCfg | None]:
-    return {
-        "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
-        "fell_over": TerminationTermCfg(
-            func=mdp.bad_orientation, params={"limit_angle": math.radians(70.0)}
-        ),
-        # Leaving the terrain truncates, it does not terminate.
-        "out_of_terrain_bounds": TerminationTermCfg(func=mdp.out_of_terrain_bounds, time_out=True),
-    }
-
-
-def _curriculum() -> dict[str, CurriculumTermCfg | None]:
-    # Steps are environment steps: iterations times 24.
-    stages: list[mdp.VelocityStage] = [
-        {"step": 0, "lin_vel_x": (-1.0, 1.0), "ang_vel_z": (-0.5, 0.5)},
-        {"step": 5000 * 24, "lin_vel_x": (-1.5, 2.0), "ang_vel_z": (-0.7, 0.7)},
-        {"step": 10000 * 24, "lin_vel_x": (-2.0, 3.0)},
-    ]
-    return {
-        "terrain_levels": CurriculumTermCfg(
-            func=mdp.terrain_levels_vel, params={"command_name": "twist"}
-        ),
-        "command_vel": CurriculumTermCfg(
-            func=mdp.commands_vel, params={"command_name": "twist", "velocity_stages": stages}
-        ),
-    }
+# Steps are environment steps: iterations times 24.
+_VELOCITY_STAGES: list[mdp.VelocityStage] = [
+    {"step": 0, "lin_vel_x": (-1.0, 1.0), "ang_vel_z": (-0.5, 0.5)},
+    {"step": 5000 * 24, "lin_vel_x": (-1.5, 2.0), "ang_vel_z": (-0.7, 0.7)},
+    {"step": 10000 * 24, "lin_vel_x": (-2.0, 3.0)},
+]
+_CURRICULUM: dict[str, CurriculumTermCfg | None] = {
+    "terrain_levels": CurriculumTermCfg(
+        func=mdp.terrain_levels_vel, params={"command_name": "twist"}
+    ),
+    "command_vel": CurriculumTermCfg(
+        func=mdp.commands_vel, params={"command_name": "twist", "velocity_stages": _VELOCITY_STAGES}
+    ),
+}

@@ -28,7 +28,7 @@ class DelayBuffer:
             "_per_env",
             "_hold_prob",
             "_update_period",
-            "_random_phase",
+            "_num_phases",
             "_num_draws",
             "_draw_device",
         }
@@ -73,15 +73,15 @@ class DelayBuffer:
         self._per_env = per_env
         self._hold_prob = hold_prob
         self._update_period = update_period
-        self._random_phase = per_env_phase and update_period > 0
+        self._num_phases = max(1, update_period) if per_env_phase else 1
         self._generator = generator
         # A generator samples only on its own device.
         self._draw_device = device if generator is None else generator.device
         self._buffer = CircularBuffer(max_lag + 1, batch_size, device)
         # Sampled lags: one per row, or a single one for all rows.
         self._num_draws = batch_size if per_env else 1
-        self._drawn_lags = self._draw_lags()
-        self._phase = self._draw_phases()
+        self._drawn_lags = self._draw(min_lag, max_lag + 1)
+        self._phase = self._draw(0, self._num_phases)
         self._step_count = torch.zeros_like(self._drawn_lags)
         # Lags in use differ from sampled lags only after `set_lags`.
         self._current_lags = self._drawn_lags.expand(batch_size).clone()
@@ -114,7 +114,22 @@ class DelayBuffer:
     def compute(self) -> torch.Tensor:
         """Resample lags of rows that are due, and return the delayed frame, (batch_size, ...)."""
         if self._min_lag < self._max_lag:
-            self._update_lags()
+            lags = self._draw(self._min_lag, self._max_lag + 1)
+            due: torch.Tensor | None = None
+            if self._update_period > 0:
+                due = (self._step_count + self._phase) % self._update_period == 0
+            if self._hold_prob > 0:
+                draw = torch.rand(
+                    self._num_draws,
+                    dtype=torch.float32,
+                    generator=self._generator,
+                    device=self._draw_device,
+                )
+                moved = draw.to(self._device) >= self._hold_prob
+                due = moved if due is None else due & moved
+            self._step_count += 1
+            for held in (self._drawn_lags, self._current_lags):
+                held.copy_(lags if due is None else torch.where(due, lags, held))
         return self.peek()
 
     def peek(self) -> torch.Tensor:
@@ -132,12 +147,12 @@ class DelayBuffer:
         rows = slice(None) if batch_ids is None else batch_ids
         self._buffer.reset(rows)
         if self._per_env:
-            self._drawn_lags[rows] = self._draw_lags()[rows]
-            self._phase[rows] = self._draw_phases()[rows]
+            self._drawn_lags[rows] = self._draw(self._min_lag, self._max_lag + 1)[rows]
+            self._phase[rows] = self._draw(0, self._num_phases)[rows]
             self._step_count[rows] = 0
         elif isinstance(rows, slice) and rows == slice(None):
-            self._drawn_lags.copy_(self._draw_lags())
-            self._phase.copy_(self._draw_phases())
+            self._drawn_lags.copy_(self._draw(self._min_lag, self._max_lag + 1))
+            self._phase.copy_(self._draw(0, self._num_phases))
             self._step_count.zero_()
         self._current_lags[rows] = self._drawn_lags.expand(self._batch_size)[rows]
 
@@ -152,37 +167,8 @@ class DelayBuffer:
         lags = torch.as_tensor(lags, device=self._device)
         self._current_lags[rows] = lags.to(torch.int64).clamp(self._min_lag, self._max_lag)
 
-    def _update_lags(self) -> None:
-        lags = self._draw_lags()
-        change: torch.Tensor | None = None
-        if self._update_period > 0:
-            change = (self._step_count + self._phase) % self._update_period == 0
-        if self._hold_prob > 0:
-            draw = torch.rand(
-                self._num_draws,
-                dtype=torch.float32,
-                generator=self._generator,
-                device=self._draw_device,
-            )
-            moved = draw.to(self._device) >= self._hold_prob
-            change = moved if change is None else change & moved
-        self._step_count += 1
-        if change is None:
-            self._drawn_lags.copy_(lags)
-            self._current_lags.copy_(lags.expand(self._batch_size))
-            return
-        torch.where(change, lags, self._drawn_lags, out=self._drawn_lags)
-        torch.where(change, lags, self._current_lags, out=self._current_lags)
-
-    def _draw_lags(self) -> torch.Tensor:
-        return self._draw_integers(self._min_lag, self._max_lag + 1)
-
-    def _draw_phases(self) -> torch.Tensor:
-        if self._random_phase:
-            return self._draw_integers(0, self._update_period)
-        return torch.zeros(self._num_draws, dtype=torch.int64, device=self._device)
-
-    def _draw_integers(self, low: int, high: int) -> torch.Tensor:
+    def _draw(self, low: int, high: int) -> torch.Tensor:
+        """Sample integers in [low, high): one per row, or one for all rows."""
         if high - low == 1:
             return torch.full((self._num_draws,), low, dtype=torch.int64, device=self._device)
         return torch.randint(

@@ -62,28 +62,23 @@ def resolve_matching_names_values(
 def _match_names(keys: Sequence[str], names: Sequence[str]) -> list[int | None]:
     """Return the index of the matching key for each name, or None."""
     patterns = [compile_pattern(key) for key in keys]
-    owners: list[int | None] = []
-    for name in names:
-        matching = [i for i, pattern in enumerate(patterns) if pattern.fullmatch(name)]
-        if len(matching) > 1:
-            raise ValueError(
-                f"The name {name!r} is matched by several patterns: "
-                f"{[keys[i] for i in matching]}. Each name may be matched by one pattern only."
-                + _matches_report(keys, names)
-            )
-        owners.append(matching[0] if matching else None)
-    unmatched = [key for i, key in enumerate(keys) if i not in owners]
-    if unmatched:
-        raise ValueError(
-            f"These patterns match no name: {unmatched}. A pattern must match a whole name."
-            + _matches_report(keys, names)
+    owners = [[i for i, pattern in enumerate(patterns) if pattern.fullmatch(n)] for n in names]
+    unmatched = sorted(set(range(len(keys))).difference(*owners))
+    several = next((k for k, own in enumerate(owners) if len(own) > 1), None)
+    if several is not None:
+        problem = (
+            f"The name {names[several]!r} is matched by several patterns: "
+            f"{[keys[i] for i in owners[several]]}. Each name may be matched by one pattern only."
         )
-    return owners
-
-
-def _matches_report(keys: Sequence[str], names: Sequence[str]) -> str:
+    elif unmatched:
+        problem = (
+            f"These patterns match no name: {[keys[i] for i in unmatched]}. A pattern must match a "
+            "whole name."
+        )
+    else:
+        return [own[0] if own else None for own in owners]
     lines = [f"\n  {key!r}: {[n for n in names if re.fullmatch(key, n)]}" for key in keys]
-    return f"\nMatches:{''.join(lines)}\nAvailable names: {list(names)}"
+    raise ValueError(f"{problem}\nMatches:{''.join(lines)}\nAvailable names: {list(names)}")
 
 
 def to_camel_case(snake_str: str, to: str = "cC") -> str:
@@ -130,27 +125,22 @@ def callable_to_string(value: Callable) -> str:
     Raises `ValueError` if the value is not callable, or if the source of a lambda is not found.
     """
     if not callable(value):
-        found = f"{type(value).__name__}: {value!r}"
-        raise ValueError(f"Expected a callable, got {found}.")
-    if getattr(value, "__name__", "") == "<lambda>":
-        return _lambda_source(value)
-    return qualified_name(value)
-
-
-def _lambda_source(function: Callable) -> str:
+        raise ValueError(f"Expected a callable, got {type(value).__name__}: {value!r}.")
+    if getattr(value, "__name__", "") != "<lambda>":
+        return qualified_name(value)
     try:
         # A lambda inside a call or dict is not a complete statement: take the text from "lambda"
         # and drop characters at the end until the rest is one expression.
-        text = inspect.getsource(function).strip()
+        text = inspect.getsource(value).strip()
     except (OSError, TypeError) as error:
-        raise ValueError(f"Source of lambda {function!r} not found.") from error
+        raise ValueError(f"Source of lambda {value!r} not found.") from error
     if text.count("lambda") == 1:
         text = text[text.index("lambda") :]
         for end in range(len(text), 0, -1):
             if is_lambda_expression(text[:end]):
                 return text[:end].strip()
     raise ValueError(
-        f"Source of {function!r} is ambiguous; use a named function, or a lambda on a separate line."
+        f"Source of {value!r} is ambiguous; use a named function, or a lambda on a separate line."
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 
 import torch
 
-from mjlab.utils.errors import check_one_of
+from mjlab.utils.errors import check_field, check_one_of
 from mjlab.utils.state import stateful
 from mjlab.utils.torch import constant_tensor
 
@@ -29,7 +29,7 @@ class NoiseCfg(ABC):
     """Combination with the data: `add` (x + n), `scale` (x * n) or `abs` (n, independent of x)."""
 
     def __post_init__(self) -> None:
-        self._check_operation()
+        check_one_of(f"{type(self).__name__}.operation", self.operation, _OPERATIONS)
 
     @abstractmethod
     def apply(self, data: torch.Tensor) -> torch.Tensor:
@@ -41,11 +41,8 @@ class NoiseCfg(ABC):
             return noise.add_(data)
         if self.operation == "scale":
             return noise.mul_(data)
-        self._check_operation()
-        return noise
-
-    def _check_operation(self) -> None:
         check_one_of(f"{type(self).__name__}.operation", self.operation, _OPERATIONS)
+        return noise
 
 
 @dataclass
@@ -96,8 +93,7 @@ class GaussianNoiseCfg(NoiseCfg):
     def __post_init__(self) -> None:
         """Raise `ValueError` unless std is positive (components of tuples may be 0)."""
         super().__post_init__()
-        if not _in_order(0.0, self.std):
-            raise ValueError(f"GaussianNoiseCfg.std: expected a number > 0, got {self.std}.")
+        check_field(self, "std", _in_order(0.0, self.std), "a number > 0")
 
     def apply(self, data: torch.Tensor) -> torch.Tensor:
         """Return the data with n = mean + std z, z standard normal."""
@@ -111,10 +107,8 @@ class NoiseModel:
 
     def __init__(self, noise_model_cfg: NoiseModelCfg, num_envs: int, device: str) -> None:
         """Create the model. Raises `ValueError` if `noise_cfg` is None."""
-        if noise_model_cfg.noise_cfg is None:
-            raise ValueError(
-                f"{type(noise_model_cfg).__name__}.noise_cfg: expected a NoiseCfg, got None."
-            )
+        is_set = noise_model_cfg.noise_cfg is not None
+        check_field(noise_model_cfg, "noise_cfg", is_set, "a NoiseCfg")
         self._noise_model_cfg = noise_model_cfg
         self._num_envs = num_envs
         self._device = device
@@ -159,11 +153,9 @@ class NoiseModelWithAdditiveBias(NoiseModel):
     ) -> None:
         """Create the model. Raises `ValueError` if `noise_cfg` or `bias_noise_cfg` is None."""
         super().__init__(noise_model_cfg, num_envs, device)
-        if noise_model_cfg.bias_noise_cfg is None:
-            raise ValueError(
-                f"{type(noise_model_cfg).__name__}.bias_noise_cfg: expected a NoiseCfg, got None."
-            )
-        self._bias_noise_cfg = noise_model_cfg.bias_noise_cfg
+        is_set = noise_model_cfg.bias_noise_cfg is not None
+        check_field(noise_model_cfg, "bias_noise_cfg", is_set, "a NoiseCfg")
+        self._bias_noise_cfg: Any = noise_model_cfg.bias_noise_cfg
         # One bias per environment, expanded to one per component when the first data arrives.
         self._bias = torch.zeros(num_envs, 1, dtype=torch.float32, device=device)
         self._waits_for_components = noise_model_cfg.sample_bias_per_component

@@ -293,16 +293,12 @@ class ClipWriter:
         # Not a pipe: a full pipe would block the encoder.
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115
         height, width = image.shape[:2]
-        raw = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps:g} -i -"
+        flags = (
+            f"-loglevel error -y -f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps:g} -i - "
+            f"{_CODECS[self.path.suffix]} -f {self.path.suffix.removeprefix('.')}"
+        )
         self._encoder = subprocess.Popen(
-            [
-                imageio_ffmpeg.get_ffmpeg_exe(),
-                *("-loglevel", "error", "-y"),
-                *raw.split(),
-                *_CODECS[self.path.suffix].split(),
-                *("-f", self.path.suffix.removeprefix(".")),
-                self._partial.name,
-            ],
+            [imageio_ffmpeg.get_ffmpeg_exe(), *flags.split(), self._partial.name],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._messages,

@@ -188,7 +188,6 @@ class NativeMujocoViewer(BaseViewer):
             if self._view.body_id is not None and self._com_differs:
                 handle.cam.lookat[:] = self._view.target(self.mjd.xpos)
             if self.env.unwrapped.num_envs > 1:
-                self._mark_selected(self._visualizer_of(handle.user_scn))
                 self._draw_neighbors(handle.user_scn)
         handle.set_texts(self._overlay())
         if self._show_plots and handle.viewport is not None:
@@ -244,14 +243,10 @@ class NativeMujocoViewer(BaseViewer):
             self._user_key_callback(key)
 
     def _configure_window(self, handle: mujoco.viewer.Handle) -> None:
-        camera = handle.cam
-        camera.lookat[:] = self._view.target(self.mjd.xpos)
-        camera.distance = self._view.distance
-        camera.azimuth = self._view.azimuth
-        camera.elevation = self._view.elevation
+        self._view.apply(handle.cam, self.mjd.xpos)
         if self._view.body_id is not None and not self._com_differs:
-            camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-            camera.trackbodyid = self._view.body_id
+            handle.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+            handle.cam.trackbodyid = self._view.body_id
         handle.opt.frame = mujoco.mjtFrame.mjFRAME_WORLD
         handle.opt.flags[mujoco.mjtVisFlag.mjVIS_SCLINERTIA] = 1
         handle.opt.geomgroup[:] = self.cfg.geom_group
@@ -293,14 +288,12 @@ class NativeMujocoViewer(BaseViewer):
         """
         return bool(self.env.unwrapped.sim.expanded_fields & VIEWER_INERTIAL_FIELDS)
 
-    def _mark_selected(self, visualizer: MujocoNativeDebugVisualizer) -> None:
-        """Draw a red arrow above the followed body of the environment in view."""
-        if self._marked_body is None:
-            return
-        tip = self.mjd.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
-        visualizer.add_arrow(tip + np.array([0.0, 0.0, 0.4]), tip, _MARKER_COLOR, width=0.03)
-
     def _draw_neighbors(self, scn: mujoco.MjvScene) -> None:
+        """Draw the nearest environments, and a red arrow above the one in view."""
+        if self._marked_body is not None:
+            tip = self.mjd.xpos[self._marked_body] + np.array([0.0, 0.0, 0.5])
+            start = tip + np.array([0.0, 0.0, 0.4])
+            self._visualizer_of(scn).add_arrow(start, tip, _MARKER_COLOR, width=0.03)
         env, sim = self.env.unwrapped, self.env.unwrapped.sim
         origins = to_numpy(env.scene.env_origins)
         option = mujoco.MjvOption()
@@ -315,16 +308,13 @@ class NativeMujocoViewer(BaseViewer):
     def _overlay(self) -> list[tuple[int | None, int | None, str | None, str | None]]:
         status = self.get_status()
         state = "paused" if status.paused else "CAPPED" if status.capped else "running"
+        realtime = f"{status.actual_realtime:.2f}x of {status.target_realtime:g}x"
         rows = [
             ("env", f"{self.env_idx + 1}/{self.env.unwrapped.num_envs}"),
             ("step", f"{status.step_count}"),
             ("status", state),
             ("speed", status.speed_label),
-            (
-                "real time",
-                f"{status.actual_realtime:.2f}x of {status.target_realtime:g}x"
-                f" ({status.smoothed_fps:.0f} FPS)",
-            ),
+            ("real time", f"{realtime} ({status.smoothed_fps:.0f} FPS)"),
         ]
         if status.last_error is not None:
             rows.append(("error", status.last_error[:80]))
@@ -368,7 +358,7 @@ class MousePush:
         self._model = model
         self._env_idx: int | None = None
         self._base: np.ndarray | None = None
-        self._written: np.ndarray | None = None
+        self._written = np.zeros(0)
 
     @property
     def active(self) -> bool:
@@ -385,37 +375,30 @@ class MousePush:
         if self._env_idx != env_idx:
             self.release(sim)
         # If a reset or the task overwrote the row, its values are those of the task.
-        if self._base is None or not self._is_unchanged(sim, env_idx):
+        if self._base is None or not np.array_equal(_row(sim, env_idx), self._written):
             self._base = _row(sim, env_idx)
         self._env_idx = env_idx
-        self._write(sim, env_idx, self._base + self._generalized_force(data, perturb))
-
-    def release(self, sim: Any) -> None:
-        """Remove the push; forces applied by the environment stay."""
-        if self._env_idx is None or self._base is None:
-            return
-        if self._is_unchanged(sim, self._env_idx):
-            self._write(sim, self._env_idx, self._base)
-        self._env_idx = self._base = self._written = None
-
-    def _is_unchanged(self, sim: Any, env_idx: int) -> bool:
-        return self._written is not None and np.array_equal(_row(sim, env_idx), self._written)
-
-    def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
-        rows = sim.data.qfrc_applied
-        rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
-        self._written = _row(sim, env_idx)
-
-    def _generalized_force(self, data: mujoco.MjData, perturb: mujoco.MjvPerturb) -> np.ndarray:
         scripted = data.xfrc_applied.copy()
         data.xfrc_applied[:] = 0.0
         mujoco.mjv_applyPerturbForce(self._model, data, perturb)
         wrench = data.xfrc_applied[perturb.select].copy()
         data.xfrc_applied[:] = scripted
-        force = np.zeros(self._model.nv)
-        point = data.xipos[perturb.select].copy()
+        force, point = np.zeros(self._model.nv), data.xipos[perturb.select]
         mujoco.mj_applyFT(self._model, data, wrench[:3], wrench[3:], point, perturb.select, force)
-        return force
+        self._write(sim, env_idx, self._base + force)
+
+    def release(self, sim: Any) -> None:
+        """Remove the push; forces applied by the environment stay."""
+        if self._env_idx is None or self._base is None:
+            return
+        if np.array_equal(_row(sim, self._env_idx), self._written):
+            self._write(sim, self._env_idx, self._base)
+        self._env_idx = self._base = None
+
+    def _write(self, sim: Any, env_idx: int, force: np.ndarray) -> None:
+        rows = sim.data.qfrc_applied
+        rows[env_idx] = torch.as_tensor(force, dtype=rows.dtype, device=rows.device)
+        self._written = _row(sim, env_idx)
 
 
 def _row(sim: Any, env_idx: int) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import time
 from collections.abc import Callable, Mapping
+from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from mjlab.viewer.viser.viewer import ViserPlayViewer
@@ -115,11 +116,12 @@ def progress_html(title: str, stats: Stats | None, age: float) -> str:
         f'<div style="width:{100.0 * done / max(total, 1):.1f}%;height:6px;background:#1c7ed6;'
         'border-radius:2px"></div></div>'
     )
+    time_left = timedelta(seconds=int(max(stats["time_left"], 0.0)))
     rows = [
         ("Iteration", f"{done:,} of {total:,}"),
         ("Mean reward", _number(stats["mean_reward"])),
         ("Episode length", f"{_number(stats['mean_episode_length'], 0)} steps"),
-        ("Speed", f"{stats['steps_per_second']:,.0f} steps/s, {_time(stats['time_left'])} left"),
+        ("Speed", f"{stats['steps_per_second']:,.0f} steps/s, {time_left} left"),
         ("Policy", f"{age:.0f} s old"),
     ]
     lines = "".join(f"<div><strong>{row}:</strong> {value}</div>" for row, value in rows)
@@ -131,9 +133,3 @@ def progress_html(title: str, stats: Stats | None, age: float) -> str:
 
 def _number(value: float | None, decimals: int = 2) -> str:
     return "—" if value is None else f"{value:,.{decimals}f}"
-
-
-def _time(seconds: float) -> str:
-    minutes, seconds = divmod(int(max(seconds, 0.0)), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"

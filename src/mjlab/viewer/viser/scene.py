@@ -86,6 +86,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         self.geom_groups_visible = [bool(shown) for shown in geom_group]
         self.site_groups_visible = [bool(shown) for shown in site_group]
         self._sync_visibilities()
+        self._fov = float(np.clip(self.view.fovy or _DEFAULT_FOV, *_FOV_RANGE))
         self._tracked_body_id = first_moving_body(mj_model)
         if view is not None:
             self.camera_tracking_enabled = view.body_id is not None
@@ -132,11 +133,13 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             mocap_quat = to_numpy(data.mocap_quat).copy()
         mj_data = None
         if self._any_decor_visible():
-            self._sync_model_fields(env_idx)
+            sync_model_fields(self.mj_model, self._sim_model, self._expanded_fields, env_idx)
             copy_state(wp_data, env_idx, self.mj_data)
             mujoco.mj_forward(self.mj_model, self.mj_data)
             mj_data = self.mj_data
-        offset = self._offset(body_xpos[env_idx])
+        offset = np.zeros(3)
+        if self.camera_tracking_enabled and self._tracked_body_id is not None:
+            offset = -np.asarray(body_xpos[env_idx, self._tracked_body_id], dtype=float)
         self._update_visualization(
             body_xpos, body_xmat, mocap_pos, mocap_quat, env_idx, offset, mj_data
         )
@@ -156,7 +159,8 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
 
         `qpos` and `qvel` are for contacts and other overlays computed by MuJoCo.
         """
-        self._sync_model_fields(self.env_idx if env_idx is None else env_idx)
+        shown = self.env_idx if env_idx is None else env_idx
+        sync_model_fields(self.mj_model, self._sim_model, self._expanded_fields, shown)
         super().update_from_arrays(
             body_xpos, body_xmat, mocap_pos, mocap_quat, env_idx, qpos, qvel, ctrl
         )
@@ -197,26 +201,26 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         gui = self.server.gui
         if self.num_envs > 1:
             with gui.add_folder("Environment"):
-                self._create_environment_gui()
+                select = gui.add_slider(
+                    "Select", 0, self.num_envs - 1, 1, self.env_idx,
+                    hint=f"Environment in view, 0 to {self.num_envs - 1}.",
+                )  # fmt: skip
+                hint = "Show only the selected environment."
+                self._add_switch("Hide others", "show_only_selected", hint=hint)
+
+            @select.on_update
+            def _(_: Any) -> None:
+                self.env_idx = int(select.value)
+                if self._last_body_xpos is not None and self.env_idx < len(self._last_body_xpos):
+                    self._last_env_idx = self.env_idx
+                self.request_update()
+
         with gui.add_folder("Camera"):
             self._create_camera_gui()
         if show_debug_viz_control:
             with gui.add_folder("Debug Viz"):
-                enabled = gui.add_checkbox("Enabled", self.debug_visualization_enabled)
-                all_envs = gui.add_checkbox(
-                    "All envs", self.show_all_envs, visible=self.num_envs > 1
-                )
-
-                @enabled.on_update
-                def _(_: Any) -> None:
-                    self.debug_visualization_enabled = enabled.value
-                    self.request_update()
-
-                @all_envs.on_update
-                def _(_: Any) -> None:
-                    self.show_all_envs = all_envs.value
-                    self.request_update()
-
+                self._add_switch("Enabled", "debug_visualization_enabled")
+                self._add_switch("All envs", "show_all_envs", visible=self.num_envs > 1)
                 if debug_viz_extra_gui is not None:
                     debug_viz_extra_gui()
 
@@ -251,15 +255,6 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         with place:
             super().create_groups_gui()
 
-    def _offset(self, body_xpos: np.ndarray) -> np.ndarray:
-        if not self.camera_tracking_enabled or self._tracked_body_id is None:
-            return np.zeros(3)
-        return -np.asarray(body_xpos[self._tracked_body_id], dtype=float)
-
-    def _sync_model_fields(self, env_idx: int) -> None:
-        if self._expanded_fields:
-            sync_model_fields(self.mj_model, self._sim_model, self._expanded_fields, env_idx)
-
     def _update_visualization_locked(
         self,
         body_xpos: np.ndarray,
@@ -282,40 +277,20 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
     def _look_at(self) -> np.ndarray:
         return np.zeros(3) if self.camera_tracking_enabled else np.asarray(self.view.lookat)
 
-    def _fov(self) -> float:
-        return float(np.clip(self.view.fovy or _DEFAULT_FOV, *_FOV_RANGE))
-
     def _aim_initial_camera(self) -> None:
         camera = self.server.initial_camera
         camera.position = self._look_at() + self.view.offset()
         camera.look_at = self._look_at()
         camera.up = (0.0, 0.0, 1.0)
-        camera.fov = np.deg2rad(self._fov())
+        camera.fov = np.deg2rad(self._fov)
 
-    def _create_environment_gui(self) -> None:
-        gui = self.server.gui
-        select = gui.add_slider(
-            "Select",
-            min=0,
-            max=self.num_envs - 1,
-            step=1,
-            initial_value=self.env_idx,
-            hint=f"Environment in view, 0 to {self.num_envs - 1}.",
-        )
-        hide = gui.add_checkbox(
-            "Hide others", self.show_only_selected, hint="Show only the selected environment."
-        )
+    def _add_switch(self, label: str, attribute: str, **options: Any) -> None:
+        """Add a checkbox that sets an attribute of the scene and redraws."""
+        switch = self.server.gui.add_checkbox(label, getattr(self, attribute), **options)
 
-        @select.on_update
+        @switch.on_update
         def _(_: Any) -> None:
-            self.env_idx = int(select.value)
-            if self._last_body_xpos is not None and self.env_idx < len(self._last_body_xpos):
-                self._last_env_idx = self.env_idx
-            self.request_update()
-
-        @hide.on_update
-        def _(_: Any) -> None:
-            self.show_only_selected = hide.value
+            setattr(self, attribute, switch.value)
             self.request_update()
 
     def _create_camera_gui(self) -> None:
@@ -331,7 +306,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             min=_FOV_RANGE[0],
             max=_FOV_RANGE[1],
             step=1,
-            initial_value=round(self._fov()),
+            initial_value=round(self._fov),
             hint="Vertical field of view.",
         )
         reset = gui.add_button("Reset camera", icon=viser.Icon.VIDEO)
@@ -385,9 +360,8 @@ class GeomVariants:
         quats = vtf.SO3.from_matrix(body_xmat).wxyz
         for shape in self._shapes.values():
             envs, bodies = np.array(shape.envs), np.array(shape.bodies)
-            chosen = envs < len(body_xpos)
-            if self._scene.show_only_selected:
-                chosen = envs == env_idx
+            only_selected = self._scene.show_only_selected
+            chosen = envs == env_idx if only_selected else envs < len(body_xpos)
             envs, bodies = envs[chosen], bodies[chosen]
             shape.handle.visible = self._scene.geom_groups_visible[shape.group] and len(envs) > 0
             if shape.handle.visible:
@@ -396,9 +370,7 @@ class GeomVariants:
 
     def _rebuild_if_changed(self) -> None:
         values = {name: to_numpy(getattr(self._sim_model, name)) for name in sorted(self._fields)}
-        if values.keys() == self._seen.keys() and all(
-            np.array_equal(value, self._seen[name]) for name, value in values.items()
-        ):
+        if all(np.array_equal(values[name], self._seen.get(name, ())) for name in values):
             return
         self._seen = {name: value.copy() for name, value in values.items()}
         for shape in self._shapes.values():
@@ -423,19 +395,21 @@ class GeomVariants:
         for env_idx in range(self._scene.num_envs):
             sync_model_fields(model, self._sim_model, self._fields, env_idx)
             for body, group in sorted(self._taken_over):
-                for part, geom_ids in enumerate(_drawn_geoms(model, body, group)):
+                drawn = (model.geom_bodyid == body) & (model.geom_group == group)
+                drawn &= model.geom_rgba[:, 3] > 0
+                # Textures prevent merging of some geoms.
+                parts = group_geoms_by_visual_compat(model, np.flatnonzero(drawn).tolist())
+                for part, geom_ids in enumerate(parts):
                     appearance = self._scene._geom_subgroup_fingerprint(model, geom_ids, False)
                     key: Any = (appearance, group)
+                    source = model
                     if key not in self._shapes and len(self._shapes) >= _MAX_SHAPES:
                         # Beyond the limit, bodies keep the appearance of the model file.
-                        exceeded, key = True, (body, group, part)
-                        model_of_key = self._base
-                    else:
-                        model_of_key = model
+                        exceeded, key, source = True, (body, group, part), self._base
                     if key not in self._shapes:
                         handle = self._scene.server.scene.add_batched_meshes_trimesh(
                             f"/variants/{len(self._shapes)}",
-                            merge_geoms(model_of_key, geom_ids),
+                            merge_geoms(source, geom_ids),
                             batched_wxyzs=np.array([[1.0, 0.0, 0.0, 0.0]]),
                             batched_positions=np.zeros((1, 3)),
                             lod="off",
@@ -471,10 +445,3 @@ def _varying_geoms(model: mujoco.MjModel, values: dict[str, np.ndarray]) -> np.n
         else:
             varying |= ~equal
     return varying
-
-
-def _drawn_geoms(model: mujoco.MjModel, body: int, group: int) -> list[list[int]]:
-    """Return the drawn geoms of one body and group, split by textures that prevent merging."""
-    ids = np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == group))
-    drawn = [int(i) for i in ids if model.geom_rgba[i, 3] > 0]
-    return group_geoms_by_visual_compat(model, drawn) if drawn else []

@@ -230,7 +230,11 @@ class ViserPlayViewer(BaseViewer):
 
     def handle_action(self, action: ViewerAction, payload: Any) -> bool:
         if action is ViewerAction.FETCH_CHECKPOINT:
-            self._load_checkpoint(str(payload))
+            panel = self._checkpoint_panel
+            policy = None if panel is None else panel.load(str(payload))
+            if policy is not None:
+                self.policy = policy
+                self.reset_environment()
             return True
         # Command panels send gui_reset to start from the state that they show.
         if isinstance(payload, dict) and payload.get("type") == "gui_reset":
@@ -239,10 +243,9 @@ class ViserPlayViewer(BaseViewer):
         return False
 
     def _create_gui(self) -> None:
-        gui, scene = self._server.gui, self.scene
+        gui, scene, env = self._server.gui, self.scene, self.env.unwrapped
 
         def add_debug_vis_switches() -> None:
-            env = self.env.unwrapped
             for part in (*env.manager_visualizers.values(), env.sensor_visualizers):
                 part.create_debug_vis_gui(self._server, scene.request_update)
 
@@ -251,7 +254,12 @@ class ViserPlayViewer(BaseViewer):
         with tabs.add_tab("Controls", icon=viser.Icon.SETTINGS):
             self.add_first_panels()
             self._controls = SimulationControls(self._server, self.request_action)
-            self._add_command_panels()
+            with gui.add_folder("Commands") as folder:
+                env.command_manager.create_gui(
+                    self._server, lambda: scene.env_idx, scene.request_update, self.request_action
+                )
+            if not folder._children:
+                folder.remove()
             with gui.add_folder("Scene"):
                 scene.create_scene_gui(debug_viz_extra_gui=add_debug_vis_switches)
             if self._camera_overlays is not None:
@@ -269,20 +277,6 @@ class ViserPlayViewer(BaseViewer):
                     lambda name: self.request_action("fetch_checkpoint", name),
                 )
 
-    def _add_command_panels(self) -> None:
-        commands = self.env.unwrapped.command_manager
-        if not getattr(commands, "active_terms", ()):
-            return
-        with self._server.gui.add_folder("Commands") as folder:
-            commands.create_gui(
-                self._server,
-                lambda: self.scene.env_idx,
-                self.scene.request_update,
-                self.request_action,
-            )
-        if not folder._children:
-            folder.remove()
-
     def _follow_env_switch(self) -> None:
         """Restart plots and drawings if the page selected another environment."""
         env_idx = self.scene.env_idx
@@ -293,21 +287,6 @@ class ViserPlayViewer(BaseViewer):
             if overlays is not None:
                 overlays.on_env_switch()
         self._update_reasons.add(UpdateReason.ENV_SWITCH)
-
-    def _load_checkpoint(self, name: str) -> None:
-        """Switch to the policy of a checkpoint. If loading fails, keep the current policy."""
-        panel = self._checkpoint_panel
-        if self._checkpoint_manager is None or panel is None:
-            return
-        try:
-            policy = self._checkpoint_manager.load_checkpoint(name)
-        except Exception as error:
-            log.exception("Cannot load checkpoint %s.", name)
-            panel.show_error(f"Cannot load {name}: {error}")
-            return
-        self.policy = policy
-        self.reset_environment()
-        panel.show_loaded(name)
 
     def _gui_reset(self, all_envs: bool) -> None:
         """Reset the selected or all environments to the state of a command panel."""
@@ -455,11 +434,18 @@ class CheckpointPanel:
             if candidate == name:
                 self._set_silently("value", label)
 
-    def show_loaded(self, name: str) -> None:
-        """Select `name` and report that it is loaded."""
+    def load(self, name: str) -> PolicyProtocol | None:
+        """Return the policy of a checkpoint and select its name. None: loading failed."""
+        try:
+            policy = self._manager.load_checkpoint(name)
+        except Exception as error:
+            log.exception("Cannot load checkpoint %s.", name)
+            self.show_error(f"Cannot load {name}: {error}")
+            return None
         self._manager.current_name = name
         self.select(name)
         self._show(f"Loaded {name}.")
+        return policy
 
     def show_error(self, message: str) -> None:
         """Show an error message."""

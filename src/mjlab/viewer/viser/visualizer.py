@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -169,45 +170,27 @@ class ViserDebugVisualizer(DebugVisualizer):
             if heads.positions:
                 self._batches["shaft"], self._batches["head"] = shafts, heads
         for key, batch in self._batches.items():
-            self._send_batch(key, batch, offset)
-        for key, handle in self._debug_handles.items():
-            if key not in self._batches and handle.visible:
-                handle.visible = False
-
-    def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
-        self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
-
-    def _send_batch(self, key: str, batch: _Batch, offset: np.ndarray) -> None:
-        positions = np.array(batch.positions, dtype=np.float32).reshape(-1, 3)
-        positions += np.asarray(offset, dtype=np.float32)
-        wxyzs = np.array(batch.wxyzs, dtype=np.float32).reshape(-1, 4)
-        scales = np.array(batch.scales, dtype=np.float32).reshape(-1, 3)
-        rgba = np.clip(np.array(batch.colors, dtype=np.float32), 0.0, 1.0)
-        colors = (rgba[:, :3] * 255).astype(np.uint8)
-        handle = self._debug_handles.get(key)
-        if handle is None:
+            values = batch.arrays(offset)
+            if key in self._debug_handles:
+                for name, value in values.items():
+                    setattr(self._debug_handles[key], name, value)
+                continue
             mesh = self._meshes[key]
             self._debug_handles[key] = self._server.scene.add_batched_meshes_simple(
                 f"/debug/{key}",
                 np.asarray(mesh.vertices, dtype=np.float32),
                 np.asarray(mesh.faces, dtype=np.uint32),
-                batched_wxyzs=wxyzs,
-                batched_positions=positions,
-                batched_scales=scales,
-                batched_colors=colors,
-                batched_opacities=rgba[:, 3],
+                **values,
                 lod="off",
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            return
-        handle.batched_positions = positions
-        handle.batched_wxyzs = wxyzs
-        handle.batched_scales = scales
-        handle.batched_colors = colors
-        handle.batched_opacities = rgba[:, 3]
-        if not handle.visible:
-            handle.visible = True
+        for key, handle in self._debug_handles.items():
+            if handle.visible != (key in self._batches):
+                handle.visible = not handle.visible
+
+    def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
+        self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
 
 
 @dataclass
@@ -231,6 +214,18 @@ class _Batch:
         self.wxyzs.extend(wxyzs)
         self.scales.extend(scales)
         self.colors.extend(colors)
+
+    def arrays(self, offset: np.ndarray) -> dict[str, Any]:
+        """Return the properties of viser's mesh handle, with positions translated by `offset`."""
+        positions = np.array(self.positions, dtype=np.float32).reshape(-1, 3)
+        rgba = np.clip(np.array(self.colors, dtype=np.float32), 0.0, 1.0)
+        return {
+            "batched_positions": positions + np.asarray(offset, dtype=np.float32),
+            "batched_wxyzs": np.array(self.wxyzs, dtype=np.float32).reshape(-1, 4),
+            "batched_scales": np.array(self.scales, dtype=np.float32).reshape(-1, 3),
+            "batched_colors": (rgba[:, :3] * 255).astype(np.uint8),
+            "batched_opacities": rgba[:, 3],
+        }
 
 
 @dataclass

@@ -247,7 +247,7 @@ def test_gains_and_effort_limits_of_every_kind_act_on_the_joint(
 
 def test_only_scale_and_abs_are_known(make_world: Any) -> None:
     world = make_world(actuators=(POSITION,))
-    with pytest.raises(ValueError, match="pd_gains operation: .*'scale' or 'abs', got 'add'"):
+    with pytest.raises(ValueError, match=r"pd_gains operation: .*\['scale', 'abs'\], got 'add'"):
         world.apply(dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0), operation="add")
 
 

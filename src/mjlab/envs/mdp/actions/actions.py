@@ -9,6 +9,7 @@ import torch
 
 from mjlab.actuator.actuator import TransmissionType, constant_within_step
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
+from mjlab.managers.manager_base import label_errors
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names, resolve_matching_names_values
 
@@ -40,7 +41,7 @@ class BaseAction(ActionTerm):
     """Base class of action terms with one component per target.
 
     Raises `ValueError` if a pattern (of targets, scale, offset or clip) matches nothing, if two
-    patterns match one name, or if scale or offset are neither a number nor a dict.
+    patterns match one name, and `TypeError` if scale or offset are neither a number nor a dict.
     """
 
     cfg: BaseActionCfg
@@ -69,7 +70,20 @@ class BaseAction(ActionTerm):
         self._processed_actions = torch.zeros_like(self._raw_actions)
         self._scale = self._by_target("scale", cfg.scale, 1.0)
         self._offset = self._by_target("offset", cfg.offset, 0.0)
-        self._clip = self._resolve_clip()
+        # Bounds of all targets, (N, action_dim, 2), infinite for unclipped targets.
+        self._clip: torch.Tensor | None = None
+        if cfg.clip is not None:
+            bounds = torch.tensor([-torch.inf, torch.inf], dtype=torch.float32, device=self.device)
+            bounds = bounds.repeat(self.action_dim, 1)
+            with label_errors(f"{type(cfg).__name__}.clip"):
+                found = resolve_matching_names_values(cfg.clip, self._target_names)
+            for i, name, pair in zip(*found, strict=True):
+                if len(pair) != 2 or not pair[0] <= pair[1]:
+                    raise ValueError(
+                        f"clip of target {name!r}: expected (low, high) with low <= high, got {pair!r}."
+                    )
+                bounds[i] = torch.tensor(pair, dtype=torch.float32, device=self.device)
+            self._clip = bounds.repeat(self.num_envs, 1, 1)
 
     @property
     def action_dim(self) -> int:
@@ -131,37 +145,13 @@ class BaseAction(ActionTerm):
     ) -> torch.Tensor | float:
         if isinstance(value, (int, float)):
             return float(value)
-        if not isinstance(value, dict):
-            raise ValueError(
-                f"{type(self.cfg).__name__}.{name}: expected a number or a dict of name pattern to "
-                f"number, got {type(value).__name__}: {value!r}."
-            )
         per_target = torch.full(
             (self.action_dim,), default, dtype=torch.float32, device=self.device
         )
-        ids, _, values = resolve_matching_names_values(value, self._target_names)
+        with label_errors(f"{type(self.cfg).__name__}.{name}"):
+            ids, _, values = resolve_matching_names_values(value, self._target_names)
         per_target[ids] = torch.tensor(values, dtype=torch.float, device=self.device)
         return per_target.repeat(self.num_envs, 1)
-
-    def _resolve_clip(self) -> torch.Tensor | None:
-        """Return the bounds of all targets, (N, action_dim, 2), infinite for unclipped targets."""
-        if self.cfg.clip is None:
-            return None
-        if not isinstance(self.cfg.clip, dict):
-            raise ValueError(
-                f"{type(self.cfg).__name__}.clip: expected a dict of name pattern to (low, high), "
-                f"got {type(self.cfg.clip).__name__}: {self.cfg.clip!r}."
-            )
-        bounds = torch.tensor([-torch.inf, torch.inf], dtype=torch.float32, device=self.device)
-        bounds = bounds.repeat(self.action_dim, 1)
-        ids, names, values = resolve_matching_names_values(self.cfg.clip, self._target_names)
-        for i, name, pair in zip(ids, names, values, strict=True):
-            if len(pair) != 2 or not pair[0] <= pair[1]:
-                raise ValueError(
-                    f"clip of target {name!r}: expected (low, high) with low <= high, got {pair!r}."
-                )
-            bounds[i] = torch.tensor(pair, dtype=torch.float32, device=self.device)
-        return bounds.repeat(self.num_envs, 1, 1)
 
 
 @dataclass(kw_only=True)

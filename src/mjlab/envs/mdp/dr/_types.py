@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 import torch
 
+from mjlab.utils.lab_api.math import sample_log_uniform, sample_uniform
+
 Bounds = tuple[float, float] | list[float]
 """Two numbers: lower and upper bound, or mean and standard deviation for "gaussian"."""
 
@@ -48,17 +50,10 @@ class Operation:
     current value."""
 
 
-def _uniform(
-    lower: torch.Tensor, upper: torch.Tensor, shape: tuple[int, ...], device: str
-) -> torch.Tensor:
-    return torch.rand(shape, dtype=torch.float32, device=device) * (upper - lower) + lower
-
-
 def _log_uniform(
     lower: torch.Tensor, upper: torch.Tensor, shape: tuple[int, ...], device: str
 ) -> torch.Tensor:
-    low, high = torch.log(lower), torch.log(upper)
-    samples = torch.exp(torch.rand(shape, dtype=torch.float32, device=device) * (high - low) + low)
+    samples = sample_log_uniform(lower, upper, shape, device)
     # Equal bounds are a constant, even for bounds <= 0 without a logarithm.
     return torch.where(lower == upper, lower.expand(shape), samples)
 
@@ -85,7 +80,7 @@ def _check_deviation(mean: float, deviation: float) -> None:
         )
 
 
-UNIFORM = Distribution("uniform", _uniform)
+UNIFORM = Distribution("uniform", sample_uniform)
 LOG_UNIFORM = Distribution("log_uniform", _log_uniform, _check_log_bounds)
 GAUSSIAN = Distribution("gaussian", _gaussian, _check_deviation)
 

@@ -38,7 +38,7 @@ from mjlab.envs.mdp.dr._types import (
     resolve_operation,
 )
 from mjlab.managers.event_manager import requires_model_fields
-from mjlab.utils.errors import WrongTypeError
+from mjlab.utils.errors import WrongTypeError, check_one_of
 from mjlab.utils.indexing import as_columns, as_ids
 
 if TYPE_CHECKING:
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.envs.mdp.dr._types import Distribution
     from mjlab.managers.scene_entity_config import SceneEntityCfg
-    from mjlab.utils.mujoco import CommandField
 
 __all__ = ["effort_limits", "pd_gains"]
 
@@ -85,7 +84,8 @@ def pd_gains(
             with a slew rate.
         TypeError: a selected actuator has no gains, such as a motor or a muscle.
     """
-    dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "pd_gains")
+    dist, op = resolve_distribution(distribution), resolve_operation(operation)
+    check_one_of("pd_gains operation", op.name, ("scale", "abs"))
     bounds = read_bounds(kp_range, "kp_range"), read_bounds(kd_range, "kd_range")
     chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     locations = [_locate_gains(env, selected) for selected in chosen]
@@ -134,7 +134,8 @@ def effort_limits(
         TypeError: a selected actuator is of a custom type, or is an XML actuator with effort
             commands but without an effort limit.
     """
-    dist, op = resolve_distribution(distribution), _scale_or_abs(operation, "effort_limits")
+    dist, op = resolve_distribution(distribution), resolve_operation(operation)
+    check_one_of("effort_limits operation", op.name, ("scale", "abs"))
     bounds = read_bounds(effort_limit_range, "effort_limit_range")
     chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     locations = [_locate_limits(env, selected) for selected in chosen]
@@ -263,10 +264,13 @@ def _locate_gains(env: ManagerBasedRlEnv, selected: SelectedActuator) -> Gains:
             return _PID_GAINS
         if (kinds != mujoco.mjtGain.mjGAIN_FIXED).any():
             raise WrongTypeError(_unsupported("pd_gains", actuator, _TYPES_WITH_GAINS))
-    if _reads(actuator, "position", BuiltinPositionActuator):
-        return _SERVO_GAINS
-    if _reads(actuator, "velocity", BuiltinVelocityActuator):
-        return _VELOCITY_GAINS
+    if isinstance(actuator, (XmlActuator, BuiltinPositionActuator, BuiltinVelocityActuator)):
+        servos: dict[tuple[str, ...], Gains] = {
+            ("position",): _SERVO_GAINS,
+            ("velocity",): _VELOCITY_GAINS,
+        }
+        if actuator.command_fields in servos:
+            return servos[actuator.command_fields]
     raise WrongTypeError(_unsupported("pd_gains", actuator, _TYPES_WITH_GAINS))
 
 
@@ -364,13 +368,6 @@ def _locate_xml_limits(env: ManagerBasedRlEnv, selected: SelectedActuator) -> tu
     return _MOTOR_RANGES if by_control else _FORCE_RANGE
 
 
-def _reads(actuator: Actuator, command: CommandField, builtin: type[Actuator]) -> bool:
-    """Return True for a MuJoCo servo, builtin or XML, with this command."""
-    if isinstance(actuator, XmlActuator):
-        return actuator.command_fields == (command,)
-    return isinstance(actuator, builtin)
-
-
 def _unsupported(function: str, actuator: Actuator, supported: str) -> str:
     kind = type(actuator).__name__
     if isinstance(actuator, XmlActuator):
@@ -382,13 +379,6 @@ def _unsupported(function: str, actuator: Actuator, supported: str) -> str:
 
 
 # Write.
-
-
-def _scale_or_abs(operation: Operation | str, function: str) -> Operation:
-    op = resolve_operation(operation)
-    if op not in (SCALE, ABS):
-        raise ValueError(f"{function} operation: expected 'scale' or 'abs', got {op.name!r}.")
-    return op
 
 
 def _default(

@@ -153,7 +153,16 @@ def pseudo_inertia(
     for name, value in zip(_PARAMETERS, ranges, strict=True):
         bounds = read_bounds(value, f"pseudo_inertia: {name}_range")
         parameters.append(draw(dist, bounds, bodies.shape, env.device).double())
-    transform = _transform(parameters)
+    alpha, d1, d2, d3, s12, s13, s23, t1, t2, t3 = parameters
+    zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)
+    rows = (
+        (torch.exp(d1), s12, s13, t1),
+        (zero, torch.exp(d2), s23, t2),
+        (zero, zero, torch.exp(d3), t3),
+        (zero, zero, zero, one),
+    )
+    u = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    transform = torch.exp(alpha)[..., None, None] * u
     perturbed = transform @ default @ transform.transpose(-1, -2)
     new = inertial_from_pseudo_inertia(perturbed)
     for field, value in zip(_FIELDS, new, strict=True):
@@ -176,20 +185,6 @@ def _default_pseudo_inertia(bodies: Selection) -> torch.Tensor:
             "in the model."
         )
     return pseudo_inertia_matrix(values)
-
-
-def _transform(parameters: list[torch.Tensor]) -> torch.Tensor:
-    """Return `e^alpha U`, (..., 4, 4), for parameters of shape (...)."""
-    alpha, d1, d2, d3, s12, s13, s23, t1, t2, t3 = parameters
-    zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)
-    rows = (
-        (torch.exp(d1), s12, s13, t1),
-        (zero, torch.exp(d2), s23, t2),
-        (zero, zero, torch.exp(d3), t3),
-        (zero, zero, zero, one),
-    )
-    matrix = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    return torch.exp(alpha)[..., None, None] * matrix
 
 
 def pseudo_inertia_matrix(body: Inertial) -> torch.Tensor:

@@ -17,7 +17,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range
 from mjlab.tasks.manipulation.mdp.goal_panel import GoalPanel
-from mjlab.utils.errors import check_exists, check_one_of, check_positive
+from mjlab.utils.errors import check_one_of, check_positive
 from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ class GoalCommandCfg(CommandTermCfg):
 class GoalCommand(CommandTerm):
     """Base class of commands with a goal position for an object.
 
-    Subclasses define `object_pos()` and `_place_objects(env_ids)`, and may sample more in
-    `_draw_command(env_ids)`.
+    Subclasses define `object_pos()`, and extend `_resample_command(env_ids)` to place the objects
+    with `_place`.
 
     When the goal is resampled within an episode, the objects are placed at new poses. `sim.forward`
     then recomputes the derived quantities of these environments only, so that observations are of
@@ -179,21 +179,12 @@ class GoalCommand(CommandTerm):
         self.last_goal_met[env_ids] = metrics["at_goal"][env_ids] > 0.0
         metrics["goal_success"][env_ids] = 0.0
         self.goal_age[env_ids] = 0.0
-        self._draw_command(env_ids)
         if self.cfg.difficulty == "fixed":
             goals = torch.tensor(FIXED_GOAL, dtype=torch.float32, device=self.device)
         else:
             within = self.cfg.target_position_range
             goals = sample_ranges((within.x, within.y, within.z), len(env_ids), self.device)
         self.target_pos[env_ids] = goals + self._env.scene.env_origins[env_ids]
-        self._place_objects(env_ids)
-
-    def _draw_command(self, env_ids: torch.Tensor) -> None:
-        """Sample subclass quantities before the goal. Default: nothing."""
-
-    def _place_objects(self, env_ids: torch.Tensor) -> None:
-        """Place the objects of `env_ids` at their start poses, with `_place`."""
-        raise NotImplementedError
 
     def _place(
         self, entity: Entity, positions: torch.Tensor, yaws: torch.Tensor, env_ids: torch.Tensor
@@ -222,14 +213,10 @@ class GoalCommand(CommandTerm):
         for name in ("goal_success", "episode_success"):
             torch.maximum(metrics[name], metrics["at_goal"], out=metrics[name])
 
-    @property
-    def _goal_color(self) -> Color:
-        return _GOAL_COLOR
-
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
+        color = self.cfg.viz.target_color if hasattr(self.cfg, "viz") else _GOAL_COLOR
         for index in visualizer.get_env_indices(self.num_envs):
-            goal = self.target_pos[index].cpu().numpy()
-            visualizer.add_sphere(goal, _GOAL_RADIUS, self._goal_color)
+            visualizer.add_sphere(self.target_pos[index].cpu().numpy(), _GOAL_RADIUS, color)
 
 
 @dataclass(kw_only=True)
@@ -264,7 +251,7 @@ class LiftingCommandCfg(GoalCommandCfg):
     """Visualization settings."""
 
     def build(self, env: ManagerBasedRlEnv) -> LiftingCommand:
-        """Build the term; raises `ValueError` for invalid ranges or an invalid object."""
+        """Build the term; raises `ValueError` for invalid ranges or a fixed object."""
         return LiftingCommand(self, env)
 
 
@@ -279,7 +266,7 @@ class LiftingCommand(GoalCommand):
     def __init__(self, cfg: LiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         is_moved = cfg.object_pose_range is not None
-        self.object: Entity = require_object(env, cfg.entity_name, "entity_name", is_moved)
+        self.object: Entity = require_object(env, cfg.entity_name, is_moved)
         if cfg.object_pose_range is not None:
             check_pose_range(cfg.object_pose_range)
         self.metrics = {
@@ -290,7 +277,8 @@ class LiftingCommand(GoalCommand):
     def object_pos(self) -> torch.Tensor:
         return self.object.data.root_link_pos_w
 
-    def _place_objects(self, env_ids: torch.Tensor) -> None:
+    def _resample_command(self, env_ids: torch.Tensor) -> None:
+        super()._resample_command(env_ids)
         within = self.cfg.object_pose_range
         if within is None:
             return
@@ -302,10 +290,6 @@ class LiftingCommand(GoalCommand):
     def _update_metrics(self) -> None:
         super()._update_metrics()
         self.metrics["object_height"].copy_(self.object_pos()[:, 2])
-
-    @property
-    def _goal_color(self) -> Color:
-        return self.cfg.viz.target_color
 
 
 @dataclass(kw_only=True)
@@ -331,7 +315,7 @@ class MultiCubeLiftingCommandCfg(GoalCommandCfg):
     """Ranges of the object poses."""
 
     def build(self, env: ManagerBasedRlEnv) -> MultiCubeLiftingCommand:
-        """Build the term; raises `ValueError` for invalid ranges or objects."""
+        """Build the term; raises `ValueError` for invalid ranges or fixed objects."""
         return MultiCubeLiftingCommand(self, env)
 
 
@@ -354,7 +338,7 @@ class MultiCubeLiftingCommand(GoalCommand):
         if not cfg.entity_names:
             raise ValueError("entity_names: expected at least one object, got ().")
         self.objects: list[Entity] = [
-            require_object(env, name, "entity_names", is_moved=True) for name in cfg.entity_names
+            require_object(env, name, is_moved=True) for name in cfg.entity_names
         ]
         self.target_selection = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         ids = [torch.as_tensor(one.indexing.geom_ids).long().cpu() for one in self.objects]
@@ -380,14 +364,11 @@ class MultiCubeLiftingCommand(GoalCommand):
         index = self.target_selection.view(1, -1, 1).expand(1, -1, 3)
         return positions.gather(0, index).squeeze(0)
 
-    def _draw_command(self, env_ids: torch.Tensor) -> None:
-        self.target_selection[env_ids] = torch.randint(
-            len(self.objects), (len(env_ids),), device=self.device
-        )
-
-    def _place_objects(self, env_ids: torch.Tensor) -> None:
-        within = self.cfg.object_pose_range
-        count = len(env_ids)
+    def _resample_command(self, env_ids: torch.Tensor) -> None:
+        within, count = self.cfg.object_pose_range, len(env_ids)
+        selected = torch.randint(len(self.objects), (count,), device=self.device)
+        self.target_selection[env_ids] = selected
+        super()._resample_command(env_ids)
         positions, yaws = [], []
         for _ in self.objects:
             positions.append(sample_ranges((within.x, within.y, within.z), count, self.device))
@@ -411,13 +392,12 @@ def check_pose_range(within: Any) -> None:
         check_range(f"object_pose_range.{name}", getattr(within, name))
 
 
-def require_object(env: ManagerBasedRlEnv, name: str, field: str, is_moved: bool) -> Entity:
-    """Return the entity `name`; raises `ValueError` if unknown, or fixed and `is_moved`."""
-    check_exists(f"entity in {field}", name, env.scene.entities)
-    entity: Entity = env.scene.entities[name]
+def require_object(env: ManagerBasedRlEnv, name: str, is_moved: bool) -> Entity:
+    """Return the entity `name`; raises `ValueError` if it has a fixed base and `is_moved`."""
+    entity: Entity = env.scene[name]
     if is_moved and entity.is_fixed_base:
         raise ValueError(
-            f"{field} {name!r}: expected a floating base, got a fixed base; give its root body a "
+            f"Entity {name!r}: expected a floating base, got a fixed base; give its root body a "
             "free joint."
         )
     return entity
@@ -445,22 +425,16 @@ def keep_apart(
     """
     apart = apart.expand(len(positions), -1, -1)
     for index in range(1, positions.shape[1]):
-        close = _too_close(positions, index, apart)
+        rows = torch.arange(len(positions), device=positions.device)
         for _ in range(_MAX_TRIES):
-            rows = close.nonzero().flatten()
+            offsets = positions[rows, :index, :2] - positions[rows, index : index + 1, :2]
+            distances = torch.linalg.vector_norm(offsets, dim=-1)
+            rows = rows[(distances < apart[rows, index, :index]).any(dim=1)]
             if len(rows) == 0:
                 break
             drawn = torch.rand(len(rows), 2, dtype=torch.float32, device=positions.device)
             positions[rows, index, 0] = drawn[:, 0] * (x[1] - x[0]) + x[0]
             positions[rows, index, 1] = drawn[:, 1] * (y[1] - y[0]) + y[0]
-            close[rows] = _too_close(positions[rows], index, apart[rows])
-
-
-def _too_close(positions: torch.Tensor, index: int, apart: torch.Tensor) -> torch.Tensor:
-    """Return True if object `index` is too close to an earlier object, (n,) bool."""
-    offsets = positions[:, :index, :2] - positions[:, index : index + 1, :2]
-    distances = torch.linalg.vector_norm(offsets, dim=-1)
-    return (distances < apart[:, index, :index]).any(dim=1)
 
 
 def distance_apart(
@@ -490,11 +464,9 @@ def distance_apart(
     covered = sum(math.pi * radius**2 for radius in largest)
     if len(largest) > 1 and covered > _CROWDED * sides[0] * sides[1]:
         logger.warning(
-            "object_pose_range is small for the %d objects %s: objects may start in penetration "
-            "and be thrown apart. Widen x or y, or use fewer or smaller objects.",
-            len(largest),
-            list(names),
-        )
+            "object_pose_range is small for the objects %s: objects may start in penetration "
+            "and be thrown apart. Widen x or y, or use fewer or smaller objects.", list(names),
+        )  # fmt: skip
     return radii.unsqueeze(1) + radii.unsqueeze(2)
 
 
@@ -513,16 +485,16 @@ def check_reach(
         return
     center, longest = found
     goals, starts = cfg.target_position_range, getattr(cfg, "object_pose_range", None)
-    narrow = "narrow {}"
-    places: list[tuple[str, list[tuple[float, ...]], str]]
-    places = [("goals", _corners(goals), narrow.format("target_position_range"))]
+    places: list[tuple[str, Any, str]]
+    places = [("goals", (goals.x, goals.y, goals.z), "narrow target_position_range")]
     if cfg.difficulty == "fixed":
         nearer = "move the arm nearer, or use difficulty 'dynamic', whose goals have a range"
-        places = [("goals", [FIXED_GOAL], nearer)]
+        places = [("goals", [(value,) for value in FIXED_GOAL], nearer)]
     if starts is not None:
-        places.append(("objects", _corners(starts), narrow.format("object_pose_range")))
-    for kind, points, remedy in places:
-        farthest = max(points, key=lambda point: math.dist(point, center))
+        places.append(("objects", (starts.x, starts.y, starts.z), "narrow object_pose_range"))
+    for kind, ranges, remedy in places:
+        corners = itertools.product(*ranges)
+        farthest = max(corners, key=lambda point: math.dist(point, center))
         distance = math.dist(farthest, center)
         if distance > longest + cfg.success_threshold:
             raise ValueError(
@@ -530,10 +502,6 @@ def check_reach(
                 f"joint of entity {entity_name!r}, the reach of site {site!r}, got {distance:.2f} m "
                 f"at {farthest} (m, relative to the environment's origin); {remedy}."
             )
-
-
-def _corners(within: Any) -> list[tuple[float, ...]]:
-    return list(itertools.product(within.x, within.y, within.z))
 
 
 def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:

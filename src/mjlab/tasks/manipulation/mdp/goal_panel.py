@@ -12,7 +12,6 @@ import torch
 if TYPE_CHECKING:
     import viser
 
-_AXES = ("x", "y", "z")
 _SLIDER_STEP = 0.01
 # Slider range beyond the range of goals (m).
 _BEYOND = 0.1
@@ -50,7 +49,7 @@ class GoalPanel:
             on_change: Called after every change.
         """
         self._get_env_idx = get_env_idx
-        self._on_change = on_change
+        self._on_change = on_change or (lambda: None)
         # Viser calls callbacks in other threads.
         self._lock = threading.Lock()
         self._origin = np.zeros(3)
@@ -62,20 +61,19 @@ class GoalPanel:
                 hint="Keep the goal of the displayed environment at the handle. Dragging the "
                 "handle or moving a slider switches this on.",
             )
-            self._sliders = [self._add_slider(server, axis, ranges) for axis in _AXES]
+            self._sliders = []
+            for axis in ("x", "y", "z"):
+                low, high = getattr(ranges, axis)
+                slider = server.gui.add_slider(
+                    axis, low - _BEYOND, high + _BEYOND, _SLIDER_STEP, (low + high) / 2.0
+                )
+                slider.on_update(self._moved)
+                self._sliders.append(slider)
         self._handle = server.scene.add_transform_controls(
             f"{_WORLD}/{name}_handle", scale=_HANDLE_SIZE, disable_rotations=True, depth_test=False
         )
-        self._held.on_update(self._changed)
+        self._held.on_update(lambda _event: self._on_change())
         self._handle.on_update(self._dragged)
-
-    def _add_slider(self, server: viser.ViserServer, axis: str, ranges: Any) -> Any:
-        low, high = getattr(ranges, axis)
-        slider = server.gui.add_slider(
-            axis, low - _BEYOND, high + _BEYOND, _SLIDER_STEP, (low + high) / 2.0
-        )
-        slider.on_update(self._moved)
-        return slider
 
     def write_to(self, goals: torch.Tensor, origins: torch.Tensor) -> int | None:
         """Move the displayed environment's goal to the handle if held, else the handle to the goal.
@@ -120,7 +118,7 @@ class GoalPanel:
             # The next `_show` then skips the dragged handle, unless the sliders clipped the goal.
             self._shown = np.asarray(self._handle.position, dtype=float)
             self._set_sliders(self._shown - self._origin)
-        self._changed(event)
+        self._on_change()
 
     def _moved(self, event: Any) -> None:
         # Slider updates from the command have no client.
@@ -128,8 +126,4 @@ class GoalPanel:
             return
         if not self._held.value:
             self._held.value = True
-        self._changed(event)
-
-    def _changed(self, _event: Any) -> None:
-        if self._on_change is not None:
-            self._on_change()
+        self._on_change()

@@ -6,6 +6,7 @@ positions are positions of their root links. Images have channels first: (N, C, 
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +15,14 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import checked_when_built, require_command, require_sensor
+from mjlab.managers.term_checks import checked_when_built, require_sensor
 from mjlab.sensor import CameraSensor
 from mjlab.tasks.manipulation.mdp.commands import (
     LiftingCommand,
     MultiCubeLiftingCommand,
     check_reach,
 )
-from mjlab.utils.errors import WrongTypeError, check_exists, check_positive
+from mjlab.utils.errors import WrongTypeError, check_exists, check_in_range, check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 
@@ -45,17 +46,60 @@ DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 
 
-def _check_ee_to_object(
+def check_task_term(
     env: ManagerBasedRlEnv,
-    object_name: str,
+    *,
+    kinds: tuple[type, ...] = (),
+    has_hand: bool = False,
+    command_name: str | None = None,
+    object_name: str | None = None,
     asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
-    **_: Any,
+    max_vel: float = 0.0,
+    **params: Any,
 ) -> None:
-    check_entity(env, object_name, "object_name")
-    check_site(env, asset_cfg)
+    """Check a term of a manipulation task.
+
+    Args:
+        env: The environment.
+        kinds: Classes of commands that the term reads; see `goal_command`.
+        has_hand: The term reads the end effector, a site of `asset_cfg`.
+        command_name: Parameter of the term, as the following ones.
+        object_name: Entity.
+        asset_cfg: Robot.
+        max_vel: Speed limit, >= 0.
+        params: Further parameters; `std` and `..._std` must be positive.
+
+    Raises:
+        KeyError: unknown command.
+        TypeError: the command is not of `kinds`.
+        ValueError: unknown object, invalid number, not exactly one site, or goals out of reach.
+    """
+    for name, value in params.items():
+        if name.endswith("std"):
+            check_positive(name, value)
+    check_in_range("max_vel", max_vel, 0.0, math.inf)
+    if object_name is not None:
+        check_exists("entity in object_name", object_name, env.scene.entities)
+    command = None if command_name is None else goal_command(env, command_name, *kinds)
+    if has_hand:
+        site = find_site(env, asset_cfg)
+        if command is not None:
+            check_reach(env, str(command_name), command.cfg, asset_cfg.name, site)
 
 
-@checked_when_built(_check_ee_to_object)
+def find_site(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> str:
+    """Return the name of the selected site; raises `ValueError` unless exactly one is selected."""
+    names, ids = env.scene[asset_cfg.name].site_names, asset_cfg.site_ids
+    selected = list(names[ids]) if isinstance(ids, slice) else [names[index] for index in ids]
+    if len(selected) != 1:
+        raise ValueError(
+            f"asset_cfg: expected one site of entity {asset_cfg.name!r}, got {len(selected)}; set "
+            f"site_names, e.g. to the site between the fingers. Available: {list(names)}."
+        )
+    return selected[0]
+
+
+@checked_when_built(partial(check_task_term, has_hand=True))
 def ee_to_object_distance(
     env: ManagerBasedRlEnv, object_name: str, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -66,18 +110,6 @@ def ee_to_object_distance(
     return quat_apply_inverse(asset.data.root_link_quat_w, offset)
 
 
-def _check_object_to_goal(
-    env: ManagerBasedRlEnv,
-    object_name: str,
-    command_name: str,
-    asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    check_single(env, command_name, object_name)
-    check_entity(env, asset_cfg.name, "asset_cfg.name")
-
-
-@checked_when_built(_check_object_to_goal)
 def object_to_goal_distance(
     env: ManagerBasedRlEnv,
     object_name: str,
@@ -91,22 +123,12 @@ def object_to_goal_distance(
     """
     asset: Entity = env.scene[asset_cfg.name]
     target: Entity = env.scene[object_name]
-    offset = lifting_command(env, command_name).target_pos - target.data.root_link_pos_w
+    goal = goal_command(env, command_name, LiftingCommand).target_pos
+    offset = goal - target.data.root_link_pos_w
     return quat_apply_inverse(asset.data.root_link_quat_w, offset)
 
 
-def _check_target_position(
-    env: ManagerBasedRlEnv,
-    command_name: str,
-    asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    require_command(env, command_name)
-    command = goal_command(env, command_name)
-    check_reach(env, command_name, command.cfg, asset_cfg.name, check_site(env, asset_cfg))
-
-
-@checked_when_built(_check_target_position)
+@checked_when_built(partial(check_task_term, has_hand=True))
 def target_position(
     env: ManagerBasedRlEnv, command_name: str, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -119,13 +141,7 @@ def target_position(
     return quat_apply_inverse(site_quat(env, asset_cfg), offset)
 
 
-def _check_ee_velocity(
-    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG, **_: Any
-) -> None:
-    check_site(env, asset_cfg)
-
-
-@checked_when_built(_check_ee_velocity)
+@checked_when_built(partial(check_task_term, has_hand=True))
 def ee_velocity(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -139,12 +155,24 @@ def ee_velocity(
 # Images.
 
 
-def _check_camera(env: ManagerBasedRlEnv, sensor_name: str, data_type: str, **_: Any) -> None:
+def _check_camera(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    data_type: str,
+    min_depth: float = 0.01,
+    cutoff_distance: float = math.inf,
+    **_: Any,
+) -> None:
     cfg = require_sensor(env, sensor_name, CameraSensor).cfg
     if data_type not in cfg.data_types:
         raise ValueError(
             f"Camera {sensor_name!r} data_types: expected {data_type!r} among them, got "
             f"{tuple(cfg.data_types)}; add it."
+        )
+    if not 0.0 <= min_depth < cutoff_distance:
+        raise ValueError(
+            "min_depth and cutoff_distance: expected 0 <= min_depth < cutoff_distance, got "
+            f"{min_depth} and {cutoff_distance}."
         )
 
 
@@ -154,22 +182,7 @@ def camera_rgb(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     return env.scene[sensor_name].data.rgb.permute(0, 3, 1, 2).float().div_(255.0)
 
 
-def _check_depth(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    cutoff_distance: float,
-    min_depth: float = 0.01,
-    **_: Any,
-) -> None:
-    _check_camera(env, sensor_name, "depth")
-    if not 0.0 <= min_depth < cutoff_distance:
-        raise ValueError(
-            "min_depth and cutoff_distance: expected 0 <= min_depth < cutoff_distance, got "
-            f"{min_depth} and {cutoff_distance}."
-        )
-
-
-@checked_when_built(_check_depth)
+@checked_when_built(partial(_check_camera, data_type="depth"))
 def camera_depth(
     env: ManagerBasedRlEnv, sensor_name: str, cutoff_distance: float, min_depth: float = 0.01
 ) -> torch.Tensor:
@@ -190,13 +203,7 @@ def camera_segmentation(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tenso
     return env.scene[sensor_name].data.segmentation.permute(0, 3, 1, 2)
 
 
-def _check_mask(env: ManagerBasedRlEnv, sensor_name: str, command_name: str, **_: Any) -> None:
-    _check_camera(env, sensor_name, "segmentation")
-    require_command(env, command_name)
-    multi_cube_command(env, command_name)
-
-
-@checked_when_built(_check_mask)
+@checked_when_built(partial(_check_camera, data_type="segmentation"))
 def camera_target_cube_mask(
     env: ManagerBasedRlEnv, sensor_name: str, command_name: str
 ) -> torch.Tensor:
@@ -205,35 +212,21 @@ def camera_target_cube_mask(
     Raises:
         TypeError: the command is not a `MultiCubeLiftingCommand`.
     """
-    target = multi_cube_command(env, command_name).target_geom_ids
+    target = goal_command(env, command_name, MultiCubeLiftingCommand).target_geom_ids
     ids, types = env.scene[sensor_name].data.segmentation.unbind(dim=-1)
     is_target = (ids.unsqueeze(-1) == target[:, None, None, :]).any(dim=-1)
     return (is_target & (types == _GEOM)).float().unsqueeze(1)
 
 
-# Shared lookups and checks.
+# Shared lookups.
 
 
-def lifting_command(env: ManagerBasedRlEnv, name: str) -> LiftingCommand:
-    """Return the command; raises `TypeError` unless it is a `LiftingCommand`."""
-    return _command(env, name, LiftingCommand)
-
-
-def multi_cube_command(env: ManagerBasedRlEnv, name: str) -> MultiCubeLiftingCommand:
-    """Return the command; raises `TypeError` unless it is a `MultiCubeLiftingCommand`."""
-    return _command(env, name, MultiCubeLiftingCommand)
-
-
-def goal_command(env: ManagerBasedRlEnv, name: str) -> LiftingCommand | MultiCubeLiftingCommand:
-    """Return the command; raises `TypeError` unless it is one of the two lifting commands."""
-    return _command(env, name, (LiftingCommand, MultiCubeLiftingCommand))
-
-
-def _command(env: ManagerBasedRlEnv, name: str, kind: Any) -> Any:
+def goal_command(env: ManagerBasedRlEnv, name: str, *kinds: type) -> Any:
+    """Return the command; raises `TypeError` unless it is of one of `kinds` (default: either lifting command)."""
+    kinds = kinds or (LiftingCommand, MultiCubeLiftingCommand)
     command = env.command_manager.get_term(name)
-    if not isinstance(command, kind):
-        kinds = kind if isinstance(kind, tuple) else (kind,)
-        expected = " or ".join(cls.__name__ for cls in kinds)
+    if not isinstance(command, kinds):
+        expected = " or ".join(kind.__name__ for kind in kinds)
         raise WrongTypeError(
             f"Command {name!r}: expected {expected}, got {type(command).__name__}."
         )
@@ -250,77 +243,6 @@ def site_quat(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor
     """Return the world orientation of the selected site, (N, 4)."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.site_quat_w[:, as_columns(asset_cfg.site_ids, env.device)].squeeze(1)
-
-
-def check_single(
-    env: ManagerBasedRlEnv,
-    command_name: str,
-    object_name: str,
-    asset_cfg: SceneEntityCfg | None = None,
-    **params: Any,
-) -> None:
-    """Check a single-object term, and that the arm of `asset_cfg` reaches object and goal."""
-    require_command(env, command_name)
-    command = lifting_command(env, command_name)
-    check_entity(env, object_name, "object_name")
-    check_stds(**params)
-    if asset_cfg is not None:
-        check_reach(env, command_name, command.cfg, asset_cfg.name, check_site(env, asset_cfg))
-
-
-def check_single_with_hand(
-    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG, **params: Any
-) -> None:
-    """Check a single-object term that reads the end effector."""
-    check_single(env, asset_cfg=asset_cfg, **params)
-
-
-def check_multi(
-    env: ManagerBasedRlEnv,
-    command_name: str,
-    asset_cfg: SceneEntityCfg | None = None,
-    **params: Any,
-) -> None:
-    """Check a multi-object term, and that the arm of `asset_cfg` reaches objects and goal."""
-    require_command(env, command_name)
-    command = multi_cube_command(env, command_name)
-    check_stds(**params)
-    if asset_cfg is not None:
-        check_reach(env, command_name, command.cfg, asset_cfg.name, check_site(env, asset_cfg))
-
-
-def check_multi_with_hand(
-    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG, **params: Any
-) -> None:
-    """Check a multi-object term that reads the end effector."""
-    check_multi(env, asset_cfg=asset_cfg, **params)
-
-
-def check_entity(env: ManagerBasedRlEnv, name: str, field: str) -> None:
-    """Raise `ValueError` unless the scene has an entity called `name`."""
-    check_exists(f"entity in {field}", name, env.scene.entities)
-
-
-def check_site(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> str:
-    """Return the name of the selected site; raises `ValueError` unless exactly one is selected."""
-    check_entity(env, asset_cfg.name, "asset_cfg.name")
-    names = env.scene.entities[asset_cfg.name].site_names
-    ids = asset_cfg.site_ids
-    selected = list(names[ids]) if isinstance(ids, slice) else [names[index] for index in ids]
-    if len(selected) != 1:
-        raise ValueError(
-            f"asset_cfg: expected one site of entity {asset_cfg.name!r}, got {len(selected)}; set "
-            "site_names, e.g. to the site between the fingers. Available: "
-            f"{list(names)}."
-        )
-    return selected[0]
-
-
-def check_stds(**params: Any) -> None:
-    """Raise `ValueError` unless all parameters named `std` or `..._std` are positive."""
-    for name, value in params.items():
-        if name.endswith("std"):
-            check_positive(name, value)
 
 
 __getattr__ = older_names(__name__)

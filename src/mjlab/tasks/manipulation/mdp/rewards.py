@@ -6,25 +6,21 @@ before the last physics substep.
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import checked_when_built
+from mjlab.tasks.manipulation.mdp.commands import LiftingCommand, MultiCubeLiftingCommand
 from mjlab.tasks.manipulation.mdp.observations import (
     DEFAULT_ASSET_CFG,
-    check_multi,
-    check_multi_with_hand,
-    check_single,
-    check_single_with_hand,
-    lifting_command,
-    multi_cube_command,
+    check_task_term,
+    goal_command,
     site_pos,
 )
-from mjlab.utils.errors import check_in_range
 from mjlab.utils.indexing import as_columns
 
 if TYPE_CHECKING:
@@ -40,7 +36,7 @@ __all__ = [
 ]
 
 
-@checked_when_built(check_single_with_hand)
+@checked_when_built(partial(check_task_term, kinds=(LiftingCommand,), has_hand=True))
 def staged_position_reward(
     env: ManagerBasedRlEnv,
     command_name: str,
@@ -55,22 +51,22 @@ def staged_position_reward(
     the end effector to the object (m) and g the distance from the object to the goal (m).
     """
     target: Entity = env.scene[object_name]
-    goal = lifting_command(env, command_name).target_pos
+    goal = goal_command(env, command_name, LiftingCommand).target_pos
     hand = site_pos(env, asset_cfg)
     return _staged(hand, target.data.root_link_pos_w, goal, reaching_std, bringing_std)
 
 
-@checked_when_built(check_single)
+@checked_when_built(partial(check_task_term, kinds=(LiftingCommand,)))
 def bring_object_reward(
     env: ManagerBasedRlEnv, command_name: str, object_name: str, std: float
 ) -> torch.Tensor:
     """Reward an object at its goal: `exp(-g^2 / std^2)`, g: distance from object to goal (m)."""
     target: Entity = env.scene[object_name]
-    goal = lifting_command(env, command_name).target_pos
+    goal = goal_command(env, command_name, LiftingCommand).target_pos
     return _closeness(target.data.root_link_pos_w, goal, std)
 
 
-@checked_when_built(check_multi_with_hand)
+@checked_when_built(partial(check_task_term, kinds=(MultiCubeLiftingCommand,), has_hand=True))
 def multi_cube_staged_position_reward(
     env: ManagerBasedRlEnv,
     command_name: str,
@@ -79,26 +75,22 @@ def multi_cube_staged_position_reward(
     asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
 ) -> torch.Tensor:
     """Reward reaching the target object and its goal; see `staged_position_reward`."""
-    command = multi_cube_command(env, command_name)
+    command = goal_command(env, command_name, MultiCubeLiftingCommand)
     hand = site_pos(env, asset_cfg)
     target = command.target_object_pos()
     return _staged(hand, target, command.target_pos, reaching_std, bringing_std)
 
 
-@checked_when_built(check_multi)
+@checked_when_built(partial(check_task_term, kinds=(MultiCubeLiftingCommand,)))
 def multi_cube_bring_object_reward(
     env: ManagerBasedRlEnv, command_name: str, std: float
 ) -> torch.Tensor:
     """Reward the target object at its goal; see `bring_object_reward`."""
-    command = multi_cube_command(env, command_name)
+    command = goal_command(env, command_name, MultiCubeLiftingCommand)
     return _closeness(command.target_object_pos(), command.target_pos, std)
 
 
-def _check_max_vel(env: ManagerBasedRlEnv, max_vel: float, **_: Any) -> None:
-    check_in_range("max_vel", max_vel, 0.0, math.inf)
-
-
-@checked_when_built(_check_max_vel)
+@checked_when_built(check_task_term)
 def joint_velocity_hinge_penalty(
     env: ManagerBasedRlEnv, max_vel: float, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:

@@ -14,7 +14,7 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.lookup import Lookup
-from mjlab.managers.term_checks import check_range, require_command
+from mjlab.managers.term_checks import check_range
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
     MotionReader,
@@ -34,7 +34,6 @@ from mjlab.tasks.tracking.mdp.motion_sampling import (
 from mjlab.utils.errors import (
     WrongTypeError,
     check_count,
-    check_exists,
     check_one_of,
     check_positive,
 )
@@ -250,7 +249,9 @@ class MotionCommand(MotionReader, CommandTerm):
     @property
     def frame_indexes(self) -> torch.Tensor:
         """(N,) int64, frame of each environment, indexed over all motions."""
-        return self._global_frames(self.time_steps)
+        if len(self.motion) == 1:
+            return self.time_steps
+        return self.time_steps + self.motion.starts.index_select(0, self.motion_ids)
 
     @property
     def matching_frame(self) -> MotionFrame:
@@ -258,12 +259,8 @@ class MotionCommand(MotionReader, CommandTerm):
 
         Between steps the command itself is one frame ahead of the robot.
         """
-        return MotionFrame(self, self._global_frames((self.time_steps - 1).clamp_(min=0)))
-
-    def _global_frames(self, frames: torch.Tensor) -> torch.Tensor:
-        if len(self.motion) == 1:
-            return frames
-        return frames + self.motion.starts.index_select(0, self.motion_ids)
+        # The first frame of a motion has no predecessor.
+        return MotionFrame(self, self.frame_indexes - self.time_steps.clamp(max=1))
 
     def update_relative_body_poses(self) -> None:
         """Update the relative poses from the current reference and robot state."""
@@ -319,15 +316,15 @@ class MotionCommand(MotionReader, CommandTerm):
             self._num_starts[env_ids] += 1
             return motions, torch.zeros_like(motions)
         if self.sampler is None:
-            self._write_sampling_metrics(1.0, 1.0 / self._num_bins, 0.5)
-            return draw_uniform(self.motion, len(env_ids))
-        probabilities = self.sampler.probabilities()
-        self._write_sampling_metrics(*self.sampler.statistics(probabilities))
-        return self.sampler.draw(self.motion, len(env_ids), probabilities)
-
-    def _write_sampling_metrics(self, *values: Any) -> None:
-        for name, value in zip(_SAMPLING_METRICS, values, strict=True):
+            statistics: tuple[Any, ...] = (1.0, 1.0 / self._num_bins, 0.5)
+            drawn = draw_uniform(self.motion, len(env_ids))
+        else:
+            probabilities = self.sampler.probabilities()
+            statistics = self.sampler.statistics(probabilities)
+            drawn = self.sampler.draw(self.motion, len(env_ids), probabilities)
+        for name, value in zip(_SAMPLING_METRICS, statistics, strict=True):
             self.metrics[name][:] = value
+        return drawn
 
     def _write_start(self, env_ids: torch.Tensor, perturbed: bool) -> None:
         """Write the robot state of the current frame; reset targets, delays and histories."""
@@ -381,12 +378,9 @@ class MotionCommand(MotionReader, CommandTerm):
 
     def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
         """Plan the lookups of `compute(dt)`; see `CommandTerm.plan_lookups`."""
-        is_over = self._is_over(self.time_steps + 1)
+        is_over = self.time_steps + 1 >= self.motion.lengths[self.motion_ids]
         over = self._over.plan(is_over, self.time_steps, self.motion_ids)
         return [*super().plan_lookups(dt), over]
-
-    def _is_over(self, time_steps: torch.Tensor) -> torch.Tensor:
-        return time_steps >= self.motion.lengths[self.motion_ids]
 
     def _update_metrics(self) -> None:
         if self._started:
@@ -402,7 +396,8 @@ class MotionCommand(MotionReader, CommandTerm):
         over = None if env_ids is not None else self._over.take(self.time_steps, self.motion_ids)
         self.time_steps[slice(None) if env_ids is None else env_ids] += 1
         if over is None:
-            over = self._is_over(self.time_steps).nonzero().flatten()
+            is_over = self.time_steps >= self.motion.lengths[self.motion_ids]
+            over = is_over.nonzero().flatten()
         if not is_empty(over):
             self._resample_command(over)
             if self.cfg.advance_after_teleport:
@@ -492,11 +487,11 @@ def check_motion_term(
     """Check a term that reads a motion command.
 
     Raises:
-        ValueError: unknown command, a body that the command does not track, empty `body_names`, or
-            `std` or `threshold` not positive.
+        KeyError: unknown command.
+        ValueError: a body that the command does not track, empty `body_names`, or `std` or
+            `threshold` not positive.
         TypeError: the command lacks attributes of `MotionCommand`.
     """
-    require_command(env, command_name)
     command: Any = motion_command(env, command_name)
     missing: list[str] = []
     if not isinstance(command, MotionCommand):
@@ -545,11 +540,7 @@ def check_command_cfg(cfg: MotionCommandCfg) -> None:
     """Raise `ValueError` for invalid names, ranges or numbers in the config."""
     if len(set(cfg.body_names)) != len(cfg.body_names):
         raise ValueError(f"body_names: expected distinct bodies, got {list(cfg.body_names)}.")
-    if cfg.anchor_body_name not in cfg.body_names:
-        raise ValueError(
-            f"anchor_body_name: expected one of body_names, {list(cfg.body_names)}, got "
-            f"{cfg.anchor_body_name!r}."
-        )
+    check_one_of("anchor_body_name", cfg.anchor_body_name, cfg.body_names)
     check_one_of("sampling_mode", cfg.sampling_mode, _MODES)
     check_one_of("viz.mode", cfg.viz.mode, _DRAWINGS)
     for name in ("pose_range", "velocity_range"):
@@ -569,10 +560,10 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
     """Return the entity `cfg.entity_name`.
 
     Raises:
-        ValueError: unknown entity, fixed base, a tracked body not found, or the first tracked body
-            is not the floating base.
+        KeyError: unknown entity.
+        ValueError: fixed base, a tracked body not found, or the first tracked body is not the
+            floating base.
     """
-    check_exists("entity in entity_name", cfg.entity_name, env.scene.entities)
     robot: Entity = env.scene[cfg.entity_name]
     if robot.is_fixed_base:
         raise ValueError(
@@ -585,11 +576,10 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
             f"body_names: expected bodies of entity {cfg.entity_name!r}, got {missing}. Available: "
             f"{list(robot.body_names)}."
         )
-    root = robot.body_names[0]
-    if cfg.body_names[0] != root:
+    if cfg.body_names[0] != robot.body_names[0]:
         raise ValueError(
-            f"body_names: expected the floating base {root!r} first, got {cfg.body_names[0]!r}. "
-            "Episodes start from its pose."
+            f"body_names: expected the floating base {robot.body_names[0]!r} first, got "
+            f"{cfg.body_names[0]!r}. Episodes start from its pose."
         )
     return robot
 

@@ -39,12 +39,12 @@ _LONGER_THAN_MOTIONS_S = 3600.0
 
 def compute_mpkpe(command: MotionReader) -> torch.Tensor:
     """Return the mean distance of the tracked bodies to the reference in the world (m), (N,)."""
-    return _distance(command.body_pos_w, command.robot_body_pos_w).mean(dim=1)
+    return (command.body_pos_w - command.robot_body_pos_w).norm(dim=-1).mean(dim=1)
 
 
 def compute_root_relative_mpkpe(command: MotionReader) -> torch.Tensor:
     """Return the mean distance of the tracked bodies to the relative reference (m), (N,)."""
-    return _distance(command.body_pos_relative_w, command.robot_body_pos_w).mean(dim=1)
+    return (command.body_pos_relative_w - command.robot_body_pos_w).norm(dim=-1).mean(dim=1)
 
 
 def compute_joint_velocity_error(command: MotionReader) -> torch.Tensor:
@@ -64,7 +64,7 @@ def compute_ee_position_error(
             len(command.robot_joint_vel), dtype=torch.float32, device=command.body_indexes.device
         )
     columns = body_columns(command, ee_body_names)
-    distance = _distance(command.body_pos_relative_w, command.robot_body_pos_w)
+    distance = (command.body_pos_relative_w - command.robot_body_pos_w).norm(dim=-1)
     return distance[:, columns].mean(dim=1)
 
 
@@ -82,10 +82,6 @@ def compute_ee_orientation_error(
     columns = body_columns(command, ee_body_names)
     angle = quat_error_magnitude(command.body_quat_relative_w, command.robot_body_quat_w)
     return angle[:, columns].mean(dim=1)
-
-
-def _distance(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    return torch.linalg.vector_norm(one - other, dim=-1)
 
 
 # Evaluation metrics, and the config of evaluation environments.

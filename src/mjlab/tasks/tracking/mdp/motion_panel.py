@@ -63,7 +63,8 @@ class MotionPanel:
         self._library, self._num_envs = motion, num_envs
         self._get_env_idx, self._get_frame, self._set_frame = get_env_idx, get_frame, set_frame
         self._get_matching, self._get_current = get_matching, get_current
-        self._on_change, self._request_action = on_change, request_action
+        self._on_change = on_change or (lambda: None)
+        self._request_action = request_action
         self._paused = False
         self._requested: tuple[int, int] | None = None
         self._start: tuple[int, int] | None = None
@@ -91,7 +92,7 @@ class MotionPanel:
         @beside.on_update
         def _(_event: Any) -> None:
             ghost_offset[1] = beside.value
-            self._redraw()
+            self._on_change()
 
     def set_paused(self, paused: bool) -> None:
         """Store the pause state; enable frame and motion selection while paused."""
@@ -157,7 +158,7 @@ class MotionPanel:
         motion = self._library.names.index(self._motion.value)
         last = int(self._library.lengths[motion]) - 1
         self._requested = motion, min(int(self._frame.value), last)
-        self._redraw()
+        self._on_change()
 
     def _start_here(self, _event: Any) -> None:
         motion = self._library.names.index(self._motion.value)
@@ -165,7 +166,3 @@ class MotionPanel:
         if self._request_action is not None:
             payload = {"type": "gui_reset", "all_envs": bool(self._all_envs.value)}
             self._request_action("start_here", payload)
-
-    def _redraw(self) -> None:
-        if self._on_change is not None:
-            self._on_change()

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul, sample_uniform
+from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul, sample_ranges, sample_uniform
 from mjlab.utils.state import stateful
-from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary
@@ -164,9 +163,11 @@ def perturbed_start(
         )
     )  # fmt: skip
     joint_pos = motion.joint_pos[frames]
-    pose = scale * _sample_axes(pose_range, count, device)
+    pose, velocity = (
+        scale * sample_ranges([ranges.get(axis, (0.0, 0.0)) for axis in AXES], count, device)
+        for ranges in (pose_range, velocity_range)
+    )
     turn = quat_from_euler_xyz(*pose[:, 3:].unbind(1))
-    velocity = scale * _sample_axes(velocity_range, count, device)
     joints = scale * sample_uniform(*joint_position_range, tuple(joint_pos.shape), device)
     root_state = torch.cat(
         (
@@ -178,11 +179,3 @@ def perturbed_start(
         dim=1,
     )
     return root_state, joint_pos + joints
-
-
-def _sample_axes(
-    ranges: Mapping[str, tuple[float, float]], count: int, device: str
-) -> torch.Tensor:
-    bounds = zip(*(ranges.get(axis, (0.0, 0.0)) for axis in AXES), strict=True)
-    low, high = (constant_tensor(side, device) for side in bounds)
-    return sample_uniform(low, high, (count, len(AXES)), device)

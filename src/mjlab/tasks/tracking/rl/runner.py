@@ -16,6 +16,7 @@ from mjlab.tasks.tracking.mdp.commands import MotionCommand
 from mjlab.tasks.tracking.mdp.motion_sampling import HardSegmentSampler
 from mjlab.tasks.tracking.motion_sources import full_artifact_name, record_motions
 from mjlab.tasks.tracking.rl.reference_actor import ReferenceActor
+from mjlab.utils.errors import check_exists
 
 if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary
@@ -66,7 +67,11 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             ValueError: no motion command found, or `ReferenceActor` cannot follow it.
         """
         super().__init__(env, train_cfg, log_dir, device)
-        self.motion_command: Any = _motion_command(self.env.unwrapped)
+        manager: Any = self.env.unwrapped.command_manager
+        terms = {name: manager.get_term(name) for name in manager.active_terms}
+        name = next((n for n, term in terms.items() if isinstance(term, MotionCommand)), "motion")
+        check_exists("motion command", name, terms)
+        self.motion_command: Any = terms[name]
         actor = self.alg.get_policy()
         if isinstance(actor, ReferenceActor):
             actor.follow(self.env.unwrapped, self.motion_command)
@@ -172,18 +177,6 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         if self._registry_name is not None and not self._is_marked:
             self._is_marked = True
             wandb.run.use_artifact(full_artifact_name(self._registry_name))
-
-
-def _motion_command(env: Any) -> Any:
-    manager = env.command_manager
-    terms = {name: manager.get_term(name) for name in manager.active_terms}
-    found = [term for term in terms.values() if isinstance(term, MotionCommand)]
-    if not found and "motion" not in terms:
-        raise ValueError(
-            "MotionTrackingOnPolicyRunner commands: expected a MotionCommand or a command named "
-            f"'motion', got {list(terms)}."
-        )
-    return found[0] if found else terms["motion"]
 
 
 class PolicyWithReference(torch.nn.Module):

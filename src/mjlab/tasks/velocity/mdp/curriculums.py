@@ -10,9 +10,9 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import check_range, checked_when_built, require_command
-from mjlab.tasks.velocity.mdp.rewards import velocity_command
-from mjlab.tasks.velocity.mdp.velocity_command import RANGES, UniformVelocityCommand
-from mjlab.utils.string import suggest
+from mjlab.tasks.velocity.mdp.rewards import check_command, velocity_command
+from mjlab.tasks.velocity.mdp.velocity_command import RANGES
+from mjlab.utils.errors import check_exists
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -42,19 +42,7 @@ class VelocityStage(TypedDict, total=False):
     """Yaw rate (rad/s)."""
 
 
-def _check_levels(
-    env: ManagerBasedRlEnv, command_name: str, use_elapsed_time: bool = False, **_: Any
-) -> None:
-    require_command(env, command_name)
-    term = env.command_manager.get_term(command_name)
-    if use_elapsed_time and not isinstance(term, UniformVelocityCommand):
-        raise ValueError(
-            f"use_elapsed_time: expected {command_name!r} to be a UniformVelocityCommand, got "
-            f"{type(term).__name__}; use False."
-        )
-
-
-@checked_when_built(_check_levels)
+@checked_when_built(check_command)
 def terrain_levels_vel(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor,
@@ -126,12 +114,8 @@ def _check_stages(
         if "step" not in stage:
             raise ValueError(f"velocity_stages: expected a stage with 'step', got {dict(stage)}.")
         for key, bounds in stage.items():
-            if key != "step" and key not in RANGES:
-                raise ValueError(
-                    f"velocity_stages: unknown range {key!r} in the stage of step {stage['step']}; "
-                    f"{suggest(key, RANGES)}"
-                )
             if key != "step" and bounds is not None:
+                check_exists("range in velocity_stages", key, RANGES)
                 check_range(f"velocity_stages: {key} of the stage of step {stage['step']}", bounds)
 
 

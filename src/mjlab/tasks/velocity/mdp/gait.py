@@ -18,10 +18,9 @@ from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.observations import height_columns
 from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
-from mjlab.utils.errors import check_positive
+from mjlab.utils.errors import check_exists, check_field, check_fields_positive, check_positive
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
-from mjlab.utils.string import suggest
 from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
@@ -90,21 +89,16 @@ class GaitClockCommand(CommandTerm):
 
     def __init__(self, cfg: GaitClockCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        check_positive("frequency", cfg.frequency)
-        if not 0.0 <= cfg.fade_s < math.inf:
-            raise ValueError(f"fade_s: expected a time of at least 0 s, got {cfg.fade_s!r}.")
-        starts = cfg.starts
-        if starts is not None and not (starts and all(0.0 <= start < 1.0 for start in starts)):
-            raise ValueError(
-                f"starts: expected offsets from 0 to below 1 (strides), got {starts!r}; use None for any."
-            )
+        check_fields_positive(cfg, "frequency")
+        check_field(cfg, "fade_s", 0.0 <= cfg.fade_s < math.inf, "a time >= 0 (s)")
+        fits = cfg.starts is None or (cfg.starts and all(0.0 <= o < 1.0 for o in cfg.starts))
+        check_field(
+            cfg, "starts", bool(fits), "offsets from 0 to below 1 (strides), or None for any"
+        )
         # Names are read from the config, because the command manager is still being built.
-        name, names = cfg.velocity_command_name, list(env.cfg.commands)
-        if name is not None and env.cfg.commands.get(name) is None:
-            raise ValueError(
-                f"velocity_command_name: unknown command {name!r}; {suggest(name, names)} Use None "
-                "if the clock should always run."
-            )
+        if cfg.velocity_command_name is not None:
+            names = [name for name, command in env.cfg.commands.items() if command is not None]
+            check_exists("command in velocity_command_name", cfg.velocity_command_name, names)
         self.cycles = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._faded = torch.zeros_like(self.cycles)
 
@@ -202,7 +196,7 @@ def _check_height_by_phase(
     **_: Any,
 ) -> None:
     require_gait_clock(env, command_name)
-    feet = [name for name, _ in height_columns(env, height_sensor_name)]
+    feet = [name for name, _ in height_columns(env, height_sensor_name).columns]
     if len(offsets) != len(feet):
         raise ValueError(
             f"offsets: expected one number per foot of {height_sensor_name!r}, {feet}, got {offsets}; "
@@ -266,7 +260,7 @@ class weighted_joint_deviation:
         asset: Entity = env.scene[asset_cfg.name]
         # Resolved names are in the order of the joint ids.
         joints = list(asset_cfg.joint_names or asset.joint_names)
-        values = values_of_joints(joints, "weights", weights, least=0.0)
+        values = values_of_joints(joints, "weights", weights, allow_zero=True)
         self._weights = torch.tensor(values, dtype=torch.float32, device=env.device)
 
     def __call__(
@@ -306,7 +300,19 @@ class feet_tilt:
                 f"{asset_cfg.site_names} and body_names={asset_cfg.body_names}; name the feet."
             )
         self._up = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float32, device=env.device)
-        self._rest = _up_at_rest(env, asset_cfg).to(env.device)
+        # World z in each foot frame, in the default pose with an upright root, (feet, 3).
+        model = env.sim.mj_model
+        data = mujoco.MjData(model)
+        asset: Entity = env.scene[asset_cfg.name]
+        addresses = model.jnt_qposadr[asset.indexing.joint_ids.tolist()]
+        data.qpos[addresses] = asset.data.default_joint_pos[0].tolist()
+        mujoco.mj_kinematics(model, data)
+        if asset_cfg.site_names:
+            matrices = data.site_xmat[asset.indexing.site_ids[asset_cfg.site_ids].cpu()]
+        else:
+            matrices = data.xmat[asset.indexing.body_ids[asset_cfg.body_ids].cpu()]
+        # The third row of a rotation matrix is world z in the rotated frame.
+        self._rest = torch.tensor(matrices[:, 6:], dtype=torch.float32, device=env.device)
 
     def __call__(self, env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
         """Return the cost, (N,)."""
@@ -318,23 +324,6 @@ class feet_tilt:
         up = quat_apply_inverse(quat, self._up.expand(*quat.shape[:-1], 3))
         # Norm of the cross product, because 1 - cos^2 cancels at small angles.
         return torch.linalg.cross(up, self._rest.expand_as(up)).square_().sum(dim=(1, 2))
-
-
-def _up_at_rest(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
-    """Return world z in each foot frame, in the default pose with an upright root, (feet, 3)."""
-    model = env.sim.mj_model
-    data = mujoco.MjData(model)
-    asset: Entity = env.scene[asset_cfg.name]
-    pose = asset.data.default_joint_pos[0].tolist()
-    for joint, position in zip(asset.indexing.joint_ids.tolist(), pose, strict=True):
-        data.qpos[model.jnt_qposadr[joint]] = position
-    mujoco.mj_kinematics(model, data)
-    if asset_cfg.site_names:
-        matrices = data.site_xmat[asset.indexing.site_ids[asset_cfg.site_ids].cpu()]
-    else:
-        matrices = data.xmat[asset.indexing.body_ids[asset_cfg.body_ids].cpu()]
-    # The third row of a rotation matrix is world z in the rotated frame.
-    return torch.tensor(matrices[:, 6:], dtype=torch.float32)
 
 
 def height_over_feet(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 
@@ -107,35 +107,44 @@ def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> 
 # Foot columns of sensors and site selections.
 
 
-# Name of a source for messages, and (name, body id) of each column.
-Source = tuple[str, list[tuple[str, int]]]
+class Source(NamedTuple):
+    """Columns of a sensor or of a selection of sites."""
+
+    name: str
+    """Name for messages."""
+    columns: list[tuple[str, int]]
+    """Name and body id of each column."""
 
 
-def contact_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str, int]]:
-    """Return name and body id of each column of a contact sensor."""
+def contact_columns(env: ManagerBasedRlEnv, sensor_name: str) -> Source:
+    """Return the columns of a contact sensor with one slot per foot."""
+    check_feet_sensor(env, sensor_name)
     sensor = require_sensor(env, sensor_name, ContactSensor)
     primary = sensor.cfg.primary
     kind = "geom" if primary.mode == "geom" else "body"
-    return [_element(env, kind, name, primary.entity) for name in sensor.primary_names]
+    columns = [_element(env, kind, name, primary.entity) for name in sensor.primary_names]
+    return Source(f"contact sensor {sensor_name!r}", columns)
 
 
-def height_columns(env: ManagerBasedRlEnv, sensor_name: str) -> list[tuple[str, int]]:
-    """Return name and body id of each column of a height sensor, in the order of its frames."""
+def height_columns(env: ManagerBasedRlEnv, sensor_name: str) -> Source:
+    """Return the columns of a height sensor, in the order of its frames."""
     check_height_sensor(env, sensor_name)
     frame = require_sensor(env, sensor_name, TerrainHeightSensor).cfg.frame
     frames = frame if isinstance(frame, tuple) else (frame,)
-    return [_element(env, ref.type, ref.name, ref.entity) for ref in frames]
+    columns = [_element(env, ref.type, ref.name, ref.entity) for ref in frames]
+    return Source(f"height sensor {sensor_name!r}", columns)
 
 
-def site_columns(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> list[tuple[str, int]]:
-    """Return name and body id of each selected site."""
+def site_columns(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> Source:
+    """Return the columns of a selection of sites."""
     entity = env.scene.entities[asset_cfg.name]
     names = entity.site_names if asset_cfg.site_names is None else asset_cfg.site_names
     if not names:
         raise ValueError(
             f"asset_cfg.site_names: expected the foot sites of entity {asset_cfg.name!r}, got none."
         )
-    return [_element(env, "site", name, asset_cfg.name) for name in names]
+    columns = [_element(env, "site", name, asset_cfg.name) for name in names]
+    return Source("asset_cfg.site_names", columns)
 
 
 def check_same_feet(env: ManagerBasedRlEnv, source: Source, other: Source) -> None:
@@ -143,17 +152,16 @@ def check_same_feet(env: ManagerBasedRlEnv, source: Source, other: Source) -> No
 
     Two columns match if they are on the same body, or one is on a descendant of the other's body.
     """
-    (name, columns), (other_name, other_columns) = source, other
     model = env.sim.mj_model
-    fits = len(columns) == len(other_columns) and all(
+    fits = len(source.columns) == len(other.columns) and all(
         _is_within(model, a, b) or _is_within(model, b, a)
-        for (_, a), (_, b) in zip(columns, other_columns, strict=True)
+        for (_, a), (_, b) in zip(source.columns, other.columns, strict=True)
     )
     if not fits:
         raise ValueError(
-            f"Columns of {name} and {other_name}: expected the same feet in the same order, got "
-            f"{[column for column, _ in columns]} and {[column for column, _ in other_columns]}. Contacts "
-            "and sites are in model order, heights in the order of the sensor's frames."
+            f"Columns of {source.name} and {other.name}: expected the same feet in the same order, got "
+            f"{[name for name, _ in source.columns]} and {[name for name, _ in other.columns]}. Contacts and sites are in model order, heights in "
+            "the order of the sensor's frames."
         )
 
 

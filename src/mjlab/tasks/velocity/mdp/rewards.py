@@ -9,7 +9,6 @@ feet in the same order. The terms check the order when they are built.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -60,12 +59,15 @@ __all__ = [
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
-def _check_tracking(env: ManagerBasedRlEnv, std: float, command_name: str, **_: Any) -> None:
-    check_positive("std", std)
+def check_command(
+    env: ManagerBasedRlEnv, command_name: str | None = None, std: float = 1.0, **_: Any
+) -> None:
+    """Raise `ValueError` unless the command exists and `std` > 0."""
     require_command(env, command_name)
+    check_positive("std", std)
 
 
-@checked_when_built(_check_tracking)
+@checked_when_built(check_command)
 def track_linear_velocity(
     env: ManagerBasedRlEnv,
     std: float,
@@ -85,7 +87,7 @@ def track_linear_velocity(
     return torch.exp(error.square().sum(dim=1) / -(std**2))
 
 
-@checked_when_built(_check_tracking)
+@checked_when_built(check_command)
 def track_angular_velocity(
     env: ManagerBasedRlEnv,
     std: float,
@@ -142,7 +144,7 @@ class upright:
         terrain_sensor_names: tuple[str, ...] | None = None,
     ) -> torch.Tensor:
         """Return the reward."""
-        quat = self._quat()
+        quat = body_quat(env.scene[asset_cfg.name].data, self._body)
         if terrain_sensor_names:
             # Copied in place: assignment in a rollout under `inference_mode` would leave an inference
             # tensor, and `reset` could not write it afterwards.
@@ -159,11 +161,12 @@ class upright:
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
         """Draw the reference direction (green) and the body z axis (blue)."""
         data = self._env.scene[self._asset_cfg.name].data
+        quat = body_quat(data, self._body)
         for index in visualizer.get_env_indices(self._env.num_envs):
             start = data.root_link_pos_w[index]
             if self._body is not None:
                 start = data.body_link_pos_w[index, self._body]
-            body_z = quat_apply(self._quat()[index : index + 1], self._up)[0]
+            body_z = quat_apply(quat[index : index + 1], self._up)[0]
             base = start.cpu().numpy()
             for direction, color in (
                 (self._normal[index], (0.2, 0.8, 0.2, 0.8)),
@@ -171,20 +174,35 @@ class upright:
             ):
                 visualizer.add_arrow(base, base + 0.3 * direction.cpu().numpy(), color)
 
-    def _quat(self) -> torch.Tensor:
-        data = self._env.scene[self._asset_cfg.name].data
-        if self._body is None:
-            return data.root_link_quat_w
-        return data.body_link_quat_w[:, self._body]
 
-
-def _check_body(
+def single_body(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG, **_: Any
-) -> None:
-    single_body(env, asset_cfg)
+) -> int | None:
+    """Return the index of the selected body; None without selection, for the root.
+
+    Raises:
+        ValueError: several bodies are selected; the message names them.
+    """
+    ids: Any = asset_cfg.body_ids
+    entity: Entity = env.scene[asset_cfg.name]
+    if isinstance(ids, slice) and asset_cfg.body_names is None:
+        return None
+    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else list(ids)
+    if len(chosen) != 1:
+        names = [entity.body_names[i] for i in chosen]
+        raise ValueError(
+            f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
+            f"body_names for the root {entity.body_names[0]!r}."
+        )
+    return int(chosen[0])
 
 
-@checked_when_built(_check_body)
+def body_quat(data: Any, body: int | None) -> torch.Tensor:
+    """Return the orientation of a body, or of the root link for None, (N, 4)."""
+    return data.root_link_quat_w if body is None else data.body_link_quat_w[:, body]
+
+
+@checked_when_built(single_body)
 def body_angular_velocity_penalty(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -242,16 +260,15 @@ class variable_posture:
                 f"walking_threshold: expected at most running_threshold {thresholds[1]}, got "
                 f"{thresholds[0]}."
             )
-        asset_cfg: SceneEntityCfg = params["asset_cfg"]
-        if asset_cfg.joint_names is None:
+        # Resolved names are in the order of the joint ids.
+        joints = params["asset_cfg"].joint_names
+        if joints is None:
             raise ValueError(
                 "asset_cfg.joint_names: expected joint names, got None; use ('.*',) for all joints."
             )
-        # Resolved names are in the order of the joint ids.
-        joints = list(asset_cfg.joint_names)
         tables = [f"std_{gait}" for gait in ("standing", "walking", "running")]
         stds = torch.tensor(
-            [values_of_joints(joints, name, params[name], above=0.0) for name in tables],
+            [values_of_joints(list(joints), name, params[name]) for name in tables],
             dtype=torch.float32,
         )
         # Weights of squared errors, (3, joints); 1 / len(joints) makes the sum a mean.
@@ -321,20 +338,25 @@ def feet_air_time(
     return if_commanded(swinging.sum(dim=1).float(), env, command_name, command_threshold)
 
 
-def _check_clearance(
+def _check_feet(
     env: ManagerBasedRlEnv,
-    height_sensor_name: str,
+    sensor_name: str = "",
+    height_sensor_name: str | None = None,
     command_name: str | None = None,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
     **_: Any,
 ) -> None:
+    """Check the command, and that contacts or heights are those of the selected sites."""
     require_command(env, command_name)
-    heights = f"height sensor {height_sensor_name!r}", height_columns(env, height_sensor_name)
-    check_same_feet(env, heights, ("asset_cfg.site_names", site_columns(env, asset_cfg)))
+    if height_sensor_name is None:
+        source = contact_columns(env, sensor_name)
+    else:
+        source = height_columns(env, height_sensor_name)
+    check_same_feet(env, source, site_columns(env, asset_cfg))
 
 
 @accepts_older_params
-@checked_when_built(_check_clearance)
+@checked_when_built(_check_feet)
 def feet_clearance(
     env: ManagerBasedRlEnv,
     target_height: float,
@@ -391,16 +413,13 @@ class feet_swing_height:
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         params = cfg.params
-        contact = params["sensor_name"]
         require_command(env, params["command_name"])
-        check_air_time_sensor(env, contact)
-        check_feet_sensor(env, contact)
+        check_air_time_sensor(env, params["sensor_name"])
         check_positive("target_height", params["target_height"])
-        feet = contact_columns(env, contact)
-        contacts = f"contact sensor {contact!r}", feet
-        self._check_feet(env, contacts, self._height_columns(env, params))
+        contacts = contact_columns(env, params["sensor_name"])
+        self._check_heights(env, params, contacts)
         self.peak_heights = torch.zeros(
-            env.num_envs, len(feet), dtype=torch.float32, device=env.device
+            env.num_envs, len(contacts.columns), dtype=torch.float32, device=env.device
         )
 
     def __call__(
@@ -433,35 +452,18 @@ class feet_swing_height:
         peaks.masked_fill_(has_landed, 0.0)
         return cost
 
-    def _check_feet(self, env: ManagerBasedRlEnv, contacts: Source, heights: Source) -> None:
-        check_same_feet(env, contacts, heights)
-
-    @staticmethod
-    def _height_columns(
-        env: ManagerBasedRlEnv, params: dict[str, Any]
-    ) -> tuple[str, list[tuple[str, int]]]:
-        name = params["height_sensor_name"]
-        return f"height sensor {name!r}", height_columns(env, name)
+    def _check_heights(
+        self, env: ManagerBasedRlEnv, params: dict[str, Any], contacts: Source
+    ) -> None:
+        """Raise `ValueError` unless heights and contacts are those of the same feet."""
+        check_same_feet(env, contacts, height_columns(env, params["height_sensor_name"]))
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Clear the peak heights of `env_ids`, so that unfinished swings do not affect the next episode."""
         self.peak_heights[slice(None) if env_ids is None else env_ids] = 0.0
 
 
-def _check_slip(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    command_name: str,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    require_command(env, command_name)
-    check_feet_sensor(env, sensor_name)
-    contacts = f"contact sensor {sensor_name!r}", contact_columns(env, sensor_name)
-    check_same_feet(env, contacts, ("asset_cfg.site_names", site_columns(env, asset_cfg)))
-
-
-@checked_when_built(_check_slip)
+@checked_when_built(_check_feet)
 def feet_slip(
     env: ManagerBasedRlEnv,
     sensor_name: str,
@@ -570,33 +572,8 @@ def tilt_of(quat: torch.Tensor) -> torch.Tensor:
     return 4.0 * s * (1.0 - s)
 
 
-def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None:
-    """Return the index of the selected body; None without selection, for the root.
-
-    Raises:
-        ValueError: several bodies are selected; the message names them.
-    """
-    ids: Any = asset_cfg.body_ids
-    entity: Entity = env.scene[asset_cfg.name]
-    if isinstance(ids, slice) and asset_cfg.body_names is None:
-        return None
-    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else list(ids)
-    if len(chosen) != 1:
-        names = [entity.body_names[i] for i in chosen]
-        raise ValueError(
-            f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
-            f"body_names for the root {entity.body_names[0]!r}."
-        )
-    return int(chosen[0])
-
-
 def values_of_joints(
-    joints: list[str],
-    name: str,
-    table: dict[str, float],
-    *,
-    above: float = -math.inf,
-    least: float = -math.inf,
+    joints: list[str], name: str, table: dict[str, float], allow_zero: bool = False
 ) -> list[float]:
     """Return the value of each joint from `table`, a dict of name pattern to value.
 
@@ -604,12 +581,11 @@ def values_of_joints(
         joints: Joint names.
         name: Parameter name for messages.
         table: Dict of joint name pattern to value.
-        above: Lower bound of the values, exclusive.
-        least: Lower bound of the values, inclusive.
+        allow_zero: Accept 0, besides numbers > 0.
 
     Raises:
         ValueError: a joint matches no pattern or several, a pattern matches no joint, or a value is
-            out of bounds.
+            negative or not allowed to be 0.
     """
     try:
         _, covered, values = resolve_matching_names_values(table, joints)
@@ -620,11 +596,9 @@ def values_of_joints(
         raise ValueError(
             f"{name}: expected patterns for all selected joints, got {list(table)}; missing: {missing}."
         )
-    wrong = {
-        pattern: value for pattern, value in table.items() if not (value > above and value >= least)
-    }
+    wrong = {p: v for p, v in table.items() if not (v >= 0.0 if allow_zero else v > 0.0)}
     if wrong:
-        bound = f"> {above:g}" if above > least else f">= {least:g}"
+        bound = ">= 0" if allow_zero else "> 0"
         raise ValueError(f"{name}: expected numbers {bound}, got {wrong}.")
     return [float(value) for value in values]
 

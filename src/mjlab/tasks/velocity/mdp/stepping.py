@@ -18,6 +18,7 @@ import torch
 
 from mjlab.envs.mdp.actions import JointPositionAction
 from mjlab.tasks.velocity.mdp.gait import require_gait_clock
+from mjlab.utils.errors import check_exists
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -119,23 +120,22 @@ class stepping_action:
         pattern = params.get("joint", "{side}_{joint}_joint")
         self._joints: dict[str, torch.Tensor] = {}
         self._columns: dict[str, torch.Tensor] = {}
-
-        def ids(values: list[int]) -> torch.Tensor:
-            return torch.tensor(values, device=env.device)
-
         reference = mujoco.MjData(env.sim.mj_model)
         mujoco.mj_kinematics(env.sim.mj_model, reference)
         for joint, axis in _AXES.items():
             names = [pattern.format(side=side, joint=joint) for side in _SIDES]
-            missing = [target for target in names if target not in term.target_names]
-            if missing:
+            for target in names:
+                check_exists(f"joint of action {name!r}", target, term.target_names)
+            ids = [asset.joint_names.index(target) for target in names]
+            axes = reference.xaxis[asset.indexing.joint_ids[ids].cpu()]
+            if (axes @ axis < _MIN_ALIGNMENT).any():
                 raise ValueError(
-                    f"joint: expected joints of action {name!r}, got {missing}. Available: "
-                    f"{list(term.target_names)}."
+                    f"joint: expected {names} to turn about {axis} in the model's reference pose, got "
+                    f"{axes.round(2).tolist()}; the stepping controller does not support these legs."
                 )
-            self._joints[joint] = ids([asset.joint_names.index(target) for target in names])
-            self._columns[joint] = ids([term.target_names.index(target) for target in names])
-            _check_axes(reference, asset, names, axis)
+            columns = [term.target_names.index(target) for target in names]
+            self._joints[joint] = torch.tensor(ids, device=env.device)
+            self._columns[joint] = torch.tensor(columns, device=env.device)
 
     def __call__(
         self,
@@ -184,16 +184,3 @@ class stepping_action:
         actions = ((targets - self._term.offset) / self._term.scale).clamp_(-_LARGEST, _LARGEST)
         actions[:, self._columns["hip_yaw"]] = 2.0
         return actions
-
-
-def _check_axes(
-    data: mujoco.MjData, asset: Entity, names: list[str], axis: tuple[float, float, float]
-) -> None:
-    for name in names:
-        joint = asset.indexing.joint_ids[asset.joint_names.index(name)].item()
-        along = float(data.xaxis[joint] @ axis)
-        if along < _MIN_ALIGNMENT:
-            raise ValueError(
-                f"joint: expected {name!r} to turn about {axis} in the model's reference pose, got "
-                f"{data.xaxis[joint].round(2).tolist()}; the stepping controller does not support this leg."
-            )

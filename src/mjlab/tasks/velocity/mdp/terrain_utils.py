@@ -10,7 +10,6 @@ import torch
 
 from mjlab.managers.term_checks import require_sensor
 from mjlab.sensor import RayCastSensor
-from mjlab.utils.errors import WrongTypeError
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -37,16 +36,12 @@ def terrain_normal_from_sensors(
         max_points: Maximum number of rays per sensor, evenly spaced over its rays.
 
     Raises:
+        ValueError: unknown sensor.
         TypeError: a sensor is not a `RayCastSensor`.
     """
     points, valid = [], []
     for name in sensor_names:
-        sensor = env.scene[name]
-        if not isinstance(sensor, RayCastSensor):
-            raise WrongTypeError(
-                f"Sensor {name!r}: expected RayCastSensor, got {type(sensor).__name__}."
-            )
-        data = sensor.data
+        data = require_sensor(env, name, RayCastSensor).data
         rays = _spread(data.distances.shape[1], max_points, str(data.distances.device))
         points.append(data.hit_pos_w[:, rays])
         valid.append(data.distances[:, rays] >= 0.0)

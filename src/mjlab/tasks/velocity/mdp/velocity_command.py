@@ -13,7 +13,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
-from mjlab.utils.errors import check_exists, check_in_range
+from mjlab.utils.errors import check_field, check_in_range
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply, wrap_to_pi
 
@@ -113,12 +113,11 @@ def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
     """Raise `ValueError` for invalid ranges, fractions or heading settings."""
     for name in RANGES:
         check_range(f"ranges.{name}", getattr(cfg.ranges, name))
-    if cfg.heading_command and cfg.ranges.heading is None:
-        raise ValueError("ranges.heading: expected a range with heading_command=True, got None.")
-    if not cfg.heading_command and cfg.ranges.heading is not None:
+    if cfg.heading_command != (cfg.ranges.heading is not None):
+        expected = "a range" if cfg.heading_command else "None"
         raise ValueError(
-            f"ranges.heading: expected None with heading_command=False, got {cfg.ranges.heading}; use "
-            "heading_command=True to command headings."
+            f"ranges.heading: expected {expected} with heading_command={cfg.heading_command}, got "
+            f"{cfg.ranges.heading}."
         )
     if cfg.ranges.heading is not None:
         check_range("ranges.heading", cfg.ranges.heading)
@@ -159,13 +158,9 @@ class UniformVelocityCommand(CommandTerm):
         # Copy the ranges, because curricula edit them at run time.
         super().__init__(dataclasses.replace(cfg, ranges=dataclasses.replace(cfg.ranges)), env)
         check_command_cfg(cfg)
-        check_exists("entity in entity_name", cfg.entity_name, env.scene.entities)
         self.robot: Entity = env.scene[cfg.entity_name]
-        if cfg.init_velocity_prob > 0.0 and self.robot.is_fixed_base:
-            raise ValueError(
-                f"init_velocity_prob: expected 0 for entity {cfg.entity_name!r} with a fixed base, got "
-                f"{cfg.init_velocity_prob}."
-            )
+        is_possible = cfg.init_velocity_prob == 0.0 or not self.robot.is_fixed_base
+        check_field(cfg, "init_velocity_prob", is_possible, "0 for an entity with a fixed base")
         self.vel_command_b = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.vel_command_w = torch.zeros_like(self.vel_command_b)
         self.heading_target = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
@@ -174,11 +169,9 @@ class UniformVelocityCommand(CommandTerm):
         self.is_standing_env = torch.zeros_like(self.is_heading_env)
         self.is_world_env = torch.zeros_like(self.is_heading_env)
         self.is_forward_env = torch.zeros_like(self.is_heading_env)
-        self.metrics = {
-            "error_vel_xy": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
-            "error_vel_yaw": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
-        }
-        self._samples = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
+        for name in ("error_vel_xy", "error_vel_yaw"):
+            self.metrics[name] = torch.zeros_like(self.heading_target)
+        self._samples = torch.zeros_like(self.heading_target)
         self._joystick: VelocityJoystick | None = None
 
     @property
@@ -291,9 +284,11 @@ class UniformVelocityCommand(CommandTerm):
                 turn = (cfg.heading_control_stiffness * error).clamp_(*cfg.ranges.ang_vel_z)
                 command[:, 2] = torch.where(self.is_heading_env[index], turn, command[:, 2])
             if cfg.rel_world_envs > 0.0:
-                turned = _rotated(self.vel_command_w[index], -heading)
-                is_world = self.is_world_env[index].unsqueeze(1)
-                command[:, :2] = torch.where(is_world, turned, command[:, :2])
+                # World to root frame: rotation about z by -heading.
+                cos, sin = torch.cos(heading), torch.sin(heading)
+                x, y = self.vel_command_w[index, 0], self.vel_command_w[index, 1]
+                turned = torch.stack((cos * x + sin * y, cos * y - sin * x), dim=1)
+                command[:, :2] = torch.where(self.is_world_env[index, None], turned, command[:, :2])
         is_standing = self.is_standing_env[index].unsqueeze(1)
         self.vel_command_b[index] = command.masked_fill_(is_standing, 0.0)
         if cfg.rel_world_envs > 0.0:
@@ -379,13 +374,6 @@ def _heading_of(quat: torch.Tensor) -> torch.Tensor:
     """Return the heading: angle from world x to the horizontal projection of body x (rad), (K,)."""
     w, x, y, z = quat.unbind(-1)
     return torch.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
-
-
-def _rotated(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Return the horizontal components of vectors rotated about z by `angle`, (K, 2)."""
-    cos, sin = torch.cos(angle), torch.sin(angle)
-    x, y = vector[:, 0], vector[:, 1]
-    return torch.stack((cos * x - sin * y, sin * x + cos * y), dim=1)
 
 
 __getattr__ = older_names(__name__)

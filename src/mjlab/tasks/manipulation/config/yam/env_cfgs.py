@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import colorsys
+import copy
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 
@@ -16,10 +17,9 @@ from mjlab.managers import (
     EventTermCfg,
     ObservationGroupCfg,
     ObservationTermCfg,
-    RewardTermCfg,
     SceneEntityCfg,
 )
-from mjlab.sensor import CameraSensorCfg, ContactSensorCfg
+from mjlab.sensor import CameraSensorCfg
 from mjlab.tasks.manipulation import mdp
 from mjlab.tasks.manipulation.lift_cube_env_cfg import make_lift_cube_env_cfg
 from mjlab.utils.errors import check_count, check_one_of
@@ -30,7 +30,9 @@ _CAMERA = "camera_d405"
 _IMAGE_SIZE = 32
 # Geom groups in camera images: ground and cubes (0), collision geoms of the arm (3).
 _SEEN_GROUPS = (0, 3)
-_DEPTH_CUTOFF = 0.5
+_DEPTH_IMAGE = ObservationTermCfg(
+    func=mdp.camera_depth, params={"sensor_name": _CAMERA, "cutoff_distance": 0.5}
+)
 _PLAY_GOAL_TIME = 4.0
 # Warp contacts to reserve per cube: cubes can touch the whole gripper and the other cubes.
 _CONTACTS_PER_CUBE = 120
@@ -73,27 +75,22 @@ class _ColoredCube:
 
 def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the config of the state-based task, for training or `play`."""
-    cfg = make_lift_cube_env_cfg()
-    cfg.scene.entities = {
-        "robot": get_yam_robot_cfg(),
-        "cube": EntityCfg(spec_fn=get_cube_spec),
-    }
-    joint_pos = cfg.actions["joint_pos"]
-    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
-    joint_pos.scale = dict(YAM_ACTION_SCALE)
-    for group in ("actor", "critic"):
-        _terms(cfg, group)["ee_to_cube"].params["asset_cfg"].site_names = _HAND
-    _reward(cfg, "lift").params["asset_cfg"].site_names = _HAND
+    cfg: Any = make_lift_cube_env_cfg()
+    cfg.scene.entities = {"robot": get_yam_robot_cfg(), "cube": EntityCfg(spec_fn=get_cube_spec)}
+    cfg.actions["joint_pos"].scale = dict(YAM_ACTION_SCALE)
+    actor, critic = cfg.observations["actor"], cfg.observations["critic"]
+    for term in (actor.terms["ee_to_cube"], critic.terms["ee_to_cube"], cfg.rewards["lift"]):
+        term.params["asset_cfg"].site_names = _HAND
     for name in ("slide", "spin", "roll"):
-        event = cfg.events[f"fingertip_friction_{name}"]
-        assert event is not None
-        event.params["asset_cfg"].geom_names = _FINGERTIPS
+        cfg.events[f"fingertip_friction_{name}"].params["asset_cfg"].geom_names = _FINGERTIPS
     (hand_on_the_ground,) = cfg.scene.sensors
-    assert isinstance(hand_on_the_ground, ContactSensorCfg)
     hand_on_the_ground.primary.pattern = "link_6"
     cfg.viewer.body_name = "arm"
     if play:
-        _make_play_cfg(cfg)
+        cfg.episode_length_s = int(1e9)
+        actor.enable_corruption = False
+        cfg.curriculum = {}
+        cfg.commands["lift_height"].resampling_time_range = (_PLAY_GOAL_TIME, _PLAY_GOAL_TIME)
     return cfg
 
 
@@ -124,7 +121,7 @@ def yam_lift_cube_vision_env_cfg(
             },
         )
     else:
-        image = _depth_image()
+        image = copy.deepcopy(_DEPTH_IMAGE)
     cfg.observations["camera"] = ObservationGroupCfg(
         terms={f"{_CAMERA}_{cam_type}": image}, enable_corruption=False
     )
@@ -151,52 +148,43 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
         ValueError: `num_cubes` is below 1.
     """
     check_count("num_cubes", num_cubes)
-    cfg = yam_lift_cube_env_cfg(play=play)
+    cfg: Any = yam_lift_cube_env_cfg(play=play)
     del cfg.scene.entities["cube"]
     cubes = tuple(f"cube_{index}" for index in range(num_cubes))
     for index, name in enumerate(cubes):
         color = (*colorsys.hsv_to_rgb(index / num_cubes, 0.8, 0.9), 1.0)
         cfg.scene.entities[name] = EntityCfg(spec_fn=_ColoredCube(color))
     cfg.sim.nconmax = max(cfg.sim.nconmax or 0, 55 + _CONTACTS_PER_CUBE * num_cubes)
-    _use_multi_cube_terms(cfg, cubes)
+    single = cfg.commands["lift_height"]
+    cfg.commands["lift_height"] = mdp.MultiCubeLiftingCommandCfg(
+        entity_names=cubes,
+        resampling_time_range=single.resampling_time_range,
+        debug_vis=single.debug_vis,
+        difficulty=single.difficulty,
+    )
+    cfg.rewards["lift"].func = mdp.multi_cube_staged_position_reward
+    cfg.rewards["lift_precise"].func = mdp.multi_cube_bring_object_reward
+    for name in ("lift", "lift_precise"):
+        del cfg.rewards[name].params["object_name"]
     cfg.scene.sensors += (_camera(("depth", "segmentation")),)
     mask = ObservationTermCfg(
         func=mdp.camera_target_cube_mask,
         params={"sensor_name": _CAMERA, "command_name": "lift_height"},
     )
     cfg.observations["camera"] = ObservationGroupCfg(
-        terms={"depth": _depth_image(), "target_mask": mask},
+        terms={"depth": copy.deepcopy(_DEPTH_IMAGE), "target_mask": mask},
         enable_corruption=False,
         # Channels; the batch dimension does not count.
         concatenate_dim=0,
     )
-    for group in ("actor", "critic"):
-        _replace_cube_by_goal(cfg, group)
+    _replace_cube_by_goal(cfg, "actor")
+    _replace_cube_by_goal(cfg, "critic")
     return cfg
 
 
-def _use_multi_cube_terms(cfg: ManagerBasedRlEnvCfg, cubes: tuple[str, ...]) -> None:
-    """Replace the single-cube command and rewards by the multi-cube ones."""
-    command = cfg.commands["lift_height"]
-    assert isinstance(command, mdp.LiftingCommandCfg)
-    cfg.commands["lift_height"] = mdp.MultiCubeLiftingCommandCfg(
-        entity_names=cubes,
-        resampling_time_range=command.resampling_time_range,
-        debug_vis=command.debug_vis,
-        difficulty=command.difficulty,
-    )
-    for name, func in (
-        ("lift", mdp.multi_cube_staged_position_reward),
-        ("lift_precise", mdp.multi_cube_bring_object_reward),
-    ):
-        old = _reward(cfg, name)
-        params = {key: value for key, value in old.params.items() if key != "object_name"}
-        cfg.rewards[name] = RewardTermCfg(func=func, weight=old.weight, params=params)
-
-
-def _replace_cube_by_goal(cfg: ManagerBasedRlEnvCfg, group: str) -> None:
+def _replace_cube_by_goal(cfg: Any, group: str) -> None:
     """Replace the cube terms of an observation group by the goal position in the hand frame."""
-    terms = _terms(cfg, group)
+    terms = cfg.observations[group].terms
     del terms["ee_to_cube"], terms["cube_to_goal"]
     terms["goal_position"] = ObservationTermCfg(
         func=mdp.target_position,
@@ -218,38 +206,3 @@ def _camera(data_types: tuple[Literal["rgb", "depth", "segmentation"], ...]) -> 
         use_shadows=False,
         enabled_geom_groups=_SEEN_GROUPS,
     )
-
-
-def _depth_image() -> ObservationTermCfg:
-    return ObservationTermCfg(
-        func=mdp.camera_depth,
-        params={"sensor_name": _CAMERA, "cutoff_distance": _DEPTH_CUTOFF},
-    )
-
-
-def _make_play_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Turn a training config into a play config.
-
-    Episodes have no time limit, observations no noise, and goals are resampled often.
-    """
-    cfg.episode_length_s = int(1e9)
-    actor = cfg.observations["actor"]
-    assert actor is not None
-    actor.enable_corruption = False
-    cfg.curriculum = {}
-    command = cfg.commands["lift_height"]
-    assert command is not None
-    command.resampling_time_range = (_PLAY_GOAL_TIME, _PLAY_GOAL_TIME)
-
-
-def _terms(cfg: ManagerBasedRlEnvCfg, group: str) -> dict[str, ObservationTermCfg]:
-    found = cfg.observations[group]
-    assert found is not None
-    # No term is None here.
-    return found.terms  # ty: ignore[invalid-explicit-return]
-
-
-def _reward(cfg: ManagerBasedRlEnvCfg, name: str) -> RewardTermCfg:
-    found = cfg.rewards[name]
-    assert found is not None
-    return found

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_ACTION_SCALE
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg
-from mjlab.tasks.tracking import mdp
 from mjlab.tasks.tracking.tracking_env_cfg import make_tracking_env_cfg
 
 MOTIONS = "squat,wave"
@@ -48,7 +49,7 @@ def unitree_g1_flat_tracking_env_cfg(
             reference anchor, which a real robot must estimate.
         play: Start at the first frame without perturbation; no noise, no pushes.
     """
-    cfg = make_tracking_env_cfg()
+    cfg: Any = make_tracking_env_cfg()
     cfg.scene.entities = {"robot": get_g1_robot_cfg()}
     itself = ContactMatch(mode="subtree", pattern="pelvis", entity="robot")
     cfg.scene.sensors += (
@@ -62,30 +63,27 @@ def unitree_g1_flat_tracking_env_cfg(
             history_length=4,
         ),
     )
-    joint_pos = cfg.actions["joint_pos"]
-    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
-    joint_pos.scale = dict(G1_ACTION_SCALE)
+    cfg.actions["joint_pos"].scale = dict(G1_ACTION_SCALE)
     motion = cfg.commands["motion"]
-    assert isinstance(motion, mdp.MotionCommandCfg)
     motion.motion_file = MOTIONS
     motion.anchor_body_name = _TORSO
     motion.body_names = _BODIES
-    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
-    end_effectors = cfg.terminations["ee_body_pos"]
-    assert friction is not None
-    assert base_com is not None
-    assert end_effectors is not None
-    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
-    base_com.params["asset_cfg"].body_names = (_TORSO,)
-    end_effectors.params["body_names"] = _END_EFFECTORS
+    cfg.events["foot_friction"].params["asset_cfg"].geom_names = _FOOT_GEOMS
+    cfg.events["base_com"].params["asset_cfg"].body_names = (_TORSO,)
+    cfg.terminations["ee_body_pos"].params["body_names"] = _END_EFFECTORS
     cfg.viewer.body_name = _TORSO
+    actor = cfg.observations["actor"]
     if not has_state_estimation:
-        actor = cfg.observations["actor"]
-        assert actor is not None
         actor.terms.pop("motion_anchor_pos_b")
         actor.terms.pop("base_lin_vel")
     if play:
-        _make_play_cfg(cfg)
+        cfg.episode_length_s = int(1e9)
+        actor.enable_corruption = False
+        cfg.events.pop("push_robot")
+        motion.pose_range = {}
+        motion.velocity_range = {}
+        motion.joint_position_range = (0.0, 0.0)
+        motion.sampling_mode = "start"
     return cfg
 
 
@@ -94,17 +92,3 @@ def unitree_g1_flat_tracking_no_state_estimation_env_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """Return the config of the task without observations of base velocity and anchor position."""
     return unitree_g1_flat_tracking_env_cfg(has_state_estimation=False, play=play)
-
-
-def _make_play_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
-    cfg.episode_length_s = int(1e9)
-    actor = cfg.observations["actor"]
-    assert actor is not None
-    actor.enable_corruption = False
-    cfg.events.pop("push_robot")
-    motion = cfg.commands["motion"]
-    assert isinstance(motion, mdp.MotionCommandCfg)
-    motion.pose_range = {}
-    motion.velocity_range = {}
-    motion.joint_position_range = (0.0, 0.0)
-    motion.sampling_mode = "start"

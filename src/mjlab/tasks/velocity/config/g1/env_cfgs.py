@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_ACTION_SCALE
 from mjlab.envs import ManagerBasedRlEnvCfg
@@ -55,29 +58,46 @@ _STD_RUNNING = {
 }
 
 
+_FEET_GROUND_CONTACT = ContactSensorCfg(
+    name="feet_ground_contact",
+    primary=ContactMatch(
+        mode="subtree", pattern=r"^(left_ankle_roll_link|right_ankle_roll_link)$", entity="robot"
+    ),
+    secondary=ContactMatch(mode="body", pattern="terrain"),
+    fields=("found", "force"),
+    reduce="netforce",
+    num_slots=1,
+    track_air_time=True,
+)
+_SELF_COLLISION = ContactSensorCfg(
+    name="self_collision",
+    primary=ContactMatch(mode="subtree", pattern="pelvis", entity="robot"),
+    secondary=ContactMatch(mode="subtree", pattern="pelvis", entity="robot"),
+    fields=("found", "force"),
+    reduce="maxforce",
+    num_slots=1,
+    history_length=4,
+)
+
+
 def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the rough-terrain task, for training or for `play`."""
-    cfg = make_velocity_env_cfg()
+    cfg: Any = make_velocity_env_cfg()
     cfg.sim.mujoco.ccd_iterations = 500
     cfg.sim.contact_sensor_maxmatch = 500
     cfg.sim.nconmax = 70
     cfg.scene.entities = {"robot": get_g1_robot_cfg()}
-    terrain = cfg.scene.terrain
-    assert terrain is not None
-    assert terrain.terrain_generator is not None
-    terrain.terrain_generator.curriculum = True
-    _set_sensors(cfg)
-    joint_pos, twist = cfg.actions["joint_pos"], cfg.commands["twist"]
-    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
-    joint_pos.scale = dict(G1_ACTION_SCALE)
-    assert isinstance(twist, mdp.UniformVelocityCommandCfg)
+    cfg.scene.terrain.terrain_generator.curriculum = True
+    terrain_scan, foot_heights = (get_sensor(cfg, n) for n in ("terrain_scan", "foot_height_scan"))
+    terrain_scan.frame = ObjRef(type="body", name="pelvis", entity="robot")
+    foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
+    foot_heights.pattern = RingPatternCfg.single_ring(radius=0.03, num_samples=6)
+    cfg.scene.sensors += copy.deepcopy((_FEET_GROUND_CONTACT, _SELF_COLLISION))
+    cfg.actions["joint_pos"].scale = dict(G1_ACTION_SCALE)
     # Draw the command above the head.
-    twist.viz.z_offset = 1.15
-    friction, base_com = cfg.events["foot_friction"], cfg.events["base_com"]
-    assert friction is not None
-    friction.params["asset_cfg"].geom_names = _FOOT_GEOMS
-    assert base_com is not None
-    base_com.params["asset_cfg"].body_names = (_TORSO,)
+    cfg.commands["twist"].viz.z_offset = 1.15
+    cfg.events["foot_friction"].params["asset_cfg"].geom_names = _FOOT_GEOMS
+    cfg.events["base_com"].params["asset_cfg"].body_names = (_TORSO,)
     _set_rewards(cfg)
     cfg.viewer.body_name = _TORSO
     if play:
@@ -90,38 +110,6 @@ def unitree_g1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     cfg = unitree_g1_rough_env_cfg(play=play)
     make_flat(cfg, play)
     return cfg
-
-
-def _set_sensors(cfg: ManagerBasedRlEnvCfg) -> None:
-    terrain_scan = get_sensor(cfg, "terrain_scan")
-    terrain_scan.frame = ObjRef(type="body", name="pelvis", entity="robot")
-    foot_heights = get_sensor(cfg, "foot_height_scan")
-    foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
-    foot_heights.pattern = RingPatternCfg.single_ring(radius=0.03, num_samples=6)
-    feet_ground_contact = ContactSensorCfg(
-        name="feet_ground_contact",
-        primary=ContactMatch(
-            mode="subtree",
-            pattern=r"^(left_ankle_roll_link|right_ankle_roll_link)$",
-            entity="robot",
-        ),
-        secondary=ContactMatch(mode="body", pattern="terrain"),
-        fields=("found", "force"),
-        reduce="netforce",
-        num_slots=1,
-        track_air_time=True,
-    )
-    itself = ContactMatch(mode="subtree", pattern="pelvis", entity="robot")
-    self_collision = ContactSensorCfg(
-        name="self_collision",
-        primary=itself,
-        secondary=itself,
-        fields=("found", "force"),
-        reduce="maxforce",
-        num_slots=1,
-        history_length=4,
-    )
-    cfg.scene.sensors += (feet_ground_contact, self_collision)
 
 
 def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import Any
 
 from mjlab.asset_zoo.robots.unitree_g1.g1_constants import FULL_COLLISION
 from mjlab.envs import ManagerBasedRlEnvCfg
@@ -80,6 +81,43 @@ _POSE = {
     r".*_(hip_yaw|ankle_pitch|ankle_roll)_joint": 5.0,
     r"(waist|.*_shoulder|.*_elbow|.*_wrist)_.*": 50.0,
 }
+# Rewards of the gait. They replace those of the task; its penalties stay.
+_GAIT_REWARDS = {
+    # The narrow kernel gives no gradient at first, the wide one too little in the end.
+    _LINEAR: RewardTermCfg(
+        func=mdp.track_linear_velocity, weight=3.0, params={"std": 0.5, "command_name": "twist"}
+    ),
+    "linear_wide": RewardTermCfg(
+        func=mdp.track_linear_velocity, weight=3.0, params={"std": 1.0, "command_name": "twist"}
+    ),
+    "angular": RewardTermCfg(
+        func=mdp.track_angular_velocity, weight=4.5, params={"std": 0.5, "command_name": "twist"}
+    ),
+    "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
+    "feet": RewardTermCfg(
+        func=mdp.feet_height_by_phase,
+        weight=5.0,
+        params={"height_sensor_name": "foot_height_scan"},
+    ),
+    "height": RewardTermCfg(
+        func=mdp.root_height_l2,
+        weight=-50.0,
+        params={"target_height": 0.74, "asset_cfg": copy.deepcopy(_FEET)},
+    ),
+    "apart": RewardTermCfg(
+        func=mdp.feet_apart_l2,
+        weight=-100.0,
+        params={"distance": 0.2, "asset_cfg": copy.deepcopy(_FEET)},
+    ),
+    "rolling": RewardTermCfg(func=mdp.body_angular_velocity_penalty, weight=-0.5),
+    "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
+    "deviation": RewardTermCfg(
+        func=mdp.weighted_joint_deviation, weight=-0.25, params={"weights": _POSE}
+    ),
+    "soles": RewardTermCfg(
+        func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": copy.deepcopy(_FEET)}
+    ),
+}
 # Colliding geoms: the long capsules of the feet, and the limbs that feet or hands may hit.
 _FOOT = r"^(left|right)_foot[26]_collision$"
 _LIMBS = tuple(
@@ -99,11 +137,18 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlB
     """
     env_cfg.scene.num_envs = _NUM_ENVS
     _add_stepping(env_cfg)
+    penalties = {n: term for n, term in env_cfg.rewards.items() if term and term.weight < 0.0}
+    rewards: dict[str, RewardTermCfg | None] = {
+        **copy.deepcopy(_GAIT_REWARDS),
+        **penalties,
+        "action_rate_l2": RewardTermCfg(func=envs_mdp.action_rate_l2, weight=-0.5),
+        "dof_pos_limits": RewardTermCfg(func=envs_mdp.joint_pos_limits, weight=-2.5),
+    }
     undos = [
         drop_easing,
         coarsen_physics(env_cfg, num_steps=3),
         _reduce_collisions(env_cfg),
-        _shape_rewards(env_cfg),
+        replace_rewards(env_cfg, rewards),
         _terminate_early(env_cfg),
     ]
     grow_difficulty(
@@ -127,17 +172,13 @@ def _add_stepping(env_cfg: ManagerBasedRlEnvCfg) -> None:
     env_cfg.commands[_CLOCK] = mdp.GaitClockCommandCfg(
         frequency=_STRIDES_PER_SECOND, starts=(0.0, 0.5), fade_s=0.3, velocity_command_name=None
     )
-    for group in env_cfg.observations.values():
-        assert group is not None
+    observations: Any = env_cfg.observations
+    for group in observations.values():
         group.terms[_CLOCK] = ObservationTermCfg(
             func=mdp.generated_commands, params={"command_name": _CLOCK}
         )
-    actor = env_cfg.observations["actor"]
-    assert actor is not None
     for name in _FILTERED:
-        term = actor.terms[name]
-        assert term is not None
-        term.history_length = _HISTORY
+        observations["actor"].terms[name].history_length = _HISTORY
     env_cfg.observations[_TEACHER] = ObservationGroupCfg(
         terms={"step": ObservationTermCfg(func=mdp.stepping_action)}
     )
@@ -160,60 +201,9 @@ def _reduce_collisions(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     return undo
 
 
-def _shape_rewards(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
-    """Replace the rewards of the task, and add penalties."""
-    twist = {"command_name": "twist"}
-    penalties = {
-        name: term
-        for name, term in env_cfg.rewards.items()
-        if term is not None and term.weight < 0.0
-    }
-    rewards = {
-        # The narrow kernel gives no gradient at first, the wide one too little in the end.
-        _LINEAR: RewardTermCfg(
-            func=mdp.track_linear_velocity, weight=3.0, params={"std": 0.5, **twist}
-        ),
-        "linear_wide": RewardTermCfg(
-            func=mdp.track_linear_velocity, weight=3.0, params={"std": 1.0, **twist}
-        ),
-        "angular": RewardTermCfg(
-            func=mdp.track_angular_velocity, weight=4.5, params={"std": 0.5, **twist}
-        ),
-        "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
-        "feet": RewardTermCfg(
-            func=mdp.feet_height_by_phase,
-            weight=5.0,
-            params={"height_sensor_name": "foot_height_scan"},
-        ),
-        "height": RewardTermCfg(
-            func=mdp.root_height_l2,
-            weight=-50.0,
-            params={"target_height": 0.74, "asset_cfg": copy.deepcopy(_FEET)},
-        ),
-        "apart": RewardTermCfg(
-            func=mdp.feet_apart_l2,
-            weight=-100.0,
-            params={"distance": 0.2, "asset_cfg": copy.deepcopy(_FEET)},
-        ),
-        "rolling": RewardTermCfg(func=mdp.body_angular_velocity_penalty, weight=-0.5),
-        "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
-        "deviation": RewardTermCfg(
-            func=mdp.weighted_joint_deviation, weight=-0.25, params={"weights": dict(_POSE)}
-        ),
-        "soles": RewardTermCfg(
-            func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": copy.deepcopy(_FEET)}
-        ),
-        **penalties,
-        "action_rate_l2": RewardTermCfg(func=envs_mdp.action_rate_l2, weight=-0.5),
-        "dof_pos_limits": RewardTermCfg(func=envs_mdp.joint_pos_limits, weight=-2.5),
-    }
-    return replace_rewards(env_cfg, rewards)
-
-
 def _terminate_early(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     """Terminate falling robots earlier: the rest of a fall teaches little."""
-    fell = env_cfg.terminations["fell_over"]
-    assert fell is not None
+    fell: Any = env_cfg.terminations["fell_over"]
     before, early = fell.params["limit_angle"], math.radians(60.0)
     fell.params["limit_angle"] = early
     env_cfg.terminations["sank"] = TerminationTermCfg(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import copy
+from typing import Any, Literal
 
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_go1.go1_constants import GO1_ACTION_SCALE
@@ -27,20 +28,62 @@ _FEET = ("FR", "FL", "RR", "RL")
 _FOOT_GEOMS = tuple(f"{foot}_foot_collision" for foot in _FEET)
 
 
+def _touch(name: str, geoms: list[str]) -> ContactSensorCfg:
+    """Return a sensor of the strongest ground contact of each geom, with a history of substeps."""
+    return ContactSensorCfg(
+        name=name,
+        primary=ContactMatch(mode="geom", pattern=tuple(geoms), entity="robot"),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+        fields=("found", "force"),
+        reduce="maxforce",
+        num_slots=1,
+        history_length=4,
+    )
+
+
+_CONTACT_SENSORS = (
+    ContactSensorCfg(
+        name="feet_ground_contact",
+        primary=ContactMatch(mode="geom", pattern=_FOOT_GEOMS, entity="robot"),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+        fields=("found", "force"),
+        reduce="netforce",
+        num_slots=1,
+        track_air_time=True,
+    ),
+    ContactSensorCfg(
+        name="self_collision",
+        primary=ContactMatch(mode="subtree", pattern=_TRUNK, entity="robot"),
+        secondary=ContactMatch(mode="subtree", pattern=_TRUNK, entity="robot"),
+        history_length=4,
+    ),
+    _touch("thigh_ground_touch", [f"{f}_thigh_collision{i}" for f in _FEET for i in (1, 2, 3)]),
+    _touch("shank_ground_touch", [f"{f}_calf_collision{i}" for f in _FEET for i in (1, 2)]),
+    _touch("trunk_ground_touch", ["trunk_collision", "head_collision"]),
+)
+
+
 def unitree_go1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the rough-terrain task, for training or for `play`."""
-    cfg = make_velocity_env_cfg()
+    cfg: Any = make_velocity_env_cfg()
     cfg.sim.mujoco.ccd_iterations = 500
     cfg.sim.mujoco.impratio = 10
     cfg.sim.mujoco.cone = "elliptic"
     cfg.sim.contact_sensor_maxmatch = 500
     cfg.scene.entities = {"robot": get_go1_robot_cfg()}
-    terrain = cfg.scene.terrain
-    assert terrain is not None
-    assert terrain.terrain_generator is not None
-    terrain.terrain_generator.curriculum = True
-    _set_sensors(cfg)
-    _set_actions_and_events(cfg)
+    cfg.scene.terrain.terrain_generator.curriculum = True
+    terrain_scan, foot_heights = (get_sensor(cfg, n) for n in ("terrain_scan", "foot_height_scan"))
+    terrain_scan.frame = ObjRef(type="body", name=_TRUNK, entity="robot")
+    foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
+    foot_heights.pattern = RingPatternCfg.single_ring(radius=0.04, num_samples=4)
+    cfg.scene.sensors += copy.deepcopy(_CONTACT_SENSORS)
+    cfg.actions["joint_pos"].scale = dict(GO1_ACTION_SCALE)
+    cfg.events["base_com"].params["asset_cfg"].body_names = (_TRUNK,)
+    # Feet have condim 6; torsional and rolling friction range over orders of magnitude.
+    cfg.events.pop("foot_friction")
+    cfg.events["foot_friction_slide"] = _foot_friction(0, (0.3, 1.5))
+    cfg.events["foot_friction_spin"] = _foot_friction(1, (1e-4, 2e-2), "log_uniform")
+    cfg.events["foot_friction_roll"] = _foot_friction(2, (1e-5, 5e-3), "log_uniform")
     _set_rewards(cfg)
     cfg.terminations.pop("fell_over")
     cfg.terminations["illegal_contact"] = TerminationTermCfg(
@@ -65,64 +108,8 @@ def unitree_go1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     for name in ("self_collisions", "shank_collision", "trunk_head_collision"):
         cfg.rewards.pop(name)
     cfg.terminations.pop("illegal_contact")
-    fell_over = make_velocity_env_cfg().terminations["fell_over"]
-    cfg.terminations["fell_over"] = fell_over
+    cfg.terminations["fell_over"] = make_velocity_env_cfg().terminations["fell_over"]
     return cfg
-
-
-def _set_sensors(cfg: ManagerBasedRlEnvCfg) -> None:
-    terrain_scan = get_sensor(cfg, "terrain_scan")
-    terrain_scan.frame = ObjRef(type="body", name=_TRUNK, entity="robot")
-    foot_heights = get_sensor(cfg, "foot_height_scan")
-    foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
-    foot_heights.pattern = RingPatternCfg.single_ring(radius=0.04, num_samples=4)
-    feet_ground_contact = ContactSensorCfg(
-        name="feet_ground_contact",
-        primary=ContactMatch(mode="geom", pattern=_FOOT_GEOMS, entity="robot"),
-        secondary=ContactMatch(mode="body", pattern="terrain"),
-        fields=("found", "force"),
-        reduce="netforce",
-        num_slots=1,
-        track_air_time=True,
-    )
-    itself = ContactMatch(mode="subtree", pattern=_TRUNK, entity="robot")
-    self_collision = ContactSensorCfg(
-        name="self_collision", primary=itself, secondary=itself, history_length=4
-    )
-    cfg.scene.sensors += (
-        feet_ground_contact,
-        self_collision,
-        _touch("thigh_ground_touch", [f"{f}_thigh_collision{i}" for f in _FEET for i in (1, 2, 3)]),
-        _touch("shank_ground_touch", [f"{f}_calf_collision{i}" for f in _FEET for i in (1, 2)]),
-        _touch("trunk_ground_touch", ["trunk_collision", "head_collision"]),
-    )
-
-
-def _touch(name: str, geoms: list[str]) -> ContactSensorCfg:
-    """Return a sensor of the strongest ground contact of each geom, with a history of substeps."""
-    return ContactSensorCfg(
-        name=name,
-        primary=ContactMatch(mode="geom", pattern=tuple(geoms), entity="robot"),
-        secondary=ContactMatch(mode="body", pattern="terrain"),
-        fields=("found", "force"),
-        reduce="maxforce",
-        num_slots=1,
-        history_length=4,
-    )
-
-
-def _set_actions_and_events(cfg: ManagerBasedRlEnvCfg) -> None:
-    joint_pos = cfg.actions["joint_pos"]
-    assert isinstance(joint_pos, mdp.JointPositionActionCfg)
-    joint_pos.scale = dict(GO1_ACTION_SCALE)
-    base_com = cfg.events["base_com"]
-    assert base_com is not None
-    base_com.params["asset_cfg"].body_names = (_TRUNK,)
-    # Feet have condim 6; torsional and rolling friction range over orders of magnitude.
-    cfg.events.pop("foot_friction")
-    cfg.events["foot_friction_slide"] = _foot_friction(0, (0.3, 1.5))
-    cfg.events["foot_friction_spin"] = _foot_friction(1, (1e-4, 2e-2), "log_uniform")
-    cfg.events["foot_friction_roll"] = _foot_friction(2, (1e-5, 5e-3), "log_uniform")
 
 
 def _foot_friction(
@@ -150,10 +137,8 @@ def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
     params["body_ang_vel"]["asset_cfg"].body_names = (_TRUNK,)
     for name in ("foot_clearance", "foot_slip"):
         params[name]["asset_cfg"].site_names = _FEET
-    hips_and_thighs, calves = (
-        r".*(FR|FL|RR|RL)_(hip|thigh)_joint.*",
-        r".*(FR|FL|RR|RL)_calf_joint.*",
-    )
+    hips_and_thighs = r".*(FR|FL|RR|RL)_(hip|thigh)_joint.*"
+    calves = r".*(FR|FL|RR|RL)_calf_joint.*"
     params["pose"]["std_standing"] = {hips_and_thighs: 0.05, calves: 0.1}
     params["pose"]["std_walking"] = {hips_and_thighs: 0.3, calves: 0.6}
     params["pose"]["std_running"] = {hips_and_thighs: 0.3, calves: 0.6}

@@ -1,17 +1,23 @@
-"""Rows and output of the benchmark table."""
+"""Rows of the benchmark table, timers of alternating functions, and commands in separate processes."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from mjlab.utils.processes import available_cores
 
 RESULTS = Path(__file__).parent / "results"
+Sample = Callable[[], Any]
 
 
 @dataclass(frozen=True)
@@ -72,3 +78,47 @@ def processor() -> str:
         if line.startswith("model name"):
             return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def alternate(
+    *samples: Sample,
+    steps: int = 20,
+    repeats: int = 15,
+    warm_up: int = 5,
+    before: Sample = lambda: None,
+    wait: Sample = lambda: None,
+) -> list[float]:
+    """Return the median time of each sample, in seconds, taking turns so that noise hits all.
+
+    `before` is called before each round of samples, and not timed. `wait` returns when a device has
+    done what samples have queued on it.
+    """
+    for sample in samples:
+        for _ in range(warm_up):
+            sample()
+    times: list[list[float]] = [[] for _ in samples]
+    turns = list(zip(samples, times, strict=True))
+    for _ in range(repeats):
+        before()
+        # Reverse the order: the caches favor one position.
+        turns.reverse()
+        for sample, taken in turns:
+            wait()
+            begin = time.perf_counter()
+            for _ in range(steps):
+                sample()
+            wait()
+            taken.append((time.perf_counter() - begin) / steps)
+    return [statistics.median(taken) for taken in times]
+
+
+def output_of(command: list[str]) -> str:
+    """Run a command; return what it prints.
+
+    Raises:
+        RuntimeError: it failed; the message ends with what it said of that.
+    """
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr[-2000:]}")
+    return done.stdout

@@ -1,0 +1,148 @@
+"""Legacy task registry and functions of scripts; resolved through the tables of `mjlab.compat`."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import tempfile
+from collections.abc import Iterator, MutableMapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjlab.tasks import registry
+
+logger = logging.getLogger(__name__)
+
+# Task registry as a dict.
+
+
+@dataclass
+class RegisteredTask:
+    """Copies of a task's configs, and its runner class."""
+
+    env_cfg: Any
+    """Environment config for training."""
+    play_env_cfg: Any
+    """Environment config for play."""
+    rl_cfg: Any
+    """Config of the learner."""
+    runner_cls: type | None
+    """Runner class. None: default."""
+
+
+class _Registry(MutableMapping[str, RegisteredTask]):
+    """Registered tasks by name."""
+
+    def __getitem__(self, name: str) -> RegisteredTask:
+        return RegisteredTask(
+            registry.load_env_cfg(name),
+            registry.load_env_cfg(name, play=True),
+            registry.load_rl_cfg(name),
+            registry.load_runner_cls(name),
+        )
+
+    def __setitem__(self, name: str, task: RegisteredTask) -> None:
+        if name in self:
+            del self[name]
+        registry.register_mjlab_task(
+            name, task.env_cfg, task.play_env_cfg, task.rl_cfg, task.runner_cls
+        )
+
+    def __delitem__(self, name: str) -> None:
+        registry.require_task(name)
+        del registry._tasks[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in iter(self)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(registry.list_tasks())
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+REGISTRY = _Registry()
+
+
+# Legacy functions of scripts.
+
+
+def run_sim(
+    sim: Any,
+    scene: Any,
+    joint_names: Sequence[str],
+    input_file: str,
+    input_fps: float,
+    output_fps: float,
+    output_name: str,
+    render: bool,
+    line_range: tuple[int, int] | None,
+    renderer: Any = None,
+) -> None:
+    """Convert a CSV of poses of the scene's `robot` to `motion.npz`.
+
+    Writes to the temporary folder, as in 1.6, with a copy `<output_name>.npz` in the working folder.
+    `csv_to_npz` uploads it with `--upload True`.
+
+    Args:
+        sim: No effect; the conversion needs no simulation.
+        scene: Scene with the robot.
+        joint_names: Joints in column order. Other joints keep their default position.
+        input_file: CSV file.
+        input_fps: Poses per second of the CSV.
+        output_fps: Frames per second of the motion.
+        output_name: Name of the motion.
+        render: Record a video next to the copy.
+        line_range: First and last line to read, counted from 1. None: all lines.
+        renderer: No effect.
+    """
+    from mjlab.scripts.csv_to_npz import record_motion
+    from mjlab.tasks.tracking.motion_file import npz_path, write_motion
+    from mjlab.tasks.tracking.motion_recording import make_motion, read_csv, resampled
+
+    robot = scene["robot"]
+    recording = read_csv(input_file, input_fps, joint_names, line_range)
+    joint_pos = robot.data.default_joint_pos[0].cpu().numpy()
+    joint_pos = np.tile(joint_pos, (len(recording), 1)).astype(recording.joint_pos.dtype)
+    columns, _ = robot.find_joints(joint_names, preserve_order=True)
+    joint_pos[:, columns] = recording.joint_pos
+    recording = dataclasses.replace(recording, joint_pos=joint_pos)
+    robot = robot.cfg.build()
+    motion = make_motion(
+        resampled(recording, output_fps), robot.compile(), robot.joint_names, robot.body_names
+    )
+    write_motion(Path(tempfile.gettempdir()) / "motion.npz", motion)
+    path = write_motion(npz_path(f"{output_name}.npz"), motion)
+    logger.warning("Motion written to %s; upload it with csv_to_npz --upload True.", path)
+    if render:
+        record_motion(motion, robot, path.with_suffix(".mp4"))
+
+
+_DEMO_MOTION = "slow_walk"
+
+
+def ensure_default_motion() -> str:
+    """Return the path of a bundled G1 motion."""
+    from mjlab.tasks.tracking.motion_sources import shipped_motions
+
+    return str(shipped_motions()[_DEMO_MOTION])
+
+
+def ensure_default_checkpoint() -> str:
+    """Raise `FileNotFoundError`: the package has no bundled tracking policy."""
+    raise FileNotFoundError(
+        "mjlab has no bundled motion tracking checkpoint; train one with "
+        "`train Mjlab-Tracking-Flat-Unitree-G1`, or run `demo` for a bundled Go1 policy."
+    )
+
+
+def ensure_asset_downloaded(asset_name: str, force_download: bool = False) -> Path:
+    """Return the path of `demo_motion.npz`; `demo_ckpt.pt` is not available."""
+    assets = {"demo_motion.npz": ensure_default_motion, "demo_ckpt.pt": ensure_default_checkpoint}
+    if asset_name not in assets:
+        raise ValueError(f"asset_name: expected one of {sorted(assets)}, got {asset_name!r}.")
+    return Path(assets[asset_name]())
