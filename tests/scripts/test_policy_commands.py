@@ -79,14 +79,14 @@ def test_a_policy_with_networks_from_the_command_line_is_played(run, train, tmp_
 def test_without_terminations_no_episode_ends(run, monkeypatch):
     from mjlab.tasks.cartpole import cartpole_env_cfg
 
-    make = cartpole_env_cfg._make_env_cfg
+    make = cartpole_env_cfg.cartpole_balance_env_cfg
 
-    def short(swing_up, play):
-        cfg = make(swing_up, play)
+    def short(play):
+        cfg = make(play)
         cfg.episode_length_s = 0.1
         return cfg
 
-    monkeypatch.setattr(cartpole_env_cfg, "_make_env_cfg", short)
+    monkeypatch.setattr(cartpole_env_cfg, "cartpole_balance_env_cfg", short)
     ended = run("play", TASK, "--agent", "zero", *HEADLESS).out
     endless = run("play", TASK, "--agent", "zero", *HEADLESS, "--no-terminations").out
     assert "6 episodes ended" in ended

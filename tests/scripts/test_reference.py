@@ -112,11 +112,6 @@ def test_the_width_is_that_of_a_prediction_interval():
     assert half == pytest.approx(7.6489 * np.sqrt(4 / 3), rel=1e-3)
 
 
-def test_one_seed_has_no_band():
-    with pytest.raises(ValueError, match="at least 2, got 1"):
-        band([curve([1.0])], np.array([1.0]))
-
-
 ALLOWED = FALSE_ALARMS + 3 * np.sqrt(FALSE_ALARMS * (1 - FALSE_ALARMS) / 1000)
 
 

@@ -10,7 +10,7 @@ import pytest
 from mjlab.scripts.run_folder import (
     checkpoints_in,
     newest_checkpoint,
-    read_agent_params,
+    read_params,
     read_run_info,
     resolve_checkpoint,
     write_run_info,
@@ -52,7 +52,7 @@ def test_unreadable_parameters_are_none(tmp_path, text):
     if text is not None:
         (tmp_path / "params").mkdir()
         (tmp_path / "params" / "agent.yaml").write_text(text)
-    assert read_agent_params(tmp_path) == {}
+    assert read_params(tmp_path, "agent") == {}
 
 
 def test_checkpoints_come_in_the_order_of_their_numbers(tmp_path):

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from mjlab.scripts import prepare_threads
-from mjlab.utils.errors import BadCallError, MjlabError, UserError
+from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
-from mjlab.utils.string import suggest
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
@@ -271,8 +270,7 @@ def _dispatch(argv: list[str]) -> None:
         print(version("mjlab"))
         return
     name = argv[0].replace("_", "-")
-    if name not in _BY_NAME:
-        raise BadCallError(f"Unknown command {argv[0]!r}; {suggest(name, _BY_NAME)}")
+    check_exists("command", name, _BY_NAME, BadCallError)
     run_subcommand(_BY_NAME[name], argv[1:], f"mjlab {name}")
 
 
@@ -386,11 +384,12 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     the exit status is `MjlabError.exit_status`, else 1. Other errors keep their traceback.
     """
     prepare_threads()
-    # Plain library messages; one line per warning.
+    # Plain library messages.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
     logging.getLogger("mjlab").setLevel(logging.INFO)
     logging.captureWarnings(True)
-    warnings.formatwarning = _one_line  # ty: ignore[invalid-assignment]
+    # One line per warning, without file and source line.
+    warnings.formatwarning = lambda message, category, *_: f"{category.__name__}: {message}"  # ty: ignore[invalid-assignment]
     try:
         command(sys.argv[1:])
     except KeyboardInterrupt:
@@ -401,12 +400,14 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
-        if isinstance(error, MemoryError) or any(text in str(error) for text in _OUT_OF_MEMORY):
+        text = shorten(str(error).strip() or type(error).__name__)
+        if isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY):
             # The original message names the failed call, not the lack of memory.
-            error = UserError(
-                f"Out of memory or threads ({_message(error)}). Use fewer environments, or raise the "
-                "limits (ulimit)."
+            text = (
+                f"Out of memory or threads ({text}). Use fewer environments, or raise the limits "
+                "(ulimit)."
             )
+            error = UserError(text)
         elif not isinstance(error, (MjlabError, ValueError, OSError)):
             raise
         if os.environ.get(TRACEBACK_VARIABLE):
@@ -415,25 +416,10 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
         # Only the failed process and rank 0 report.
         if rank == "0" or not isinstance(error, OtherProcessError):
             process = "" if rank == "0" else f" in process {rank}"
-            print(f"error{process}: {_message(error)}", file=sys.stderr)
+            print(f"error{process}: {text}", file=sys.stderr)
             print(f"(Set {TRACEBACK_VARIABLE}=1 for the traceback.)", file=sys.stderr)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     sys.exit(0)
-
-
-def _message(error: BaseException) -> str:
-    text = str(error).strip()
-    return shorten(text) if text else type(error).__name__
-
-
-def _one_line(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    line: str | None = None,
-) -> str:
-    return f"{category.__name__}: {message}"
 
 
 if __name__ == "__main__":

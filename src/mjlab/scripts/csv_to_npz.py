@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +12,7 @@ from mjviser import ViserMujocoScene
 
 from mjlab.compat import older_names
 from mjlab.scripts.cli import run_alias
+from mjlab.scripts.export_scene import robot_cfg
 from mjlab.scripts.flags import parse_flags
 from mjlab.tasks.tracking.motion_file import Motion, npz_path, read_motion, write_motion
 from mjlab.tasks.tracking.motion_recording import (
@@ -91,7 +90,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
         check_positive(f"--{name.replace('_', '-')}", getattr(cfg, name))
     if cfg.view:
         check_address(cfg.host, cfg.port, "--")
-    robot = _robot(cfg.robot)
+    robot = robot_cfg(cfg.robot).build()
     source = Path(cfg.input_file)
     name = cfg.output_name or source.stem
     target = npz_path(cfg.output_file or f"{name}.npz")
@@ -136,26 +135,6 @@ def _read(cfg: CsvToNpzConfig, source: Path, robot: Entity) -> Recording:
         root_quat=recording.root_quat[kept],
         joint_pos=recording.joint_pos[kept],
     )
-
-
-def _robot(name: str) -> Entity:
-    """Build the robot called `name`, or configured by `module:function`."""
-    from mjlab.asset_zoo.robots import get_g1_robot_cfg, get_go1_robot_cfg
-
-    known: dict[str, Callable[[], Any]] = {"g1": get_g1_robot_cfg, "go1": get_go1_robot_cfg}
-    if name in known:
-        return known[name]().build()
-    module, colon, function = name.partition(":")
-    if not colon:
-        raise UserError(
-            f"--robot: expected one of {list(known)}, or `module:function` that returns an EntityCfg, "
-            f"got {name!r}."
-        )
-    try:
-        make = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"--robot {name}: {error}.") from error
-    return make().build()
 
 
 def _display_model(robot: Entity) -> mujoco.MjModel:

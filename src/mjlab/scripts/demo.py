@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjlab.scripts.cli import run_alias
-from mjlab.utils.errors import UserError, check_one_of
+from mjlab.utils.errors import check_one_of
 
 if TYPE_CHECKING:
     from mjlab.scripts.play import PlayConfig
@@ -54,32 +54,15 @@ def demo_cfg(demo: Demo) -> PlayConfig:
     )
 
 
-def run_demo(demo: Demo, cfg: PlayConfig) -> None:
-    """Play a demo with the flags `cfg`.
-
-    Raises:
-        UserError: bundled policy not found, or see `run_play`.
-    """
-    from mjlab.scripts.play import run_play
-
-    uses_bundled_policy = cfg.agent == "trained" and cfg.checkpoint_file == str(demo.policy)
-    if uses_bundled_policy and not demo.policy.is_file():
-        raise UserError(
-            f"Bundled policy {demo.policy} not found; use --checkpoint-file FILE.onnx with a policy of "
-            f"{demo.task}. `train` exports one to the folder of every run."
-        )
-    run_play(demo.task, cfg)
-
-
 def command(argv: list[str], prog: str) -> None:
     """Run `demo`."""
     name, flags = ("go1", argv) if not argv or argv[0].startswith("-") else (argv[0], argv[1:])
     check_one_of("demo", name, DEMOS)
     from mjlab.scripts.flags import parse_flags
-    from mjlab.scripts.play import PlayConfig
+    from mjlab.scripts.play import PlayConfig, run_play
 
     demo = DEMOS[name]
-    run_demo(demo, parse_flags(PlayConfig, demo_cfg(demo), flags, prog=f"{prog} {name}"))
+    run_play(demo.task, parse_flags(PlayConfig, demo_cfg(demo), flags, prog=f"{prog} {name}"))
 
 
 def main() -> None:

@@ -12,8 +12,6 @@ from mjlab.utils.processes import ProcessRank, process_rank
 if TYPE_CHECKING:
     from mjlab.scripts.train_config import TrainConfig
 
-_EGL_VARIABLE = "MUJOCO_EGL_DEVICE_ID"
-
 
 def resolve_device(device: str | None) -> str:
     """Return the torch device: `device`, or for None a GPU if available, else the CPU.
@@ -63,7 +61,7 @@ def training_device(cfg: TrainConfig, rank: ProcessRank) -> str:
         # EGL counts all GPUs of the machine, torch only visible GPUs.
         physical = egl_device_id(int(device.partition(":")[2] or 0))
         if physical is not None:
-            os.environ.setdefault(_EGL_VARIABLE, str(physical))
+            os.environ.setdefault("MUJOCO_EGL_DEVICE_ID", str(physical))
     return device
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import os
 import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.flags import parse_flags
 from mjlab.utils.errors import UserError
+from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.entity import EntityCfg
@@ -72,17 +71,12 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
 
 
 def _load(target: str) -> tuple[SceneCfg, MujocoCfg]:
-    """Return scene and physics options of a task, a robot (short name) or `module:function`."""
+    """Return scene and physics options of a task, or of a robot."""
     from mjlab.scene import SceneCfg
     from mjlab.sim import MujocoCfg
 
-    if ":" in target:
-        return SceneCfg(entities={"robot": _from_function(target)}), MujocoCfg()
-    if target in ROBOTS:
-        from mjlab.asset_zoo import robots
-
-        make: Callable[[], EntityCfg] = getattr(robots, ROBOTS[target])
-        return SceneCfg(entities={"robot": make()}), MujocoCfg()
+    if ":" in target or target in ROBOTS:
+        return SceneCfg(entities={"robot": robot_cfg(target)}), MujocoCfg()
     from mjlab.tasks.registry import UnknownTaskError, load_env_cfg
 
     try:
@@ -94,36 +88,33 @@ def _load(target: str) -> tuple[SceneCfg, MujocoCfg]:
     return env_cfg.scene, env_cfg.sim.mujoco
 
 
-def _needs_arguments(make: Callable[..., Any]) -> bool:
-    try:
-        inspect.signature(make).bind()
-    except TypeError:
-        return True
-    except ValueError:
-        # Functions of extension modules may lack a signature.
-        return False
-    return False
+def robot_cfg(name: str) -> EntityCfg:
+    """Return the config of a robot: short name, or `module:function` that returns an EntityCfg.
 
-
-def _from_function(target: str) -> EntityCfg:
+    Raises:
+        UserError: unknown name, failed import, or not an EntityCfg.
+    """
     from mjlab.entity import EntityCfg
 
-    module_name, _, name = target.partition(":")
+    module, colon, function = name.partition(":")
+    if not colon:
+        if name not in ROBOTS:
+            raise UserError(
+                f"Unknown robot {name!r}; {suggest(name, ROBOTS)} Or use module:function, a function that "
+                "returns an EntityCfg."
+            )
+        module, function = "mjlab.asset_zoo.robots", ROBOTS[name]
     if os.getcwd() not in sys.path:
         # As `python -m` does: modules in the working folder can be imported.
         sys.path.append(os.getcwd())
     try:
-        make = getattr(importlib.import_module(module_name), name)
+        make = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:
-        raise UserError(f"{target!r} cannot be imported: {error}.") from error
-    if callable(make) and _needs_arguments(make):
-        raise UserError(
-            f"{target!r}: expected a function without required arguments that returns an EntityCfg."
-        )
+        raise UserError(f"{name!r} cannot be imported: {error}.") from error
     made = make() if callable(make) else make
     if not isinstance(made, EntityCfg):
         raise UserError(
-            f"{target!r}: expected a function that returns an EntityCfg, got {type(made).__name__}."
+            f"{name!r}: expected a function that returns an EntityCfg, got {type(made).__name__}."
         )
     return made
 
@@ -135,15 +126,9 @@ def _destination(cfg: ExportSceneConfig) -> tuple[Path, Path]:
         folder = folder.with_suffix("") if folder.suffix == ".zip" else folder
         # An archive needs a name; the paths `.`, `..` and `/` have none.
         folder = folder.resolve() if folder.name in ("", "..") else folder
-        if not folder.name:
-            raise UserError(
-                f"--output-dir: expected a path with a name for the archive, got {cfg.output_dir}."
-            )
     result = folder.with_name(f"{folder.name}.zip") if cfg.zip else folder
-    if not cfg.zip and result.exists() and not result.is_dir():
-        raise UserError(f"--output-dir: expected a folder, got the file {result}.")
-    is_free = not result.exists() or (result.is_dir() and not any(result.iterdir()))
-    if not is_free and not cfg.overwrite:
+    is_taken = result.exists() and (cfg.zip or any(result.iterdir()))
+    if is_taken and not cfg.overwrite:
         taken = f"archive {result} exists" if cfg.zip else f"folder {result} is not empty"
         raise UserError(
             f"--output-dir: {taken}; use another folder, or --overwrite True to replace an earlier "

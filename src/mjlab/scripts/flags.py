@@ -12,8 +12,9 @@ import ast
 import copy
 import dataclasses
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -88,10 +89,18 @@ def parse_known_flags(
 
 
 def _arguments(config_type: Any, default: Any, flags: list[str], prog: str) -> dict[str, Any]:
+    """Return the arguments of `tyro.cli`. A bare `--video` becomes `--video True`."""
     edited, flags = switch_terms_off(default, flags)
+    fields = dataclasses.fields(config_type)
+    switches = {"--" + f.name.replace("_", "-") for f in fields if f.type in ("bool", bool)}
+    words: list[str] = []
+    for flag, following in pairwise([*flags, "--"]):
+        words.append(flag)
+        if flag.replace("_", "-") in switches and following.startswith("--"):
+            words.append("True")
     return {
         "default": edited,
-        "args": _with_explicit_switches(config_type, flags),
+        "args": words,
         "prog": prog,
         "config": mjlab.TYRO_FLAGS,
         "registry": flag_rules(),
@@ -101,23 +110,6 @@ def _arguments(config_type: Any, default: Any, flags: list[str], prog: str) -> d
 def is_given(flag: str, flags: list[str]) -> bool:
     """Return True if the command line `flags` sets `flag`, spelled with `-` or `_`."""
     return any(word.partition("=")[0].replace("_", "-") == flag for word in flags)
-
-
-def _with_explicit_switches(config_type: Any, flags: list[str]) -> list[str]:
-    """Expand a bare `--video` to `--video True`, for top-level bool fields of `config_type`."""
-    switches = {
-        "--" + field.name.replace("_", "-")
-        for field in dataclasses.fields(config_type)
-        if field.type in ("bool", bool)
-    }
-    explicit: list[str] = []
-    for position, flag in enumerate(flags):
-        explicit.append(flag)
-        following = flags[position + 1] if position + 1 < len(flags) else None
-        bare = following is None or following.startswith("--")
-        if flag.replace("_", "-") in switches and bare:
-            explicit.append("True")
-    return explicit
 
 
 # Profile and learner.
@@ -286,7 +278,15 @@ def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
     """
     config = copy.deepcopy(default)
     remaining: list[str] = []
-    for flag, value, words in _flag_values(flags):
+    position = 0
+    while position < len(flags):
+        # `--flag None` or `--flag=None`.
+        words = [flags[position]]
+        flag, equals, value = words[0].partition("=")
+        if not equals and flags[position + 1 : position + 2] == ["None"]:
+            value = "None"
+            words.append(value)
+        position += len(words)
         holder, name = _term_at(config, flag) if value == "None" else (None, "")
         if holder is None:
             remaining += words
@@ -295,26 +295,6 @@ def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
         else:
             setattr(holder, name, None)
     return config, remaining
-
-
-def _flag_values(flags: list[str]) -> Iterator[tuple[str, str | None, list[str]]]:
-    """Yield each flag with its value, and its words on the command line.
-
-    `--flag value` and `--flag=value` are equivalent; values after the first are yielded as separate
-    words.
-    """
-    position = 0
-    while position < len(flags):
-        word = flags[position]
-        flag, equals, value = word.partition("=")
-        if equals:
-            yield flag, value, [word]
-        elif word.startswith("--") and flags[position + 1 : position + 2] == ["None"]:
-            yield word, "None", [word, "None"]
-            position += 1
-        else:
-            yield word, None, [word]
-        position += 1
 
 
 def _term_at(config: Any, flag: str) -> tuple[Any, str]:

@@ -106,7 +106,15 @@ class LiveView(TrainingObserver):
         """End the process."""
         process, self._process = self._process, None
         if process is not None:
-            _end(process)
+            assert process.stdin is not None
+            # The process ends when its standard input is closed.
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+            try:
+                process.wait(_SECONDS_TO_END)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
         self._lock.close()
         self._folder.cleanup()
 
@@ -180,15 +188,3 @@ def _start(exchange: Exchange, host: str, port: int) -> subprocess.Popen:
             # Linux schedules by session first, and by priority only within a session.
             process_group=0 if os.name == "posix" else None,
         )
-
-
-def _end(process: subprocess.Popen) -> None:
-    """End the process by closing its standard input; kill it after a timeout."""
-    assert process.stdin is not None
-    with contextlib.suppress(OSError):
-        process.stdin.close()
-    try:
-        process.wait(_SECONDS_TO_END)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

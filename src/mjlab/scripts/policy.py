@@ -26,7 +26,7 @@ from mjlab.scripts.flags import (
 )
 from mjlab.scripts.run_folder import (
     newest_checkpoint,
-    read_agent_params,
+    read_params,
     read_run_info,
     resolve_checkpoint,
 )
@@ -294,7 +294,7 @@ def _agent_cfg(
     """
     rl_cfg = load_rl_cfg(task, profile=profile, learner=learner)
     cfg = acting_cfg(rl_cfg)
-    saved = read_agent_params(checkpoint.parent)
+    saved = read_params(checkpoint.parent, "agent")
     for network in ("actor", "critic", "student", "teacher"):
         if network in cfg:
             cfg[network] |= _saved_settings(saved, network, getattr(rl_cfg, network))
@@ -367,7 +367,7 @@ def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Path | None) ->
         return
     flag, teacher = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
     if resumed is not None:
-        saved, network = read_agent_params(resumed.parent), "teacher"
+        saved, network = read_params(resumed.parent, "agent"), "teacher"
         recorded = saved.get("teacher_checkpoint")
         if teacher is not None and teacher != recorded:
             raise UserError(
@@ -383,7 +383,7 @@ def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Path | None) ->
         if (trained := read_run_info(path.parent).get("task", task)) != task:
             raise UserError(f"{flag}: expected a checkpoint of {task}, got {path} of {trained}.")
         cfg.teacher_checkpoint = str(path)
-        saved, network = read_agent_params(path.parent), "actor"
+        saved, network = read_params(path.parent, "agent"), "actor"
     else:
         return
     cfg.teacher = replace(cfg.teacher, **_saved_settings(saved, network, cfg.teacher))

@@ -135,17 +135,17 @@ def _step(env: Any, policy: Any, count: int) -> float:
     seconds = 0.0
     for _ in range(count):
         actions = policy(env.get_observations())
-        _synchronize(env.device)
-        begin = time.perf_counter()
+        begin = _now(env.device)
         env.step(actions)
-        _synchronize(env.device)
-        seconds += time.perf_counter() - begin
+        seconds += _now(env.device) - begin
     return seconds
 
 
-def _synchronize(device: Any) -> None:
+def _now(device: torch.device) -> float:
+    """Return the time (s) once `device` has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+    return time.perf_counter()
 
 
 def profile_rows(profile: StepProfile) -> dict[str, Any]:
@@ -255,79 +255,94 @@ def profiled_steps(env: ManagerBasedRlEnv) -> Generator[StepProfile]:
     On a GPU every part is synchronized to attribute times correctly; this slows down the steps. The
     environment is restored after the block, also on errors.
     """
-    stopwatch = _Stopwatch(env.device)
     with contextlib.ExitStack() as undo:
-        _Instrumentation(env, stopwatch, undo).install()
-        yield stopwatch.profile
+        yield _StepTimer(env, undo).profile
 
 
-class _Stopwatch:
-    """Timer that wraps calls and adds their time to a profile."""
+class _StepTimer:
+    """Times the methods called in a step, and registers their restoration in `undo`."""
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, env: ManagerBasedRlEnv, undo: contextlib.ExitStack) -> None:
         self.profile = StepProfile()
-        self._is_cuda = torch.device(device).type == "cuda"
-        self._device = device
-        self._is_in_step = False
-        self._phase: str | None = None
-        self._term: str | None = None
+        self._device = torch.device(env.device)
+        self._undo = undo
+        # Running phase and term, () for a step outside all phases; None outside steps.
+        self._running: tuple[str, ...] | None = None
+        self._replace(env, "step", self.step(env.step))
+        for owner, methods in ((env.sim, _SIMULATION), (env.scene, _SCENE)):
+            for method, phase in methods.items():
+                self._time(owner, method, phase)
+        for phase, (attribute, methods) in _MANAGERS.items():
+            manager = getattr(env, attribute)
+            if not isinstance(manager, NullManager):
+                for method in methods:
+                    self._time(manager, method, phase)
+                self._time_terms(phase, manager)
 
     def step(self, call: Callable[..., Any]) -> Callable[..., Any]:
         """Return `call` timed as a step."""
 
         def timed(*args: Any, **kwargs: Any) -> Any:
-            self._is_in_step = True
-            begin = self._now()
+            self._running = ()
+            begin = _now(self._device)
             try:
                 result = call(*args, **kwargs)
             finally:
-                self._is_in_step = False
-            self.profile.step_time += self._now() - begin
+                self._running = None
+            self.profile.step_time += _now(self._device) - begin
             self.profile.num_steps += 1
             return result
 
         return timed
 
-    def phase(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return `call` timed as the phase `name`, if called directly by a step."""
-        seconds = self.profile.phases
+    def timed(self, call: Callable[..., Any], *names: str) -> Callable[..., Any]:
+        """Return `call` timed as a phase, or as phase and term, if called directly by its caller."""
+        *phase, name = names
+        seconds = self.profile.terms.setdefault(phase[0], {}) if phase else self.profile.phases
         seconds.setdefault(name, 0.0)
+        caller = names[:-1]
 
         def timed(*args: Any, **kwargs: Any) -> Any:
-            if not self._is_in_step or self._phase is not None:
+            if self._running != caller:
                 return call(*args, **kwargs)
-            self._phase = name
-            begin = self._now()
+            self._running = names
+            begin = _now(self._device)
             try:
                 return call(*args, **kwargs)
             finally:
-                seconds[name] += self._now() - begin
-                self._phase = None
+                seconds[name] += _now(self._device) - begin
+                self._running = caller
 
         return timed
 
-    def term(self, phase: str, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return `call` timed as the term `name`, if called by its manager in `phase`."""
-        seconds = self.profile.terms.setdefault(phase, {})
-        seconds.setdefault(name, 0.0)
+    def _time_terms(self, phase: str, manager: Any) -> None:
+        if phase == "observations":
+            for group in manager._groups.values():
+                for term in group.terms.values():
+                    self._time(term, "compute", phase, term.label)
+        elif phase in _TERM_METHODS:
+            for name, term in manager._terms.items():
+                for method in _TERM_METHODS[phase]:
+                    self._time(term, method, phase, name)
+            return
+        else:
+            for name, cfg in zip(manager._term_names, manager._term_cfgs, strict=True):
+                timed = _TimedFunction(cfg.func, self.timed(cfg.func, phase, name))
+                self._replace(cfg, "func", timed)
+        for name, term in manager._class_terms.items():
+            if callable(getattr(term, "reset", None)):
+                self._time(term, "reset", phase, name)
 
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            if self._phase != phase or self._term is not None:
-                return call(*args, **kwargs)
-            self._term = name
-            begin = self._now()
-            try:
-                return call(*args, **kwargs)
-            finally:
-                seconds[name] += self._now() - begin
-                self._term = None
+    def _time(self, owner: Any, method: str, *names: str) -> None:
+        self._replace(owner, method, self.timed(getattr(owner, method), *names))
 
-        return timed
-
-    def _now(self) -> float:
-        if self._is_cuda:
-            torch.cuda.synchronize(self._device)
-        return time.perf_counter()
+    def _replace(self, owner: Any, name: str, value: Any) -> None:
+        own = vars(owner)
+        if name in own:
+            self._undo.callback(setattr, owner, name, own[name])
+        else:
+            self._undo.callback(delattr, owner, name)
+        setattr(owner, name, value)
 
 
 class _TimedFunction:
@@ -345,65 +360,6 @@ class _TimedFunction:
 
     def __setattr__(self, name: str, value: Any) -> None:
         setattr(self._function, name, value)
-
-
-class _Instrumentation:
-    """Wraps the methods called in a step by a stopwatch, and registers their restoration in `undo`."""
-
-    def __init__(
-        self, env: ManagerBasedRlEnv, stopwatch: _Stopwatch, undo: contextlib.ExitStack
-    ) -> None:
-        self._env = env
-        self._stopwatch = stopwatch
-        self._undo = undo
-
-    def install(self) -> None:
-        """Wrap all methods."""
-        self._replace(self._env, "step", self._stopwatch.step)
-        for owner, methods in ((self._env.sim, _SIMULATION), (self._env.scene, _SCENE)):
-            for method, phase in methods.items():
-                self._replace(owner, method, lambda call, p=phase: self._stopwatch.phase(p, call))
-        for phase, (attribute, methods) in _MANAGERS.items():
-            manager = getattr(self._env, attribute)
-            if isinstance(manager, NullManager):
-                continue
-            for method in methods:
-                self._replace(manager, method, lambda call, p=phase: self._stopwatch.phase(p, call))
-            self._install_terms(phase, manager)
-
-    def _install_terms(self, phase: str, manager: Any) -> None:
-        if phase == "observations":
-            for group in manager._groups.values():
-                for term in group.terms.values():
-                    self._time_methods(phase, term.label, term, ("compute",))
-        elif phase in _TERM_METHODS:
-            for name, term in manager._terms.items():
-                self._time_methods(phase, name, term, _TERM_METHODS[phase])
-            return
-        else:
-            for name, cfg in zip(manager._term_names, manager._term_cfgs, strict=True):
-                function = cfg.func
-                timed = self._stopwatch.term(phase, name, function)
-                cfg.func = _TimedFunction(function, timed)
-                self._undo.callback(setattr, cfg, "func", function)
-        for name, term in manager._class_terms.items():
-            if callable(getattr(term, "reset", None)):
-                self._time_methods(phase, name, term, ("reset",))
-
-    def _time_methods(self, phase: str, name: str, term: Any, methods: tuple[str, ...]) -> None:
-        for method in methods:
-            self._replace(term, method, lambda call: self._stopwatch.term(phase, name, call))
-
-    def _replace(
-        self, owner: Any, name: str, wrap: Callable[[Callable[..., Any]], Callable[..., Any]]
-    ) -> None:
-        """Replace the method `name` of `owner` by its wrapped version."""
-        own = vars(owner)
-        if name in own:
-            self._undo.callback(setattr, owner, name, own[name])
-        else:
-            self._undo.callback(delattr, owner, name)
-        setattr(owner, name, wrap(getattr(owner, name)))
 
 
 def main() -> None:

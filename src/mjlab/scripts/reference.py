@@ -15,7 +15,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, sessions_of
+from mjlab.scripts.run_folder import read_params, read_run_info, sessions_of
 from mjlab.utils.errors import UserError
 from mjlab.utils.os import replacing
 
@@ -36,9 +36,8 @@ FALSE_ALARMS = 0.05
 _TAIL = FALSE_ALARMS / 3
 ENDED = ("solved", "finished")
 """Stop reasons of completed training."""
-# Points and significant digits per stored curve: tens of kilobytes per task.
+# Points per stored curve: tens of kilobytes per task.
 _POINTS = 60
-_DIGITS = 5
 # Number of comparison points, equally spaced in samples.
 _GRID = 101
 # Upper bound of `samples_limit`, in multiples of the slowest seed's samples.
@@ -140,8 +139,9 @@ class Reference:
     def save(self, folder: Path) -> Path:
         """Write the reference into `folder` atomically; return the file."""
         path = reference_path(folder, self.task, self.kind)
-        # No indentation, to keep the file small.
-        text = json.dumps(_rounded(dataclasses.asdict(self))) + "\n"
+        # Five significant digits and no indentation, to keep the file small.
+        text = json.dumps(dataclasses.asdict(self))
+        text = json.dumps(json.loads(text, parse_float=lambda x: float(f"{float(x):.5g}"))) + "\n"
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
             file.write(text.encode())
@@ -200,7 +200,7 @@ def read_run(run_dir: Path) -> RunRecord:
             f"{run_dir}: expected a run with evaluations, got none; train longer, or set "
             "--agent.evaluation.solved-return and --agent.evaluation.trigger-return."
         )
-    agent, env = read_agent_params(run_dir), read_env_params(run_dir)
+    agent, env = read_params(run_dir, "agent"), read_params(run_dir, "env")
     per_iteration = agent["num_steps_per_env"] * env["scene"]["num_envs"]
     # Metrics common to all evaluations; custom runners may add others.
     names = set.intersection(*(set(metrics) for metrics in evaluations.values()))
@@ -227,7 +227,7 @@ def end_of(run_dir: Path) -> str | None:
     ended = info.get("ended")
     if (
         ended == "interrupted"
-        and info["iterations"] >= read_agent_params(run_dir)["max_iterations"]
+        and info["iterations"] >= read_params(run_dir, "agent")["max_iterations"]
     ):
         return "finished"
     return ended
@@ -287,17 +287,10 @@ def band(
 
     with probability 1 - a, if seeds are normally distributed. Student's t accounts for the uncertainty
     of s: for n = 3 and a = 1/60, t = 7.6 instead of 2.4 for the normal distribution. Seeds may agree
-    by chance, so s is at least `standard_error`, that of one evaluation.
-
-    Raises:
-        ValueError: fewer than two curves; their deviation is undefined.
+    by chance, so s is at least `standard_error`, that of one evaluation. s is undefined for n < 2.
     """
     import numpy as np
 
-    if len(curves) < 2:
-        raise ValueError(
-            f"reference seeds: expected at least 2, got {len(curves)}; train more seeds."
-        )
     values = np.stack([np.interp(at, *curve) for curve in curves])
     deviation = np.maximum(values.std(axis=0, ddof=1), standard_error)
     return values.mean(axis=0), _width(len(curves), 1.0 - _TAIL / 2) * deviation
@@ -396,13 +389,3 @@ def compare(runs: Sequence[RunRecord], run: RunRecord, standard_error: float) ->
         limit=samples_limit(runs),
         solved_at=run.samples if run.ended == "solved" else None,
     )
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(f"{value:.{_DIGITS}g}")
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_rounded(item) for item in value]
-    return value

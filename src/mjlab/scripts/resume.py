@@ -13,7 +13,7 @@ from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint, load_che
 from mjlab.rl.distributed import STORE_VARIABLE
 from mjlab.rl.learners import learner_of
 from mjlab.scripts.flags import profile_of_run
-from mjlab.scripts.run_folder import read_agent_params, read_env_params, read_run_info, run_folders
+from mjlab.scripts.run_folder import read_params, read_run_info, run_folders
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
@@ -41,7 +41,7 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
     if not cfg.agent.resume:
         return None
     agent = cfg.agent
-    experiment = Path(cfg.log_root).resolve() / agent.experiment_name
+    experiment = cfg.experiment_folder
     if cfg.wandb_run_path is not None:
         run_path = Path(cfg.wandb_run_path)
         return get_wandb_checkpoint_path(experiment, run_path, cfg.wandb_checkpoint_name)[0]
@@ -52,20 +52,46 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
             raise UserError(
                 f"--agent.load-{flag}: expected a regular expression, got {pattern!r}: {error}."
             ) from error
-    # Matching rule of `get_checkpoint_path`, newest first.
-    runs = run_folders(experiment)
-    matching = [run for run in runs if re.fullmatch(agent.load_run, run.name)]
-    matching = matching or [run for run in runs if re.match(agent.load_run, run.name)]
-    others = {run.name: why for run in matching if (why := _mismatch(run, task, cfg.learner))}
-    if others and len(others) == len(matching):
-        raise UserError(_mismatch_message(task, cfg.learner, agent.load_run, experiment, others))
-    for run in matching:
-        if run.name not in others:
-            with contextlib.suppress(ValueError):
-                return get_checkpoint_path(experiment, re.escape(run.name), agent.load_checkpoint)
-    own = "|".join(re.escape(run.name) for run in matching if run.name not in others)
+    runs = _runs_to_resume(task, cfg)
+    for run in runs:
+        with contextlib.suppress(ValueError):
+            return get_checkpoint_path(experiment, re.escape(run.name), agent.load_checkpoint)
+    own = "|".join(re.escape(run.name) for run in runs)
     # Raises an error that lists the runs and checkpoints.
     return get_checkpoint_path(experiment, own or agent.load_run, agent.load_checkpoint)
+
+
+def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Path]:
+    """Return the runs that match the pattern, the task and the learner, newest first.
+
+    Raises:
+        UserError: all runs that match the pattern are of other tasks or learners.
+    """
+    experiment, pattern, learner = cfg.experiment_folder, cfg.agent.load_run, cfg.learner
+    # Matching rule of `get_checkpoint_path`.
+    runs = run_folders(experiment)
+    matching = [run for run in runs if re.fullmatch(pattern, run.name)]
+    matching = matching or [run for run in runs if re.match(pattern, run.name)]
+    others = {run: why for run in matching if (why := _mismatch(run, task, learner))}
+    if others and len(others) == len(matching):
+        listed = [f"{run.name} is {why}" for run, why in others.items()]
+        listed[3:] = [f"and {len(listed) - 3} more"] if len(listed) > 3 else []
+        by = "" if learner is None else f" by the learner {learner!r}"
+        raise UserError(
+            f"No run of {task}{by} in {experiment} matches --agent.load-run {pattern!r}: "
+            f"{', '.join(listed)}; resume a run with its task and learner."
+        )
+    return [run for run in matching if run not in others]
+
+
+def _mismatch(run_dir: Path, task: str, learner: str | None) -> str | None:
+    """Describe why a run is not of `task` and `learner`; None if it is, or if not recorded."""
+    info = read_run_info(run_dir)
+    if (found := info.get("task", task)) != task:
+        return f"of {found}"
+    if learner is not None and (found := info.get("learner", learner)) != learner:
+        return f"of the learner {found!r}"
+    return None
 
 
 def choices_to_resume(
@@ -87,17 +113,19 @@ def choices_to_resume(
     except (UserError, ValueError, OSError, CheckpointError):
         # Reported when training starts, after other errors in the flags.
         return choices
+    # All processes parse the flags; our launcher has printed the messages before starting the others.
+    reports = STORE_VARIABLE not in os.environ and process_rank().is_first
     if (
         "profile" not in requested
         and (profile := profile_of_run(task, checkpoint.parent)) is not None
     ):
         choices["profile"] = profile
-        if _is_reporting_process():
+        if reports:
             print_notice(f"Resuming with the profile {profile!r}, as before; --profile overrides.")
     default = load_rl_cfg(task, profile=choices.get("profile", cfg.profile))
     if "learner" not in requested and learner != learner_of(default):
         choices["learner"] = learner
-        if _is_reporting_process():
+        if reports:
             print_notice(f"Resuming with the learner {learner!r}, as before.")
     return choices
 
@@ -116,14 +144,6 @@ def check_learner_resumes(cfg: TrainConfig, checkpoint: Path) -> None:
         )
 
 
-def _is_reporting_process() -> bool:
-    """Return True if this process prints the messages of the run.
-
-    All processes parse the flags; our launcher has printed the messages before starting the others.
-    """
-    return STORE_VARIABLE not in os.environ and process_rank().is_first
-
-
 def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
     """Set the number of environments to that of the resumed run, unless set by flags.
 
@@ -136,7 +156,11 @@ def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
     default = load_env_cfg(task, profile=cfg.profile).scene.num_envs
     if cfg.num_envs is not None or scene.num_envs != default:
         return
-    count = _saved_num_envs(checkpoint)
+    # Runs of other tools lack the training state, but may have saved their config.
+    state = load_checkpoint(checkpoint).get("training_state")
+    saved: Any = [state, read_params(checkpoint.parent, "env").get("scene")]
+    counts = [holder.get("num_envs") for holder in saved if isinstance(holder, dict)]
+    count = next((n for n in counts if isinstance(n, int) and n >= 1), None)
     if count is None:
         print_notice(
             f"{checkpoint} does not record the number of environments; using {scene.num_envs}, the "
@@ -150,7 +174,7 @@ def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
 def choose_seed(checkpoint: Path | None) -> int:
     """Return and print the seed of the resumed run, or a random seed."""
     if checkpoint is not None:
-        seed: Any = read_agent_params(checkpoint.parent).get("seed")
+        seed: Any = read_params(checkpoint.parent, "agent").get("seed")
         if isinstance(seed, int) and seed >= 0:
             print(f"Seed:    {seed}, as before; --agent.seed overrides")
             return seed
@@ -169,39 +193,3 @@ def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path)
         f"is {total}, including these. To continue, use e.g. --agent.max-iterations {done + 100}."
     )
     return True
-
-
-def _saved_num_envs(checkpoint: Path) -> int | None:
-    """Return the number of environments of the run of `checkpoint`; None if not recorded."""
-    # Runs of other tools lack the training state, but may have saved their config.
-    for holder in (
-        load_checkpoint(checkpoint).get("training_state"),
-        read_env_params(checkpoint.parent).get("scene"),
-    ):
-        count: Any = holder.get("num_envs") if isinstance(holder, dict) else None
-        if isinstance(count, int) and count >= 1:
-            return count
-    return None
-
-
-def _mismatch(run_dir: Path, task: str, learner: str | None) -> str | None:
-    """Describe why a run is not of `task` and `learner`; None if it is, or if not recorded."""
-    info = read_run_info(run_dir)
-    if (found := info.get("task", task)) != task:
-        return f"of {found}"
-    if learner is not None and (found := info.get("learner", learner)) != learner:
-        return f"of the learner {found!r}"
-    return None
-
-
-def _mismatch_message(
-    task: str, learner: str | None, pattern: str, experiment: Path, others: dict[str, str]
-) -> str:
-    runs = [f"{name} is {why}" for name, why in list(others.items())[:3]]
-    more = f", and {len(others) - 3} more" if len(others) > 3 else ""
-    filters = "" if pattern == ".*" else f" that matches --agent.load-run {pattern!r}"
-    filters = f" by the learner {learner!r}{filters}" if learner is not None else filters
-    return (
-        f"No run of {task} in {experiment}{filters} found: {', '.join(runs)}{more}; resume a run with "
-        "its task and learner."
-    )

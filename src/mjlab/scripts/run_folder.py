@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Literal
 
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
@@ -163,26 +163,17 @@ def read_run_info(run_dir: Path) -> dict[str, Any]:
 
 
 def write_params(run_dir: Path, env: Any, agent: Any) -> None:
-    """Write the configs of a run, for users and for `read_env_params`."""
+    """Write the configs of a run, for users and for `read_params`."""
     dump_yaml(run_dir / "params" / "env.yaml", dataclasses.asdict(env))
     dump_yaml(run_dir / "params" / "agent.yaml", dataclasses.asdict(agent))
 
 
-def read_agent_params(run_dir: Path) -> dict[str, Any]:
-    """Return the learner config of a run; empty if missing or unreadable."""
-    return _read_params(run_dir / "params" / "agent.yaml")
-
-
-def read_env_params(run_dir: Path) -> dict[str, Any]:
-    """Return the environment config of a run; empty if missing or unreadable."""
-    return _read_params(run_dir / "params" / "env.yaml")
-
-
-def _read_params(path: Path) -> dict[str, Any]:
+def read_params(run_dir: Path, name: Literal["env", "agent"]) -> dict[str, Any]:
+    """Return the environment or learner config of a run; empty if missing or unreadable."""
     import yaml
 
     try:
-        params = yaml.safe_load(path.read_text())
+        params = yaml.safe_load((run_dir / "params" / f"{name}.yaml").read_text())
     except (OSError, ValueError, RecursionError, yaml.YAMLError):
         return {}
     return params if isinstance(params, dict) else {}
@@ -240,6 +231,12 @@ def resolve_checkpoint(path: Path, task: str) -> Path:
     available = [str(file) for folder in folders for file in checkpoints_in(folder)[-3:]]
     hint = f"Available: {', '.join(available)}." if available else f"Use `train {task}` first."
     raise UserError(f"Checkpoint {path} not found. {hint}")
+
+
+def runs_named(experiment: Path, run_name: str) -> list[Path]:
+    """Return the run folders that `NewRunFolder` created for `run_name`, in the order of `run_folders`."""
+    pattern = re.compile(rf".*_{re.escape(run_name)}(-\d+)?")
+    return [run_dir for run_dir in run_folders(experiment) if pattern.fullmatch(run_dir.name)]
 
 
 def run_folders(experiment: Path) -> list[Path]:

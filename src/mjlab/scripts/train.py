@@ -170,9 +170,8 @@ def _run_folder(
     cfg: TrainConfig, rank: ProcessRank, output: ProcessOutput | None
 ) -> Generator[NewRunFolder | SharedRunFolder]:
     """Enter the run folder. The first process creates it for all."""
-    experiment = Path(cfg.log_root).resolve() / cfg.agent.experiment_name
     with contextlib.ExitStack() as stack:
-        new = NewRunFolder(experiment, cfg.agent.run_name)
+        new = NewRunFolder(cfg.experiment_folder, cfg.agent.run_name)
         stack.enter_context(exit_by_signal(unless=lambda: new.is_kept))
         path = broadcast_from_first(lambda: stack.enter_context(new).path)
         if output is not None:

@@ -31,7 +31,6 @@ _ALGORITHM_COUNTS = (
     "noise_hold",
     "gradient_length",
 )
-_SEPARATORS = ("/", "\\")
 
 
 @dataclass
@@ -100,6 +99,11 @@ class TrainConfig:
         )
 
     @property
+    def experiment_folder(self) -> Path:
+        """Folder of the runs."""
+        return Path(self.log_root).resolve() / self.agent.experiment_name
+
+    @property
     def learner_name(self) -> Learner:
         """Learner configured by `agent`."""
         return learner_of(self.agent)
@@ -121,7 +125,7 @@ def check_flags(cfg: TrainConfig) -> None:
     _check_numbers(cfg)
     # The run folder must not be placed outside `log_root`.
     run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
-    if any(separator in run_name for separator in _SEPARATORS):
+    if "/" in run_name or "\\" in run_name:
         raise UserError(
             f"--agent.run-name: expected a name without path separators, got {run_name!r}; use "
             "--agent.experiment-name to group runs."
@@ -171,28 +175,27 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
 def _check_numbers(cfg: TrainConfig) -> None:
     """Check numbers that would otherwise fail during training. The environment checks its config."""
     agent: Any = cfg.agent
+    algorithm = vars(agent.algorithm)
+    # Each algorithm has a subset of the counts.
     counts = {f"--agent.{name}": getattr(agent, name) for name in _AGENT_COUNTS}
-    for name in _ALGORITHM_COUNTS:
-        # Each algorithm has a subset of these fields.
-        counts[f"--agent.algorithm.{name}"] = getattr(getattr(agent, "algorithm", None), name, 1)
-    gradient_length = getattr(agent.algorithm, "gradient_length", None)
-    steps = agent.num_steps_per_env * getattr(agent.algorithm, "num_learning_epochs", 1)
-    if gradient_length is not None and gradient_length > steps:
-        raise UserError(
-            f"--agent.algorithm.gradient-length: expected at most {steps}, the steps of an iteration "
-            f"times its epochs, got {gradient_length}; otherwise the policy is never updated."
-        )
-    learning_starts = getattr(agent.algorithm, "learning_starts", 0)
-    if learning_starts > (total := agent.num_steps_per_env * agent.max_iterations):
-        raise UserError(
-            f"--agent.algorithm.learning-starts: expected at most {total}, the environment steps of "
-            f"the run, got {learning_starts}; otherwise learning never starts."
-        )
+    counts |= {f"--agent.algorithm.{n}": algorithm[n] for n in _ALGORITHM_COUNTS if n in algorithm}
     counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
     for flag, value in counts.items():
         check_count(flag.replace("_", "-"), value)
+    steps = agent.num_steps_per_env * algorithm.get("num_learning_epochs", 1)
+    if (length := algorithm.get("gradient_length", 1)) > steps:
+        raise UserError(
+            f"--agent.algorithm.gradient-length: expected at most {steps}, the steps of an iteration "
+            f"times its epochs, got {length}; otherwise the policy is never updated."
+        )
+    total = agent.num_steps_per_env * agent.max_iterations
+    if (first := algorithm.get("learning_starts", 0)) > total:
+        raise UserError(
+            f"--agent.algorithm.learning-starts: expected at most {total}, the environment steps of "
+            f"the run, got {first}; otherwise learning never starts."
+        )
     # Infinite bounds are valid: e.g. no gradient clipping.
-    for name, value in vars(agent.algorithm).items():
+    for name, value in algorithm.items():
         if isinstance(value, float) and (
             math.isnan(value) or (name.endswith("learning_rate") and math.isinf(value))
         ):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from types import FrameType
 
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.flags import is_given
-from mjlab.scripts.run_folder import read_run_info, run_folders
+from mjlab.scripts.run_folder import read_run_info, runs_named
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
 from mjlab.utils.signals import FORWARDED, handled_signals
@@ -23,48 +22,42 @@ _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, sequentially (def
 
 def command(argv: list[str], prog: str) -> None:
     """Run `train-seeds`."""
-    task = argv[0]
-    count, flags = _take_count(argv[1:])
-    if "-h" in flags or "--help" in flags:
-        print(f"{_SEEDS_HELP}\nAll other flags are those of `train`:\n", flush=True)
-    experiment = _experiment(task, flags, prog)
+    count, flags, experiment = _parse(argv, prog)
     for seed in range(1, count + 1):
         print(f"\nSeed {seed} of {count}", flush=True)
         # Averaged curves must have equal length, so runs must not stop when solved. User flags come
         # last and take precedence.
-        arguments = [sys.executable, "-m", "mjlab.scripts.train", task]
+        arguments = [sys.executable, "-m", "mjlab.scripts.train", argv[0]]
         arguments += ["--agent.evaluation.stop-when-solved", "False"]
         arguments += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
-        before = set(run_folders(experiment))
+        before = runs_named(experiment, f"seed_{seed}")
         status, stopped = run_forwarding_signals(arguments)
         # A training process interrupted by a signal also exits with 0.
-        if stopped or (status == 0 and _interrupted(experiment, before, seed)):
+        new = [run for run in runs_named(experiment, f"seed_{seed}") if run not in before]
+        interrupted = any(read_run_info(run).get("ended") == "interrupted" for run in new)
+        if stopped or (status == 0 and interrupted):
             print(f"Stopped during seed {seed} of {count}; no other seed is trained.")
             return
         if status != 0:
             raise UserError(f"Training with seed {seed} ended with status {status}.")
 
 
-def _take_count(flags: list[str]) -> tuple[int, list[str]]:
-    """Extract `--seeds N` or `--seeds=N` from `flags`; return N (default 5) and the remaining flags."""
-    for position, flag in enumerate(flags):
-        name, equals, value = flag.partition("=")
-        if name == "--seeds":
-            end = position + 1
-            if not equals:
-                value = flags[end] if end < len(flags) else ""
-                end += 1
-            if not value.isdigit() or int(value) < 1:
-                raise UserError(f"--seeds: expected an integer >= 1, got {value!r}.")
-            return int(value), flags[:position] + flags[end:]
-    return 5, flags
+def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
+    """Return the number of seeds, the flags of `train`, and the folder of the runs.
 
-
-def _experiment(task: str, flags: list[str], prog: str) -> Path:
-    """Return the folder of the runs. Exits on invalid flags and on `--help`."""
+    Exits on invalid flags and on `--help`.
+    """
     from mjlab.scripts.train import parse_train_flags
     from mjlab.scripts.train_config import check_typed_flags
 
+    task, *words = argv
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--seeds", nargs="?", default="5", const="")
+    args, flags = parser.parse_known_args(words)
+    if not args.seeds.isdigit() or int(args.seeds) < 1:
+        raise UserError(f"--seeds: expected an integer >= 1, got {args.seeds!r}.")
+    if "-h" in flags or "--help" in flags:
+        print(f"{_SEEDS_HELP}\nAll other flags are those of `train`:\n", flush=True)
     cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
     check_typed_flags(cfg, flags)
     for flag in ("--agent.seed", "--agent.run-name"):
@@ -73,14 +66,7 @@ def _experiment(task: str, flags: list[str], prog: str) -> Path:
                 f"{flag}: expected no value, because runs use the seeds 1, 2, ... and are named after them; "
                 "use --seeds N for the number of seeds, or `train` for one run."
             )
-    return Path(cfg.log_root).resolve() / cfg.agent.experiment_name
-
-
-def _interrupted(experiment: Path, before: set[Path], seed: int) -> bool:
-    """Return True if the new run of `seed`, not in `before`, was interrupted."""
-    name = re.compile(rf".*_seed_{seed}(-\d+)?")
-    new = (run for run in run_folders(experiment) if run not in before and name.fullmatch(run.name))
-    return any(read_run_info(run).get("ended") == "interrupted" for run in new)
+    return int(args.seeds), flags, cfg.experiment_folder
 
 
 def run_forwarding_signals(command: list[str], seconds: float | None = None) -> tuple[int, bool]:
@@ -131,9 +117,6 @@ def plot_command(argv: list[str], prog: str) -> None:
     parser.add_argument("--tag", help="TensorBoard tag of the metric to plot")
     parser.add_argument("--title", help="title of the plot")
     args = parser.parse_args(argv)
-    missing = [str(run) for run in args.runs if not run.is_dir()]
-    if missing:
-        raise UserError(f"RUN: expected run folders, got {', '.join(missing)}.")
     from mjlab.rl.plot import DEFAULT_TAG, plot_seeds
 
     path = plot_seeds(args.runs, args.output, tag=args.tag or DEFAULT_TAG, title=args.title)

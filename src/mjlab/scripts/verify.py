@@ -27,7 +27,7 @@ from mjlab.scripts.reference import (
     referenced_tasks,
     samples_limit,
 )
-from mjlab.scripts.run_folder import read_run_info, run_folders, sessions_of
+from mjlab.scripts.run_folder import read_run_info, runs_named, sessions_of
 from mjlab.utils.errors import BadCallError, UserError
 
 if TYPE_CHECKING:
@@ -128,9 +128,8 @@ def _newest_run(task: str, cfg: VerifyConfig) -> Path:
     from mjlab.tasks.registry import load_rl_cfg
 
     experiment = Path(cfg.log_root).resolve() / load_rl_cfg(task).experiment_name
-    name = re.compile(rf".*_verify_seed_{cfg.seed}(-\d+)?")
-    for run_dir in run_folders(experiment):
-        if name.fullmatch(run_dir.name) and read_run_info(run_dir).get("task") == task:
+    for run_dir in runs_named(experiment, f"verify_seed_{cfg.seed}"):
+        if read_run_info(run_dir).get("task") == task:
             return run_dir
     raise UserError(
         f"--resume: expected a run of `verify {task}` with seed {cfg.seed} in {experiment}, got "

@@ -25,7 +25,6 @@ from mjlab.viewer.page_server import check_address, page_url, serve_page
 from mjlab.viewer.viser.scene import MjlabViserScene
 
 RobotName = Literal["unitree_go1", "unitree_g1", "none"]
-Kind = Literal["number", "count", "range", "switch", "choice"]
 # Fields set by the page, or not representable by a slider.
 _NOT_CONTROLS = {"proportion", "size", "flat_patch_sampling"}
 # Pixel sizes: near 0 a height field would have millions of pixels.
@@ -109,7 +108,6 @@ class TerrainPage:
         self.scene: TerrainScene | None = None
         """Current scene; None before the first `rebuild`."""
         self._changed = threading.Event()
-        self._changed.set()
         self._aimed_at: tuple[Any, ...] | None = None
         gui = server.gui
         self._status = gui.add_markdown("")
@@ -126,8 +124,8 @@ class TerrainPage:
         self._handles: dict[str, Any] = {}
         self._preset = terrain
         for handle in (self._levels, self._size, self._seed, self._robot):
-            handle.on_update(self._request_rebuild)
-        self._terrain.on_update(self._on_preset)
+            handle.on_update(lambda _: self._changed.set())
+        self._terrain.on_update(self._add_controls)
         self._add_controls()
 
     @property
@@ -184,40 +182,18 @@ class TerrainPage:
                 shown.aim()
         self._aimed_at = (levels, kinds, size)
 
-    # Callbacks of controls, called from server threads.
-
-    def _request_rebuild(self, _: Any = None) -> None:
-        self._changed.set()
-
-    def _on_preset(self, _: Any) -> None:
-        self._add_controls()
-        self._request_rebuild()
-
-    def _add_controls(self) -> None:
-        """Replace the sliders by those of the selected preset."""
+    def _add_controls(self, _: Any = None) -> None:
+        """Replace the sliders by those of the selected preset, and request the preset."""
         with self._lock, self._folder:
             for handle in self._handles.values():
                 handle.remove()
             self._handles, self._preset = {}, self._terrain.value
-            if self._preset == ALL:
-                return
-            for control in controls_of(ALL_TERRAIN_PRESETS[self._preset]()):
-                handle = self._add_control(control)
-                handle.on_update(self._request_rebuild)
-                self._handles[control.field] = handle
-
-    def _add_control(self, control: FieldControl) -> Any:
-        gui, label = self.server.gui, control.field
-        if control.kind == "switch":
-            return gui.add_checkbox(label, control.value)
-        if control.kind == "choice":
-            return gui.add_dropdown(label, control.options, initial_value=control.value)
-        if control.kind == "count":
-            return gui.add_slider(label, int(control.low), int(control.high), 1, control.value)
-        step = (control.high - control.low) / 200
-        if control.kind == "range":
-            return gui.add_multi_slider(label, control.low, control.high, step, control.value)
-        return gui.add_slider(label, control.low, control.high, step, control.value)
+            if self._preset != ALL:
+                preset = ALL_TERRAIN_PRESETS[self._preset]()
+                self._handles = add_controls(self.server.gui, preset)
+            for handle in self._handles.values():
+                handle.on_update(lambda _: self._changed.set())
+        self._changed.set()
 
 
 # Terrain.
@@ -298,51 +274,32 @@ def count_polygons(model: mujoco.MjModel) -> int:
 # Controls of config fields.
 
 
-@dataclass(frozen=True)
-class FieldControl:
-    """Control of a config field."""
+def add_controls(gui: viser.GuiApi, cfg: SubTerrainCfg) -> dict[str, Any]:
+    """Add the controls of a config in field order and return them by field.
 
-    field: str
-    """Name of the field."""
-    kind: Kind
-    """Kind of value: float, int, pair of floats, bool, or one of several strings."""
-    value: Any
-    """Current value."""
-    low: float = 0.0
-    """Minimum of the slider."""
-    high: float = 1.0
-    """Maximum of the slider."""
-    options: tuple[str, ...] = ()
-    """Options of a choice."""
-
-
-def controls_of(cfg: SubTerrainCfg) -> list[FieldControl]:
-    """Return the controls of a config in field order. Fields that are None are skipped."""
+    Fields that are None have no control.
+    """
     hints = typing.get_type_hints(type(cfg))
-    controls = []
-    for field in dataclasses.fields(cfg):
-        if field.name in _NOT_CONTROLS:
-            continue
-        control = _control(field.name, getattr(cfg, field.name), hints[field.name])
-        if control is not None:
-            controls.append(control)
-    return controls
+    names = [f.name for f in dataclasses.fields(cfg) if f.name not in _NOT_CONTROLS]
+    controls = {n: _add_control(gui, n, getattr(cfg, n), hints[n]) for n in names}
+    return {name: control for name, control in controls.items() if control is not None}
 
 
-def _control(name: str, value: Any, hint: Any) -> FieldControl | None:
+def _add_control(gui: viser.GuiApi, name: str, value: Any, hint: Any) -> Any:
     if isinstance(value, bool):
-        return FieldControl(name, "switch", value)
+        return gui.add_checkbox(name, value)
     if typing.get_origin(hint) is Literal:
-        return FieldControl(name, "choice", value, options=typing.get_args(hint))
+        return gui.add_dropdown(name, typing.get_args(hint), initial_value=value)
     if isinstance(value, int):
-        return FieldControl(name, "count", value, 1, 3 * max(value, 1))
-    if isinstance(value, float):
-        if name in _PIXELS:
-            return FieldControl(name, "number", value, value / 2, 4 * value)
-        return FieldControl(name, "number", value, min(0.0, 2 * value), max(1.0, 2 * value))
+        return gui.add_slider(name, 1, 3 * max(value, 1), 1, value)
     if isinstance(value, tuple) and len(value) == 2:
-        low, high = value
-        return FieldControl(name, "range", value, min(0.0, 2 * low), max(2 * high, 0.1))
+        low, high = min(0.0, 2 * value[0]), max(2 * value[1], 0.1)
+        return gui.add_multi_slider(name, low, high, (high - low) / 200, value)
+    if isinstance(value, float):
+        low, high = min(0.0, 2 * value), max(1.0, 2 * value)
+        if name in _PIXELS:
+            low, high = value / 2, 4 * value
+        return gui.add_slider(name, low, high, (high - low) / 200, value)
     return None
 
 

@@ -45,8 +45,7 @@ def run_viz_nan(path: str, cfg: VizNanConfig) -> None:
     """Serve the page of the dump at `path` until Ctrl-C.
 
     Raises:
-        UserError: the dump or its model is missing or unreadable.
-        ValueError: invalid address.
+        UserError, ValueError, OSError: invalid address, or see `load_dump`.
     """
     check_address(cfg.host, cfg.port, "--")
     dump, model = load_dump(path)
@@ -64,24 +63,11 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
     """Return a dump and its model.
 
     Raises:
-        UserError: dump or model is missing or unreadable.
+        FileNotFoundError: dump or model is missing; the model must be in the folder of the dump.
+        ValueError: the file is not a valid dump.
+        UserError: the model is damaged, or of another dump.
     """
-    try:
-        dump = NanDump.load(path)
-    except ValueError as error:
-        raise UserError(str(error)) from error
-    except FileNotFoundError:
-        raise UserError(
-            f"Dump {path} not found; use `train --enable-nan-guard True` to write a dump when a NaN "
-            "occurs."
-        ) from None
-    if not dump.steps:
-        raise UserError(f"Dump {path}: expected recorded states, got none.")
-    if not dump.model_file.is_file():
-        raise UserError(
-            f"Dump {path}: expected its model {dump.model_file.name} in the same folder, got none; "
-            "copy both files."
-        )
+    dump = NanDump.load(path)
     digest = hashlib.sha256(dump.model_file.read_bytes()).hexdigest()
     # MuJoCo loads most damaged models without an error. Older dumps lack the digest.
     if dump.metadata.get("model_sha256", digest) != digest:

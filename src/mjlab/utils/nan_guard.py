@@ -253,21 +253,20 @@ class NanDump:
             FileNotFoundError: `path` does not exist.
             ValueError: the file is not a valid dump.
         """
-        import numpy as np
-
         path = Path(path).resolve()
         with path.open("rb") as file:
             is_archive = file.read(len(_ARCHIVE)) == _ARCHIVE
         try:
             if not is_archive:
                 raise ValueError("not an .npz file")
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
+            arrays = _read_arrays(path)
             metadata = json.loads(str(arrays.pop("_metadata")))
+            if missing := [name for name in _METADATA if name not in metadata]:
+                raise ValueError(f"metadata {missing} not found")
             for name, kind in _METADATA.items():
-                if not isinstance(metadata.get(name), kind):
+                if not isinstance(metadata[name], kind):
                     raise ValueError(
-                        f"metadata {name}: expected {kind.__name__}, got {metadata.get(name)!r}"
+                        f"metadata {name}: expected {kind.__name__}, got {metadata[name]!r}"
                     )
             rows = metadata["num_envs_dumped"]
             if rows != len(metadata["dumped_env_ids"]) or rows < 1:
@@ -314,6 +313,23 @@ class NanDump:
                 present[:] = values[row].reshape(present.shape)
             else:
                 setattr(owner, field, values[row].item())
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    import numpy as np
+
+    arrays = {}
+    with np.load(path, allow_pickle=False) as file:
+        for name in file.files:
+            try:
+                arrays[name] = file[name]
+            except ValueError as error:
+                if "allow_pickle" in str(error):
+                    raise ValueError(
+                        f"{name}: Python objects are not allowed in dumps; nothing was executed"
+                    ) from error
+                raise
+    return arrays
 
 
 def _link(link: Path, target: Path) -> None:
