@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 
 from mjlab.rl.learners import Learner
 from mjlab.utils.errors import MjlabError, check_count
@@ -36,6 +35,7 @@ from mjlab.utils.random import rng_state, set_rng_state
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
 
 logger = logging.getLogger(__name__)
 
@@ -526,6 +526,9 @@ def restore_training_state(
 
 def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
     """Return the observations of `state`; raise ValueError if it is of different environments."""
+    # Loads torch's compiler, which takes seconds; `train TASK --help` imports this module.
+    from tensordict import TensorDict
+
     if state.get("version") != VERSION:
         raise ValueError(f"training_state version: expected {VERSION}, got {state.get('version')}.")
     if state["num_envs"] != env.num_envs:

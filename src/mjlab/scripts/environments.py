@@ -9,8 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjlab import rl
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.rl.learners import learner_of
 from mjlab.scripts.flags import options_of
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls, task_source
@@ -47,7 +47,7 @@ def make_env(
         cfg.sim.engine = engine
     env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
     clip_actions = load_rl_cfg(task, profile=profile).clip_actions
-    return RslRlVecEnvWrapper(env, clip_actions=clip_actions)
+    return rl.RslRlVecEnvWrapper(env, clip_actions=clip_actions)
 
 
 def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) -> Any:
@@ -67,7 +67,7 @@ def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank
             video_length=cfg.video_length,
             disable_logger=True,
         )
-    return RslRlVecEnvWrapper(env, clip_actions=cfg.agent.clip_actions)
+    return rl.RslRlVecEnvWrapper(env, clip_actions=cfg.agent.clip_actions)
 
 
 @contextlib.contextmanager
@@ -90,9 +90,9 @@ def _reserve_learner_core(cfg: TrainConfig, device: str, rank: ProcessRank) -> G
 
 def training_runner(
     task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str
-) -> MjlabOnPolicyRunner:
+) -> rl.MjlabOnPolicyRunner:
     """Return the runner of `task`, with newly initialized networks."""
-    runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
+    runner_cls: Any = load_runner_cls(task) or rl.MjlabOnPolicyRunner
     if cfg.agent.logger == "wandb":
         add_wandb_tags(cfg.agent.wandb_tags)
     # Reseed, so that the initial networks depend on the seed alone, not on the random numbers drawn

@@ -20,7 +20,6 @@ from mjlab.rl.distributed import (
 )
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import gpus_to_share, training_device
-from mjlab.scripts.display import report_divergence, show_training, write_results
 from mjlab.scripts.environments import training_env, training_runner
 from mjlab.scripts.flags import (
     parse_with_choices,
@@ -111,6 +110,9 @@ run_train = launch_training
 def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
+    # Imports rsl_rl, which takes seconds; flags are checked before.
+    from mjlab.scripts.display import report_divergence, write_results
+
     # One process looks up the checkpoint, before the new run folder could be found.
     checkpoint = broadcast_from_first(lambda: checkpoint_to_resume(task, cfg))
     if cfg.agent.seed == -1:
@@ -185,6 +187,8 @@ def _learn(
     if isinstance(folder, SharedRunFolder):
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
         return
+    from mjlab.scripts.display import show_training
+
     show_training(task, cfg, runner, folder)
     try:
         runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
