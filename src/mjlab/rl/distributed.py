@@ -240,12 +240,9 @@ def output_of(rank: ProcessRank) -> Generator[ProcessOutput | None]:
         yield None
         return
     output = ProcessOutput()
-    handlers = [
-        handler
-        for handler in logging.getLogger().handlers
-        if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr
-    ]
     terminal = sys.stderr
+    streams = [h for h in logging.getLogger().handlers if isinstance(h, logging.StreamHandler)]
+    handlers = [handler for handler in streams if handler.stream is terminal]
     for handler in handlers:
         handler.setStream(output)
     try:

@@ -246,10 +246,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Return the initial observations: resumed ones, or those of the environments."""
         self.alg.train_mode()
         # Enabled here instead of in the wrapper, which play and evaluation use as well.
-        takes_final = isinstance(self.alg, PPO) or getattr(
+        uses_ends = isinstance(self.alg, PPO) or getattr(
             self.alg, "takes_final_observations", False
         )
-        if takes_final and hasattr(self.env, "observe_ends"):
+        if uses_ends and hasattr(self.env, "observe_ends"):
             self.env.observe_ends()
         if self.is_distributed:
             self.alg.broadcast_parameters()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,8 +129,8 @@ def _read(cfg: CsvToNpzConfig, source: Path, robot: Entity) -> Recording:
             f"{cfg.line_range}."
         )
     kept = slice(first - 1, last)
-    return Recording(
-        fps=recording.fps,
+    return replace(
+        recording,
         root_pos=recording.root_pos[kept],
         root_quat=recording.root_quat[kept],
         joint_pos=recording.joint_pos[kept],

@@ -189,12 +189,9 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
         if comparison.limit is not None:
             axes.axvline(comparison.limit / 1e6, color="gray", ls=":", label="solved by here")
 
+    curves = [seed.run.curve_in_millions() for seed in reference.seeds]
     return plot_curves(
-        {
-            f"reference, {len(reference.seeds)} seeds": [
-                seed.run.curve_in_millions() for seed in reference.seeds
-            ]
-        },
+        {f"reference, {len(curves)} seeds": curves},
         output,
         title=reference.task,
         xlabel="Samples (millions)",

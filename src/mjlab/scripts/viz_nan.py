@@ -184,14 +184,11 @@ class NanPage:
         shown = ", ".join(map(str, ids[:_SHOWN_ENVS])) + (" ..." if len(ids) > _SHOWN_ENVS else "")
         # Non-finite fields, or the largest values.
         bad = [name for name in _FIELDS if not np.isfinite(getattr(self.data, name)).all()]
-        if bad:
-            findings = [f"Not finite here: {', '.join(bad)}"]
-        else:
-            findings = [
-                f"Largest |{name}|: {_largest(self.model, getattr(self.data, name))}"
-                for name in ("qvel", "qacc")
-                if self.model.nv > 0
-            ]
+        findings = [f"Not finite here: {', '.join(bad)}"]
+        if not bad:
+            names = ("qvel", "qacc") if self.model.nv > 0 else ()
+            largest = {name: _largest(self.model, getattr(self.data, name)) for name in names}
+            findings = [f"Largest |{name}|: {value}" for name, value in largest.items()]
         lines = [
             f"**Substep {self.dump.steps[index]}** ({index + 1} of {len(self.dump.steps)} recorded; "
             f"NaN found after substep {metadata['detection_step'] - 1})",

@@ -487,9 +487,7 @@ def _bounds_by_axis(
         return dict.fromkeys(targets, read_bounds(ranges, f"{row.name}: ranges"))
     missing = [axis for axis in targets if axis not in ranges]
     if missing:
-        raise ValueError(
-            f"{row.name}: ranges: expected entries for axes {missing}, got {ranges!r}."
-        )
+        raise ValueError(f"{row.name} ranges: expected axes {missing}, got {ranges!r}.")
     return {axis: read_bounds(ranges[axis], f"{row.name}: ranges[{axis}]") for axis in targets}
 
 
