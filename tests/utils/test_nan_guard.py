@@ -241,6 +241,19 @@ def test_a_file_that_is_no_dump_is_refused(tmp_path: Path) -> None:
         NanDump.load(tmp_path / "missing.npz")
 
 
+def test_a_dump_without_states_is_refused(
+    model: mujoco.MjModel, data: SimpleNamespace, tmp_path: Path
+) -> None:
+    guard = make_guard(model, tmp_path)
+    run_until_nan(guard, data, [0])
+    with np.load(guard.dump_path or "") as arrays:
+        kept = {name: arrays[name] for name in arrays if not name.startswith("states_step_")}
+    path = Path(guard.dump_path or "").with_name("other.npz")
+    np.savez(path, **kept)
+    with pytest.raises(ValueError, match="recorded states, got none"):
+        NanDump.load(path)
+
+
 @pytest.mark.parametrize("field", ["buffer_size", "max_envs_to_dump"])
 def test_sizes_below_one_are_refused(model: mujoco.MjModel, tmp_path: Path, field: str) -> None:
     with pytest.raises(ValueError, match=f"{field}.*0"):

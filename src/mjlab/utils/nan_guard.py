@@ -277,6 +277,8 @@ class NanDump:
             steps = sorted(
                 int(name.rpartition("_")[2]) for name in arrays if name.startswith("states_step_")
             )
+            if not steps:
+                raise ValueError("expected recorded states, got none")
         except Exception as error:
             # Damaged bytes can make the readers raise any exception.
             reason = " ".join(str(error).split()) or type(error).__name__

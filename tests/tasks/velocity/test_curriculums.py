@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from stand_ins import StandInEnv, velocity_command
 from velocity_tasks import GO1_ROUGH
 
+from mjlab.managers import CommandTerm, CommandTermCfg
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.mdp.curriculums import VelocityStage
 
@@ -110,6 +112,33 @@ def test_with_the_elapsed_time_an_episode_cut_short_does_not_send_down():
     _, moves = levels(env, use_elapsed_time=True)
     assert moves[1:] == ([0] * 4, [0, 1, 1, 0])
     assert levels(env)[1][2] == [1, 1, 1, 1]
+
+
+def test_a_command_that_does_not_know_its_time_is_refused(make_env):
+    @dataclass(kw_only=True)
+    class OtherCommandCfg(CommandTermCfg):
+        def build(self, env):
+            return NullCommand(self, env)
+
+    class NullCommand(CommandTerm):
+        command = torch.zeros(4, 3)
+
+        def _update_metrics(self):
+            pass
+
+        def _resample_command(self, env_ids):
+            pass
+
+        def _update_command(self):
+            pass
+
+    def edit(cfg):
+        cfg.commands["other"] = OtherCommandCfg(resampling_time_range=(1.0, 1.0))
+        params = {"command_name": "other", "use_elapsed_time": True}
+        cfg.curriculum["terrain_levels"].params.update(params)
+
+    with pytest.raises(ValueError, match="elapsed_s, got NullCommand as 'other'"):
+        make_env(GO1_ROUGH, edit=edit)
 
 
 def test_the_time_since_the_reset_does_not_start_at_a_random_number(make_env):

@@ -10,7 +10,7 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import check_range, checked_when_built, require_command
-from mjlab.tasks.velocity.mdp.rewards import check_command, velocity_command
+from mjlab.tasks.velocity.mdp.rewards import velocity_command
 from mjlab.tasks.velocity.mdp.velocity_command import RANGES
 from mjlab.utils.errors import check_exists
 
@@ -42,7 +42,19 @@ class VelocityStage(TypedDict, total=False):
     """Yaw rate (rad/s)."""
 
 
-@checked_when_built(check_command)
+def _check_levels(
+    env: ManagerBasedRlEnv, command_name: str, use_elapsed_time: bool = False, **_: Any
+) -> None:
+    require_command(env, command_name)
+    term = env.command_manager.get_term(command_name)
+    if use_elapsed_time and not hasattr(term, "elapsed_s"):
+        raise ValueError(
+            f"use_elapsed_time: expected a command term with elapsed_s, got {type(term).__name__} as "
+            f"{command_name!r}; use UniformVelocityCommandCfg, or use_elapsed_time=False."
+        )
+
+
+@checked_when_built(_check_levels)
 def terrain_levels_vel(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor,
