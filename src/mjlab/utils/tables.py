@@ -144,6 +144,7 @@ class _Column:
 
     def __init__(self, name: str, values: list[Any]) -> None:
         self.name = name
+        values = [_array_as_list(value) for value in values]
         self.cells = ["" if value is False else format_value(value) for value in values]
         if name in _DETAILS:
             self.cells = [
