@@ -222,6 +222,28 @@ flags:
         ),
     ),
     Command(
+        "view",
+        "Tasks",
+        "Show any MJCF or URDF in the browser, with sliders.",
+        "mjlab.scripts.view:command",
+        "MODEL",
+        """\
+Show a model in the browser: joint and actuator sliders, geom groups, sites, contacts, inertia and frames.
+MODEL is a file (MJCF, URDF, MJB or a MuJoCo archive), a robot (g1, go1, yam, or module:function that
+returns an EntityCfg) or a task.
+
+flags:
+    --host ADDRESS            address to serve on; 0.0.0.0: all interfaces (default: 127.0.0.1)
+    --port N                  port to serve on; the next free port if taken (default: 8080)
+    --open-browser BOOL       open the page (default: True)""",
+        (
+            "mjlab view robot.xml",
+            "mjlab view robot.urdf",
+            "mjlab view go1",
+            "mjlab view Mjlab-Velocity-Rough-Unitree-Go1",
+        ),
+    ),
+    Command(
         "visualize-terrain",
         "Tasks",
         "Show terrains in the browser.",

@@ -56,7 +56,7 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
     """
     from mjlab.scene import Scene
 
-    scene_cfg, options = _load(target)
+    scene_cfg, options = scene_and_options(target)
     folder, result = _destination(cfg)
     scene = Scene(scene_cfg, "cpu")
     target_options: Any = SimpleNamespace(opt=scene.spec.option)
@@ -70,8 +70,12 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
     return result
 
 
-def _load(target: str) -> tuple[SceneCfg, MujocoCfg]:
-    """Return scene and physics options of a task, or of a robot."""
+def scene_and_options(target: str) -> tuple[SceneCfg, MujocoCfg]:
+    """Return scene and physics options of a task, or of a robot (see `robot_cfg`).
+
+    Raises:
+        UserError: unknown target.
+    """
     from mjlab.scene import SceneCfg
     from mjlab.sim import MujocoCfg
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
-import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -26,7 +24,7 @@ from mjlab.scripts.run_folder import is_run_folder
 from mjlab.utils.errors import UserError, check_count
 from mjlab.utils.torch import threads_for_policy
 from mjlab.viewer.base import run_headless
-from mjlab.viewer.page_server import check_address
+from mjlab.viewer.page_server import check_address, open_browser
 
 __getattr__ = older_names(__name__)
 
@@ -145,18 +143,13 @@ def _make_viewer(
         )
     viewer = ViserPlayViewer(env, policy, checkpoint_manager=manager, host=cfg.host, port=cfg.port)
     print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)
-    if cfg.open_browser and _can_open_browser():
-        webbrowser.open(viewer.url)
+    if cfg.open_browser:
+        open_browser(viewer.url)
     return viewer
 
 
 def _has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _can_open_browser() -> bool:
-    # Without a display, Linux would open a text browser in this terminal.
-    return sys.platform in ("darwin", "win32") or _has_display()
 
 
 def main() -> None:

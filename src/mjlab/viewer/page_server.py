@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
+import sys
+import webbrowser
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -65,3 +68,13 @@ def page_url(server: viser.ViserServer) -> str:
     if host in (*_LOOPBACK, *_ALL_INTERFACES):
         host = "localhost"
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
+
+
+def open_browser(url: str) -> None:
+    """Open `url` in the browser of this machine, if it has a display.
+
+    Without a display, Linux would open a text browser in the terminal.
+    """
+    has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform in ("darwin", "win32") or has_display:
+        webbrowser.open(url)

@@ -1,0 +1,340 @@
+"""Show a model in the browser: `mjlab view robot.xml`, also URDF, a robot or a task."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import viser
+
+from mjlab.scripts.export_scene import ROBOTS, scene_and_options
+from mjlab.scripts.flags import parse_flags
+from mjlab.utils.errors import MjlabError, UserError
+from mjlab.viewer.camera import whole_model_view
+from mjlab.viewer.page_server import check_address, open_browser, page_url, serve_page
+from mjlab.viewer.viser.look import set_theme
+from mjlab.viewer.viser.scene import MjlabViserScene
+
+_SUFFIXES = (".xml", ".mjcf", ".urdf", ".mjb", ".mjz", ".zip")
+_FRAME_TIME = 1.0 / 30.0
+_MAX_LISTED = 60
+# Distance of the camera, in extents of the model.
+_DISTANCE = 1.8
+# Limits of sliders for joints and actuators without a range.
+_HINGE_LIMIT, _SLIDE_LIMIT, _CTRL_LIMIT = 3.1416, 1.0, 1.0
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_KEY, _JOINT, _ACTUATOR = (
+    mujoco.mjtObj.mjOBJ_KEY,
+    mujoco.mjtObj.mjOBJ_JOINT,
+    mujoco.mjtObj.mjOBJ_ACTUATOR,
+)
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """Flags of `view`."""
+
+    host: str = "127.0.0.1"
+    """Address of the page. `0.0.0.0`: all interfaces."""
+    port: int = 8080
+    """Port of the page; the next free port if taken."""
+    open_browser: bool = True
+    """Open the page in the browser of this machine."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `mjlab view`."""
+    target, *flags = argv
+    run_view(target, parse_flags(ViewConfig, ViewConfig(), flags, f"{prog} MODEL"))
+
+
+def run_view(target: str, cfg: ViewConfig) -> None:
+    """Serve the page of a model until Ctrl-C.
+
+    Raises:
+        UserError: the model cannot be found or compiled.
+        ValueError: invalid address.
+    """
+    check_address(cfg.host, cfg.port, "--")
+    model = load_model(target)
+    server = serve_page(cfg.host, cfg.port)
+    page = ModelPage(server, target, model, lambda: load_model(target))
+    print(f"Open {page_url(server)} in a browser. Ctrl-C ends.", flush=True)
+    if cfg.open_browser:
+        open_browser(page_url(server))
+    try:
+        page.run()
+    finally:
+        server.stop()
+
+
+def load_model(target: str) -> mujoco.MjModel:
+    """Return the model of a file, robot or task, with a floor if it would fall forever.
+
+    Args:
+        target: Path of an MJCF, URDF, MJB or MuJoCo archive; a robot (g1, go1, yam or
+            `module:function`); or the name of a task.
+
+    Raises:
+        UserError: not found, or MuJoCo cannot compile it; the message has the path and the reason.
+    """
+    path = Path(target)
+    if path.suffix.lower() in _SUFFIXES or path.exists():
+        return _load_file(path)
+    from mjlab.scene import Scene
+    from mjlab.terrains import TerrainEntityCfg
+
+    try:
+        scene_cfg, physics = scene_and_options(target)
+    except MjlabError as error:
+        raise UserError(
+            f"View {target!r}: expected a file ({', '.join(_SUFFIXES)}), a robot ({', '.join(ROBOTS)} or "
+            f"module:function) or a task, found none. {error}"
+        ) from None
+    if scene_cfg.terrain is None:
+        scene_cfg.terrain = TerrainEntityCfg(terrain_type="plane")
+    scene = Scene(scene_cfg, "cpu")
+    options: Any = SimpleNamespace(opt=scene.spec.option)
+    physics.apply(options)
+    return scene.compile()
+
+
+def _load_file(path: Path) -> mujoco.MjModel:
+    if not path.is_file():
+        raise UserError(f"View {path}: expected a file ({', '.join(_SUFFIXES)}), found none.")
+    try:
+        if path.suffix.lower() == ".mjb":
+            return mujoco.MjModel.from_binary_path(str(path))
+        spec = _read_spec(path)
+        # A robot without ground would fall out of view once the physics runs.
+        is_free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints)
+        if is_free and not spec.worldbody.geoms:
+            floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE)
+            floor.size = (10.0, 10.0, 0.1)
+        return spec.compile()
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path}: MuJoCo cannot load the model: {reason}") from error
+
+
+def _read_spec(path: Path) -> mujoco.MjSpec:
+    """Return the spec of an MJCF or URDF, with the visual geoms and package paths of a URDF.
+
+    MuJoCo drops the visual geoms of a URDF, and knows no ROS packages: `package://NAME/FILE` becomes the
+    first existing FILE or NAME/FILE below the folders above the URDF.
+    """
+    if path.suffix.lower() != ".urdf":
+        return mujoco.MjSpec.from_file(str(path))
+    try:
+        robot = ElementTree.fromstring(path.read_text(encoding="utf-8"))
+    except ElementTree.ParseError as error:
+        raise ValueError(f"not an XML file: {error}") from error
+    if robot.find("mujoco") is not None:
+        return mujoco.MjSpec.from_file(str(path))
+    for mesh in robot.iter("mesh"):
+        name = mesh.get("filename", "")
+        package, _, file = name.removeprefix("package://").partition("/")
+        folders = [path.resolve().parent] if file == "" else path.resolve().parents
+        tried = [folder / part for folder in folders for part in (file, f"{package}/{file}")]
+        if not name.startswith("package://"):
+            tried = [path.resolve().parent / name.removeprefix("file://")]
+        found = [candidate for candidate in tried if candidate.is_file()]
+        if not found:
+            raise ValueError(
+                f"mesh {name!r} not found; looked for {tried[0]} and in the folders above, for packages"
+            )
+        mesh.set("filename", str(found[0]))
+    options = ElementTree.SubElement(robot, "mujoco")
+    ElementTree.SubElement(options, "compiler", discardvisual="false", strippath="false")
+    return mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
+
+
+class ModelPage:
+    """Page of one model: joint and actuator sliders, physics, keyframes and MuJoCo's overlays.
+
+    Controls change the state under a lock; the thread that calls `run` steps and draws.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        title: str,
+        model: mujoco.MjModel,
+        reload: Callable[[], mujoco.MjModel],
+    ) -> None:
+        """Build the page, with the physics paused.
+
+        Args:
+            server: Server of the page.
+            title: Name of the model.
+            model: Compiled model.
+            reload: Returns the model again, for the button Reload; raises `UserError` if it is
+                damaged.
+        """
+        self._server, self._title, self._reload = server, title, reload
+        self._lock = threading.RLock()
+        self._next: mujoco.MjModel | None = None
+        self._changed = threading.Event()
+        set_theme(server)
+        self._build(model)
+
+    def run(self) -> None:
+        """Step the physics in real time if not paused, and draw, until Ctrl-C."""
+        last = time.perf_counter()
+        while True:
+            time.sleep(_FRAME_TIME)
+            now = time.perf_counter()
+            self.advance(min(now - last, 2.0 * _FRAME_TIME))
+            last = now
+
+    def advance(self, seconds: float) -> None:
+        """Advance the physics by `seconds` unless paused, and draw changes."""
+        with self._lock:
+            if self._next is not None:
+                model, self._next = self._next, None
+                self._server.gui.reset()
+                self._server.scene.reset()
+                self._build(model)
+            if self.playing.value:
+                end = self.data.time + seconds
+                while self.data.time < end:
+                    mujoco.mj_step(self.model, self.data)
+                self._changed.set()
+            if self._changed.is_set() or self.scene.needs_update:
+                self._changed.clear()
+                mujoco.mj_forward(self.model, self.data)
+                self.scene.update_from_mjdata(self.data)
+
+    def _build(self, model: mujoco.MjModel) -> None:
+        gui = self._server.gui
+        self.model, self.data = model, mujoco.MjData(model)
+        self.joints: dict[str, viser.GuiSliderHandle[float]] = {}
+        self.actuators: dict[str, viser.GuiSliderHandle[float]] = {}
+        view = replace(whole_model_view(model), distance=_DISTANCE * float(model.stat.extent))
+        self.scene = MjlabViserScene(self._server, model, 1, view=view)
+        self.scene.set_refresh_handler(self._changed.set)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Model", icon=viser.Icon.ROBOT):
+            gui.add_markdown(describe_model(self._title, model))
+            self.message = gui.add_markdown("")
+            self.playing = gui.add_checkbox("Run physics", False)
+            gui.add_button("Reload", icon=viser.Icon.REFRESH).on_click(lambda _: self.reload())
+            keys = [_name(model, _KEY, key) for key in range(model.nkey)]
+            self.pose = gui.add_dropdown("Pose", ["initial", *keys])
+            gui.add_button("Set pose").on_click(lambda _: self.set_pose(self.pose.value))
+            with gui.add_folder("Scene"):
+                self.scene.create_scene_gui(show_debug_viz_control=False)
+        with tabs.add_tab("Joints", icon=viser.Icon.ADJUSTMENTS):
+            self._add_joint_sliders()
+            self._add_actuator_sliders()
+        with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
+            self.scene.create_overlay_gui()
+        self.scene.create_groups_gui(tabs)
+        self.set_pose(keys[0] if keys else "initial")
+
+    def reload(self) -> None:
+        """Load the model again; a damaged one leaves the page as it is, with the message."""
+        try:
+            self._next = self._reload()
+        except MjlabError as error:
+            self.message.content = f"**Not reloaded.** {error}"
+
+    def set_pose(self, name: str) -> None:
+        """Set a keyframe by name, or the `initial` pose of the model."""
+        with self._lock:
+            key = next(
+                (k for k in range(self.model.nkey) if _name(self.model, _KEY, k) == name), None
+            )
+            if key is None:
+                mujoco.mj_resetData(self.model, self.data)
+            else:
+                mujoco.mj_resetDataKeyframe(self.model, self.data, key)
+            for joint, slider in self.joints.items():
+                slider.value = float(self.data.joint(joint).qpos[0])
+            for actuator, slider in self.actuators.items():
+                slider.value = float(self.data.actuator(actuator).ctrl[0])
+            self._changed.set()
+
+    def _add_joint_sliders(self) -> None:
+        model = self.model
+        with self._server.gui.add_folder("Joints (rad, m)"):
+            for joint in range(model.njnt):
+                kind, name = int(model.jnt_type[joint]), model.joint(joint).name
+                if kind not in (_HINGE, _SLIDE) or not name:
+                    continue
+                limit = _HINGE_LIMIT if kind == _HINGE else _SLIDE_LIMIT
+                bounds = model.jnt_range[joint] if model.jnt_limited[joint] else (-limit, limit)
+                self.joints[name] = self._add_slider(name, bounds, "qpos")
+
+    def _add_actuator_sliders(self) -> None:
+        model = self.model
+        with self._server.gui.add_folder("Actuators (ctrl)"):
+            for actuator in range(model.nu):
+                name, joint = model.actuator(actuator).name, int(model.actuator_trnid[actuator, 0])
+                drives_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+                bounds: Any = (-_CTRL_LIMIT, _CTRL_LIMIT)
+                if model.actuator_ctrllimited[actuator]:
+                    bounds = model.actuator_ctrlrange[actuator]
+                elif drives_joint and model.jnt_limited[joint]:
+                    bounds = model.jnt_range[joint]
+                if name:
+                    self.actuators[name] = self._add_slider(name, bounds, "ctrl")
+
+    def _add_slider(self, name: str, bounds: Any, target: str) -> viser.GuiSliderHandle[float]:
+        """Add a slider that writes `qpos` of a joint or `ctrl` of an actuator."""
+        low, high = float(bounds[0]), float(bounds[1])
+        slider = self._server.gui.add_slider(
+            name, low, high, max((high - low) / 500.0, 1e-6), min(max(0.0, low), high)
+        )
+
+        @slider.on_update
+        def _(event: viser.GuiEvent) -> None:
+            # Values set by the page itself have no client.
+            if event.client is not None:
+                self.set_value(name, target, slider.value)
+
+        return slider
+
+    def set_value(self, name: str, target: str, value: float) -> None:
+        """Set `qpos` of a joint or `ctrl` of an actuator by name."""
+        with self._lock:
+            if target == "qpos":
+                self.data.joint(name).qpos = value
+            else:
+                self.data.actuator(name).ctrl = value
+            self._changed.set()
+
+
+def describe_model(title: str, model: mujoco.MjModel) -> str:
+    """Return sizes, mass and joints of a model as Markdown."""
+    kinds = {0: "free", 1: "ball", _SLIDE: "slide", _HINGE: "hinge"}
+    lines = [
+        f"**{title}**",
+        "",
+        f"{model.nbody - 1} bodies, {model.ngeom} geoms, {model.nu} actuators, {model.nsensor} sensors; "
+        f"nq {model.nq}, nv {model.nv}. Mass {model.body_mass.sum():.3g} kg, timestep "
+        f"{model.opt.timestep:g} s.",
+        "",
+        "| joint | type | range |",
+        "| --- | --- | --- |",
+    ]
+    for joint in range(min(model.njnt, _MAX_LISTED)):
+        kind = int(model.jnt_type[joint])
+        low, high = model.jnt_range[joint]
+        unit = "rad" if kind == _HINGE else "m"
+        limits = f"{low:.3g} to {high:.3g} {unit}" if model.jnt_limited[joint] else "unlimited"
+        lines.append(f"| {_name(model, _JOINT, joint)} | {kinds[kind]} | {limits} |")
+    if model.njnt > _MAX_LISTED:
+        lines.append(f"| ... {model.njnt - _MAX_LISTED} more | | |")
+    return "\n".join(lines)
+
+
+def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
+    return mujoco.mj_id2name(model, kind, index) or f"{index}"

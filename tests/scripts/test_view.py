@@ -1,0 +1,145 @@
+"""`mjlab view`: models of any kind on a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjlab.scripts.view import ModelPage, ViewConfig, load_model, run_view
+from mjlab.utils.errors import UserError
+
+MJCF = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos="0 0 1"><freejoint/><geom size=".1"/>
+      <body name="arm"><joint name="elbow" range="-90 45"/><geom size=".02 .1" type="capsule"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor name="elbow_motor" joint="elbow" ctrlrange="-2 2"/></actuator>
+  <keyframe><key name="bent" qpos="0 0 .5 1 0 0 0 .3" ctrl="1"/></keyframe>
+</mujoco>
+"""
+URDF = """
+<robot name="two"><link name="a"/>
+  <link name="b"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry>{geometry}</geometry></visual></link>
+  <joint name="hinge" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "robot.xml"
+    path.write_text(MJCF, encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def page(file: Path, viser_server) -> ModelPage:
+    return ModelPage(viser_server, "robot", load_model(str(file)), lambda: load_model(str(file)))
+
+
+def test_a_robot_without_ground_gets_a_floor(file: Path) -> None:
+    model = load_model(str(file))
+    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).sum() == 1
+
+
+def test_urdf_and_binary_models_are_loaded(tmp_path: Path, file: Path) -> None:
+    urdf = tmp_path / "two.urdf"
+    urdf.write_text(URDF.format(geometry='<box size="1 1 1"/>'), encoding="utf-8")
+    model = load_model(str(urdf))
+    assert model.joint("hinge").range.tolist() == [-1.0, 1.0]
+    # MuJoCo alone would drop the visual geoms.
+    assert model.ngeom == 1
+    binary = tmp_path / "robot.mjb"
+    mujoco.mj_saveModel(load_model(str(file)), str(binary))
+    assert load_model(str(binary)).nu == 1
+
+
+def test_meshes_of_ros_packages_are_found(tmp_path: Path) -> None:
+    meshes = tmp_path / "two_description" / "meshes"
+    meshes.mkdir(parents=True)
+    corners = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
+    faces = ("1 3 2", "1 2 4", "1 4 3", "2 3 4")
+    lines = [*(f"v {corner}" for corner in corners), *(f"f {face}" for face in faces)]
+    (meshes / "part.obj").write_text("\n".join(lines), encoding="utf-8")
+    urdf = tmp_path / "two_description" / "urdf" / "two.urdf"
+    urdf.parent.mkdir()
+    mesh = '<mesh filename="package://two_description/meshes/part.obj"/>'
+    urdf.write_text(URDF.format(geometry=mesh), encoding="utf-8")
+    assert load_model(str(urdf)).nmesh == 1
+
+
+def test_robots_and_tasks_are_loaded_with_a_ground() -> None:
+    assert load_model("yam").nu > 0
+    assert load_model("Mjlab-Cartpole-Swingup").joint("cartpole/slider") is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("missing.xml", None, "missing.xml: expected a file"),
+        (
+            "broken.xml",
+            "<mujoco><worldbody><geom/></worldbody></mujoco>",
+            "broken.xml: MuJoCo cannot",
+        ),
+        (
+            "mesh.urdf",
+            URDF.format(geometry='<mesh filename="package://x/b.stl"/>'),
+            "'package://x/b.stl' not found",
+        ),
+        ("robot.pdf", "", "robot.pdf"),
+    ],
+)
+def test_what_cannot_be_loaded_is_named(tmp_path: Path, name: str, text, message: str) -> None:
+    path = tmp_path / name
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match=message):
+        run_view(str(path), ViewConfig(port=18124, open_browser=False))
+
+
+def test_an_unknown_name_lists_what_can_be_shown() -> None:
+    with pytest.raises(UserError, match="g1, go1, yam.*Mjlab-Cartpole"):
+        load_model("Mjlab-Cartpole-Swingupp")
+
+
+def test_sliders_have_the_ranges_and_set_the_state(page: ModelPage) -> None:
+    slider = page.joints["elbow"]
+    assert (slider.min, slider.max) == pytest.approx((-np.pi / 2, np.pi / 4))
+    # The first keyframe is the pose at the start.
+    assert slider.value == pytest.approx(0.3)
+    page.set_value("elbow", "qpos", -0.5)
+    page.set_value("elbow_motor", "ctrl", 2.0)
+    page.advance(0.01)
+    assert page.data.joint("elbow").qpos == pytest.approx(-0.5)
+    assert page.data.time == 0.0
+    page.set_pose("initial")
+    assert page.data.joint("elbow").qpos == 0.0
+    assert page.data.actuator("elbow_motor").ctrl == 0.0
+
+
+def test_physics_runs_in_real_time_when_asked_for(page: ModelPage) -> None:
+    page.playing.value = True
+    page.advance(0.1)
+    assert page.data.time == pytest.approx(0.1, abs=page.model.opt.timestep)
+    assert page.data.body("base").xpos[2] < 0.5
+
+
+def test_reload_reads_the_file_and_keeps_the_model_if_it_is_damaged(
+    page: ModelPage, file: Path
+) -> None:
+    file.write_text("<mujoco><nonsense/></mujoco>", encoding="utf-8")
+    page.reload()
+    page.advance(0.0)
+    assert "nonsense" in page.message.content
+    assert page.model.nu == 1
+    file.write_text(MJCF.replace("-90 45", "-30 30"), encoding="utf-8")
+    page.reload()
+    page.advance(0.0)
+    assert page.joints["elbow"].max == pytest.approx(np.pi / 6)
