@@ -1,4 +1,4 @@
-"""Run every benchmark and write the table: `make bench`.
+"""Run every benchmark, and write the table and `docs/benchmarks.md`: `make bench`.
 
 With `--before FOLDER`, a checkout of an earlier commit with its own `.venv`, its `env.step` is measured
 beside ours: `make bench BEFORE=../before`.
@@ -15,6 +15,7 @@ import engines_agree
 import growth
 import learning
 import live_view
+import page
 import reach
 import repeatability
 import side_by_side
@@ -39,7 +40,7 @@ def main() -> None:
         # Write after each benchmark, so that a stopped run keeps its results.
         write(rows)
     print(show(rows))
-    print(f"\nWritten to {RESULTS / 'table.md'}")
+    print(f"\nWritten to {RESULTS / 'table.md'} and {page.write_page()}")
 
 
 if __name__ == "__main__":

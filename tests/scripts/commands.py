@@ -119,7 +119,12 @@ def interrupt_training(command: list[str], log_root: Path, patience: float = 60.
         time.sleep(0.02)
     # As a terminal does it: to the whole process group.
     os.killpg(process.pid, signal.SIGINT)
-    out = process.communicate(timeout=patience)[0]
+    try:
+        out = process.communicate(timeout=patience)[0]
+    except subprocess.TimeoutExpired:
+        # A run that ignores the signal must not outlive the test.
+        os.killpg(process.pid, signal.SIGTERM)
+        raise
     assert process.returncode == 0, out
     assert out.count("SIGINT: finishing this iteration, then saving") == 1
     (run_dir,) = (log_root / "cartpole").iterdir()

@@ -1,0 +1,263 @@
+"""Record the clips of the README: `python tools/make_clips.py [NAME ...] --run lift=FOLDER`.
+
+Animated WebP of 480 x 270 pixels at 25 frames per second, below 500 KB each. Clips of policies that do
+not ship with the package need the run folder of a training, for example
+
+    uv run train Mjlab-Lift-Cube-Yam --profile cpu
+    uv run python tools/make_clips.py lift --run lift=logs/rsl_rl/yam_lift_cube/<time>
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import mujoco
+import numpy as np
+import torch
+import tyro
+from PIL import Image
+
+from mjlab.rl.checkpoint import latest_checkpoint
+from mjlab.scripts.demo import DEMOS
+from mjlab.scripts.environments import make_env
+from mjlab.scripts.policy import make_policy, policy_env_cfg
+from mjlab.viewer.model_sync import compute_poses, copy_state, host_model
+from mjlab.viewer.native.visualizer import add_moving_geoms
+from mjlab.viewer.offscreen_renderer import open_renderer
+
+_IMAGES = Path(__file__).parents[1] / "docs" / "images"
+_WIDTH, _HEIGHT, _FPS = 480, 270, 25
+# Frames are rendered larger and downsampled for antialiasing.
+_OVERSAMPLING = 2
+_MAX_BYTES = 500_000
+_HORIZON = (0.93, 0.94, 0.96)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Clip of a policy."""
+
+    task: str
+    """Task of the policy."""
+    profile: str | None = "cpu"
+    """Profile of the training."""
+    policy: Path | None = None
+    """Bundled policy. None: checkpoint of a run folder passed by `--run`."""
+    num_envs: int = 1
+    """Number of environments, all in view."""
+    spacing: float = 1.0
+    """Distance between environments (m)."""
+    command: dict[str, tuple[float, float]] | None = None
+    """Ranges of the velocity command; None: those of the task."""
+    motion: str | None = None
+    """Motion of a tracking task."""
+    start: float = 0.0
+    """Time before the first frame (s)."""
+    seconds: float = 4.0
+    """Duration (s)."""
+    speed: float = 1.0
+    """Speed of the clip relative to real time."""
+    body: str | None = None
+    """Body whose mean over the environments the camera follows in x and y. None: fixed camera."""
+    lookat: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Camera target, relative to the followed place (m)."""
+    distance: float = 2.0
+    """Distance from the camera to its target (m)."""
+    azimuth: float = 120.0
+    """Azimuth of the view (degrees)."""
+    elevation: float = -14.0
+    """Elevation of the view (degrees)."""
+    hidden_sites: bool = True
+    """Hide sites."""
+
+
+CLIPS = {
+    "swingup": Clip(
+        "Mjlab-Cartpole-Swingup", lookat=(0.0, 0.0, 1.1), distance=4.4, azimuth=90.0,
+        elevation=-6.0, seconds=5.0,
+    ),
+    "go1": Clip(
+        DEMOS["go1"].task, None, DEMOS["go1"].policy, num_envs=6, spacing=0.9,
+        command={"lin_vel_x": (0.9, 0.9), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
+        start=2.0, seconds=3.0, body="robot/trunk", lookat=(0.0, 0.0, 0.2), distance=3.0, azimuth=145.0,
+    ),
+    "g1": Clip(
+        DEMOS["g1"].task, "cpu", DEMOS["g1"].policy, num_envs=2, spacing=1.2,
+        command={"lin_vel_x": (0.8, 0.8), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
+        start=3.0, seconds=3.0, body="robot/pelvis", lookat=(0.0, 0.0, 0.6), distance=3.4, azimuth=155.0,
+    ),
+    "lift": Clip(
+        "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0, elevation=-16.0,
+        seconds=3.0,
+    ),
+    "g1_tracking": Clip(
+        "Mjlab-Tracking-Flat-Unitree-G1", motion="squat", seconds=4.0, body="robot/pelvis",
+        lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
+    ),
+}  # fmt: skip
+
+
+@dataclass
+class Args:
+    """Flags."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = tuple(CLIPS)
+    """Clips to record."""
+    run: tuple[str, ...] = ()
+    """Run folders, as NAME=FOLDER."""
+    folder: Path = _IMAGES
+    """Folder of the clips."""
+    seed: int = 1
+    """Seed of the episodes."""
+    frames: Path | None = field(default=None)
+    """Folder for the frames as PNG. None: none."""
+
+
+def main(args: Args) -> None:
+    """Record the clips."""
+    runs = dict(item.split("=", 1) for item in args.run)
+    for name in args.names:
+        clip = CLIPS[name]
+        policy = clip.policy or latest_checkpoint(Path(runs[name]))
+        if policy is None:
+            raise SystemExit(f"{runs[name]}: expected a checkpoint, found none.")
+        frames = record(clip, policy, args.seed)
+        path = args.folder / f"{name}.webp"
+        save(frames, path)
+        if args.frames is not None:
+            args.frames.mkdir(parents=True, exist_ok=True)
+            for index in range(0, len(frames), 15):
+                Image.fromarray(frames[index]).save(args.frames / f"{name}_{index:03d}.png")
+        print(f"{path}: {path.stat().st_size // 1000} kB, {len(frames)} frames")
+
+
+def save(frames: list[np.ndarray], path: Path) -> None:
+    """Write an animated WebP, at the best quality below the size limit."""
+    first, *rest = [Image.fromarray(frame) for frame in frames]
+    for quality in (80, 70, 60, 50, 40):
+        first.save(
+            path, save_all=True, append_images=rest, duration=1000 // _FPS, loop=0, quality=quality,
+            method=6, minimize_size=True,
+        )  # fmt: skip
+        if path.stat().st_size < _MAX_BYTES:
+            return
+    raise SystemExit(f"{path}: expected less than {_MAX_BYTES} bytes; use a shorter clip.")
+
+
+def record(clip: Clip, policy: Path, seed: int) -> list[np.ndarray]:
+    """Return the frames of a clip, each (height, width, 3), uint8."""
+    cfg = policy_env_cfg(clip.task, clip.profile, purpose="play")
+    cfg.scene.env_spacing = clip.spacing
+    cfg.scene.spec_fn = light_studio
+    # The robot starts at the center of its environment, and walks at one velocity.
+    if clip.command is not None:
+        command: Any = cfg.commands["twist"]
+        for name, bounds in clip.command.items():
+            setattr(command.ranges, name, bounds)
+        command.heading_command, command.ranges.heading = False, None
+        command.rel_standing_envs = 0.0
+        reset: Any = cfg.events["reset_base"]
+        reset.params["pose_range"] = {}
+    if clip.motion is not None:
+        motion: Any = cfg.commands["motion"]
+        motion.motion_file = clip.motion
+    env = make_env(clip.task, cfg, "cpu", clip.num_envs, seed=seed)
+    try:
+        act = make_policy(clip.task, env, "trained", policy, "cpu", clip.profile)
+        return film(clip, env, act)
+    finally:
+        env.close()
+
+
+def film(clip: Clip, env: Any, policy: Any) -> list[np.ndarray]:
+    """Step the environments and render each of them into one scene."""
+    sim = env.unwrapped.sim
+    model = host_model(sim.mj_model)
+    # Shadows are sharp only near the target.
+    model.stat.extent = 2.0 * clip.distance
+    model.vis.map.shadowclip = 0.9
+    data, camera, option = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvOption()
+    option.sitegroup[:] = not clip.hidden_sites
+    camera.distance, camera.azimuth, camera.elevation = clip.distance, clip.azimuth, clip.elevation
+    steps_per_frame = max(round(clip.speed / _FPS / env.unwrapped.step_dt), 1)
+    size = (_HEIGHT * _OVERSAMPLING, _WIDTH * _OVERSAMPLING)
+    frames: list[np.ndarray] = []
+    target = np.zeros(3)
+    with torch.inference_mode(), open_renderer(model, *size) as renderer:
+        renderer.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
+        for _ in range(round(clip.start / env.unwrapped.step_dt)):
+            env.step(policy(env.get_observations()))
+        while len(frames) < clip.seconds * _FPS:
+            places = []
+            for index in reversed(range(clip.num_envs)):
+                copy_state(sim, index, data)
+                compute_poses(model, data)
+                if clip.body is not None:
+                    places.append(data.body(clip.body).xpos * (1.0, 1.0, 0.0))
+            if places:
+                # Smooth, so that the camera does not sway with the gait.
+                place = np.mean(places, axis=0)
+                target = 0.8 * target + 0.2 * place if frames else place
+            camera.lookat = np.array(clip.lookat) + target
+            suns = model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+            data.light_xpos[suns] = camera.lookat - 4.0 * data.light_xdir[suns]
+            renderer.update_scene(data, camera, option)
+            for index in range(1, clip.num_envs):
+                copy_state(sim, index, data)
+                compute_poses(model, data)
+                add_moving_geoms(renderer.scene, model, data, option)
+            image = Image.fromarray(renderer.render())
+            frames.append(np.asarray(image.resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS)))
+            for _ in range(steps_per_frame):
+                env.step(policy(env.get_observations()))
+    return frames
+
+
+def light_studio(spec: mujoco.MjSpec) -> None:
+    """Replace lights, sky and ground: one sun from the side, weak fill, light and dull ground."""
+    for light in spec.lights:
+        light.active = False
+    for direction, diffuse, casts in (
+        ((-0.5, 0.6, -1.0), (0.62, 0.60, 0.56), True),
+        ((0.6, -0.4, -0.6), (0.15, 0.18, 0.25), False),
+    ):
+        spec.worldbody.add_light(
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=direction, diffuse=diffuse,
+            ambient=(0.0, 0.0, 0.0), specular=(0.1, 0.1, 0.1), castshadow=casts,
+        )  # fmt: skip
+    for texture in list(spec.textures):
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            spec.delete(texture)
+    spec.add_texture(
+        name="studio_sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=(0.55, 0.68, 0.85), rgb2=_HORIZON,
+        width=512, height=3072,
+    )  # fmt: skip
+    spec.add_texture(
+        name="studio_ground", type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, rgb1=(0.72, 0.75, 0.79), rgb2=(0.65, 0.68, 0.72),
+        width=512, height=512,
+    )  # fmt: skip
+    ground = spec.add_material(
+        name="studio_ground", texuniform=True, texrepeat=(0.5, 0.5), reflectance=0.0, specular=0.0
+    )
+    ground.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "studio_ground"
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.material, geom.rgba = "studio_ground", (1.0, 1.0, 1.0, 1.0)
+    visual = spec.visual
+    visual.headlight.ambient = (0.28, 0.29, 0.32)
+    visual.headlight.diffuse = (0.18, 0.18, 0.18)
+    visual.headlight.specular = (0.0, 0.0, 0.0)
+    visual.rgba.haze = visual.rgba.fog = (*_HORIZON, 1.0)
+    visual.map.haze, visual.map.fogstart, visual.map.fogend = 0.5, 1.5, 9.0
+    visual.quality.offsamples, visual.quality.shadowsize = 8, 4096
+    visual.global_.fovy = 38.0
+    visual.global_.offwidth = _WIDTH * _OVERSAMPLING
+    visual.global_.offheight = _HEIGHT * _OVERSAMPLING
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
