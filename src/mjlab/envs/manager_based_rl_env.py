@@ -39,6 +39,8 @@ from mjlab.managers import (
     RewardManager,
     RewardTermCfg,
     SensorSwitches,
+    Table,
+    Tabular,
     TerminationManager,
     TerminationTermCfg,
     look_up,
@@ -48,7 +50,6 @@ from mjlab.sim import Simulation, SimulationCfg
 from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
-from mjlab.utils.tables import Table, Tabular
 from mjlab.viewer.viewer_config import ViewerConfig
 
 if TYPE_CHECKING:

@@ -35,6 +35,7 @@ from mjlab.managers.recorder_manager import (
 from mjlab.managers.reward_manager import RewardManager, RewardTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.termination_manager import TerminationManager, TerminationTermCfg
+from mjlab.utils.tables import Table, Tabular
 
 __all__ = [
     "ActionManager",
@@ -68,6 +69,8 @@ __all__ = [
     "RewardTermCfg",
     "SceneEntityCfg",
     "SensorSwitches",
+    "Table",
+    "Tabular",
     "TerminationManager",
     "TerminationTermCfg",
     "look_up",

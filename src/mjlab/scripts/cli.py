@@ -179,7 +179,7 @@ entities and sensors. Builds one environment on the CPU.
 flags:
     --profile NAME      settings of a profile, such as cpu
     --play              the environment of `play` instead of that of `train`
-    --json              JSON, with all columns and values
+    --json              JSON, with all columns and lists in full
     --markdown          Markdown""",
         (
             "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1",

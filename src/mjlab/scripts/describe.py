@@ -37,7 +37,7 @@ class DescribeConfig(ConfigChoice):
     """Flags of `describe`."""
 
     json: bool = False
-    """Print JSON, with all columns and values."""
+    """Print JSON, with all columns and lists in full."""
     markdown: bool = False
     """Print Markdown."""
     env: ManagerBasedRlEnvCfg | None = None
@@ -81,6 +81,8 @@ def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:
     prepare_env_cfg(task, cfg, env_cfg, checkpoint=None)
     num_envs = env_cfg.scene.num_envs
     env_cfg.scene.num_envs = 1
+    # Tasks that require a GPU are described without one.
+    env_cfg.sim.engine = "auto"
     env = ManagerBasedRlEnv(env_cfg, device="cpu")
     try:
         return TaskDescription(task, cfg, num_envs, env)

@@ -34,6 +34,7 @@ _SPECIAL = re.compile(r"[*_<>\[\]{}$|\\^~`]")
 # Ranges and other short lists stay in one line: their spaces are replaced while text is wrapped.
 _SHORT_PARENTHESES = re.compile(r"(?:[^\s(){},]+: )?\([^()]{,30}\)")
 _GLUE = "\ue000"
+_CELL_STYLE = "text-align: left; vertical-align: top; padding: 2px 12px 2px 0"
 
 
 @dataclass
@@ -104,18 +105,18 @@ class Table:
         return "\n\n".join([table, *self._unset()])
 
     def html(self) -> str:
-        """Return the table in HTML, with its title as caption."""
+        """Return the table in HTML, folded by a click on its title."""
 
         def row(cells: Iterable[str], tag: str) -> str:
-            inner = (f'<{tag} style="text-align: left">{html.escape(c)}</{tag}>' for c in cells)
+            inner = (f'<{tag} style="{_CELL_STYLE}">{html.escape(cell)}</{tag}>' for cell in cells)
             return f"<tr>{''.join(inner)}</tr>"
 
         shown = self._shown()
         body = [row(cells, "td") for cells in zip(*(c.cells for c in shown), strict=True)]
         return (
-            f'<table><caption style="text-align: left"><b>{html.escape(self.title)}</b></caption>'
+            f"<details open><summary><b>{html.escape(self.title)}</b></summary><table>"
             f"<thead>{row((c.name for c in shown), 'th')}</thead><tbody>{''.join(body)}</tbody>"
-            f"</table>{''.join(f'<p>{line}</p>' for line in self._unset())}"
+            f"</table>{''.join(self._unset())}</details>"
         )
 
     def _shown(self) -> list[_Column]:
@@ -188,12 +189,11 @@ def tables_text(tables: Sequence[Table], width: int = WIDTH) -> str:
 def format_value(value: Any) -> str:
     """Return a value in short ASCII: four digits, long lists cut, functions by name."""
     value = _array_as_list(value)
+    value = value.value if isinstance(value, enum.Enum) else value
     if value is None or isinstance(value, (str, bool, int)):
         return "" if value is None else _ascii(str(value))
     if isinstance(value, Real):
         return f"{float(value):.4g}"
-    if isinstance(value, enum.Enum):
-        return _ascii(str(value.value))
     if isinstance(value, Mapping):
         return (
             "{" + _join([f"{format_value(k)}: {format_value(v)}" for k, v in value.items()]) + "}"
@@ -230,7 +230,7 @@ def json_value(value: Any) -> Any:
 def settings_of(cfg: Any, *omitted: str, changed_only: bool = False) -> dict[str, Any]:
     """Return the fields of a config that are set, or, with `changed_only`, not at their defaults.
 
-    Unset: None, empty, False by default, or a slice of everything.
+    Unset: None, empty, or by default False or a slice.
     """
     if not dataclasses.is_dataclass(cfg):
         return {}
@@ -239,8 +239,8 @@ def settings_of(cfg: Any, *omitted: str, changed_only: bool = False) -> dict[str
         value = getattr(cfg, f.name)
         default = f.default if f.default_factory is MISSING else f.default_factory()
         is_default = to_plain(value) == to_plain(default)
-        is_empty = value is None or (hasattr(value, "__len__") and len(value) == 0)
-        is_unset = is_empty or (is_default and (value is False or value == slice(None)))
+        is_empty = value is None or (isinstance(value, (str, Mapping, list, tuple)) and not value)
+        is_unset = is_empty or (is_default and (value is False or isinstance(value, slice)))
         if f.name not in omitted and not is_unset and not (changed_only and is_default):
             settings[f.name] = value
     return settings
