@@ -20,6 +20,7 @@ from typing import Any
 from mjlab.tasks.tracking.motion_file import MotionFileError, motion_hash
 from mjlab.utils.os import own_folder, replacing
 from mjlab.utils.string import suggest
+from mjlab.utils.wandb import check_wandb_login
 
 FOLDER = "motion"
 """Name of the motion folder in the run folder."""
@@ -159,6 +160,7 @@ def fetch_artifact(registry_name: str) -> list[Path]:
 
     name = full_artifact_name(registry_name)
     try:
+        check_wandb_login(f"Motion {name!r}")
         artifact = wandb.Api().artifact(name)
         return _motions_in(artifact, name)
     except MotionFileError:
@@ -190,6 +192,7 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
     import wandb
 
     try:
+        check_wandb_login(f"Run {run_path!r}")
         run = wandb.Api().run(run_path)
         files = [file for file in run.files() if file.name.startswith(f"{FOLDER}/")]
         if any(file.name == f"{FOLDER}/{INDEX}" for file in files):
