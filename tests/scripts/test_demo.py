@@ -36,7 +36,7 @@ def test_demo_plays_its_policy_without_being_told_anything(run, go1_policy, monk
     monkeypatch.setitem(demo.DEMOS, "go1", replace(GO1, policy=go1_policy))
     outcome = run("demo", *HEADLESS)
     assert outcome.status == 0, outcome.err
-    assert "3 steps in 1 environments" in outcome.out
+    assert "3 steps in 1 environment," in outcome.out
 
 
 def test_a_policy_that_is_missing_is_named(run, monkeypatch, tmp_path):
@@ -126,4 +126,7 @@ def test_a_browser_is_opened_only_where_there_is_a_display(monkeypatch, platform
         monkeypatch.delenv("DISPLAY", raising=False)
     else:
         monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
     assert play_run._can_open_browser() is opened
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 22")
+    assert not play_run._can_open_browser()

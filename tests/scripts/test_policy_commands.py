@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import onnx
 import pytest
@@ -75,6 +76,32 @@ def test_training_that_is_uploaded_needs_a_login_before_anything_is_built(
     assert "--agent.logger wandb: expected a login" in outcome.message
     assert "WANDB_MODE=offline" in outcome.message
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "shown"),
+    [((), ["page", "browser"]), (("--open-browser", "False"), ["page"]),
+     (("--viewer", "native"), ["window"])],
+)  # fmt: skip
+def test_play_shows_the_page_also_with_a_display(run, monkeypatch, flags, shown):
+    seen = []
+
+    def viewer(kind):
+        def make(*args, **kwargs):
+            seen.append(kind)
+            return SimpleNamespace(url="http://localhost:8080", run=lambda num_steps: None)
+
+        return make
+
+    monkeypatch.setenv("DISPLAY", ":1")
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    monkeypatch.setattr("webbrowser.open", lambda url: seen.append("browser"))
+    monkeypatch.setattr("mjlab.viewer.ViserPlayViewer", viewer("page"))
+    monkeypatch.setattr("mjlab.viewer.NativeMujocoViewer", viewer("window"))
+    outcome = run("play", TASK, "--agent", "zero", "--num-envs", "1", "--device", "cpu", *flags)
+    assert outcome.status == 0, outcome.err
+    assert seen == shown
+    assert ("http://localhost:8080" in outcome.out) == ("page" in shown)
 
 
 def log_out(monkeypatch, folder) -> None:

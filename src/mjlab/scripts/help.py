@@ -116,7 +116,7 @@ _PAGE = (
     Row("no_terminations", "", "episodes never end"),
     Row("port", "N"),
     Row("host", "ADDRESS"),
-    Row("open_browser", "False", "no browser tab"),
+    Row("open_browser", "False", "only print the address", ""),
 )
 _RECORD = (
     Row("video", "", "record a clip instead"),
