@@ -174,10 +174,7 @@ def profile_of_run(task: str, run_dir: Path) -> str | None:
 def suggest_profile(task: str, profile: str | None, device: str) -> None:
     """Print a hint to the `cpu` profile when training on the CPU without a profile."""
     if profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task):
-        print_notice(
-            f"Training on the CPU: `train {task} --profile {CPU_PROFILE}` has settings for a "
-            "few cores."
-        )
+        print_notice(f"`train {task} --profile {CPU_PROFILE}` has settings for a few cores.")
 
 
 def report_untuned_learner(task: str, profile: str | None, learner: str) -> None:

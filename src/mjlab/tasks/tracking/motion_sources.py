@@ -154,13 +154,14 @@ def fetch_artifact(registry_name: str) -> list[Path]:
     """Download an artifact such as `org/motions/dance` or `.../dance:v3`; return its motions.
 
     Raises:
+        UserError: no login at Weights & Biases.
         MotionFileError: the artifact cannot be fetched, or contains no motion.
     """
     import wandb
 
     name = full_artifact_name(registry_name)
+    check_wandb_login(f"Motion {name!r}")
     try:
-        check_wandb_login(f"Motion {name!r}")
         artifact = wandb.Api().artifact(name)
         return _motions_in(artifact, name)
     except MotionFileError:
@@ -187,12 +188,13 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
         run_path: entity/project/run.
 
     Raises:
+        UserError: no login at Weights & Biases.
         MotionFileError: the run cannot be read, or has neither.
     """
     import wandb
 
+    check_wandb_login(f"Run {run_path!r}")
     try:
-        check_wandb_login(f"Run {run_path!r}")
         run = wandb.Api().run(run_path)
         files = [file for file in run.files() if file.name.startswith(f"{FOLDER}/")]
         if any(file.name == f"{FOLDER}/{INDEX}" for file in files):
