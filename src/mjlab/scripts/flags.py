@@ -22,7 +22,7 @@ import tyro
 
 import mjlab
 from mjlab.scripts.flag_values import flag_rules
-from mjlab.scripts.help import print_help, requested_topic
+from mjlab.scripts.help import TERM_DICTS, print_help, requested_topic
 from mjlab.scripts.run_folder import read_run_info
 from mjlab.tasks.registry import (
     PolicyOrigin,
@@ -43,21 +43,6 @@ CPU_PROFILE = "cpu"
 _CHOICES = ("profile", "learner")
 # Field of the task options.
 _FIELD = "options"
-# Dicts of terms by name. Observation terms are in `terms` of their group.
-_TERM_DICTS = frozenset(
-    (
-        "observations",
-        "terms",
-        "actions",
-        "rewards",
-        "terminations",
-        "events",
-        "commands",
-        "curriculum",
-        "metrics",
-        "recorders",
-    )
-)
 
 
 def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
@@ -307,7 +292,7 @@ def _term_at(config: Any, flag: str) -> tuple[Any, str]:
         value = holder[key] if isinstance(holder, Mapping) else getattr(holder, key)
         if not is_dataclass(value) and not isinstance(value, Mapping | None):
             return None, ""
-    is_term = isinstance(holder, dict) and inside in _TERM_DICTS
+    is_term = isinstance(holder, dict) and inside in TERM_DICTS
     return (holder, key) if is_term or _may_be_none(holder, key) else (None, "")
 
 

@@ -28,6 +28,11 @@ MISSING = object()
 """Value of `lookup` for an unknown path."""
 OPTIONS = "options"
 """Field with the options of a task. Their flags are not below `--options.`."""
+TERM_DICTS = frozenset(
+    ("observations", "terms", "actions", "rewards", "terminations", "events", "commands", "curriculum",
+     "metrics", "recorders")
+)  # fmt: skip
+"""Fields with terms by name; None removes a term. Observation terms are in `terms` of their group."""
 # Branches whose parts can be named without the branch: `rewards` for `env.rewards`.
 _SHORTENED = ("", f"{OPTIONS}.", "env.", "agent.")
 
@@ -295,9 +300,12 @@ def _words(value: Any) -> str:
 
 
 def lookup(config: Any, path: str) -> tuple[str, Any]:
-    """Return the path of an entry, spelled as in the config, and its value or `MISSING`."""
+    """Return the path of an entry, spelled as in the config, and its value or `MISSING`.
+
+    An empty path is the config itself.
+    """
     names: list[str] = []
-    for part in path.split("."):
+    for part in filter(None, path.split(".")):
         entries = dict(_entries(config))
         if part == "*":
             part = next((name for name, value in entries.items() if value is not None), part)
@@ -316,37 +324,31 @@ def lookup(config: Any, path: str) -> tuple[str, Any]:
 
 def _print_topic(default: Any, topic: str, prog: str) -> None:
     """Print the flags of a branch, or one flag."""
+    path, value = _find(default, topic)
+    parent, _, name = path.rpartition(".")
+    holder = lookup(default, parent)[1]
+    if _is_branch(value):
+        kind = type(value) if is_dataclass(value) else _declared_type(holder, name)
+        note = f"Flags of {_flag_of(path)}."
+        if name in TERM_DICTS:
+            note += f" `{_flag_of(path)}.NAME None` removes a term."
+        _print_flags(*_prefixed(kind, value, path), prog, note)
+    elif is_dataclass(holder):
+        is_fixed = callable(value) or value == {}
+        note = f"{_flag_of(path)} cannot be set on the command line." if is_fixed else ""
+        _print_flags(*_prefixed(*_restricted(holder, {name}), parent), prog, note)
+    else:
+        # An entry of a dict of values.
+        _print_topic(default, parent, prog)
+
+
+def _find(default: Any, topic: str) -> tuple[str, Any]:
+    """Return path and value of a topic. Raises BadCallError if unknown or ambiguous."""
     for prefix in _SHORTENED:
         path, value = lookup(default, prefix + topic)
         if value is not MISSING:
-            break
-    else:
-        path, value = _unique_path(default, topic)
-    if _is_branch(value):
-        shown: tuple[Any, Any] = (type(value), value)
-        if not is_dataclass(value):
-            holder = lookup(default, path.rpartition(".")[0])[1]
-            shown = (_declared_type(holder, path.rpartition(".")[2]), value)
-        note = f"Flags of --{_flag_of(path)[2:]}."
-        if isinstance(value, Mapping):
-            note += f" `{_flag_of(path)}.NAME None` removes an entry."
-    else:
-        path, _, name = path.rpartition(".")
-        holder = lookup(default, path)[1] if path else default
-        if not is_dataclass(holder):
-            # An entry of a dict of values.
-            _print_topic(default, path, prog)
-            return
-        shown, note = _restricted(holder, {name}), ""
-    if path:
-        import tyro
-
-        # A branch with a prefix has the same flags as within the config.
-        kind, value = shown
-        annotation: Any = Annotated[kind, tyro.conf.arg(name="" if path == OPTIONS else path)]  # ty: ignore[invalid-type-form]
-        wrapper = dataclasses.make_dataclass("Topic", [("topic", annotation)])
-        shown = (wrapper, wrapper(value))
-    _print_flags(*shown, prog, note)
+            return path, value
+    return _unique_path(default, topic)
 
 
 def _unique_path(default: Any, topic: str) -> tuple[str, Any]:
@@ -388,6 +390,17 @@ def _print_flags(kind: Any, default: Any, prog: str, description: str) -> None:
     except SystemExit as ended:
         if ended.code:
             raise
+
+
+def _prefixed(kind: Any, value: Any, path: str) -> tuple[Any, Any]:
+    """Return a class with the flags of `kind` below `path`, named as in the whole config."""
+    if not path:
+        return kind, value
+    import tyro
+
+    annotation: Any = Annotated[kind, tyro.conf.arg(name="" if path == OPTIONS else path)]
+    wrapper = dataclasses.make_dataclass("Topic", [("topic", annotation)])
+    return wrapper, wrapper(value)
 
 
 def _restricted(config: Any, shown: set[str]) -> tuple[type, Any]:
