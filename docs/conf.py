@@ -13,6 +13,8 @@ from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
+from mjlab.scripts.describe import describe
+from mjlab.tasks.registry import list_tasks
 from mjlab.tasks.velocity import mdp as velocity_mdp
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -118,9 +120,17 @@ def _math(display: str) -> tuple[Any, None]:
     return visit, None
 
 
+def _add_task_tables(app: Sphinx, page: str, source: list[str]) -> None:
+    """Append the tables of all stock tasks to the page of tasks."""
+    if page == "reference/tasks":
+        names = [name for name in list_tasks() if name.startswith("Mjlab-")]
+        source[0] += "".join(f"\n{describe(name).markdown()}\n" for name in names)
+
+
 def setup(app: Sphinx) -> None:
     """Register the handlers of pages, docstrings, signatures and formulas."""
     app.add_html_math_renderer("mathml", _math("inline"), _math("block"))
     app.connect("source-read", _add_summary)
+    app.connect("source-read", _add_task_tables)
     app.connect("autodoc-process-signature", _readable)
     app.connect("autodoc-process-docstring", _to_rst)

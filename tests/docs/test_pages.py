@@ -20,7 +20,7 @@ _COMMAND = re.compile(r"\buv run (?:--(?:extra|group) \S+ |--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
-    r"\b(train-seeds|train|demo|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
+    r"\b(train-seeds|train|demo|describe|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
     r"|csv_to_npz|verify)"
     r"((?: [^\s`#]+)*)"
 )
@@ -77,6 +77,7 @@ def test_commands_of_the_targets_are_those_of_the_makefile() -> None:
 def _flags_of() -> dict[str, list[object]]:
     """Each command's flags: configs, whose fields they are, and sets of names."""
     from mjlab.scripts.csv_to_npz import CsvToNpzConfig
+    from mjlab.scripts.describe import DescribeConfig
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.export_scene import ExportSceneConfig
     from mjlab.scripts.play import PlayConfig
@@ -98,6 +99,7 @@ def _flags_of() -> dict[str, list[object]]:
         "train": [train, *others, MotionOptions()],
         "train-seeds": [train, *others, {"seeds": None}],
         "demo": [play],
+        "describe": [DescribeConfig(env=train.env), MotionOptions()],
         "play": [play, MotionOptions()],
         "evaluate": [EvaluateConfig(env=train.env), MotionOptions()],
         "csv_to_npz": [CsvToNpzConfig()],

@@ -164,6 +164,27 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         "mjlab.scripts.list_envs:command",
     ),
     Command(
+        "describe",
+        "build",
+        "what a task observes, rewards and ends",
+        "mjlab.scripts.describe:command",
+        "TASK",
+        """\
+Print tables of a task: observations, actions, commands, rewards, terminations, events, curriculum, metrics,
+entities and sensors. Builds one environment on the CPU.
+
+flags:
+    --profile NAME      settings of a profile, such as cpu
+    --play              the environment of `play` instead of that of `train`
+    --json              JSON, with all columns and values
+    --markdown          Markdown""",
+        (
+            "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1",
+            "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu --json",
+            "mjlab describe Mjlab-Cartpole-Swingup --env.rewards.smooth-reward.weight 2",
+        ),
+    ),
+    Command(
         "visualize-terrain",
         "build",
         "terrains, in the browser",
