@@ -58,7 +58,7 @@ def measure() -> list[Row]:
     task_help = run_time("-m", "mjlab.scripts.cli", "train", "Mjlab-Cartpole-Swingup", "--help")
     torch_import = run_time("-c", "import torch")
     versus = f"`import torch` alone: {torch_import:.2f} s"
-    rows.append(Row("`train TASK --help`, every flag", f"{task_help:.2f} s", versus, "", None))
+    rows.append(Row("`train TASK --help`", f"{task_help:.2f} s", versus, "", None))
     first = first_iteration()
     rows.append(
         Row(

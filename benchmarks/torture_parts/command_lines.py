@@ -120,7 +120,7 @@ def prepare(folder: Path) -> dict[str, object]:
     """Read the flags of the commands from their help, and train a little."""
     flags = {}
     for script, argv in _CALLS.items():
-        ask = (*argv[:1], "--help") if argv[:1] == (TASK,) else ("--help",)
+        ask = (*argv[:1], "--help", "all") if argv[:1] == (TASK,) else ("--help",)
         said = command(script, *ask).out
         flags[script] = sorted(set(re.findall(r"(?<![\w-])--[a-z][\w.-]*\w", said)) - {"--help"})
     return {"flags": flags, "run": str(trained(folder / "logs", 1))}

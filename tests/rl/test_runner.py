@@ -538,6 +538,7 @@ def test_weights_and_biases_gets_figures_and_files_only_on_request(
     for name in ("init", "log", "save", "finish"):
         setattr(client, name, lambda *args, _name=name, **kwargs: calls.append((_name, args)))
     client.config = types.SimpleNamespace(update=lambda values: calls.append(("config", values)))
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", client)
     monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", client)
 

@@ -139,7 +139,7 @@ def test_an_unknown_task_is_answered_with_the_nearest_names(run):
 
 @pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: command.name)
 def test_every_command_has_help_a_line_in_the_overview_and_a_function(mjlab, command):
-    assert f"  {command.name} " in cli.overview()
+    assert f" {command.name} " in cli.overview()
     assert command.summary in cli.overview()
     outcome = mjlab(command.name, "--help")
     assert outcome.status == 0, outcome.err

@@ -19,7 +19,23 @@ def test_commands_come_first_then_tasks():
     assert candidates(["train", "Mjlab-Cartpole-S"]) == ["Mjlab-Cartpole-Swingup"]
     assert candidates(["play", ""]) == list_tasks()
     assert candidates(["demo", ""]) == []
-    assert candidates(["train", "Mjlab-Cartpole-Swingup", "--num"]) == []
+    assert candidates(["list-envs", "Mjlab-Cartpole-Swingup", "--num"]) == []
+    assert candidates(["demo", "--po"]) == ["--port"]
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        (["--num-e"], ["--num-envs"]),
+        (["--agent.load"], ["--agent.load-run", "--agent.load-checkpoint"]),
+        (["--video", "--hel"], ["--help"]),
+        (["--help", "ag"], ["agent"]),
+        (["--engine", ""], ["auto", "native", "warp"]),
+        (["--profile", ""], ["cpu"]),
+    ],
+)
+def test_flags_and_their_values_are_completed(words, completed):
+    assert candidates(["train", "Mjlab-Velocity-Flat-Unitree-Go1", *words]) == completed
 
 
 @pytest.mark.parametrize(

@@ -201,6 +201,7 @@ def test_a_motion_is_uploaded_only_on_request(csv, tmp_path, monkeypatch):
         finish=lambda: calls.append("finished"),
     )
     wandb = SimpleNamespace(init=lambda project, name: run, Artifact=Artifact)
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     converted(csv, tmp_path)
     assert not calls
@@ -304,6 +305,7 @@ def test_an_upload_that_fails_is_one_message_and_keeps_the_motion(csv, tmp_path,
     def init(project, name):
         raise RuntimeError("No API key configured")
 
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
     with pytest.raises(UserError, match="dance.npz: upload .*No API key"):
         converted(csv, tmp_path, upload=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from mjlab.scripts import demo
 from mjlab.scripts.environments import make_env
 from mjlab.scripts.policy import load_policy, policy_env_cfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+from mjlab.viewer.page_server import open_browser
 
 GO1 = demo.DEMOS["go1"]
 HEADLESS = ("--viewer", "none", "--num-steps", "3", "--device", "cpu")
@@ -36,7 +37,7 @@ def test_demo_plays_its_policy_without_being_told_anything(run, go1_policy, monk
     monkeypatch.setitem(demo.DEMOS, "go1", replace(GO1, policy=go1_policy))
     outcome = run("demo", *HEADLESS)
     assert outcome.status == 0, outcome.err
-    assert "3 steps in 1 environments" in outcome.out
+    assert "3 steps in 1 environment," in outcome.out
 
 
 def test_a_policy_that_is_missing_is_named(run, monkeypatch, tmp_path):
@@ -119,11 +120,17 @@ def test_a_policy_of_another_task_is_refused(run, go1_policy):
     [("linux", None, False), ("linux", ":1", True), ("darwin", None, True)],
 )
 def test_a_browser_is_opened_only_where_there_is_a_display(monkeypatch, platform, display, opened):
-    play_run = importlib.import_module("mjlab.scripts.play")
-    monkeypatch.setattr(play_run.sys, "platform", platform)
+    seen = []
+    monkeypatch.setattr("webbrowser.open", seen.append)
+    monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     if display is None:
         monkeypatch.delenv("DISPLAY", raising=False)
     else:
         monkeypatch.setenv("DISPLAY", display)
-    assert play_run._can_open_browser() is opened
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    open_browser("http://localhost")
+    assert bool(seen) is opened
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.1 22")
+    open_browser("http://localhost")
+    assert len(seen) == opened

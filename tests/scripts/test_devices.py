@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from mjlab.scripts.devices import resolve_device
+from mjlab.scripts.devices import gpus_to_share, resolve_device, training_device
+from mjlab.scripts.train_config import TrainConfig, check_typed_flags
 from mjlab.utils.errors import UserError
+from mjlab.utils.processes import process_rank
 
 
 @pytest.mark.parametrize(("asked", "device"), [("cpu", "cpu"), ("cuda", "cuda:0")])
@@ -26,3 +28,21 @@ def test_a_device_that_cannot_be_used_is_refused_with_what_to_do(monkeypatch):
         resolve_device("cuda:1")
     with pytest.raises(UserError, match=r"--device: expected cpu, cuda.* got 'gpu'"):
         resolve_device("gpu")
+
+
+@pytest.mark.parametrize(
+    ("flags", "times"), [({}, 1), ({"device": "cpu"}, 0), ({"gpu_ids": None}, 0)]
+)
+def test_training_says_once_that_there_is_no_gpu_unless_the_cpu_was_asked_for(
+    flags, times, monkeypatch, capsys, caplog
+):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    cfg = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
+    for name, value in flags.items():
+        setattr(cfg, name, value)
+    with caplog.at_level("INFO"):
+        check_typed_flags(cfg, [])
+        assert gpus_to_share(cfg) == []
+        assert training_device(cfg, process_rank()) == "cpu"
+    told = capsys.readouterr()
+    assert (told.out + told.err + caplog.text).count("GPU") == times

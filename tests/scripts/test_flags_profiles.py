@@ -163,7 +163,7 @@ def test_play_and_evaluate_find_the_profile_of_the_run(run, profiled):
     outcome = run("play", PROFILED, "--viewer", "none", "--num-steps", "2", *common, *named)
     assert outcome.status == 0, outcome.err
     # The number of environments to learn with is not that to look at.
-    assert "2 steps in 1 environments" in outcome.out
+    assert "2 steps in 1 environment," in outcome.out
     outcome = run(
         "evaluate", PROFILED, "--num-episodes", "2", "--max-steps", "3", "--json", *common
     )

@@ -79,7 +79,7 @@ def test_other_tasks_do_not_have_the_flag(capsys):
 
 def test_flags_of_a_task_are_in_its_help(capsys):
     with pytest.raises(SystemExit) as ended:
-        parse_train_flags(TASK, ["--help"], "train")
+        parse_train_flags(TASK, ["--help", "all"], "train")
     assert ended.value.code == 0
     out = capsys.readouterr().out
     assert "--pole-colour STR" in out

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from types import SimpleNamespace
 
 import onnx
@@ -59,15 +58,60 @@ def test_a_policy_of_weights_and_biases_is_played(run, trained, monkeypatch):
 
 @pytest.mark.parametrize("script", ["play", "evaluate", "train"])
 def test_weights_and_biases_without_a_login_is_one_error(run, tmp_path, monkeypatch, script):
-    def fail():
-        raise RuntimeError("No API key configured.")
-
-    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(Api=fail))
+    log_out(monkeypatch, tmp_path)
     flags = ["--agent.resume", "True"] if script == "train" else []
     root = ("--log-root", str(tmp_path), "--device", "cpu")
     outcome = run(script, TASK, *root, "--wandb-run-path", "me/project/abc", *flags)
     assert outcome.status == 1
-    assert "No API key configured. Use `wandb login`" in outcome.message
+    assert "'me/project/abc': expected a login" in outcome.message
+    assert "run `wandb login` or set WANDB_API_KEY" in outcome.message
+
+
+def test_training_that_is_uploaded_needs_a_login_before_anything_is_built(
+    run, tmp_path, monkeypatch
+):
+    log_out(monkeypatch, tmp_path)
+    outcome = run("train", TASK, "--log-root", str(tmp_path / "logs"), "--agent.logger", "wandb")
+    assert outcome.status == 1
+    assert "--agent.logger wandb: expected a login" in outcome.message
+    assert "WANDB_MODE=offline" in outcome.message
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "shown"),
+    [((), ["page", "browser"]), (("--open-browser", "False"), ["page"]),
+     (("--viewer", "native"), ["window"])],
+)  # fmt: skip
+def test_play_shows_the_page_also_with_a_display(run, monkeypatch, flags, shown):
+    seen = []
+
+    def viewer(kind):
+        def make(*args, **kwargs):
+            seen.append(kind)
+            return SimpleNamespace(url="http://localhost:8080", run=lambda num_steps: None)
+
+        return make
+
+    monkeypatch.setenv("DISPLAY", ":1")
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    monkeypatch.setattr("webbrowser.open", lambda url: seen.append("browser"))
+    monkeypatch.setattr("mjlab.viewer.ViserPlayViewer", viewer("page"))
+    monkeypatch.setattr("mjlab.viewer.NativeMujocoViewer", viewer("window"))
+    outcome = run("play", TASK, "--agent", "zero", "--num-envs", "1", "--device", "cpu", *flags)
+    assert outcome.status == 0, outcome.err
+    assert seen == shown
+    assert ("http://localhost:8080" in outcome.out) == ("page" in shown)
+
+
+def log_out(monkeypatch, folder) -> None:
+    """Hide credentials of Weights & Biases, and pretend to be at a terminal, where it would prompt."""
+    for variable in ("WANDB_API_KEY", "WANDB_IDENTITY_TOKEN_FILE", "WANDB_MODE"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("NETRC", str(folder / "netrc"))
+    monkeypatch.setenv("WANDB_CONFIG_DIR", str(folder))
+    monkeypatch.setattr("builtins.input", lambda *_: pytest.fail("prompted"))
+    monkeypatch.setattr("getpass.getpass", lambda *_: pytest.fail("prompted"))
 
 
 def test_a_policy_with_networks_from_the_command_line_is_played(run, train, tmp_path):

@@ -67,9 +67,10 @@ def test_the_learner_decides_which_flags_there_are(capsys):
 
 
 def test_the_help_lists_the_flags_of_the_learner(run):
-    outcome = run("train", TASK, "--learner", "sac", "--help")
-    assert "--agent.algorithm.num-updates" in outcome.out
-    assert "num-mini-batches" not in outcome.out
+    for topic in ("", "agent"):
+        outcome = run("train", TASK, "--learner", "sac", "--help", *filter(None, [topic]))
+        assert "--agent.algorithm.num-updates" in outcome.out
+        assert "num-mini-batches" not in outcome.out
 
 
 @pytest.mark.parametrize("script", ["train", "train_seeds"])

@@ -280,7 +280,9 @@ def test_its_help_lists_the_flags_of_its_terms(task):
 
     out = io.StringIO()
     with contextlib.redirect_stdout(out), pytest.raises(SystemExit) as ended:
-        parse_flags(TrainConfig, TrainConfig.from_task(task), ["--help"], prog=f"train {task}")
+        parse_flags(
+            TrainConfig, TrainConfig.from_task(task), ["--help", "all"], prog=f"train {task}"
+        )
     assert ended.value.code == 0
     cfg = load_env_cfg(task)
     flags = ["--env.scene.num-envs", "--agent.max-iterations", "--env.sim.mujoco.timestep"]

@@ -207,6 +207,7 @@ def wandb_files(monkeypatch):
     files = {name: FakeWandbFile(name) for name in names}
     run = types.SimpleNamespace(files=lambda: list(files.values()), file=files.__getitem__)
     api = types.SimpleNamespace(run={"me/project/abc": run}.__getitem__)
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(Api=lambda: api))
     return files
 
@@ -219,6 +220,7 @@ def test_what_wandb_raises_is_one_error_with_what_to_do(tmp_path, monkeypatch):
     def fail():
         raise UsageError("No API key configured. Use `wandb login` to log in.\nTraceback: ...")
 
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(Api=fail))
     with pytest.raises(OSError, match=r"'me/project/abc'.*No API key configured.*wandb login"):
         get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))

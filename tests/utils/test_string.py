@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.utils.string import filter_exp, resolve_expr, resolve_field
+from mjlab.utils.string import counted, filter_exp, resolve_expr, resolve_field
 
 NAMES = ("hip_a", "hip_b", "knee")
 
@@ -72,3 +72,9 @@ def test_filter_and_resolve_agree_on_what_is_matched(names, patterns):
     resolved = resolve_expr(dict.fromkeys(patterns, True), names, False)
     chosen = tuple(name for name, hit in zip(names, resolved, strict=True) if hit)
     assert filter_exp(patterns, names) == chosen
+
+
+def test_one_of_a_kind_is_singular():
+    assert [counted(n, "environment") for n in (0, 1, 2)] == [
+        "0 environments", "1 environment", "2 environments",
+    ]  # fmt: skip

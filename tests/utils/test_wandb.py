@@ -1,4 +1,4 @@
-"""Tags of Weights & Biases runs."""
+"""Weights & Biases: login, and tags of runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import types
 
 import pytest
 
-from mjlab.utils.wandb import add_wandb_tags
+from mjlab.utils.errors import UserError
+from mjlab.utils.wandb import add_wandb_tags, check_wandb_login
 
 
 @pytest.fixture(autouse=True)
@@ -53,3 +54,33 @@ def test_without_tags_the_variable_is_not_left_empty(monkeypatch, present):
     assert "WANDB_TAGS" not in os.environ
     add_wandb_tags(["", "a"])
     assert os.environ["WANDB_TAGS"] == "a"
+
+
+@pytest.mark.parametrize(
+    ("key", "mode", "has_login"),
+    [("0" * 40, "online", False), (None, "offline", False), (None, "disabled", False),
+     (None, "online", True)],
+)  # fmt: skip
+def test_with_a_login_or_offline_nothing_is_asked(wandb, monkeypatch, key, mode, has_login):
+    set_login(wandb, monkeypatch, key, mode, has_login)
+    check_wandb_login("--agent.logger wandb", records=True)
+
+
+def test_without_a_login_the_error_names_the_cure(wandb, monkeypatch):
+    set_login(wandb, monkeypatch, None, "online", False)
+    with pytest.raises(UserError, match=r"a/b/c: expected a login.*`wandb login`.*API_KEY\.$"):
+        check_wandb_login("a/b/c")
+    with pytest.raises(UserError, match="WANDB_MODE=offline"):
+        check_wandb_login("--agent.logger wandb", records=True)
+
+
+def set_login(wandb, monkeypatch, key: str | None, mode: str, has_login: bool) -> None:
+    def login(prompt: bool, verify: bool) -> bool:
+        assert not prompt
+        return has_login
+
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    if key is not None:
+        monkeypatch.setenv("WANDB_API_KEY", key)
+    wandb.login = login
+    wandb.setup = lambda: types.SimpleNamespace(settings=types.SimpleNamespace(mode=mode))

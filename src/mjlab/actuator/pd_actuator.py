@@ -12,6 +12,7 @@ from mjlab.actuator.actuator import Actuator, ActuatorCfg, ActuatorCmd
 from mjlab.sim.simulation import SharedField
 from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.spec import create_motor_actuator
+from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.entity.entity import Entity
@@ -192,6 +193,6 @@ def _per_target(value: torch.Tensor, shape: tuple[int, int], name: str) -> torch
     if value.shape == shape[:1]:
         return value.unsqueeze(-1).expand(shape)
     raise ValueError(
-        f"{name}: expected shape ({shape[0]},) or {shape} for {shape[0]} environments and "
-        f"{shape[1]} targets, got {tuple(value.shape)}."
+        f"{name}: expected shape ({shape[0]},) or {shape} for {counted(shape[0], 'environment')} and "
+        f"{counted(shape[1], 'target')}, got {tuple(value.shape)}."
     )

@@ -9,6 +9,7 @@ import torch
 
 from mjlab.managers.manager_base import NullManager
 from mjlab.utils.state import capture_state, restore_state, shape_differences
+from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
@@ -68,7 +69,7 @@ def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
 def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
     if state["num_envs"] != env.num_envs:
         raise ValueError(
-            f"Saved environment state: expected {env.num_envs} environments as in this run, got "
+            f"Saved environment state: expected {counted(env.num_envs, 'environment')} as in this run, got "
             f"{state['num_envs']}; resume with --num-envs {state['num_envs']} to continue exactly."
         )
     env.sim.check_state(state["sim"])

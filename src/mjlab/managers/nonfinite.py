@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 import torch
 
+from mjlab.utils.string import counted
+
 logger = logging.getLogger(__name__)
 
 
@@ -79,9 +81,9 @@ class NonFiniteWatch:
                 continue
             self._named.add(k)
             logger.warning(
-                "%s was %s in %d of %d environments in step %d and counts as %s; not logged again.",
-                self._labels[k], self.fault, int(self._first_counts[k]), len(self.excluded), step,
-                self._counted_as,
+                "%s was %s in %d of %s in step %d and counts as %s; not logged again.",
+                self._labels[k], self.fault, int(self._first_counts[k]),
+                counted(len(self.excluded), "environment"), step, self._counted_as,
             )  # fmt: skip
 
     def streaks(self) -> dict[str, int]:

@@ -21,6 +21,7 @@ from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
 from mjlab.utils.state import capture_state, is_stateful, restore_state, stateful
+from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, format_shape, function_name
 
 if TYPE_CHECKING:
@@ -586,7 +587,7 @@ def apply_nan_policy(value: torch.Tensor, policy: NanPolicy, name: str) -> torch
             return value
         ids = bad.nonzero().flatten()
         shown = ids[: 10 if policy == "error" else 5].tolist()
-        message = f"Observation {name!r} is NaN or infinite in {len(ids)} environments: {shown}"
+        message = f"Observation {name!r} is NaN or infinite in {counted(len(ids), 'environment')}: {shown}"
         message += " and others." if len(ids) > len(shown) else "."
         if policy == "error":
             raise ValueError(message)

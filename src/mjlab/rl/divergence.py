@@ -11,6 +11,7 @@ import torch
 
 from mjlab.sim.divergence import cure_of, describe_dof, fastest_dof
 from mjlab.utils.errors import MjlabError
+from mjlab.utils.string import counted
 
 # Terms may be NaN in the first step of all episodes, and iterations of SAC are short.
 _MIN_BROKEN_STEPS = 16
@@ -72,7 +73,7 @@ class RolloutWatch:
                 f"sim.mujoco.timestep is {timestep:g} s; use a smaller one."
             )
             raise DivergedError(
-                f"The physics diverged in {diverged} of {self._env.num_envs} environments within "
+                f"The physics diverged in {diverged} of {counted(self._env.num_envs, 'environment')} within "
                 f"{num_steps} steps: {cause}"
             )
         for manager in (self._env.reward_manager, self._env.termination_manager):

@@ -21,6 +21,7 @@ from tensordict import TensorDict
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.rl.spatial_softmax import SPATIAL_SOFTMAX_KEYS, cnn_cfg_by_group
 from mjlab.utils.errors import check_positive
+from mjlab.utils.string import counted
 
 _MODELS = ("actor", "critic", "student", "teacher")
 _SAC_MODELS = {"actor": SacActorModel, "critic": TwinCriticModel}
@@ -115,7 +116,7 @@ def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
     most = num_envs if is_recurrent else num_envs * steps
     parts = algorithm.get("num_mini_batches", 1)
     if not 1 <= parts <= most:
-        of = f"{num_envs} environments" + ("" if is_recurrent else f" times {steps} steps")
+        of = counted(num_envs, "environment") + ("" if is_recurrent else f" times {steps} steps")
         why = ", which recurrent networks learn from as a whole" if is_recurrent else ""
         raise ValueError(
             f"agent.algorithm num_mini_batches: expected 1 to {most} ({of}{why}), got {parts}; use "
@@ -157,7 +158,7 @@ def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
     if rows != action_rows or rows < 2 * env.num_envs or rows % env.num_envs:
         raise ValueError(
             f"symmetry_cfg {_SYMMETRY_FUNCTION} {symmetry[_SYMMETRY_FUNCTION]!r}: expected the original "
-            f"and the mirrored rows of {env.num_envs} environments, got {rows} observations and "
+            f"and the mirrored rows of {counted(env.num_envs, 'environment')}, got {rows} observations and "
             f"{action_rows} actions."
         )
 

@@ -19,6 +19,7 @@ from rsl_rl.utils.logger import Logger
 
 from mjlab.rl.checkpoint import ensure_writable_folder
 from mjlab.utils.os import replacing
+from mjlab.utils.wandb import check_wandb_login
 
 if TYPE_CHECKING:
     from mjlab.rl.evaluation import EvaluationResult
@@ -152,7 +153,8 @@ class RunLogger(Logger):
         Raises:
             RunFolderError: the run folder is not writable.
             ModuleNotFoundError: Weights & Biases is configured but not installed.
-            ValueError: Weights & Biases did not start a run, for example without a login.
+            UserError: Weights & Biases is configured, but has no login.
+            ValueError: Weights & Biases did not start a run.
         """
         service = self.cfg.get("logger", "tensorboard")
         if self.log_dir is not None and not self.disable_logs:
@@ -163,6 +165,8 @@ class RunLogger(Logger):
                 writer = {"class_name": "WandbLogWriter", "project_name": project}
             self.cfg["logger"] = writer
             is_wandb = isinstance(writer, dict) and writer.get("class_name") == "WandbLogWriter"
+            if is_wandb:
+                check_wandb_login("logger 'wandb'", records=True)
             if is_wandb and not self.cfg.get("upload_git_diff", False):
                 # wandb would upload a separate diff, of the repository around the working folder.
                 os.environ.setdefault("WANDB_DISABLE_CODE", "true")

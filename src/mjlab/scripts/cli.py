@@ -40,9 +40,9 @@ class Command:
     name: str
     """Name on the command line."""
     group: str
-    """Heading in `mjlab --help`."""
+    """Purpose, the heading in `mjlab --help`. Commands of a group follow each other."""
     summary: str
-    """One line in `mjlab --help`."""
+    """A few words in `mjlab --help`."""
     function: str
     """Implementation as "module:function", called as `function(argv, prog)`."""
     argument: str | None = None
@@ -61,18 +61,15 @@ class Command:
         if self.examples:
             lines += ["examples:", *(f"    uv run {example}" for example in self.examples), ""]
         if self.argument == "TASK":
-            lines += [
-                f"`{prog} TASK --help` lists every flag of the task; `mjlab list-envs` lists the "
-                "tasks."
-            ]
+            lines += [f"`{prog} TASK --help` shows its flags; `mjlab list-envs` lists the tasks."]
         return "\n".join(lines).rstrip()
 
 
 COMMANDS = (
     Command(
         "train",
-        "Learning",
-        "Train a policy.",
+        "learn",
+        "train a policy (checkpoint, ONNX, curve)",
         "mjlab.scripts.train:command",
         "TASK",
         "Train a policy, by PPO or, with --learner sac, by SAC. Checkpoints, curves and the exported "
@@ -87,8 +84,8 @@ COMMANDS = (
     ),
     Command(
         "train-seeds",
-        "Learning",
-        "Train a task with several seeds, sequentially.",
+        "learn",
+        "the same task over several seeds",
         "mjlab.scripts.train_seeds:command",
         "TASK",
         "Train a task once for each seed 1, 2, ..., N (--seeds N, default 5), each run to its last\n"
@@ -100,14 +97,14 @@ COMMANDS = (
     ),
     Command(
         "plot-seeds",
-        "Learning",
-        "Plot the mean learning curve of several runs.",
+        "learn",
+        "one curve with its spread",
         "mjlab.scripts.train_seeds:plot_command",
     ),
     Command(
         "verify",
-        "Learning",
-        "Train one seed and compare its curve with reference runs.",
+        "learn",
+        "compare one seed with reference runs",
         "mjlab.scripts.verify:command",
         "TASK",
         "Train a task with one seed and check that its learning curve lies within the band of the "
@@ -119,36 +116,9 @@ COMMANDS = (
         unknown_task_status=2,
     ),
     Command(
-        "evaluate",
-        "Policies",
-        "Score a policy over many episodes.",
-        "mjlab.scripts.evaluate:command",
-        "TASK",
-        "Play episodes with a trained policy, one per environment, and print the mean return with a "
-        "95 % interval,\nand the success rate if the task defines success.",
-        (
-            "evaluate Mjlab-Cartpole-Swingup",
-            "evaluate Mjlab-Cartpole-Swingup --num-episodes 1024 --json True",
-        ),
-    ),
-    Command(
-        "play",
-        "Policies",
-        "Watch a policy in the browser, in MuJoCo's window, or as a video.",
-        "mjlab.scripts.play:command",
-        "TASK",
-        "Show a trained policy (default: the newest) in the browser, in MuJoCo's window, or as a video.",
-        (
-            "play Mjlab-Cartpole-Swingup",
-            "play Mjlab-Cartpole-Swingup --checkpoint-file logs/rsl_rl/cartpole/model_500.pt",
-            "play Mjlab-Cartpole-Swingup --agent random --viewer native",
-            "play Mjlab-Cartpole-Swingup --viewer none --num-steps 200 --video True",
-        ),
-    ),
-    Command(
         "demo",
-        "Policies",
-        "Watch a bundled policy: a walking quadruped or humanoid.",
+        "watch",
+        "drive a robot that can walk, now",
         "mjlab.scripts.demo:command",
         details="""\
 Play a robot that tracks velocity commands, in the browser and offline: a Unitree Go1 (quadruped,
@@ -161,15 +131,42 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         ),
     ),
     Command(
+        "play",
+        "watch",
+        "your newest policy, in the browser",
+        "mjlab.scripts.play:command",
+        "TASK",
+        "Show a trained policy (default: the newest) in the browser, in MuJoCo's window, or as a video.",
+        (
+            "play Mjlab-Cartpole-Swingup",
+            "play Mjlab-Cartpole-Swingup --checkpoint-file logs/rsl_rl/cartpole/model_500.pt",
+            "play Mjlab-Cartpole-Swingup --agent random --viewer native",
+            "play Mjlab-Cartpole-Swingup --viewer none --num-steps 200 --video True",
+        ),
+    ),
+    Command(
+        "evaluate",
+        "watch",
+        "return, errors and falls, with intervals",
+        "mjlab.scripts.evaluate:command",
+        "TASK",
+        "Play episodes with a trained policy, one per environment, and print the mean return with a "
+        "95 % interval,\nand the success rate if the task defines success.",
+        (
+            "evaluate Mjlab-Cartpole-Swingup",
+            "evaluate Mjlab-Cartpole-Swingup --num-episodes 1024 --json True",
+        ),
+    ),
+    Command(
         "list-envs",
-        "Tasks",
-        "List the registered tasks and their profiles.",
+        "build",
+        "tasks and their profiles",
         "mjlab.scripts.list_envs:command",
     ),
     Command(
         "describe",
-        "Tasks",
-        "Print what a task observes, rewards and ends, as tables.",
+        "build",
+        "what a task observes, rewards and ends",
         "mjlab.scripts.describe:command",
         "TASK",
         """\
@@ -188,43 +185,9 @@ flags:
         ),
     ),
     Command(
-        "profile-env",
-        "Tasks",
-        "Measure the step time by phase and term.",
-        "mjlab.scripts.profile_env:command",
-        "TASK",
-        "Step a task with random actions, and print the step time by phase (physics, forward, each "
-        "manager)\nand by term.",
-        (
-            "profile-env Mjlab-Cartpole-Swingup",
-            "profile-env Mjlab-Cartpole-Swingup --num-envs 4096 --steps 200 --json",
-        ),
-    ),
-    Command(
-        "export-scene",
-        "Tasks",
-        "Write the scene of a task, or a robot, as MuJoCo XML.",
-        "mjlab.scripts.export_scene:command",
-        "TARGET",
-        """\
-Write scene.xml and its assets, for MuJoCo's viewer and other programs.
-
-TARGET is the name of a task (`mjlab list-envs`), a robot (g1, go1, yam), or module:function, a function
-without arguments that returns an EntityCfg.
-
-flags:
-    --output-dir DIR    output folder, must be new or empty (default: export)
-    --zip               write the archive DIR.zip instead of a folder
-    --overwrite         replace an earlier export; other files are kept""",
-        (
-            "export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat",
-            "export-scene g1 --zip",
-        ),
-    ),
-    Command(
         "view",
-        "Tasks",
-        "Show any MJCF or URDF in the browser, with sliders.",
+        "build",
+        "any MJCF or URDF, with sliders",
         "mjlab.scripts.view:command",
         "MODEL",
         """\
@@ -245,29 +208,14 @@ flags:
     ),
     Command(
         "visualize-terrain",
-        "Tasks",
-        "Show terrains in the browser.",
+        "build",
+        "terrains, in the browser",
         "mjlab.scripts.visualize_terrain:command",
     ),
     Command(
-        "viz-nan",
-        "Data",
-        "Show the states that led to a NaN in the browser.",
-        "mjlab.scripts.viz_nan:command",
-        "DUMP",
-        """\
-Show the states that led to a NaN. DUMP is a file written by `train --enable-nan-guard True`, such as
-nan_dump_latest.npz; the model is read from the same folder.
-
-flags:
-    --host ADDRESS      address to serve on; 0.0.0.0: all interfaces (default: 127.0.0.1)
-    --port N            port to serve on; the next free port if taken (default: 8080)""",
-        ("viz-nan /tmp/mjlab/nan_dumps/nan_dump_latest.npz",),
-    ),
-    Command(
         "csv-to-npz",
-        "Data",
-        "Convert recorded joint angles to a reference motion.",
+        "build",
+        "recorded joint angles to a motion",
         "mjlab.scripts.csv_to_npz:command",
         "--input-file FILE",
         """\
@@ -282,9 +230,58 @@ all joint angles) to the .npz that motion tracking reads, or resample an .npz to
         ),
     ),
     Command(
+        "export-scene",
+        "build",
+        "a task or robot as MuJoCo XML",
+        "mjlab.scripts.export_scene:command",
+        "TARGET",
+        """\
+Write scene.xml and its assets, for MuJoCo's viewer and other programs.
+
+TARGET is the name of a task (`mjlab list-envs`), a robot (g1, go1, yam), or module:function, a function
+without arguments that returns an EntityCfg.
+
+flags:
+    --output-dir DIR    output folder, must be new or empty (default: export)
+    --zip               write the archive DIR.zip instead of a folder
+    --overwrite         replace an earlier export; other files are kept""",
+        (
+            "export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat",
+            "export-scene g1 --zip",
+        ),
+    ),
+    Command(
+        "profile-env",
+        "find out",
+        "where the time of a step goes",
+        "mjlab.scripts.profile_env:command",
+        "TASK",
+        "Step a task with random actions, and print the step time by phase (physics, forward, each "
+        "manager)\nand by term.",
+        (
+            "profile-env Mjlab-Cartpole-Swingup",
+            "profile-env Mjlab-Cartpole-Swingup --num-envs 4096 --steps 200 --json",
+        ),
+    ),
+    Command(
+        "viz-nan",
+        "find out",
+        "the states before a NaN",
+        "mjlab.scripts.viz_nan:command",
+        "DUMP",
+        """\
+Show the states that led to a NaN. DUMP is a file written by `train --enable-nan-guard True`, such as
+nan_dump_latest.npz; the model is read from the same folder.
+
+flags:
+    --host ADDRESS      address to serve on; 0.0.0.0: all interfaces (default: 127.0.0.1)
+    --port N            port to serve on; the next free port if taken (default: 8080)""",
+        ("viz-nan /tmp/mjlab/nan_dumps/nan_dump_latest.npz",),
+    ),
+    Command(
         "completion",
-        "Shell",
-        "Print a script that completes commands and task names (bash, zsh, fish).",
+        "shell",
+        "complete commands, tasks and flags (bash, zsh, fish)",
         "mjlab.scripts.completion:command",
     ),
 )
@@ -296,6 +293,13 @@ ALIASES = (
 """Commands that are also installed as separate executables."""
 
 _BY_NAME = {command.name: command for command in COMMANDS}
+
+_START_HERE = (
+    "start here mjlab demo",
+    "           mjlab train Mjlab-Cartpole-Swingup",
+    "",
+    "`mjlab COMMAND --help` shows a command; `mjlab --version` prints the version.",
+)
 
 
 def main() -> None:
@@ -319,17 +323,14 @@ def _dispatch(argv: list[str]) -> None:
 
 def overview() -> str:
     """Return the text of `mjlab --help`: all commands by group."""
-    lines = ["usage: mjlab COMMAND [arguments]", ""]
-    lines += ["Train and evaluate robot policies in thousands of parallel MuJoCo environments.", ""]
+    lines = ["usage: mjlab COMMAND [options]", ""]
     width = max(map(len, _BY_NAME))
-    for group in dict.fromkeys(command.group for command in COMMANDS):
-        lines.append(group)
-        lines += [f"  {c.name:<{width}}  {c.summary}" for c in COMMANDS if c.group == group]
-        lines.append("")
-    lines.append(
-        "`mjlab COMMAND --help` describes a command; `mjlab --version` prints the version."
-    )
-    return "\n".join(lines)
+    group = ""
+    for command in COMMANDS:
+        heading = "" if command.group == group else command.group
+        group = command.group
+        lines.append(f"{heading:<10} {command.name:<{width}}  {command.summary}")
+    return "\n".join([*lines, "", *_START_HERE])
 
 
 def run_subcommand(command: Command, argv: list[str], prog: str) -> None:

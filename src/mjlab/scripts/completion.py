@@ -1,13 +1,14 @@
-"""Shell completion of commands and task names: `eval "$(mjlab completion bash)"`."""
+"""Shell completion of commands, task names and frequent flags: `eval "$(mjlab completion bash)"`."""
 
 from __future__ import annotations
 
+from mjlab.scripts.help import ALL, SCREENS, TOPICS, flags_of, values_of
 from mjlab.utils.errors import BadCallError
 
 _USAGE = """\
 usage: mjlab completion bash|zsh|fish
 
-Print a script that completes subcommands and task names. Add one of these lines to the startup file of
+Print a script that completes subcommands, task names and frequent flags. Add one of these lines to the startup file of
 the shell:
 
     eval "$(mjlab completion bash)"        # ~/.bashrc
@@ -48,8 +49,21 @@ def candidates(words: list[str]) -> list[str]:
 
         names = list_tasks()
     else:
-        return []
+        names = _flag_candidates(before, partial)
     return [name for name in names if name.startswith(partial)]
+
+
+def _flag_candidates(before: list[str], partial: str) -> list[str]:
+    """Return what may follow a command and its task: a value, a topic of `--help`, or a flag."""
+    name, last = before[0], before[-1]
+    if name in SCREENS and last == "--help":
+        return [name, "agent", "env", *TOPICS, ALL]
+    if name in SCREENS and last == "--profile" and name != "demo":
+        from mjlab.tasks.registry import list_profiles
+
+        return list_profiles(before[1])
+    values = values_of(name, last)
+    return values or (["--help", *flags_of(name)] if partial.startswith("-") else [])
 
 
 def command(argv: list[str], prog: str) -> None:

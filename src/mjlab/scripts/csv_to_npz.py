@@ -24,6 +24,7 @@ from mjlab.tasks.tracking.motion_recording import (
 )
 from mjlab.utils.errors import UserError, check_positive
 from mjlab.utils.logging import print_notice
+from mjlab.utils.wandb import check_wandb_login
 from mjlab.viewer.page_server import check_address, page_url, serve_page
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ def convert(cfg: CsvToNpzConfig) -> Path:
         raise UserError("--input-file: expected a recording (.csv or .npz), got none.")
     for name in ("input_fps", "output_fps"):
         check_positive(f"--{name.replace('_', '-')}", getattr(cfg, name))
+    if cfg.upload:
+        check_wandb_login("--upload")
     if cfg.view:
         check_address(cfg.host, cfg.port, "--")
     robot = robot_cfg(cfg.robot).build()

@@ -50,7 +50,6 @@ def demo_cfg(demo: Demo) -> PlayConfig:
         num_envs=1,
         device="cpu",
         viewer="viser",
-        open_browser=True,
     )
 
 

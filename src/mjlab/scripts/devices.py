@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from mjlab.utils.errors import UserError
 from mjlab.utils.gpu import egl_device_id, select_gpus
+from mjlab.utils.logging import print_notice
 from mjlab.utils.processes import ProcessRank, process_rank
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ def training_device(cfg: TrainConfig, rank: ProcessRank) -> str:
         ValueError: `gpu_ids` contains an unavailable GPU.
     """
     device = _single_process_device(cfg) if rank.is_alone else _device_of(cfg, rank)
+    if device == "cpu" and cfg.device is None and cfg.gpu_ids and rank.is_first:
+        print_notice("No GPU is visible; using the CPU.")
     if device.startswith("cuda"):
         # EGL counts all GPUs of the machine, torch only visible GPUs.
         physical = egl_device_id(int(device.partition(":")[2] or 0))

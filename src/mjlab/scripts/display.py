@@ -22,6 +22,7 @@ from mjlab.scripts.flags import prepare_env_cfg
 from mjlab.scripts.policy import policy_env_cfg
 from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.sim.warning_log import mujoco_warnings
+from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -209,8 +210,8 @@ def report_divergence(env: ManagerBasedRlEnv) -> None:
     if episodes > 0:
         environments = int((env.nan_resets > 0).sum())
         print(
-            f"Diverged: the physics of {environments} of {env.num_envs} environments, in {episodes} "
-            "episodes (Simulation/nan_resets)"
+            f"Diverged: the physics of {environments} of {counted(env.num_envs, 'environment')}, in "
+            f"{counted(episodes, 'episode')} (Simulation/nan_resets)"
         )
     for kind, count in mujoco_warnings().items():
         print(f"MuJoCo warned {count:,} times: {kind}")

@@ -21,6 +21,7 @@ from mjlab.scripts.policy import (
 )
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import check_count
+from mjlab.utils.string import counted
 
 
 @dataclass
@@ -98,7 +99,7 @@ def _table(metrics: dict[str, Any]) -> str:
         f"Task         {metrics['task']}",
         f"Policy       {metrics['policy']}",
         f"Physics      {metrics['physics']}",
-        f"Episodes     {metrics['num_episodes']} in {metrics['num_envs']} environments, "
+        f"Episodes     {metrics['num_episodes']} in {counted(metrics['num_envs'], 'environment')}, "
         f"mean length {metrics['mean_length']:.1f} steps",
         f"Mean return  {metrics['mean_return']:.2f}   {_interval(metrics['return_interval'], '.2f')}"
         f"   range [{metrics['min_return']:.2f}, {metrics['max_return']:.2f}]",

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 import dataclasses
 import sys
@@ -20,14 +19,10 @@ from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
-from tyro.constructors import (
-    ConstructorRegistry,
-    PrimitiveConstructorSpec,
-    PrimitiveTypeInfo,
-    UnsupportedTypeAnnotationError,
-)
 
 import mjlab
+from mjlab.scripts.flag_values import flag_rules
+from mjlab.scripts.help import TERM_DICTS, print_help, requested_topic
 from mjlab.scripts.run_folder import read_run_info
 from mjlab.tasks.registry import (
     PolicyOrigin,
@@ -39,8 +34,6 @@ from mjlab.tasks.registry import (
 from mjlab.utils.logging import print_notice
 
 if TYPE_CHECKING:
-    import torch
-
     from mjlab.envs import ManagerBasedRlEnvCfg
 
 C = TypeVar("C")
@@ -50,32 +43,18 @@ CPU_PROFILE = "cpu"
 _CHOICES = ("profile", "learner")
 # Field of the task options.
 _FIELD = "options"
-# Dicts of terms by name. Observation terms are in `terms` of their group.
-_TERM_DICTS = frozenset(
-    (
-        "observations",
-        "terms",
-        "actions",
-        "rewards",
-        "terminations",
-        "events",
-        "commands",
-        "curriculum",
-        "metrics",
-        "recorders",
-    )
-)
-
-_Spec = PrimitiveConstructorSpec | UnsupportedTypeAnnotationError | None
-_SEQUENCES = (tuple, list)
 
 
 def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
-    """Return `default` updated by `flags`; exits on an unknown flag.
+    """Return `default` updated by `flags`; exits on an unknown flag, and after `--help [TOPIC]`.
 
     `--env.rewards.<term> None` removes the term (same for all other kinds of terms). `None` also
     removes a nested config if the field may be None, such as the noise of a term.
     """
+    topic = requested_topic(flags)
+    if topic is not None:
+        print_help(default, topic, prog)
+        sys.exit(0)
     arguments = _arguments(config_type, default, flags, prog)
     return tyro.cli(config_type, **arguments)
 
@@ -137,7 +116,7 @@ def parse_with_choices(
     """
     requested = requested_choices(flags)
     default = make_default(**requested)
-    if len(requested) == len(_CHOICES):
+    if len(requested) == len(_CHOICES) or requested_topic(flags) is not None:
         return parse_flags(type(default), default, flags, prog)
     # The learner of the selected run may have flags that the task's learner lacks.
     cfg, unknown = parse_known_flags(type(default), default, flags, prog)
@@ -180,10 +159,7 @@ def profile_of_run(task: str, run_dir: Path) -> str | None:
 def suggest_profile(task: str, profile: str | None, device: str) -> None:
     """Print a hint to the `cpu` profile when training on the CPU without a profile."""
     if profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task):
-        print_notice(
-            f"Training on the CPU: `train {task} --profile {CPU_PROFILE}` has settings for a "
-            "few cores."
-        )
+        print_notice(f"`train {task} --profile {CPU_PROFILE}` has settings for a few cores.")
 
 
 def report_untuned_learner(task: str, profile: str | None, learner: str) -> None:
@@ -316,7 +292,7 @@ def _term_at(config: Any, flag: str) -> tuple[Any, str]:
         value = holder[key] if isinstance(holder, Mapping) else getattr(holder, key)
         if not is_dataclass(value) and not isinstance(value, Mapping | None):
             return None, ""
-    is_term = isinstance(holder, dict) and inside in _TERM_DICTS
+    is_term = isinstance(holder, dict) and inside in TERM_DICTS
     return (holder, key) if is_term or _may_be_none(holder, key) else (None, "")
 
 
@@ -332,79 +308,3 @@ def _may_be_none(holder: Any, key: str) -> bool:
     return NoneType in options and any(
         is_dataclass(option) or get_origin(option) is dict for option in options
     )
-
-
-# Parsing rules added to tyro: lists for tuples, and tensors.
-
-
-def flag_rules() -> ConstructorRegistry:
-    """Return the parsing rules, for `tyro.cli(registry=...)`."""
-    registry = ConstructorRegistry()
-    registry.primitive_rule(_tensor_rule)
-    registry.primitive_rule(_SequenceRule())
-    return registry
-
-
-def _tensor_rule(info: PrimitiveTypeInfo) -> _Spec:
-    # Commands without tensor flags must not import torch for `--help`.
-    torch = sys.modules.get("torch")
-    if torch is None or info.type is not torch.Tensor:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="[FLOAT,...]",
-        instance_from_str=lambda args: _tensor(args[0]),
-        is_instance=lambda value: isinstance(value, info.type),
-        str_from_instance=lambda value: [repr(value.tolist())],
-    )
-
-
-def _tensor(text: str) -> torch.Tensor:
-    import torch
-
-    try:
-        return torch.tensor(ast.literal_eval(text), dtype=torch.float32)
-    except (ValueError, SyntaxError, TypeError) as error:
-        raise ValueError(f"expected numbers in brackets, got {text!r}: {error}") from error
-
-
-class _SequenceRule:
-    """tyro's rule for tuples and lists, with brackets converted to the declared type."""
-
-    def __init__(self) -> None:
-        self._in_tyro_rule = False
-
-    def __call__(self, info: PrimitiveTypeInfo) -> _Spec:
-        if self._in_tyro_rule or info.type_origin not in _SEQUENCES:
-            return None
-        self._in_tyro_rule = True
-        try:
-            spec = ConstructorRegistry.get_primitive_spec(info)
-        finally:
-            self._in_tyro_rule = False
-        if not isinstance(spec, PrimitiveConstructorSpec):
-            return spec
-        read = spec.instance_from_str
-        return dataclasses.replace(
-            spec, instance_from_str=lambda args: read([_bracketed(info.type, a) for a in args])
-        )
-
-
-def _bracketed(declared: Any, text: str) -> str:
-    try:
-        value = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        return text
-    return repr(_converted(declared, value)) if isinstance(value, _SEQUENCES) else text
-
-
-def _converted(declared: Any, value: Any) -> Any:
-    """Return `value` with its sequences converted to the tuples and lists of the type `declared`."""
-    kind, elements = get_origin(declared), get_args(declared)
-    if kind not in _SEQUENCES or not isinstance(value, _SEQUENCES):
-        return value
-    if kind is list or elements[1:] == (...,):
-        elements = elements[:1] * len(value)
-    if len(elements) != len(value):
-        return kind(value)
-    return kind(_converted(*pair) for pair in zip(elements, value, strict=True))

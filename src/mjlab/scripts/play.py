@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +21,7 @@ from mjlab.scripts.policy import (
 from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.scripts.run_folder import is_run_folder
 from mjlab.utils.errors import UserError, check_count
+from mjlab.utils.string import counted
 from mjlab.utils.torch import threads_for_policy
 from mjlab.viewer.base import run_headless
 from mjlab.viewer.page_server import check_address, open_browser
@@ -48,16 +48,16 @@ class PlayConfig(PolicyFlags):
     camera: int | str | None = None
     """Model camera to record from, name or index. None: viewer camera of the task."""
     viewer: Literal["auto", "native", "viser", "none"] = "auto"
-    """Viewer: `viser` (page in the browser), `native` (MuJoCo's window) or `none` (headless). `auto`:
-    `native` if a display is available, else `viser`."""
+    """Viewer: `viser` (page in the browser; also `auto`), `native` (MuJoCo's window) or `none`
+    (headless)."""
     num_steps: int | None = None
     """Number of environment steps. None: play until stopped."""
     host: str = "127.0.0.1"
     """Address of the page. 0.0.0.0: all interfaces."""
     port: int = 8080
     """Port of the page."""
-    open_browser: bool = False
-    """Open the page in a browser on this machine, if a display is available."""
+    open_browser: bool = True
+    """Open the page in a browser on this machine, if a display is available; not over SSH."""
     no_terminations: bool = False
     """Remove all terminations, including the time limit."""
 
@@ -113,8 +113,8 @@ def run_play(task: str, cfg: PlayConfig) -> None:
             if cfg.viewer == "none" and cfg.num_steps is not None:
                 result = run_headless(env, policy, cfg.num_steps)
                 print(
-                    f"{result.num_steps} steps in {env.num_envs} environments, "
-                    f"{result.num_episodes} episodes ended, mean reward per step "
+                    f"{counted(result.num_steps, 'step')} in {counted(env.num_envs, 'environment')}, "
+                    f"{counted(result.num_episodes, 'episode')} ended, mean reward per step "
                     f"{result.mean_step_reward:.4f}"
                 )
             else:
@@ -127,7 +127,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
 def _make_viewer(
     task: str, cfg: PlayConfig, env: Any, policy: Any, checkpoint: Path | None, device: str
 ) -> Any:
-    if cfg.viewer == "native" or (cfg.viewer == "auto" and _has_display()):
+    if cfg.viewer == "native":
         from mjlab.viewer import NativeMujocoViewer
 
         return NativeMujocoViewer(env, policy)
@@ -146,10 +146,6 @@ def _make_viewer(
     if cfg.open_browser:
         open_browser(viewer.url)
     return viewer
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ from mjlab.scripts.policy import (
     parse_policy_flags,
 )
 from mjlab.utils.errors import check_count
+from mjlab.utils.string import counted
 from mjlab.utils.torch import threads_for_policy
 
 if TYPE_CHECKING:
@@ -175,7 +176,7 @@ def _format_times(times: dict[str, Any]) -> str:
     step, profiled = times["step_ms"], times["profiled_step_ms"]
     per_second = times["num_envs"] / (step * 1e-3)
     lines = [
-        f"Task     {times['task']}, {times['num_envs']} environments",
+        f"Task     {times['task']}, {counted(times['num_envs'], 'environment')}",
         f"Physics  {times['physics']}",
         f"Step     {step:.3f} ms, {per_second:,.0f} environment steps per second; "
         f"{profiled:.3f} ms while timed in parts, over {times['steps']} steps",

@@ -47,6 +47,7 @@ from mjlab.scripts.run_folder import (
 )
 from mjlab.scripts.train_config import TrainConfig, check_flags, check_typed_flags
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
+from mjlab.utils.string import counted
 from mjlab.utils.torch import prepare_torch
 
 __getattr__ = older_names(__name__)
@@ -136,7 +137,7 @@ def _train(
             under = f", profile {cfg.profile}" if cfg.profile else ""
             under += "" if cfg.learner_name == "ppo" else f", learner {cfg.learner_name}"
             each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
-            print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
+            print(f"Task:    {task}, {counted(env.num_envs, 'environment')}{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
             with fail_together():
                 runner = training_runner(task, cfg, env, folder.path, device)

@@ -17,6 +17,7 @@ from mjlab.utils.errors import BadCallError, UserError, check_count
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.processes import ProcessRank, process_rank
 from mjlab.utils.random import process_seed
+from mjlab.utils.wandb import check_wandb_login
 from mjlab.viewer.page_server import check_address
 
 _AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
@@ -135,6 +136,8 @@ def check_flags(cfg: TrainConfig) -> None:
             f"--agent.experiment-name: expected a folder within --log-root, not absolute and without "
             f"'..', got {experiment!r}; use --log-root for another location."
         )
+    if cfg.agent.logger == "wandb":
+        check_wandb_login("--agent.logger wandb", records=True)
     if cfg.live:
         check_address(cfg.live_host, cfg.live_port, "--live-")
 

@@ -35,6 +35,7 @@ from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.nan_guard import NanGuard
 from mjlab.utils.spec import compile_spec
+from mjlab.utils.string import counted
 
 logger = logging.getLogger(__name__)
 
@@ -121,7 +122,9 @@ class Simulation:
             self.mj_model,
             model_fields=lambda: {name: getattr(self.model, name) for name in self.expanded_fields},
         )
-        logger.debug("Physics: %s, %d environments.", self.capabilities.description, num_envs)
+        logger.debug(
+            "Physics: %s, %s.", self.capabilities.description, counted(num_envs, "environment")
+        )
 
     @staticmethod
     def check(num_envs: int, cfg: SimulationCfg, device: str) -> None:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from typing import Literal
-
-logger = logging.getLogger(__name__)
 
 
 def select_gpus(
@@ -26,7 +23,6 @@ def select_gpus(
         return None, 0
     available = _available_devices()
     if not available:
-        logger.info("No GPU found; using the CPU.")
         return None, 0
     if gpu_ids == "all":
         return available, len(available)

@@ -20,6 +20,7 @@ from typing import IO, Any
 
 from mjlab.compat import older_names
 from mjlab.utils.string import qualified_name
+from mjlab.utils.wandb import check_wandb_login
 
 try:
     import fcntl
@@ -162,13 +163,15 @@ def get_wandb_checkpoint_path(
         checkpoint_name: File name such as "model_100.pt". None: highest number.
 
     Cached files are not downloaded again. Raises `ValueError`, listing the available checkpoints, if
-    the checkpoint is not found, and `ConnectionError` if the download fails.
+    the checkpoint is not found, `UserError` without a login, and `ConnectionError` if the download
+    fails.
     """
     cache = Path(log_path) / _WANDB_CACHE / Path(run_path).name
     if checkpoint_name is not None and _WANDB_CHECKPOINT.fullmatch(checkpoint_name):
         cached = cache / checkpoint_name
         if cached.is_file():
             return cached, True
+    check_wandb_login(f"Weights & Biases run {str(run_path)!r}")
     import wandb
 
     with _asking_wandb(run_path):

@@ -87,6 +87,11 @@ def name_list(names: Sequence[str], near: Iterable[str]) -> str:
     return f"{shown} and {len(names) - len(shown)} others"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun: "1 environment", "4096 environments"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def suggest(name: str, available: Iterable[str]) -> str:
     """Return a hint for an unknown `name`: "did you mean 'y'? Available: ['x', 'y']."."""
     names = list(available)

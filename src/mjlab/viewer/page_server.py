@@ -73,8 +73,10 @@ def page_url(server: viser.ViserServer) -> str:
 def open_browser(url: str) -> None:
     """Open `url` in the browser of this machine, if it has a display.
 
-    Without a display, Linux would open a text browser in the terminal.
+    Without a display, Linux would open a text browser in the terminal. Over SSH, the browser would
+    open on the remote machine, or slowly by X forwarding.
     """
     has_display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if sys.platform in ("darwin", "win32") or has_display:
+    has_display = has_display or sys.platform in ("darwin", "win32")
+    if has_display and not os.environ.get("SSH_CONNECTION"):
         webbrowser.open(url)

@@ -59,6 +59,7 @@ def wandb(monkeypatch, tmp_path):
         return find
 
     api = SimpleNamespace(artifact=found(stand_in.artifacts), run=found(stand_in.runs))
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(Api=lambda: api))
     monkeypatch.setattr(wandb_motions.tempfile, "gettempdir", lambda: str(tmp_path))
     return stand_in

@@ -20,6 +20,7 @@ from typing import Any
 from mjlab.tasks.tracking.motion_file import MotionFileError, motion_hash
 from mjlab.utils.os import own_folder, replacing
 from mjlab.utils.string import suggest
+from mjlab.utils.wandb import check_wandb_login
 
 FOLDER = "motion"
 """Name of the motion folder in the run folder."""
@@ -153,11 +154,13 @@ def fetch_artifact(registry_name: str) -> list[Path]:
     """Download an artifact such as `org/motions/dance` or `.../dance:v3`; return its motions.
 
     Raises:
+        UserError: no login at Weights & Biases.
         MotionFileError: the artifact cannot be fetched, or contains no motion.
     """
     import wandb
 
     name = full_artifact_name(registry_name)
+    check_wandb_login(f"Motion {name!r}")
     try:
         artifact = wandb.Api().artifact(name)
         return _motions_in(artifact, name)
@@ -185,10 +188,12 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
         run_path: entity/project/run.
 
     Raises:
+        UserError: no login at Weights & Biases.
         MotionFileError: the run cannot be read, or has neither.
     """
     import wandb
 
+    check_wandb_login(f"Run {run_path!r}")
     try:
         run = wandb.Api().run(run_path)
         files = [file for file in run.files() if file.name.startswith(f"{FOLDER}/")]
