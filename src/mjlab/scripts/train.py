@@ -111,6 +111,7 @@ def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
     # Imports rsl_rl, which takes seconds; flags are checked before.
+    from mjlab.rl.progress import count
     from mjlab.scripts.display import report_divergence, write_results
 
     # One process looks up the checkpoint, before the new run folder could be found.
@@ -136,7 +137,7 @@ def _train(
             under = f", profile {cfg.profile}" if cfg.profile else ""
             under += "" if cfg.learner_name == "ppo" else f", learner {cfg.learner_name}"
             each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
-            print(f"Task:    {task}, {env.num_envs} environments{each}{under}")
+            print(f"Task:    {task}, {count(env.num_envs, 'environment')}{each}{under}")
             print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
             with fail_together():
                 runner = training_runner(task, cfg, env, folder.path, device)
@@ -163,7 +164,7 @@ def _train(
         finally:
             env.close()
     if rank.is_first:
-        write_results(task, cfg, folder.path, device)
+        write_results(task, cfg, folder.path, device, runner.stop_reason)
     return folder.path
 
 
