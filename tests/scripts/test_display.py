@@ -221,11 +221,23 @@ def test_the_next_commands_name_the_folder_if_it_is_needed(flags, root, tmp_path
 
 
 def test_an_interrupted_run_is_resumed_by_the_flags_it_had(monkeypatch, tmp_path):
-    typed = ["--num-envs", "8", "--agent.resume=True", "--agent.load-run", "x", "--live", "True"]
+    observed = ["--env.observations.actor.terms.pole-vel.scale", "0.1"]
+    typed = [
+        "--num-envs",
+        "8",
+        *observed,
+        "--agent.resume=True",
+        "--agent.load-run",
+        "x",
+        "--live",
+        "True",
+    ]
     monkeypatch.setattr(sys, "argv", ["mjlab", "train", SWINGUP, *typed])
-    resume = next_commands(SWINGUP, TrainConfig.from_task(SWINGUP), tmp_path, "interrupted")[0]
-    kept = ["--num-envs", "8", "--live", "True", "--agent.resume", "True"]
-    assert shlex.split(resume) == ["uv", "run", "train", SWINGUP, *kept]
+    cfg = TrainConfig.from_task(SWINGUP)
+    resume, play, _ = map(shlex.split, next_commands(SWINGUP, cfg, tmp_path, "interrupted"))
+    kept = ["--num-envs", "8", *observed, "--live", "True", "--agent.resume", "True"]
+    assert resume == ["uv", "run", "train", SWINGUP, *kept]
+    assert play == ["uv", "run", "play", SWINGUP, *observed]
 
 
 @pytest.mark.parametrize("name", ["cartpole", "elsewhere"])

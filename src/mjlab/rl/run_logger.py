@@ -114,7 +114,7 @@ class RunLogger(Logger):
     """rsl_rl's logger, silent on the console and without a GPU synchronization per step.
 
     Step data stays on the device until `finish_iteration` reads all of it at once. Tags in the
-    event files are rsl_rl's and `Train/mean_step_reward`.
+    event files are rsl_rl's, `Train/mean_step_reward` and `Train/exploring_return`.
 
     Runners with a custom loop, written against rsl_rl, call `log` instead.
     """
@@ -441,6 +441,8 @@ class RunLogger(Logger):
             "Perf/learning_time": stats.learning_time,
             "Train/mean_step_reward": stats.mean_step_reward,
         }
+        if stats.exploring_return is not None:
+            scalars["Train/exploring_return"] = stats.exploring_return
         over_time = {}
         if stats.mean_reward is not None and stats.mean_episode_length is not None:
             scalars["Train/mean_reward"] = stats.mean_reward

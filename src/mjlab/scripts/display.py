@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_LINES = 5.0
 _UPDATES_PER_SECOND = 4
 _LOG_ROOT = "logs/rsl_rl"
+# Flags that change the inputs and outputs of the policy, so `play` and `evaluate` need them as well.
+_POLICY_FLAGS = ("--env.observations.", "--env.actions.")
 # Flags that select the run to resume.
 _RESUME_FLAGS = ("--agent.resume", "--agent.load-run", "--agent.load-checkpoint")
 
@@ -236,31 +238,32 @@ def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None)
     from mjlab.rl.checkpoint import latest_checkpoint
 
     flags = [] if cfg.log_root == _LOG_ROOT else ["--log-root", cfg.log_root]
-    typed = flags
+    typed = [*flags]
     # The commands look for the newest policy in the experiment of the task.
     if cfg.agent.experiment_name != load_rl_cfg(task).experiment_name:
         typed = [*flags, "--agent.experiment-name", cfg.agent.experiment_name]
         flags = ["--checkpoint-file", str(_short(latest_checkpoint(run_dir) or run_dir))]
+    if task in sys.argv:
+        typed = list(sys.argv[sys.argv.index(task) + 1 :])
+        flags += _picked(typed, lambda name: name.startswith(_POLICY_FLAGS))
+        typed = _picked(typed, lambda name: name not in _RESUME_FLAGS)
     commands = [["play", task, *flags], ["evaluate", task, *flags]]
     if ended == "interrupted":
-        if task in sys.argv:
-            typed = _without_resume(sys.argv[sys.argv.index(task) + 1 :])
         commands.insert(0, ["train", task, *typed, "--agent.resume", "True"])
     join = subprocess.list2cmdline if os.name == "nt" else shlex.join
     return [join(["uv", "run", *command]) for command in commands]
 
 
-def _without_resume(flags: list[str]) -> list[str]:
-    """Return a command line of `train` without the flags that select a run to resume."""
-    kept: list[str] = []
-    values = iter(flags)
-    for word in values:
-        name, has_value, _ = word.replace("_", "-").partition("=")
-        if name not in _RESUME_FLAGS:
-            kept.append(word)
-        elif not has_value:
-            next(values, None)
-    return kept
+def _picked(flags: list[str], picks: Callable[[str], bool]) -> list[str]:
+    """Return the flags of a command line, with their values, whose names `picks` accepts."""
+    picked: list[str] = []
+    is_picked = False
+    for word in flags:
+        if word.startswith("--"):
+            is_picked = picks(word.partition("=")[0].replace("_", "-"))
+        if is_picked:
+            picked.append(word)
+    return picked
 
 
 def _short(path: Path) -> Path:
