@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_OUTPUTS = 0.5
 _NOTEBOOK_WIDTH = 90
 _BARS, _ASCII_BARS = "▁▂▃▄▅▆▇█", "_.-=+*%#"
-_READINGS = 24
+_READINGS, _MOST_READINGS = 24, 480
 _ENDS = {"solved": "Finished", "finished": "Finished", "interrupted": "Interrupted"}
 
 
@@ -79,7 +79,9 @@ class TrainingProgress(TrainingObserver):
         self._bounds = Bound.all_of(cfg.evaluation)
         # Iteration and result of the last evaluations, the newest last.
         self._evaluations: list[tuple[int, EvaluationResult]] = []
+        # Exploring return of every `_stride`-th iteration.
         self._returns: list[float] = []
+        self._stride = 1
         self._first = self._total = 0
         self._started = time.perf_counter()
         # Duration of this session until its last iteration, and until its end (s).
@@ -88,14 +90,18 @@ class TrainingProgress(TrainingObserver):
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Start the clock."""
         self.stats, self.ended = None, None
-        self._evaluations, self._returns = [], []
+        self._evaluations, self._returns, self._stride = [], [], 1
         self._first, self._total = first_iteration, total_iterations
         self._started = time.perf_counter()
 
     def on_iteration(self, stats: IterationStats) -> None:
         """Keep the statistics."""
         self.stats, self._trained = stats, self.spent
-        self._returns.append(self._exploring(stats))
+        if stats.iteration % self._stride == 0:
+            self._returns.append(self._exploring(stats))
+        if len(self._returns) > _MOST_READINGS:
+            # Drawn several times per second, so the work must not grow with the run.
+            self._returns, self._stride = self._returns[1::2], 2 * self._stride
 
     def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
         """Keep the result, and the one before for trends."""
