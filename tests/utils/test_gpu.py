@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from mjlab.utils import gpu
 from mjlab.utils.gpu import egl_device_id, select_gpus
 
 
@@ -64,3 +65,12 @@ def test_rendering_goes_to_the_gpu_as_the_machine_numbers_it(machine, visible, i
     """The defect: with GPU 3 alone visible, GPU 0 rendered."""
     machine(4, visible)
     assert egl_device_id(index) == expected
+
+
+def test_that_the_cpu_is_used_is_said_once(machine, caplog):
+    gpu._report_no_gpu.cache_clear()
+    machine(0)
+    with caplog.at_level("INFO", "mjlab"):
+        for _ in range(2):
+            assert select_gpus([0]) == (None, 0)
+    assert len(caplog.records) == 1

@@ -222,8 +222,7 @@ class TrainingProgress(TrainingObserver):
             if not self._bounds:
                 return exploring and f"{exploring}."
             upcoming = self._next_evaluation()
-            upcoming = f", next evaluation {upcoming}" if upcoming else ""
-            return f"{exploring}; not evaluated{upcoming}."
+            return f"{exploring}; not evaluated" + (f", due {upcoming}." if upcoming else ".")
         iteration, result = self._evaluations[-1]
         parts = []
         for bound in self._bounds:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 from typing import Literal
@@ -26,7 +27,7 @@ def select_gpus(
         return None, 0
     available = _available_devices()
     if not available:
-        logger.info("No GPU found; using the CPU.")
+        _report_no_gpu()
         return None, 0
     if gpu_ids == "all":
         return available, len(available)
@@ -48,6 +49,12 @@ def egl_device_id(index: int) -> int | None:
     available = _available_devices()
     device = available[index] if 0 <= index < len(available) else None
     return device if isinstance(device, int) else None
+
+
+@functools.cache
+def _report_no_gpu() -> None:
+    """Log, once per process, that the CPU is used."""
+    logger.info("No GPU found; using the CPU.")
 
 
 def _available_devices() -> list[int | str]:
