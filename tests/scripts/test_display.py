@@ -13,11 +13,12 @@ from commands import run_script
 from rich.console import Console
 
 from mjlab.rl.evaluation import EvaluationResult, MeanAndInterval
-from mjlab.rl.progress import ProgressCfg, clock, count, duration, sparkline
+from mjlab.rl.progress import ProgressCfg, clock, duration, sparkline
 from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import display
 from mjlab.scripts.display import TrainingDisplay, next_commands, usual_iteration
 from mjlab.scripts.train import TrainConfig, parse_train_flags
+from mjlab.utils.string import count
 
 SWINGUP = "Mjlab-Cartpole-Swingup"
 GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -141,7 +142,7 @@ def test_the_end_says_which_bound_was_missed_by_how_much(
 
 def test_a_run_that_fails_before_it_starts_is_shown_as_failed(capsys):
     TrainingDisplay(ProgressCfg(evaluation={}), Console(file=sys.stdout)).on_end("failed")
-    assert capsys.readouterr().out.startswith("Failed")
+    assert capsys.readouterr().out == "Failed before the first iteration.\n"
 
 
 def test_no_border_is_drawn_and_characters_fit_the_encoding():

@@ -23,6 +23,7 @@ from rich.text import Text
 
 from mjlab.rl.evaluation import Bound, EvaluationResult, trigger_return
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
+from mjlab.utils.string import count
 
 if TYPE_CHECKING:
     from mjlab.rl.runner import MjlabOnPolicyRunner
@@ -198,6 +199,8 @@ class TrainingProgress(TrainingObserver):
 
     def ending(self) -> str:
         """Return how training ended: solved, or the bounds missed and by how much."""
+        if self.ended == "failed" and self.stats is None:
+            return "Failed before the first iteration."
         at = f"iteration {self.iteration}"
         if self.ended != "solved":
             at += f" of {self._total}"
@@ -359,7 +362,13 @@ class NotebookProgress(TrainingProgress):
 
     def _content(self) -> dict[str, str]:
         text = io.StringIO()
-        Console(file=text, width=_NOTEBOOK_WIDTH, force_jupyter=False, _environ={}).print(self)
+        Console(
+            file=text,
+            width=_NOTEBOOK_WIDTH,
+            force_terminal=False,
+            force_jupyter=False,
+            color_system=None,
+        ).print(self)
         plain = text.getvalue().rstrip()
         style = "line-height:1.25;white-space:pre-wrap"
         return {
@@ -376,11 +385,6 @@ def in_notebook() -> bool:
 
 
 # Formats.
-
-
-def count(number: int, noun: str) -> str:
-    """Format a count: `1 environment`, `4,096 environments`."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def number(value: float) -> str:

@@ -22,7 +22,6 @@ from mjlab.rl.progress import (
     NotebookProgress,
     ProgressCfg,
     TrainingProgress,
-    count,
     in_notebook,
     label,
     number,
@@ -34,6 +33,7 @@ from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.scripts.reference import DATA, Kind, Reference, reference_path, referenced_tasks
 from mjlab.sim.warning_log import mujoco_warnings
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.utils.string import count
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv

@@ -11,7 +11,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mjlab.rl.progress import count
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.environments import make_env
@@ -27,6 +26,7 @@ from mjlab.scripts.policy import (
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import check_count
 from mjlab.utils.logging import print_notice
+from mjlab.utils.string import count
 
 _SECONDS_BETWEEN_DRAWINGS = 0.25
 # Period of plain lines, for log files.

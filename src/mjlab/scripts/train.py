@@ -47,6 +47,7 @@ from mjlab.scripts.run_folder import (
 )
 from mjlab.scripts.train_config import TrainConfig, check_flags, check_typed_flags
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
+from mjlab.utils.string import count
 from mjlab.utils.torch import prepare_torch
 
 __getattr__ = older_names(__name__)
@@ -111,7 +112,6 @@ def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
     # Imports rsl_rl, which takes seconds; flags are checked before.
-    from mjlab.rl.progress import count
     from mjlab.scripts.display import report_divergence, write_results
 
     # One process looks up the checkpoint, before the new run folder could be found.

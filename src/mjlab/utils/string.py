@@ -106,3 +106,8 @@ def _report_unmatched(patterns: Iterable[re.Pattern[str]], names: Sequence[str])
         logger.warning(
             "Patterns %s match none of the names %s.", unmatched, name_list(names, near=unmatched)
         )
+
+
+def count(number: int, noun: str) -> str:
+    """Format a count: `1 environment`, `4,096 environments`."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
