@@ -221,7 +221,11 @@ def test_the_next_commands_name_the_folder_if_it_is_needed(flags, root, tmp_path
     assert commands == [["uv", "run", name, SWINGUP, *root] for name in ("play", "evaluate")]
 
 
-def test_an_interrupted_run_is_resumed_by_the_flags_it_had(monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    ("words", "is_train"),
+    [(["/bin/train"], True), (["mjlab", "train"], True), (["mjlab", "verify"], False)],
+)
+def test_an_interrupted_run_is_resumed_by_the_flags_it_had(words, is_train, monkeypatch, tmp_path):
     observed = ["--env.observations.actor.terms.pole-vel.scale", "0.1"]
     typed = [
         "--num-envs",
@@ -233,12 +237,12 @@ def test_an_interrupted_run_is_resumed_by_the_flags_it_had(monkeypatch, tmp_path
         "--live",
         "True",
     ]
-    monkeypatch.setattr(sys, "argv", ["mjlab", "train", SWINGUP, *typed])
+    monkeypatch.setattr(sys, "argv", [*words, SWINGUP, *typed])
     cfg = TrainConfig.from_task(SWINGUP)
     resume, play, _ = map(shlex.split, next_commands(SWINGUP, cfg, tmp_path, "interrupted"))
-    kept = ["--num-envs", "8", *observed, "--live", "True", "--agent.resume", "True"]
-    assert resume == ["uv", "run", "train", SWINGUP, *kept]
-    assert play == ["uv", "run", "play", SWINGUP, *observed]
+    kept = ["--num-envs", "8", *observed, "--live", "True"] if is_train else []
+    assert resume == ["uv", "run", "train", SWINGUP, *kept, "--agent.resume", "True"]
+    assert play == ["uv", "run", "play", SWINGUP, *(observed if is_train else [])]
 
 
 @pytest.mark.parametrize("name", ["cartpole", "elsewhere"])

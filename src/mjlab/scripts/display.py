@@ -143,8 +143,10 @@ def usual_iteration(task: str, cfg: TrainConfig) -> int | None:
 
     None if the package has no reference with the settings of `cfg`, or not every seed was solved.
     """
-    agent = cfg.agent
-    default = load_rl_cfg(task, profile=cfg.profile)
+    kinds = referenced_tasks(DATA).get(task)
+    if kinds is None:
+        return None
+    agent, default = cfg.agent, load_rl_cfg(task, profile=cfg.profile)
     parts = ("algorithm", "actor", "critic", "num_steps_per_env")
     if any(getattr(agent, part, None) != getattr(default, part, None) for part in parts):
         return None
@@ -156,7 +158,7 @@ def usual_iteration(task: str, cfg: TrainConfig) -> int | None:
         return None
     if cfg.env.scene.num_envs != env.scene.num_envs or not agent.evaluation.stop_when_solved:
         return None
-    for kind in referenced_tasks(DATA).get(task, ()):
+    for kind in kinds:
         reference = Reference.load(reference_path(DATA, task, cast(Kind, kind)))
         runs = [seed.run for seed in reference.seeds]
         if reference.profile == cfg.profile and all(run.ended == "solved" for run in runs):
@@ -243,8 +245,10 @@ def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None)
     if cfg.agent.experiment_name != load_rl_cfg(task).experiment_name:
         typed = [*flags, "--agent.experiment-name", cfg.agent.experiment_name]
         flags = ["--checkpoint-file", str(_short(latest_checkpoint(run_dir) or run_dir))]
-    if task in sys.argv:
-        typed = list(sys.argv[sys.argv.index(task) + 1 :])
+    words = sys.argv
+    # Not the flags of other commands that train, such as `verify`.
+    if task in words and Path(words[words.index(task) - 1]).stem == "train":
+        typed = words[words.index(task) + 1 :]
         flags += _picked(typed, lambda name: name.startswith(_POLICY_FLAGS))
         typed = _picked(typed, lambda name: name not in _RESUME_FLAGS)
     commands = [["play", task, *flags], ["evaluate", task, *flags]]
