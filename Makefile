@@ -34,6 +34,7 @@ test-mujoco-next:  ## Run tests/sim on MuJoCo 4.0.1 and MuJoCo Warp 4.0.0, in an
 check:  ## Check format, lint, types and import layers.
 	$(DEV) ruff format --check .
 	$(DEV) ruff check .
+	$(DEV) ruff check --preview --select PLW1514 src  # Text files are UTF-8 on every platform.
 	$(DEV) ty check
 	$(DEV) lint-imports
 

@@ -8,9 +8,13 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from docutils.nodes import SkipNode
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
+from mjlab.scripts.describe import describe
+from mjlab.tasks.registry import list_tasks
 from mjlab.tasks.velocity import mdp as velocity_mdp
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -20,16 +24,31 @@ author = "the mjlab developers"
 release = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]["version"]
 version = release
 
-extensions = ["myst_parser", "sphinx.ext.autodoc"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary"]
+extensions += ["sphinx_copybutton", "sphinx_design"]
 exclude_patterns = ["_build"]
 
+myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
+
+# Browsers draw MathML themselves, so pages need neither scripts nor a network.
+html_math_renderer = "mathml"
+
+# Copy commands without their prompt.
+copybutton_exclude = ".linenos, .gp, .go"
 
 html_theme = "furo"
 html_title = f"mjlab {release}"
 
-autodoc_typehints = "signature"
+html_theme_options = {
+    "light_css_variables": {"color-brand-primary": "#2f6690", "color-brand-content": "#2f6690"},
+    "dark_css_variables": {"color-brand-primary": "#8fc1e3", "color-brand-content": "#8fc1e3"},
+}
+
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
+toc_object_entries_show_parents = "hide"
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
 
@@ -81,7 +100,37 @@ def _readable(
     return None
 
 
+def _add_summary(app: Sphinx, name: str, source: list[str]) -> None:
+    """Insert a table of classes and functions, with their first sentences, below the title."""
+    listed = re.findall(r"(?m)^\.\. auto(?:class|function|data):: (\S+)", source[0])
+    if name.startswith("reference/api/") and listed:
+        title, rest = source[0].split("\n", 1)
+        rows = "\n".join(f"   ~{path}" for path in listed)
+        table = f".. autosummary::\n   :nosignatures:\n\n{rows}\n"
+        source[0] = f"{title}\n\n```{{eval-rst}}\n{table}```\n{rest}"
+
+
+def _math(display: str) -> tuple[Any, None]:
+    def visit(self: Any, node: Any) -> None:
+        tag = "div" if display == "block" else "span"
+        formula = convert(node.astext(), display=display)
+        self.body.append(self.starttag(node, tag, "", CLASS="math") + formula + f"</{tag}>")
+        raise SkipNode
+
+    return visit, None
+
+
+def _add_task_tables(app: Sphinx, page: str, source: list[str]) -> None:
+    """Append the tables of all stock tasks to the page of tasks."""
+    if page == "reference/tasks":
+        names = [name for name in list_tasks() if name.startswith("Mjlab-")]
+        source[0] += "".join(f"\n{describe(name).markdown()}\n" for name in names)
+
+
 def setup(app: Sphinx) -> None:
-    """Register the handlers of docstrings and signatures."""
+    """Register the handlers of pages, docstrings, signatures and formulas."""
+    app.add_html_math_renderer("mathml", _math("inline"), _math("block"))
+    app.connect("source-read", _add_summary)
+    app.connect("source-read", _add_task_tables)
     app.connect("autodoc-process-signature", _readable)
     app.connect("autodoc-process-docstring", _to_rst)

@@ -89,10 +89,10 @@ CLIPS = {
         start=3.0, seconds=3.0, body="robot/pelvis", lookat=(0.0, 0.0, 0.6), distance=3.4, azimuth=155.0,
     ),
     "lift": Clip(
-        "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.18), distance=1.1, azimuth=130.0, elevation=-18.0,
-        seconds=4.0,
+        "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0, elevation=-16.0,
+        seconds=3.0,
     ),
-    "tracking": Clip(
+    "g1_tracking": Clip(
         "Mjlab-Tracking-Flat-Unitree-G1", motion="squat", seconds=4.0, body="robot/pelvis",
         lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
     ),

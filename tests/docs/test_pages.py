@@ -16,11 +16,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in page.parts]
 
-_COMMAND = re.compile(r"\buv run (?:--extra \S+ |--\S+ )*([\w-]+)")
+_COMMAND = re.compile(r"\buv run (?:--(?:extra|group) \S+ |--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
-    r"\b(train-seeds|train|demo|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
+    r"\b(train-seeds|train|demo|describe|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
     r"|csv_to_npz|verify)"
     r"((?: [^\s`#]+)*)"
 )
@@ -31,6 +31,9 @@ _ELSEWHERE = {"help", "seeds", "keyword", "output", "tag", "title", "group"}
 _INSTALLERS = {"extra", "overrides", "no-deps", "no-index", "only-binary", "find-links", "target"}
 _INSTALLERS |= {"dest", "python-version", "implementation", "platform"}
 _INSTALLERS |= {"python-platform", "no-header", "no-annotate"}
+_INSTALLERS |= {"torch-backend"}
+# TensorBoard, ruff, sphinx-build, and the commands of Isaac Lab.
+_OTHERS = {"logdir", "check", "keep-going", "headless", "task"}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 
@@ -46,7 +49,8 @@ def _code(text: str) -> str:
 def test_commands_are_console_scripts(page: Path) -> None:
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     commands = set(_COMMAND.findall(page.read_text(encoding="utf-8")))
-    assert commands <= {*scripts, "python"}
+    others = {"python", "tensorboard", "pytest", "ruff", "ty", "lint-imports", "sphinx-build"}
+    assert commands <= {*scripts, *others}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_ids)
@@ -55,10 +59,25 @@ def test_make_targets_exist(page: Path) -> None:
     assert set(_MAKE.findall(_code(page.read_text(encoding="utf-8")))) <= targets
 
 
+def test_commands_of_the_targets_are_those_of_the_makefile() -> None:
+    page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `make ([\w-]+)` \| `([^`]+)`", page, re.MULTILINE)
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8").replace("\\\n", " ")
+    makefile = makefile.replace("$(DEV)", "$(UV) run --group dev").replace("$(UV)", "uv")
+    targets = set(re.findall(r"^([a-z-]+):.*##", makefile, re.MULTILINE))
+    assert targets - {"help", "format", "test-gpu-script", "test-mujoco-next"} == dict(rows).keys()
+    for target, command in rows:
+        recipe = re.search(rf"^{target}:.*\n((?:\t.*\n)+)", makefile, re.MULTILINE)
+        assert recipe is not None
+        text = recipe[1].replace("$(PYTHON)", "python").replace("$(DEVICE)", "cuda:0")
+        assert command in text, target
+
+
 @cache
 def _flags_of() -> dict[str, list[object]]:
     """Each command's flags: configs, whose fields they are, and sets of names."""
     from mjlab.scripts.csv_to_npz import CsvToNpzConfig
+    from mjlab.scripts.describe import DescribeConfig
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.export_scene import ExportSceneConfig
     from mjlab.scripts.play import PlayConfig
@@ -80,6 +99,7 @@ def _flags_of() -> dict[str, list[object]]:
         "train": [train, *others, MotionOptions()],
         "train-seeds": [train, *others, {"seeds": None}],
         "demo": [play],
+        "describe": [DescribeConfig(env=train.env), MotionOptions()],
         "play": [play, MotionOptions()],
         "evaluate": [EvaluateConfig(env=train.env), MotionOptions()],
         "csv_to_npz": [CsvToNpzConfig()],
@@ -120,7 +140,7 @@ def _unknown(command: str, text: str) -> set[str]:
 
 def test_flags_are_fields_of_the_commands() -> None:
     unknown = set()
-    elsewhere = _ELSEWHERE | _TORCHRUN | _INSTALLERS | _flags_of_gpu()
+    elsewhere = _ELSEWHERE | _TORCHRUN | _INSTALLERS | _OTHERS | _flags_of_gpu()
     for page in PAGES:
         code = _code(page.read_text(encoding="utf-8"))
         flags = set.intersection(*(_unknown(command, code) for command in _flags_of()))

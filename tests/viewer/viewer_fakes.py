@@ -91,6 +91,9 @@ class FakeTerms:
     def get_active_iterable_terms(self, env_idx: int) -> list[tuple[str, list[float]]]:
         return [(name, [value * (env_idx + 1)]) for name, value in self.values.items()]
 
+    def get_term_cfg(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(weight=1.0 if name in self.values else 0.0)
+
     def create_gui(self, server, get_env_idx, on_change=None, request_action=None) -> None:
         server.gui.add_slider("lin_vel_x", -1.0, 1.0, 0.05, 0.0)
 

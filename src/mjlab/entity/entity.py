@@ -686,7 +686,7 @@ class Entity:
         """
         spec = self._spec_to_write.copy()
         strip_buffer_textures(spec)
-        Path(xml_path).write_text(fix_spec_xml(spec.to_xml()))
+        Path(xml_path).write_text(fix_spec_xml(spec.to_xml()), encoding="utf-8")
 
     def to_zip(self, path: Path) -> None:
         """Write the entity's spec and assets as a MuJoCo zip archive; see `write_xml`."""

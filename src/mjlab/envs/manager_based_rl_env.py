@@ -48,6 +48,7 @@ from mjlab.sim import Simulation, SimulationCfg
 from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
+from mjlab.utils.tables import Table, Tabular
 from mjlab.viewer.viewer_config import ViewerConfig
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class ManagerBasedRlEnvCfg:
     """Multiply rewards by the control timestep (s)."""
 
 
-class ManagerBasedRlEnv:
+class ManagerBasedRlEnv(Tabular):
     """N environments stepped in parallel. All tensors have a leading dimension N.
 
     Call `reset` before the first `step`: the constructor leaves the model's initial state.
@@ -237,6 +238,26 @@ class ManagerBasedRlEnv:
     def unwrapped(self) -> ManagerBasedRlEnv:
         """This environment, without wrappers."""
         return self
+
+    def __repr__(self) -> str:
+        count = f"{self.num_envs} environment{'s' if self.num_envs != 1 else ''}"
+        return f"<{type(self).__name__}: {count} on {self.device}; {self.describe_time()}>"
+
+    def describe_time(self) -> str:
+        """Return timesteps and episode length in words."""
+        steps = f"steps of {self.step_dt:.4g} s ({self.cfg.decimation} x {self.physics_dt:.4g} s)"
+        length = f"of {self.max_episode_length_s:g} s ({self.max_episode_length} steps)"
+        # Tasks without a time limit set an episode length of years.
+        return f"{steps}, episodes {length if self.max_episode_length_s < 1e6 else 'without limit'}"
+
+    def tables(self) -> list[Table]:
+        """Return the tables of all managers, entities and sensors; empty ones too."""
+        managers = (
+            *(self.observation_manager, self.action_manager, self.command_manager),
+            *(self.reward_manager, self.termination_manager, self.event_manager),
+            *(self.curriculum_manager, self.metrics_manager, self.recorder_manager),
+        )
+        return [table for part in (*managers, self.scene) for table in part.tables()]
 
     # Construction.
 

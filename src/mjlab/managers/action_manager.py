@@ -12,11 +12,12 @@ import numpy as np
 import torch
 
 from mjlab.actuator.actuator import is_constant_within_step
-from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase, term_table
+from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase
 from mjlab.managers.term_checks import check_real
 from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import as_index
 from mjlab.utils.spaces import Box, Space, batch_space
+from mjlab.utils.tables import Table, settings_of
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -85,6 +86,7 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
     """
 
     _transient = {"_action", "_prev_action", "_prev_prev_action", "_action_parts"}
+    _title = "actions"
     _cfg_type = ActionTermCfg
     _term_type = ActionTerm
 
@@ -100,10 +102,21 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
             event = torch.cuda.Event()
             self._check_finite = DeferredCheck(*self._action.shape, self.device, event)
 
-    def __str__(self) -> str:
-        """Return a table of the active terms."""
-        rows = [(name, term.action_dim) for name, term in self._terms.items()]
-        return term_table(self, ["name", "dimension"], rows)
+    def tables(self) -> list[Table]:
+        """Return the table of the active terms; `targets` are the driven joints, tendons or sites."""
+        columns = ("term", "type", "size", "targets", "scale", "settings")
+        rows = [
+            (
+                name,
+                type(term).__name__,
+                term.action_dim,
+                getattr(term, "target_names", None),
+                getattr(term.cfg, "scale", None),
+                settings_of(term.cfg, "actuator_names", "scale", "transmission_type"),
+            )
+            for name, term in self._terms.items()
+        ]
+        return [Table(self._title, columns, rows, note=f"{self.total_action_dim} in all")]
 
     @property
     def action_term_dim(self) -> list[int]:

@@ -16,12 +16,12 @@ from mjlab.managers.manager_base import (
     DebugVisSwitches,
     ManagerTermBase,
     NullManager,
-    term_table,
 )
 from mjlab.managers.nonfinite import finite_mean
 from mjlab.utils.errors import UnsupportedError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import sample_uniform
+from mjlab.utils.tables import Table, format_shape, settings_of
 
 if TYPE_CHECKING:
     import viser
@@ -209,16 +209,27 @@ class CommandTerm(ManagerTermBase):
 class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
     """Command terms by name. The config is kept by reference and may be edited."""
 
+    _title = "commands"
     _cfg_type = CommandTermCfg
     _term_type = CommandTerm
 
     def __init__(self, cfg: Mapping[str, CommandTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
 
-    def __str__(self) -> str:
-        """Return a table of the active terms."""
-        rows = [(name, type(term).__name__) for name, term in self._terms.items()]
-        return term_table(self, ["name", "type"], rows)
+    def tables(self) -> list[Table]:
+        """Return the table of the active terms."""
+        columns = ("term", "type", "size", "resampling (s)", "settings")
+        rows = [
+            (
+                name,
+                type(term).__name__,
+                format_shape(getattr(term.command, "shape", ())[1:]),
+                term.cfg.resampling_time_range,
+                settings_of(term.cfg, "resampling_time_range", "debug_vis", "viz"),
+            )
+            for name, term in self._terms.items()
+        ]
+        return [Table(self._title, columns, rows)]
 
     def compute(self, dt: float | torch.Tensor, env_ids: torch.Tensor | None = None) -> None:
         """Advance all commands by `dt` seconds; see `CommandTerm.compute`."""

@@ -26,6 +26,7 @@ class CurriculumTermCfg(ManagerTermBaseCfg):
 class CurriculumManager(TermListManager):
     """Calls its terms at every reset, before the state of the old episode is overwritten."""
 
+    _title = "curriculum"
     _cfg_type = CurriculumTermCfg
     _leading = ("env", "env_ids")
 

@@ -17,7 +17,6 @@ from mjlab.managers.manager_base import (
     ManagerTermBaseCfg,
     TermFunctionSwitches,
     TermListManager,
-    term_table,
 )
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import is_interval
@@ -67,7 +66,9 @@ class EventManager(TermFunctionSwitches, TermListManager):
     `interval_range_s`.
     """
 
+    _title = "events"
     _cfg_type = EventTermCfg
+    _shown = {"mode": "mode", "interval (s)": "interval_range_s"}
     _leading = ("env", "env_ids")
     _transient = {"_terms_by_mode", "_lookups"}
 
@@ -98,13 +99,6 @@ class EventManager(TermFunctionSwitches, TermListManager):
                     self._timers[name] = self._sample_interval(term, 1, "cpu").item()
                 else:
                     self._timers[name] = self._sample_interval(term, self.num_envs)
-
-    def __str__(self) -> str:
-        """Return a table of the active terms."""
-        rows = [
-            (cfg.mode, name, cfg.interval_range_s or "") for name, cfg in self._live_cfgs.items()
-        ]
-        return term_table(self, ["mode", "name", "interval (s)"], rows)
 
     @property
     def active_terms(self) -> dict[str, list[str]]:  # ty: ignore[incompatible-property-override]

@@ -25,6 +25,7 @@ from mjlab.managers.term_checks import check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
 from mjlab.utils.state import SKIP, plain_scalar, stateful
+from mjlab.utils.tables import Table, Tabular, function_name
 
 if TYPE_CHECKING:
     import viser
@@ -84,10 +85,12 @@ class ManagerTermBase:
 
 
 @stateful
-class ManagerBase(ABC):
+class ManagerBase(Tabular, ABC):
     """Base class of managers. Subclasses build their terms in `_prepare_terms`."""
 
     _transient = {"cfg", "_term_names", "_value_shape", "_live_cfgs", "_built_values"}
+    # Name of the table of terms.
+    _title = "terms"
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         self._env = env
@@ -99,9 +102,13 @@ class ManagerBase(ABC):
         self._prepare_terms()
         self._built_values = {label: plain_values(cfg) for label, cfg in self._live_cfgs.items()}
 
-    def __str__(self) -> str:
-        """Return a table of the active terms."""
-        return term_table(self, ["name"], [[name] for name in self.active_terms])
+    def __repr__(self) -> str:
+        count = sum(len(table.rows) for table in self.tables())
+        return f"<{type(self).__name__}> with {count} active terms"
+
+    def tables(self) -> list[Table]:
+        """Return the table of the active terms."""
+        return [Table(self._title, ("term",), [(name,) for name in self.active_terms])]
 
     @property
     def num_envs(self) -> int:
@@ -259,22 +266,27 @@ class TermListManager(ManagerBase):
     _transient = {"_term_cfgs"}
     _cfg_type: type[ManagerTermBaseCfg] = ManagerTermBaseCfg
     _leading: Sequence[str] = ("env",)
-    # Config fields shown in the printed table.
-    _shown: Sequence[str] = ()
+    # Config fields shown in the table, by column.
+    _shown: Mapping[str, str] = {}
 
     def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
         # One copy per term: a config used twice must become two terms.
         self.cfg = {name: copy.deepcopy(term_cfg) for name, term_cfg in cfg.items()}
         super().__init__(env)
 
-    def __str__(self) -> str:
-        """Return a table of the active terms."""
-        header = ["name", *(field.replace("_", " ") for field in self._shown)]
+    def tables(self) -> list[Table]:
+        """Return the table of the active terms."""
+        columns = ("term", *self._shown, "function", "parameters")
         rows = [
-            (name, *(getattr(cfg, field) for field in self._shown))
+            (
+                name,
+                *(getattr(cfg, field) for field in self._shown.values()),
+                function_name(cfg.func),
+                cfg.params,
+            )
             for name, cfg in self._live_cfgs.items()
         ]
-        return term_table(self, header, rows)
+        return [Table(self._title, columns, rows)]
 
     @property
     def active_terms(self) -> list[str]:
@@ -343,20 +355,6 @@ class NullManager:
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return an empty list."""
         return []
-
-
-def term_table(manager: ManagerBase, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Return a printable table of a manager's terms, one row each."""
-    cells = [["#", *header]]
-    cells += [[str(i), *(str(cell) for cell in row)] for i, row in enumerate(rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    rule = "+" + "+".join("-" * (width + 2) for width in widths) + "+"
-    head, *body = (
-        "|" + "|".join(f" {cell:<{w}} " for cell, w in zip(row, widths, strict=True)) + "|"
-        for row in cells
-    )
-    title = f"<{type(manager).__name__}> with {len(rows)} active terms"
-    return "\n".join([title, rule, head, rule, *body, rule])
 
 
 @contextlib.contextmanager

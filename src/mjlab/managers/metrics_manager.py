@@ -39,7 +39,8 @@ class MetricsManager(TermListManager):
     """
 
     _cfg_type = MetricsTermCfg
-    _shown = ("reduce", "per_substep")
+    _title = "metrics"
+    _shown = {"reduction": "reduce", "per substep": "per_substep"}
     _transient = {"_rows", "_substep_rows", "_terms_by_reduce", "excluded"}
 
     def __init__(self, cfg: Mapping[str, MetricsTermCfg | None], env: ManagerBasedRlEnv) -> None:

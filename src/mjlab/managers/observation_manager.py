@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.managers.manager_base import (
-    ManagerBase,
-    ManagerTermBaseCfg,
-    label_errors,
-    term_table,
-)
+from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
 from mjlab.managers.term_checks import check_real, is_interval
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.errors import WrongTypeError, check_count, check_exists, check_one_of
@@ -26,6 +21,7 @@ from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
 from mjlab.utils.state import capture_state, is_stateful, restore_state, stateful
+from mjlab.utils.tables import Table, format_shape, function_name
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -118,6 +114,7 @@ class ObservationManager(ManagerBase):
     """
 
     _transient = {"_stateful_terms"}
+    _title = "observations"
 
     def __init__(
         self, cfg: Mapping[str, ObservationGroupCfg | None], env: ManagerBasedRlEnv
@@ -134,14 +131,25 @@ class ObservationManager(ManagerBase):
         terms = (term for group in self._groups.values() for term in group.terms.values())
         self._stateful_terms = [term for term in terms if term.has_state]
 
-    def __str__(self) -> str:
-        """Return a table of the active terms."""
+    def tables(self) -> list[Table]:
+        """Return the table of the active terms; `noise` is None in groups without corruption."""
+        columns = (
+            *("group", "term", "size", "noise", "clip", "scale", "delay", "history"),
+            *("function", "parameters"),
+        )
         rows = [
-            (group_name, term_name, term.shape)
+            (group_name, term_name, *term.describe())
             for group_name, group in self._groups.items()
             for term_name, term in group.terms.items()
         ]
-        return term_table(self, ["group", "name", "shape"], rows)
+        sizes = {
+            name: f"{len(group.terms)} tensors"
+            if group.shape is None
+            else format_shape(group.shape)
+            for name, group in self._groups.items()
+        }
+        note = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        return [Table(self._title, columns, rows, note=note)]
 
     @property
     def active_terms(self) -> dict[str, list[str]]:
@@ -459,6 +467,21 @@ class ObservationTerm:
             frames = self._history.buffer
             value = frames.flatten(1) if cfg.flatten_history_dim else frames
         return value
+
+    def describe(self) -> tuple[Any, ...]:
+        """Return size, noise, clip, scale, delay, history, function and parameters."""
+        cfg = self.cfg
+        lags = (cfg.delay_min_lag, cfg.delay_max_lag)
+        return (
+            format_shape(self.shape),
+            cfg.noise,
+            cfg.clip,
+            cfg.scale,
+            lags if self._delay is not None else None,
+            cfg.history_length or None,
+            function_name(cfg.func),
+            cfg.params,
+        )
 
     @property
     def has_state(self) -> bool:

@@ -60,6 +60,7 @@ class RecorderTerm(ManagerTermBase):
 class RecorderManager(TermListManager):
     """Calls the hooks of all recorders."""
 
+    _title = "recorders"
     _cfg_type = RecorderTermCfg
 
     def __init__(self, cfg: Mapping[str, RecorderTermCfg | None], env: ManagerBasedRlEnv) -> None:

@@ -46,7 +46,8 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     """
 
     _cfg_type = RewardTermCfg
-    _shown = ("weight",)
+    _title = "rewards"
+    _shown = {"weight": "weight"}
     # Views of `_rates`.
     _transient = {"_step_reward", "_rows", "_scale_by_dt", "nonfinite"}
 

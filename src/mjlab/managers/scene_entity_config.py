@@ -86,6 +86,17 @@ class SceneEntityCfg:
     preserve_order: bool = False
     """Order the selection by pattern instead of the entity's natural order."""
 
+    def __str__(self) -> str:
+        """Return the entity and its selected elements: `robot`, `robot joint hip`, `robot 12 joints`."""
+        parts = [self.name]
+        for kind in _FINDERS:
+            names = getattr(self, f"{kind}_names")
+            if names is not None:
+                names = [names] if isinstance(names, str) else names
+                plural = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
+                parts.append(f"{kind} {names[0]}" if len(names) == 1 else f"{len(names)} {plural}")
+        return " ".join(parts)
+
     def resolve(self, scene: Scene) -> None:
         """Resolve names and ids in the scene. Resolving is idempotent.
 

@@ -34,7 +34,8 @@ class TerminationManager(TermListManager):
     """Evaluates termination terms. All results are buffers that the next step overwrites."""
 
     _cfg_type = TerminationTermCfg
-    _shown = ("time_out",)
+    _title = "terminations"
+    _shown = {"time-out": "time_out"}
     _transient = {"_rows", "_numeric", "nonfinite"}
 
     def __init__(

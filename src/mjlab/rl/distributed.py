@@ -36,7 +36,7 @@ from mjlab.utils.processes import (
     cores_per_process,
     process_rank,
 )
-from mjlab.utils.signals import FORWARDED, handled_signals
+from mjlab.utils.signals import FORWARDED, handled_signals, send_signal, start_in_background
 
 T = TypeVar("T")
 
@@ -89,16 +89,16 @@ def launch_workers(
     def forward(number: int, frame: FrameType | None) -> None:
         received.append(FORWARDED[number])
         for worker in workers:
-            worker.send_signal(FORWARDED[number])
+            send_signal(worker, FORWARDED[number])
 
     with handled_signals(forward, FORWARDED):
         for rank in range(count):
             own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
-            # A separate session: a terminal sends Ctrl-C to all processes of its session, and a
-            # second signal stops training immediately.
-            workers.append(subprocess.Popen(command, env=own, start_new_session=True))
+            # A terminal sends Ctrl-C to all of its processes, and a second signal stops training
+            # immediately.
+            workers.append(start_in_background(command, own))
             for number in received:
-                workers[-1].send_signal(number)
+                send_signal(workers[-1], number)
         try:
             while None in (codes := [worker.poll() for worker in workers]) and not any(codes):
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
@@ -125,7 +125,7 @@ def launch_workers(
     how = f"failed with status {code}; see its output above"
     if code < 0:
         how = f"was ended by {signal.Signals(-code).name}"
-    if code == -signal.SIGKILL:
+    if code == -getattr(signal, "SIGKILL", 9):
         how += ", probably because memory ran out"
     raise UserError(f"Process {rank} of {count} {how}. The run has ended in all processes.")
 

@@ -52,7 +52,7 @@ class RslRlVecEnvWrapper(VecEnv):
         self.env.reset()
 
     def __str__(self) -> str:
-        return f"<{type(self).__name__}{self.env}>"
+        return f"<{type(self).__name__}{self.env!r}>"
 
     __repr__ = __str__
 

@@ -24,6 +24,7 @@ from mjlab.entity.building import BIT_FIELDS, EntityOptions, add_key, stated_opt
 from mjlab.sensor import (
     BuiltinSensor,
     CameraSensor,
+    ContactSensor,
     RayCastSensor,
     Sensor,
     SensorCfg,
@@ -37,6 +38,7 @@ from mjlab.utils.indexing import EnvIds
 from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
 from mjlab.utils.spec import attach, compile_composed, export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
+from mjlab.utils.tables import Table, Tabular, settings_of
 
 TERRAIN = "terrain"
 
@@ -68,7 +70,7 @@ class SceneCfg:
 
 
 @stateful
-class Scene:
+class Scene(Tabular):
     """Terrain, entities and sensors composed into one `MjSpec`. `initialize` binds a simulation."""
 
     _transient = {"_env_origins", "_device", "_updated_sensors"}
@@ -150,6 +152,47 @@ class Scene:
         attach(self._spec, entity.spec, prefix, self._spec.worldbody.add_frame())
 
     # Access.
+
+    def __repr__(self) -> str:
+        names = ", ".join(self._entities)
+        return f"<{type(self).__name__}: {names}; {len(self._sensors)} sensors>"
+
+    def tables(self) -> list[Table]:
+        """Return the tables of entities and of sensors."""
+        entities = [
+            (
+                name,
+                type(entity).__name__,
+                "fixed" if entity.is_fixed_base else "floating",
+                *(entity.num_bodies, entity.num_joints, entity.num_actuators, entity.num_geoms),
+            )
+            for name, entity in self._entities.items()
+        ]
+        parts = {
+            f"{sensor.cfg.name}_{primary}"
+            for sensor in self._sensors.values()
+            if isinstance(sensor, ContactSensor)
+            for primary in sensor.primary_names
+        }
+        sensors = [
+            (name, type(sensor).__name__, self._sensor_settings(name))
+            for name, sensor in self._sensors.items()
+            if name not in parts
+        ]
+        columns = ("entity", "type", "base", "bodies", "joints", "actuators", "geoms")
+        return [
+            Table("entities", columns, entities),
+            Table("sensors", ("sensor", "type", "settings"), sensors),
+        ]
+
+    def _sensor_settings(self, name: str) -> dict[str, Any]:
+        """Return the settings of a sensor that are not defaults. Of one in an XML, its type."""
+        cfg = getattr(self._sensors[name], "cfg", None)
+        if cfg is None:
+            return {
+                "sensor_type": self._spec.sensor(name).type.name.removeprefix("mjSENS_").lower()
+            }
+        return settings_of(cfg, "name", "debug", "debug_vis", "viz", changed_only=True)
 
     def __getitem__(self, key: str) -> Any:
         """Return the sensor, else the entity, with this name. Raises `KeyError` with all names."""

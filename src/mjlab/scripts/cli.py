@@ -168,6 +168,27 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         "mjlab.scripts.list_envs:command",
     ),
     Command(
+        "describe",
+        "Tasks",
+        "Print what a task observes, rewards and ends, as tables.",
+        "mjlab.scripts.describe:command",
+        "TASK",
+        """\
+Print tables of a task: observations, actions, commands, rewards, terminations, events, curriculum, metrics,
+entities and sensors. Builds one environment on the CPU.
+
+flags:
+    --profile NAME      settings of a profile, such as cpu
+    --play              the environment of `play` instead of that of `train`
+    --json              JSON, with all columns and values
+    --markdown          Markdown""",
+        (
+            "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1",
+            "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu --json",
+            "mjlab describe Mjlab-Cartpole-Swingup --env.rewards.smooth-reward.weight 2",
+        ),
+    ),
+    Command(
         "profile-env",
         "Tasks",
         "Measure the step time by phase and term.",

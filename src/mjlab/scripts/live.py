@@ -83,7 +83,7 @@ class LiveView(TrainingObserver):
         limit = time.perf_counter() + _SECONDS_TO_START
         while time.perf_counter() < limit and not self._give_up_if_ended():
             if self._exchange.url.exists():
-                url = self._exchange.url.read_text()
+                url = self._exchange.url.read_text(encoding="utf-8")
                 print(f"Live:    {url} (open it in a browser)", flush=True)
                 return
             time.sleep(0.02)
@@ -129,7 +129,10 @@ class LiveView(TrainingObserver):
         if self._process.poll() is None:
             return False
         self._process = None
-        reason = (self._exchange.log.read_text(errors="replace").strip().splitlines() or [""])[-1]
+        reason = (
+            self._exchange.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            or [""]
+        )[-1]
         logger.warning("Live view: process ended; training continues. %s", reason)
         return True
 

@@ -62,14 +62,25 @@ def show(pickled: bytes, exchange: Exchange, host: str, port: int) -> None:
     server = serve_page(host, port)
     with replacing(exchange.url) as file:
         file.write(page_url(server).encode())
-    note = server.gui.add_markdown("Preparing the view …")
+    # Shown at once to a browser that connects: building takes seconds while training uses the cores.
+    note = server.gui.add_markdown("Building the view …")
+
+    @server.on_client_connect
+    def _(client: Any) -> None:
+        if not is_built:
+            notes.append(client.add_notification("Building the view", "", loading=True))
+
+    notes: list[Any] = []
+    is_built = False
     while not server.get_clients():
         time.sleep(_POLL_PERIOD)
     exchange.watched.touch()
     viewer = make_viewer(pickle.loads(pickled), exchange, server)
     # After building: at low priority, building would take minutes with all cores busy.
     lower_priority()
-    note.remove()
+    is_built = True
+    for shown in (note, *notes):
+        shown.remove()
     viewer.run(catch_sigint=False)
 
 

@@ -155,7 +155,7 @@ class Reference:
             UserError: the file is not a reference.
         """
         try:
-            content: dict[str, Any] = json.loads(path.read_text())
+            content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
             for seed in content["seeds"]:
                 seed["run"] = RunRecord(**seed["run"])
             content["seeds"] = [SeedRecord(**seed) for seed in content["seeds"]]

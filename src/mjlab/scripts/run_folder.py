@@ -156,7 +156,7 @@ def is_run_folder(folder: Path) -> bool:
 def read_run_info(run_dir: Path) -> dict[str, Any]:
     """Return the metadata of a run; empty if missing or unreadable."""
     try:
-        info = json.loads((run_dir / _INFO_FILE).read_text())
+        info = json.loads((run_dir / _INFO_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
     return info if isinstance(info, dict) else {}
@@ -173,7 +173,7 @@ def read_params(run_dir: Path, name: Literal["env", "agent"]) -> dict[str, Any]:
     import yaml
 
     try:
-        params = yaml.safe_load((run_dir / "params" / f"{name}.yaml").read_text())
+        params = yaml.safe_load((run_dir / "params" / f"{name}.yaml").read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError, yaml.YAMLError):
         return {}
     return params if isinstance(params, dict) else {}

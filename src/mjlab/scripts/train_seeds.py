@@ -15,7 +15,7 @@ from mjlab.scripts.flags import is_given
 from mjlab.scripts.run_folder import read_run_info, runs_named
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import PARENT_VARIABLE
-from mjlab.utils.signals import FORWARDED, handled_signals
+from mjlab.utils.signals import FORWARDED, handled_signals, send_signal, start_in_background
 
 _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, sequentially (default: 5)."
 
@@ -85,16 +85,12 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
         if child is None:
             early.append(number)
         else:
-            child.send_signal(FORWARDED[number])
+            send_signal(child, FORWARDED[number])
 
     with handled_signals(forward, FORWARDED):
-        # New session: a terminal sends Ctrl-C to all processes of its session, and a second signal
-        # would stop training without saving.
-        child = subprocess.Popen(
-            command,
-            env={**os.environ, PARENT_VARIABLE: str(os.getpid())},
-            start_new_session=True,
-        )
+        # A terminal sends Ctrl-C to all of its processes, and a second signal would stop training
+        # without saving.
+        child = start_in_background(command, {**os.environ, PARENT_VARIABLE: str(os.getpid())})
         for number in early:
             forward(number)
         try:
@@ -102,7 +98,7 @@ def run_forwarding_signals(command: list[str], seconds: float | None = None) -> 
         except subprocess.TimeoutExpired:
             # A second signal would end the child without saving.
             if not stopped:
-                child.send_signal(signal.SIGINT)
+                send_signal(child, signal.SIGINT)
             return child.wait(), stopped
 
 

@@ -63,6 +63,10 @@ class ObjRef:
     entity: str | None = None
     """Name of the element's entity (`terrain` included). None: `name` is the full scene name."""
 
+    def __str__(self) -> str:
+        """Return type and scene name: `site robot/imu`."""
+        return f"{self.type} {self.prefixed_name()}"
+
     def prefixed_name(self) -> str:
         """Return `<entity>/<name>`. Terrain elements have no prefix in the scene."""
         return f"{self.entity}/{self.name}" if self.entity else self.name

@@ -62,7 +62,7 @@ def available_memory(device: str) -> int | None:
             # A device that torch cannot use raises later, where it is used.
             return None
     try:
-        lines = [line.split() for line in _MEMORY.read_text().splitlines()]
+        lines = [line.split() for line in _MEMORY.read_text(encoding="utf-8").splitlines()]
         sizes = {words[0]: 1024 * int(words[1]) for words in lines if len(words) == 3}
         free = sizes["MemAvailable:"]
     except (OSError, ValueError, KeyError):
@@ -76,7 +76,9 @@ def _group_limits() -> list[int]:
     A line of `/proc/self/cgroup` is `<number>:<controllers>:<path>`; version 2 has no controllers.
     """
     try:
-        lines = [line.split(":", 2) for line in _OWN_GROUPS.read_text().splitlines()]
+        lines = [
+            line.split(":", 2) for line in _OWN_GROUPS.read_text(encoding="utf-8").splitlines()
+        ]
     except OSError:
         return []
     limits = []
@@ -89,7 +91,7 @@ def _group_limits() -> list[int]:
         for folder in (group, *group.parents):
             if folder.is_relative_to(root):
                 try:
-                    text = (folder / name).read_text().strip()
+                    text = (folder / name).read_text(encoding="utf-8").strip()
                 except OSError:
                     continue
                 limits += [int(text)] if text.isdigit() else []

@@ -158,7 +158,7 @@ def _control_groups() -> Iterator[tuple[Path, tuple[str, ...]]]:
     Lines of `/proc/self/cgroup` are `<number>:<controllers>:<path>`; version 2 has no controllers.
     """
     try:
-        lines = _OWN_CGROUPS.read_text().splitlines()
+        lines = _OWN_CGROUPS.read_text(encoding="utf-8").splitlines()
     except OSError:
         return
     for line in lines:
@@ -175,7 +175,7 @@ def _control_groups() -> Iterator[tuple[Path, tuple[str, ...]]]:
 def _quota(group: Path, files: tuple[str, ...]) -> float | None:
     """Return the quota of a control group in cores. None: no limit."""
     try:
-        words = " ".join((group / file).read_text() for file in files).split()
+        words = " ".join((group / file).read_text(encoding="utf-8") for file in files).split()
     except OSError:
         return None
     if len(words) != 2 or not all(word.isdigit() and int(word) > 0 for word in words):

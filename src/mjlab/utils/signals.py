@@ -1,24 +1,46 @@
-"""Scoped signal handlers: stop requests, the first Ctrl+C, signals for child processes."""
+"""Scoped signal handlers: stop requests, the first Ctrl+C, signals for child processes.
+
+SIGHUP (closed terminal) does not exist on Windows. There, Ctrl-Break (SIGBREAK) takes the place of SIGINT
+for processes of another group, which Ctrl-C does not reach.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterable
 from types import FrameType
 from typing import Any
 
-# SIGHUP (closed terminal) does not exist on all systems.
 _HANGUP = getattr(signal, "SIGHUP", None)
+_BREAK = getattr(signal, "SIGBREAK", None)
 
 FORWARDED: dict[int, signal.Signals] = {
     signal.SIGINT: signal.SIGINT,
     signal.SIGTERM: signal.SIGTERM,
     **({} if _HANGUP is None else {_HANGUP: signal.SIGTERM}),
+    **({} if _BREAK is None else {_BREAK: signal.SIGINT}),
 }
 """Signals that end a launcher, and the signal forwarded to its training process. Training saves on
 SIGINT and SIGTERM."""
+
+
+def start_in_background(command: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+    """Start `command` so that Ctrl-C in the terminal does not reach it; `send_signal` does."""
+    if sys.platform == "win32":
+        group = subprocess.CREATE_NEW_PROCESS_GROUP
+        return subprocess.Popen(command, env=environment, creationflags=group)
+    return subprocess.Popen(command, env=environment, start_new_session=True)
+
+
+def send_signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    """Send SIGINT or SIGTERM to a process of `start_in_background`; on Windows, Ctrl-Break for both."""
+    if sys.platform == "win32":
+        number = signal.CTRL_BREAK_EVENT
+    process.send_signal(number)
 
 
 def replace_handlers(
@@ -68,7 +90,8 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         hangup = [] if _HANGUP is None else not_ignored([_HANGUP])
-        self._previous = replace_handlers(self._handle, [signal.SIGINT, signal.SIGTERM, *hangup])
+        others = hangup if _BREAK is None else [*hangup, _BREAK]
+        self._previous = replace_handlers(self._handle, [signal.SIGINT, signal.SIGTERM, *others])
         return self
 
     def __exit__(self, *exception: object) -> None:

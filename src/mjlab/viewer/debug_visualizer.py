@@ -25,7 +25,7 @@ class DebugVisualizer(ABC):
     """Draws primitives over the scene. Poses are in the world frame, lengths in m.
 
     Drawings last for one displayed frame: the viewer clears them and calls `debug_vis` again.
-    `label` documents an item in the code; viewers do not show it.
+    `label` documents an item in the code; viewers do not show it. `add_legend` explains colors.
     """
 
     env_idx: int = 0
@@ -110,6 +110,9 @@ class DebugVisualizer(ABC):
         (nmocap, 4) set all mocap bodies.
         """
 
+    def add_legend(self, color: Color, meaning: str) -> None:  # noqa: B027
+        """Explain a color of this frame's drawings. Viewers without a legend ignore this."""
+
     @abstractmethod
     def clear(self) -> None:
         """Remove everything drawn."""
@@ -177,6 +180,9 @@ class NullDebugVisualizer:
     def add_ghost_mesh(
         self, qpos, model, mocap_pos=None, mocap_quat=None, alpha=0.5, label=None
     ) -> None:
+        pass
+
+    def add_legend(self, *args, **kwargs) -> None:
         pass
 
     def clear(self) -> None:

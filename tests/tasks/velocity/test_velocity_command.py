@@ -363,7 +363,7 @@ class FakeGui:
         self.items[label] = item
         return item
 
-    def add_folder(self, label):
+    def add_folder(self, label, **_):
         import contextlib
 
         return contextlib.nullcontext()
@@ -427,21 +427,26 @@ def test_a_smaller_maximum_pulls_its_slider_in():
     assert (slider.min, slider.max, slider.value) == (-0.5, 0.5, 0.5)
 
 
-def test_arrows_show_the_command_and_what_the_robot_does():
+@pytest.mark.parametrize("measured", [False, True])
+def test_arrows_show_the_command_and_if_asked_for_what_the_robot_does(measured):
     env, term = started(debug_vis=True)
+    term.cfg.viz.show_measured = measured
     quarter_turn = torch.full((8,), math.pi / 2)
     env.data.root_link_quat_w = yaw_quat(quarter_turn)
     env.data.root_link_pos_w = torch.tensor([[1.0, 2.0, 3.0]]).repeat(8, 1)
     env.data.root_link_lin_vel_b = torch.tensor([[0.0, 1.0, 9.0]]).repeat(8, 1)
     env.data.root_link_ang_vel_b = torch.tensor([[9.0, 9.0, -0.5]]).repeat(8, 1)
     term.vel_command_b[:] = torch.tensor([2.0, 0.0, 1.0])
-    arrows = []
+    arrows, legend = [], []
     visualizer = SimpleNamespace(
         get_env_indices=lambda count: [count - 1],
+        add_legend=lambda color, meaning: legend.append((color, meaning)),
         add_arrow=lambda start, end, color: arrows.append((start.tolist(), (end - start).tolist())),
     )
     term.debug_vis(visualizer)  # ty: ignore[invalid-argument-type]
     # Above the root by 0.2 m, and half as long as the numbers.
-    assert [start for start, _ in arrows] == [pytest.approx([1.0, 2.0, 3.1])] * 4
-    expected = [[0.0, 1.0, 0.0], [0.0, 0.0, 0.5], [-0.5, 0.0, 0.0], [0.0, 0.0, -0.25]]
+    number = 4 if measured else 2
+    assert [start for start, _ in arrows] == [pytest.approx([1.0, 2.0, 3.1])] * number
+    assert len(set(legend)) == number
+    expected = [[0.0, 1.0, 0.0], [0.0, 0.0, 0.5], [-0.5, 0.0, 0.0], [0.0, 0.0, -0.25]][:number]
     assert [arrow for _, arrow in arrows] == [pytest.approx(e, abs=1e-6) for e in expected]

@@ -35,6 +35,20 @@ def test_the_window_is_a_second(viser_server, update_dt, mean) -> None:
     assert f"{0.0:+.4f}" in panel._html.content
 
 
+def test_hidden_terms_have_no_bar_and_the_sum_comes_first(viser_server) -> None:
+    weights = {"a": 1.0, "b": 0.0}
+    panel = RewardBarPanel(
+        viser_server, ["a", "b"], 0.1, is_shown=lambda name: weights[name] != 0.0
+    )
+    panel.update([term("a", 2.0), term("b", 0.0)])
+    assert ">b<" not in panel._html.content
+    assert panel._html.content.index(">sum<") < panel._html.content.index(">a<")
+    # A curriculum may raise the weight.
+    weights["b"] = 1.0
+    panel.update([term("a", 2.0), term("b", -0.5)])
+    assert ">b<" in panel._html.content
+
+
 def test_it_leaves_nothing_behind(viser_server) -> None:
     panel = RewardBarPanel(viser_server, ["a"], 0.1)
     panel.cleanup()

@@ -12,6 +12,7 @@ from viewer_fakes import FakeEnv
 from mjlab import compat
 from mjlab.viewer.debug_visualizer import DebugVisualizer
 from mjlab.viewer.viser import MjlabViserScene, ViserMujocoScene
+from mjlab.viewer.viser.scene import geom_group_meanings
 
 RED = (1.0, 0.0, 0.0, 0.5)
 
@@ -197,3 +198,27 @@ class TestReleases11And12:
         with pytest.warns(FutureWarning, match="deprecated"):
             assert is_fixed_body(model, 0)
             assert rotation_quat_from_vectors((0, 0, 1), (0, 0, 1)).tolist() == [1, 0, 0, 0]
+
+
+def test_groups_are_named_by_their_geoms(viser_server) -> None:
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody>
+      <geom type="plane" size="1 1 .1"/>
+      <body><freejoint/>
+        <geom size=".1" group="1"/>
+        <geom size=".1" group="2" contype="0" conaffinity="0"/>
+        <geom size=".1" group="3"/>
+        <geom size=".1" group="3" contype="0" conaffinity="0"/>
+      </body>
+    </worldbody></mujoco>""")
+    assert geom_group_meanings(model) == {
+        0: "Terrain", 1: "Collision", 2: "Visual", 3: "Collision and visual",
+    }  # fmt: skip
+    scene = MjlabViserScene(viser_server, model, 1)
+    scene.create_groups_gui()
+    boxes = {
+        handle.label: handle
+        for handle in viser_server.gui._gui_input_handle_from_uuid.values()
+        if hasattr(handle, "label")
+    }
+    assert "Visual (group 2)" in boxes

@@ -131,7 +131,7 @@ def recorded_motions(run_dir: Path) -> list[Path]:
     if not index.is_file():
         return []
     try:
-        entries = json.loads(index.read_text())
+        entries = json.loads(index.read_text(encoding="utf-8"))
         hashes = {folder / Path(str(entry["file"])).name: entry["sha256"] for entry in entries}
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise MotionFileError(

@@ -13,17 +13,21 @@ import torch
 
 from mjlab.utils.errors import check_field, check_one_of
 from mjlab.utils.state import stateful
+from mjlab.utils.tables import format_value, settings_of
 from mjlab.utils.torch import constant_tensor
 
 NoiseParam = float | tuple[float, ...]
 """A scalar, or one value per entry of the last axis of the data."""
 
-_OPERATIONS = ("add", "scale", "abs")
+_OPERATIONS = {"add": "+", "scale": "*", "abs": "="}
+"""Signs of operations in tables."""
 
 
 @dataclass(kw_only=True)
 class NoiseCfg(ABC):
     """Noise n on data x. Configs have no state: edited fields apply from the next call."""
+
+    _symbol: ClassVar[str] = "noise"
 
     operation: Literal["add", "scale", "abs"] = "add"
     """Combination with the data: `add` (x + n), `scale` (x * n) or `abs` (n, independent of x)."""
@@ -34,6 +38,12 @@ class NoiseCfg(ABC):
     @abstractmethod
     def apply(self, data: torch.Tensor) -> torch.Tensor:
         """Return the data with noise, as a new tensor of the same shape."""
+
+    def __str__(self) -> str:
+        """Return the noise as in the tables of `dr`: `+U(-0.1, 0.1)`."""
+        parameters = {k: v for k, v in settings_of(self).items() if k != "operation"}
+        values = ", ".join(format_value(value) for value in parameters.values())
+        return f"{_OPERATIONS[self.operation]}{self._symbol}({values})"
 
     def _combine(self, data: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """Combine data and noise in place in `noise`, a new tensor of the shape of `data`."""
@@ -49,6 +59,8 @@ class NoiseCfg(ABC):
 class ConstantNoiseCfg(NoiseCfg):
     """Constant offset, factor or value."""
 
+    _symbol = "const"
+
     bias: NoiseParam = 0.0
     """n, a scalar or one value per component."""
 
@@ -60,6 +72,8 @@ class ConstantNoiseCfg(NoiseCfg):
 @dataclass
 class UniformNoiseCfg(NoiseCfg):
     """Uniform noise, sampled per element."""
+
+    _symbol = "U"
 
     n_min: NoiseParam = -1.0
     """Lower bound of n (inclusive), a scalar or one value per component."""
@@ -84,6 +98,8 @@ class UniformNoiseCfg(NoiseCfg):
 @dataclass
 class GaussianNoiseCfg(NoiseCfg):
     """Gaussian noise, sampled per element."""
+
+    _symbol = "N"
 
     mean: NoiseParam = 0.0
     """Mean of n, a scalar or one value per component."""
@@ -133,6 +149,11 @@ class NoiseModelCfg:
 
     noise_cfg: NoiseCfg
     """Noise of each call."""
+
+    def __str__(self) -> str:
+        """Return the noises of the model by field."""
+        noises = {k: v for k, v in settings_of(self).items() if isinstance(v, NoiseCfg)}
+        return f"{self.class_type.__name__}({', '.join(f'{k}={v}' for k, v in noises.items())})"
 
     def __init_subclass__(cls, class_type: type[NoiseModel] | None = None, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

@@ -42,10 +42,15 @@ class ViserTermOverlays:
     def setup_tabs(self, tabs: viser.GuiTabGroupHandle) -> None:
         """Add a Rewards tab and, if the environment has metrics, a Metrics tab."""
         env_idx = self.scene.env_idx
-        names = list(self.env.reward_manager.active_terms)
+        manager = self.env.reward_manager
+        names = [name for name in manager.active_terms if self._has_weight(name)]
         with tabs.add_tab("Rewards", icon=viser.Icon.CHART_BAR):
             self.reward_bar_panel = RewardBarPanel(
-                self.server, names, self.frame_time, self.reward_bar_max_terms
+                self.server,
+                list(manager.active_terms),
+                self.frame_time,
+                self.reward_bar_max_terms,
+                self._has_weight,
             )
             self.reward_plotter = ViserTermPlotter(self.server, names, "Reward", env_idx=env_idx)
         metrics: list[str] = list(getattr(self.env.metrics_manager, "active_terms", ()))
@@ -90,6 +95,10 @@ class ViserTermOverlays:
         for panel in self._panels:
             panel.cleanup()
         self.reward_bar_panel = self.reward_plotter = self.metrics_plotter = None
+
+    def _has_weight(self, name: str) -> bool:
+        # Weights may change during training.
+        return self.env.reward_manager.get_term_cfg(name).weight != 0.0
 
     @property
     def _panels(self) -> list[RewardBarPanel | ViserTermPlotter]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import viser
 
@@ -17,7 +17,7 @@ _POSITIVE, _NEGATIVE = "#2f9e44", "#e03131"
 
 
 class RewardBarPanel:
-    """One bar per reward term: its mean over the last second.
+    """Sum of the reward, and one bar per term: means over the last second.
 
     The longest bar is the largest magnitude. Green: positive, red: negative.
     """
@@ -28,6 +28,7 @@ class RewardBarPanel:
         term_names: list[str],
         update_dt: float,
         max_terms: int = 20,
+        is_shown: Callable[[str], bool] = lambda name: True,
     ) -> None:
         """Add the panel to the current GUI container.
 
@@ -36,6 +37,7 @@ class RewardBarPanel:
             term_names: Names of the reward terms.
             update_dt: Time between two calls of `update` (s).
             max_terms: Maximum number of terms shown. More terms log a warning.
+            is_shown: Function of the name; False hides a term, for example one of weight zero.
         """
         if len(term_names) > max_terms:
             log.warning(
@@ -45,6 +47,7 @@ class RewardBarPanel:
                 max_terms,
             )
         self._names = term_names[:max_terms]
+        self._is_shown = is_shown
         self._history = TermHistory(max(1, round(_WINDOW_S / update_dt)))
         self._html = server.gui.add_html("")
         self._shown = ""
@@ -61,12 +64,14 @@ class RewardBarPanel:
 
     def refresh(self) -> None:
         """Show the means of the recorded values."""
-        means = {name: self._history.mean(name) for name in self._names}
+        means = {name: self._history.mean(name) for name in self._names if self._is_shown(name)}
         largest = max((abs(value) for value in means.values()), default=0.0) or 1.0
         rows = "".join(_row(name, value, largest) for name, value in means.items())
         content = (
             '<div style="padding:0.25em 1em;font-size:0.8em">'
-            f"<div><strong>Mean of the last {self._history.length} steps</strong></div>{rows}</div>"
+            f"<div><strong>Mean of the last {self._history.length} steps</strong></div>"
+            '<div style="display:flex;justify-content:space-between"><span>sum</span>'
+            f"<strong>{sum(means.values()):+.4f}</strong></div>{rows}</div>"
         )
         if content != self._shown:
             self._shown = self._html.content = content

@@ -25,6 +25,7 @@ from mjlab.compat import offers_older_static_methods
 from mjlab.viewer.camera import CameraView, first_moving_body, whole_model_view
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import copy_state, host_model, sync_model_fields, to_numpy
+from mjlab.viewer.viser.look import set_look
 from mjlab.viewer.viser.visualizer import ViserDebugVisualizer
 
 log = logging.getLogger(__name__)
@@ -79,6 +80,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             mj_model = host_model(mj_model)
         ViserMujocoScene.__init__(self, server, mj_model, num_envs)
         ViserDebugVisualizer.__init__(self, server, mj_model)
+        set_look(server, mj_model)
         # mjviser's default contact points are hidden inside a robot's feet.
         mj_model.vis.scale.contactwidth *= _CONTACT_WIDENING
         self._has_own_view = view is not None
@@ -252,8 +254,24 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         place = contextlib.nullcontext()
         if tabs is not None:
             place = tabs.add_tab("Groups", icon=viser.Icon.LAYERS_INTERSECT)
+        model, option = self.mj_model, self._mjv_option
+        others = (
+            ("Sites", model.site_group, self.site_groups_visible),
+            ("Joints", model.jnt_group, option.jointgroup),
+            ("Tendons", model.tendon_group, option.tendongroup),
+            ("Actuators", model.actuator_group, option.actuatorgroup),
+        )
         with place:
-            super().create_groups_gui()
+            with self.server.gui.add_folder("Geoms"):
+                for group, meaning in geom_group_meanings(model).items():
+                    label = f"{meaning} (group {group})"
+                    self._add_group_switch(label, self.geom_groups_visible, group)
+            for title, groups, visible in others:
+                used = sorted({int(group) for group in groups})
+                if used and used != [0]:
+                    with self.server.gui.add_folder(title):
+                        for group in used:
+                            self._add_group_switch(f"Group {group}", visible, group)
 
     def _update_visualization_locked(
         self,
@@ -293,6 +311,16 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             setattr(self, attribute, switch.value)
             self.request_update()
 
+    def _add_group_switch(self, label: str, visible: Any, group: int) -> None:
+        """Add a checkbox that shows or hides a group of elements."""
+        switch = self.server.gui.add_checkbox(label, bool(visible[group]))
+
+        @switch.on_update
+        def _(_: Any) -> None:
+            visible[group] = switch.value
+            self._sync_visibilities()
+            self.request_update()
+
     def _create_camera_gui(self) -> None:
         gui = self.server.gui
         track = gui.add_checkbox(
@@ -326,6 +354,23 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         @reset.on_click
         def _(_: Any) -> None:
             self.aim()
+
+
+def geom_group_meanings(model: mujoco.MjModel) -> dict[int, str]:
+    """Return the meaning of each geom group in use: terrain, collision, visual, or both."""
+    collides = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    bodies = [model.body(int(body)).name for body in model.geom_bodyid]
+    is_ground = np.array([name in ("world", "terrain") for name in bodies], dtype=bool)
+    meanings: dict[int, str] = {}
+    for group in sorted({int(group) for group in model.geom_group}):
+        geoms = model.geom_group == group
+        parts = {
+            "Terrain": (geoms & is_ground).any(),
+            "Collision": (geoms & ~is_ground & collides).any(),
+            "Visual": (geoms & ~is_ground & ~collides).any(),
+        }
+        meanings[group] = " and ".join(name for name, found in parts.items() if found).capitalize()
+    return meanings
 
 
 class GeomVariants:

@@ -12,7 +12,7 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,8 @@ from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
 from mjlab.viewer.page_server import DEFAULT_PORT as DEFAULT_PORT
 from mjlab.viewer.page_server import page_url, serve_page
+from mjlab.viewer.viser.clip import ClipPanel
+from mjlab.viewer.viser.look import set_theme
 from mjlab.viewer.viser.overlays import (
     ViserCameraOverlays,
     ViserContactOverlays,
@@ -36,6 +38,7 @@ from mjlab.viewer.viser.scene import MjlabViserScene
 
 if TYPE_CHECKING:
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
+    from mjlab.viewer.debug_visualizer import Color
 
 
 log = logging.getLogger(__name__)
@@ -123,6 +126,7 @@ class ViserPlayViewer(BaseViewer):
         self._debug_overlays: ViserDebugOverlays | None = None
         self._contact_overlays: ViserContactOverlays | None = None
         self._checkpoint_panel: CheckpointPanel | None = None
+        self._clip_panel: ClipPanel | None = None
         self._shown_env = 0
         self._next_scene = self._next_panels = 0.0
         # Modify in place only: threads of the server add reasons.
@@ -175,6 +179,11 @@ class ViserPlayViewer(BaseViewer):
         # Reading a field makes the engine provide it.
         for name in ("xpos", "xmat", *(("mocap_pos", "mocap_quat") if model.nmocap > 0 else ())):
             getattr(env.sim.data, name)
+        for manager, part in env.manager_visualizers.items():
+            if manager != "command_manager":
+                # Too many arrows say nothing; the switches under Debug Viz show them.
+                for name, _ in part.get_visualizable_terms():
+                    part.set_debug_vis(name, False)
         self._create_gui()
         log.debug("Viewer URL: %s", self.url)
 
@@ -184,6 +193,8 @@ class ViserPlayViewer(BaseViewer):
     def close(self) -> None:
         if not self._closed:
             self._closed = True
+            if self._clip_panel is not None:
+                self._clip_panel.close()
             self._server.stop()
 
     def add_first_panels(self) -> None:
@@ -206,11 +217,14 @@ class ViserPlayViewer(BaseViewer):
             scene.update(env.sim, self._shown_env)
             if self._camera_overlays is not None and self._camera_overlays.has_cameras:
                 self._camera_overlays.update(env.sim.data, self._shown_env, scene.offset)
+            if self._clip_panel is not None:
+                self._clip_panel.update()
         if self._term_overlays is not None:
             self._term_overlays.update(paused=True)
         if self._controls is not None and now >= self._next_panels:
             self._next_panels = now + _PANEL_PERIOD_S
             self._controls.show_status(self.get_status())
+            self._controls.show_legend(self.scene.legend)
 
     def after_env_step(self) -> None:
         self._update_reasons.add(UpdateReason.ACTION)
@@ -249,11 +263,12 @@ class ViserPlayViewer(BaseViewer):
             for part in (*env.manager_visualizers.values(), env.sensor_visualizers):
                 part.create_debug_vis_gui(self._server, scene.request_update)
 
-        gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        set_theme(self._server)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Controls", icon=viser.Icon.SETTINGS):
             self.add_first_panels()
             self._controls = SimulationControls(self._server, self.request_action)
+            self._clip_panel = ClipPanel(scene, env, fps=1.0 / max(self.scene_period, env.step_dt))
             with gui.add_folder("Commands") as folder:
                 env.command_manager.create_gui(
                     self._server, lambda: scene.env_idx, scene.request_update, self.request_action
@@ -319,7 +334,8 @@ class SimulationControls:
         gui = server.gui
         with gui.add_folder("Info"):
             self._status = gui.add_html("")
-        self._shown = ""
+            self._legend = gui.add_html("")
+        self._shown = self._shown_legend = ""
         with gui.add_folder("Simulation"):
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             self._step = gui.add_button(
@@ -346,6 +362,23 @@ class SimulationControls:
         content = status_html(status)
         if content != self._shown:
             self._shown = self._status.content = content
+
+    def show_legend(self, legend: Mapping[str, Color]) -> None:
+        """Update the displayed legend if it changed."""
+        content = legend_html(legend)
+        if content != self._shown_legend:
+            self._shown_legend = self._legend.content = content
+
+
+def legend_html(legend: Mapping[str, Color]) -> str:
+    """Return the colors of the drawings and their meanings as HTML."""
+    squares = "".join(
+        f'<span style="margin-right:1em;white-space:nowrap"><span style="color:rgb'
+        f'({",".join(str(round(255 * part)) for part in color[:3])})">\u25a0</span> '
+        f"{html.escape(meaning)}</span>"
+        for meaning, color in legend.items()
+    )
+    return f'<div style="padding:0 1em;font-size:0.85em">{squares}</div>' if legend else ""
 
 
 def status_html(status: ViewerStatus) -> str:

@@ -38,6 +38,8 @@ class ViserDebugVisualizer(DebugVisualizer):
             "sphere": trimesh.creation.icosphere(subdivisions=2, radius=1.0),
             "box": trimesh.creation.box(extents=(2.0, 2.0, 2.0)),
         }
+        self.legend: dict[str, Color] = {}
+        """Color by meaning, of the drawings of this frame."""
         self._batches: dict[str, _Batch] = {}
         self._arrows = _Arrows()
         self._debug_handles: dict[str, viser.BatchedMeshHandle] = {}
@@ -47,7 +49,11 @@ class ViserDebugVisualizer(DebugVisualizer):
     def meansize(self) -> float:
         return float(self._model.stat.meansize)
 
+    def add_legend(self, color: Color, meaning: str) -> None:
+        self.legend[meaning] = color
+
     def clear(self) -> None:
+        self.legend = {}
         self._batches.clear()
         self._arrows = _Arrows()
 

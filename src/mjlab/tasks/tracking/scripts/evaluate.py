@@ -77,7 +77,7 @@ def run_evaluate_tracking(task: str, cfg: EvaluateTrackingConfig) -> dict[str, f
     if cfg.output_file is not None:
         path = Path(cfg.output_file)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({**means, **intervals}, indent=2) + "\n")
+        path.write_text(json.dumps({**means, **intervals}, indent=2) + "\n", encoding="utf-8")
     return means
 
 

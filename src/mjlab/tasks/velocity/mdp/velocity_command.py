@@ -38,13 +38,13 @@ _PROBABILITIES = (
     "rel_forward_envs",
     "init_velocity_prob",
 )
-# Arrows: commanded linear velocity and yaw rate, actual linear velocity and yaw rate.
-_ARROW_COLORS: tuple[Color, ...] = (
-    (0.2, 0.2, 0.6, 0.6),
-    (0.2, 0.6, 0.2, 0.6),
-    (0.0, 0.6, 1.0, 0.7),
-    (0.0, 1.0, 0.4, 0.7),
-)
+# Colors of the arrows, by meaning.
+_ARROW_COLORS: dict[str, Color] = {
+    "commanded velocity": (0.2, 0.2, 0.6, 1.0),
+    "commanded yaw rate": (0.2, 0.6, 0.2, 1.0),
+    "measured velocity": (0.0, 0.6, 1.0, 0.9),
+    "measured yaw rate": (0.0, 1.0, 0.4, 0.9),
+}
 _MIN_FORWARD_SPEED = 0.3
 """Minimum speed of forward commands (m/s)."""
 
@@ -74,6 +74,8 @@ class UniformVelocityCommandCfg(CommandTermCfg):
         """Height of the arrows above the root (m), before `scale`."""
         scale: float = 0.5
         """Arrow length per m/s or rad/s (m)."""
+        show_measured: bool = False
+        """Draw arrows of the measured velocity beside those of the command."""
 
     entity_name: str
     """Name of the commanded entity."""
@@ -238,6 +240,14 @@ class UniformVelocityCommand(CommandTerm):
     ) -> None:
         """Add sliders that command the environment in view while enabled."""
         self._joystick = VelocityJoystick(name, server, self.ranges, get_env_idx, on_change)
+        viz = self.cfg.viz
+        measured = server.gui.add_checkbox("Show measured velocity", viz.show_measured)
+
+        @measured.on_update
+        def _(_event: Any) -> None:
+            viz.show_measured = measured.value
+            if on_change is not None:
+                on_change()
 
     # Sampling.
 
@@ -336,8 +346,9 @@ class UniformVelocityCommand(CommandTerm):
             self.metrics[name][index] = mean + (error - mean) * share
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
-        """Draw four arrows above the root: commanded (blue) and actual (cyan) horizontal velocity, and
-        commanded (green) and actual (light green) yaw rate along the root's z axis.
+        """Draw arrows above the root: commanded horizontal velocity (blue), and commanded yaw rate
+        along the root's z axis (green). With `cfg.viz.show_measured`, also the measured velocity
+        (cyan) and yaw rate (light green).
         """
         indices = list(visualizer.get_env_indices(self.num_envs))
         if not indices:
@@ -361,8 +372,11 @@ class UniformVelocityCommand(CommandTerm):
         # (M, 3, 5): the columns are the five vectors, rotated to the world frame.
         drawn = (viz.scale * rotations @ vectors).transpose(1, 2).cpu().numpy()
         roots = data.root_link_pos_w[indices].cpu().numpy()
+        shown = dict(list(_ARROW_COLORS.items())[: 4 if viz.show_measured else 2])
+        for meaning, color in shown.items():
+            visualizer.add_legend(color, meaning)
         for root, (offset, *arrows) in zip(roots, drawn, strict=True):
-            for arrow, color in zip(arrows, _ARROW_COLORS, strict=True):
+            for arrow, color in zip(arrows, shown.values(), strict=False):
                 visualizer.add_arrow(root + offset, root + offset + arrow, color)
 
 

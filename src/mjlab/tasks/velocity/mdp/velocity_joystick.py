@@ -50,9 +50,16 @@ class VelocityJoystick:
                 False,
                 hint="Command the environment in view by these sliders. Moving one enables them.",
             )
-            for component in _COMPONENTS:
-                self._sliders.append(self._add_slider(server, component, ranges))
+            limits = [_limit(getattr(ranges, component)) for component in _COMPONENTS]
+            for label, limit in zip(_COMPONENTS.values(), limits, strict=True):
+                self._sliders.append(server.gui.add_slider(label, -limit, limit, _STEP, 0.0))
+                self._sliders[-1].on_update(self._moved)
             zero = server.gui.add_button("Zero")
+            with server.gui.add_folder("More", expand_by_default=False):
+                for label, slider, limit in zip(
+                    _COMPONENTS.values(), self._sliders, limits, strict=True
+                ):
+                    self._add_maximum(server, label, slider, limit)
         self._enabled.on_update(self._changed)
 
         @zero.on_click
@@ -60,21 +67,17 @@ class VelocityJoystick:
             for slider in self._sliders:
                 slider.value = 0.0
 
-    def _add_slider(self, server: viser.ViserServer, component: str, ranges: Any) -> Any:
+    def _add_maximum(
+        self, server: viser.ViserServer, label: str, slider: Any, limit: float
+    ) -> None:
+        """Add a slider of the largest value of `slider`."""
         low, high = _MAX_BOUNDS
-        # Ranges may be negative or empty, sliders may not.
-        limit = min(max(abs(bound) for bound in (*getattr(ranges, component), low)), high)
-        label = _COMPONENTS[component]
-        slider = server.gui.add_slider(label, -limit, limit, _STEP, 0.0)
         maximum = server.gui.add_slider(f"Max {label[0].lower()}{label[1:]}", low, high, 0.1, limit)
-        slider.on_update(self._moved)
 
         @maximum.on_update
         def _(_event: Any) -> None:
             slider.value = min(max(slider.value, -maximum.value), maximum.value)
             slider.min, slider.max = -maximum.value, maximum.value
-
-        return slider
 
     def restore(self, command: torch.Tensor) -> None:
         """Restore the row of `command`, (N, 3), that `write_to` overwrote last, if any."""
@@ -100,3 +103,10 @@ class VelocityJoystick:
     def _changed(self, _event: Any) -> None:
         if self._on_change is not None:
             self._on_change()
+
+
+def _limit(bounds: tuple[float, float]) -> float:
+    """Return the largest magnitude of a range, within the bounds of the sliders."""
+    low, high = _MAX_BOUNDS
+    # Ranges may be negative or empty, sliders may not.
+    return min(max(abs(bound) for bound in (*bounds, low)), high)

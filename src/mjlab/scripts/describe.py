@@ -1,0 +1,142 @@
+"""Describe a task by tables of its terms: `uv run mjlab describe TASK [flags]`."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from dataclasses import dataclass
+from typing import Any
+
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.scripts.flags import (
+    parse_flags,
+    parse_known_flags,
+    prepare_env_cfg,
+    with_task_options,
+)
+from mjlab.scripts.policy import policy_env_cfg
+from mjlab.utils.errors import BadCallError
+from mjlab.utils.tables import WIDTH, json_value, tables_text
+
+_MIN_WIDTH = 80
+
+
+@dataclass
+class ConfigChoice:
+    """Flags that select the config of a task."""
+
+    profile: str | None = None
+    """Task profile, such as `cpu`."""
+    play: bool = False
+    """Describe the environment of `play` instead of that of `train`."""
+
+
+@dataclass
+class DescribeConfig(ConfigChoice):
+    """Flags of `describe`."""
+
+    json: bool = False
+    """Print JSON, with all columns and values."""
+    markdown: bool = False
+    """Print Markdown."""
+    env: ManagerBasedRlEnvCfg | None = None
+    """Environment. None: config of the task."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `describe`."""
+    task, *flags = argv
+    # The defaults of the other flags depend on these two.
+    words = [flag for flag in flags if flag not in ("-h", "--help")]
+    choice, _ = parse_known_flags(ConfigChoice, ConfigChoice(), words, f"{prog} {task}")
+    env_cfg = _env_cfg(task, choice)
+    default = with_task_options(DescribeConfig(choice.profile, choice.play, env=env_cfg), task)
+    cfg = parse_flags(type(default), default, flags, f"{prog} {task}")
+    if cfg.json and cfg.markdown:
+        raise BadCallError("describe: expected one of --json and --markdown, got both.")
+    description = describe(task, cfg)
+    if cfg.json:
+        print(json.dumps(description.as_json(), indent=2, allow_nan=False))
+    elif cfg.markdown:
+        print(description.markdown())
+    else:
+        columns = shutil.get_terminal_size((WIDTH, 24)).columns
+        print(description.text(min(max(columns, _MIN_WIDTH), WIDTH)))
+
+
+def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:
+    """Return the description of a task, read from one environment built on the CPU.
+
+    Args:
+        task: Name of the task.
+        cfg: Flags. None: the defaults.
+
+    Raises:
+        UnknownTaskError, UnknownProfileError: unknown task or profile.
+        ValueError: invalid config, or a resource of the task was not found.
+    """
+    cfg = cfg or DescribeConfig()
+    env_cfg = copy.deepcopy(cfg.env) or _env_cfg(task, cfg)
+    prepare_env_cfg(task, cfg, env_cfg, checkpoint=None)
+    num_envs = env_cfg.scene.num_envs
+    env_cfg.scene.num_envs = 1
+    env = ManagerBasedRlEnv(env_cfg, device="cpu")
+    try:
+        return TaskDescription(task, cfg, num_envs, env)
+    finally:
+        env.close()
+
+
+def _env_cfg(task: str, choice: ConfigChoice) -> ManagerBasedRlEnvCfg:
+    return policy_env_cfg(task, choice.profile, purpose="play" if choice.play else "train")
+
+
+class TaskDescription:
+    """Tables of a task.
+
+    Args:
+        task: Name of the task.
+        cfg: Flags with profile and purpose.
+        num_envs: Number of environments in the config.
+        env: Environment of the task with any number of environments.
+    """
+
+    def __init__(
+        self, task: str, cfg: DescribeConfig, num_envs: int, env: ManagerBasedRlEnv
+    ) -> None:
+        self.task = task
+        self.tables = env.tables()
+        self._facts = {
+            "task": task,
+            "profile": cfg.profile,
+            "play": cfg.play,
+            "num_envs": num_envs,
+            "physics_dt": env.physics_dt,
+            "decimation": env.cfg.decimation,
+            "step_dt": env.step_dt,
+            "episode_length_s": env.max_episode_length_s,
+            "max_episode_length": env.max_episode_length,
+            "observation_shapes": env.observation_manager.group_obs_dim,
+            "action_size": env.action_manager.total_action_dim,
+        }
+        variant = [f"profile {cfg.profile}"] * (cfg.profile is not None) + ["play"] * cfg.play
+        self._name = ", ".join([task, *variant])
+        plural = "s" if num_envs != 1 else ""
+        self._summary = f"{num_envs} environment{plural} by default; {env.describe_time()}."
+
+    def as_json(self) -> dict[str, Any]:
+        """Return sizes and times, and the rows of each table, as JSON values."""
+        return json_value(self._facts) | {table.name: table.records() for table in self.tables}
+
+    def text(self, width: int = WIDTH) -> str:
+        """Return the tables as text of at most `width` characters per line."""
+        return f"{self._name}\n{self._summary}\n\n{tables_text(self.tables, width)}"
+
+    def markdown(self) -> str:
+        """Return the tables in Markdown, under a heading of level 2."""
+        parts = [f"## {self._name}", self._summary]
+        for table in self.tables:
+            if table.rows:
+                parts += [f"**{table.title}**", table.markdown()]
+        return "\n\n".join(parts)

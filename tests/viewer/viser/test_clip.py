@@ -1,0 +1,96 @@
+"""Clips recorded from the page."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from viewer_fakes import FakeEnv, push
+
+from mjlab.viewer import ViserPlayViewer
+from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
+from mjlab.viewer.viser import clip
+
+
+class Client:
+    """Browser that pressed the button."""
+
+    client_id = 7
+
+    def __init__(self) -> None:
+        self.camera = SimpleNamespace(
+            look_at=np.zeros(3), position=np.array([0.0, -4.0, 1.0]), fov=np.deg2rad(45.0)
+        )
+        self.downloads: dict[str, bytes] = {}
+        self.notes: list[str] = []
+
+    def send_file_download(self, name: str, content: bytes) -> None:
+        self.downloads[name] = content
+
+    def add_notification(self, title: str, body: str, **_: Any) -> None:
+        self.notes.append(f"{title}: {body}")
+
+
+@pytest.fixture
+def page(viser_server, monkeypatch):
+    viewer = ViserPlayViewer(FakeEnv(2), push(), viser_server=viser_server)
+    viewer.setup()
+    client = Client()
+    monkeypatch.setattr(viser_server, "get_clients", lambda: {client.client_id: client})
+    panel: Any = viewer._clip_panel
+    return viewer, panel, client
+
+
+def show(viewer: ViserPlayViewer) -> None:
+    viewer.after_env_step()
+    viewer._next_scene = 0.0
+    viewer.sync_env_to_viewer()
+
+
+def press(panel: Any, client: Client) -> None:
+    panel._on_click(SimpleNamespace(client=client))
+
+
+def test_a_clip_has_a_frame_per_shown_step_and_is_downloaded(page, tmp_path) -> None:
+    viewer, panel, client = page
+    press(panel, client)
+    for _ in range(3):
+        show(viewer)
+    assert panel.is_recording
+    press(panel, client)
+    show(viewer)
+    assert not panel.is_recording
+    file = tmp_path / "clip.mp4"
+    file.write_bytes(client.downloads["clip.mp4"])
+    reader = imageio_ffmpeg.read_frames(str(file))
+    assert next(reader)["source_size"] == (960, 540)
+    frames = [np.frombuffer(frame, dtype=np.uint8) for frame in reader]
+    assert len(frames) == 3
+    assert frames[0].std() > 10.0
+
+
+def test_a_clip_ends_by_itself(page, monkeypatch) -> None:
+    viewer, panel, client = page
+    monkeypatch.setattr(clip, "_MAX_SECONDS", 0.05)
+    press(panel, client)
+    for _ in range(4):
+        show(viewer)
+    assert "clip.mp4" in client.downloads
+    assert not panel.is_recording
+
+
+def test_a_machine_that_cannot_render_says_so_on_the_page(page, monkeypatch) -> None:
+    viewer, panel, client = page
+
+    def fail(*_: Any) -> None:
+        raise RenderingUnavailableError("no EGL library")
+
+    monkeypatch.setattr(clip, "open_renderer", fail)
+    press(panel, client)
+    show(viewer)
+    show(viewer)
+    assert client.notes == ["No clip is recorded: no EGL library"]
+    assert not client.downloads
