@@ -164,7 +164,7 @@ def _train(
         finally:
             env.close()
     if rank.is_first:
-        write_results(task, cfg, folder.path, device)
+        write_results(task, cfg, folder.path, device, runner.stop_reason)
     return folder.path
 
 

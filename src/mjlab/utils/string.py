@@ -88,8 +88,8 @@ def name_list(names: Sequence[str], near: Iterable[str]) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number with its noun: "1 environment", "4096 environments"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+    """Return a number with its noun: "1 environment", "4,096 environments"."""
+    return f"{count} {noun}" if count == 1 else f"{count:,} {noun}s"
 
 
 def suggest(name: str, available: Iterable[str]) -> str:
