@@ -19,7 +19,6 @@ import hashlib
 import importlib.metadata
 import json
 import os
-import re
 import shlex
 import shutil
 import sys
@@ -50,8 +49,9 @@ from mjlab.scripts.reference import (  # noqa: E402
     thinned,
     trained_seconds,
 )
+from mjlab.scripts.resume import resume_flags  # noqa: E402
 from mjlab.scripts.run_folder import checkpoints_in  # noqa: E402
-from mjlab.scripts.train_seeds import run_forwarding_signals  # noqa: E402
+from mjlab.scripts.train_seeds import run_forwarding_signals, train_command  # noqa: E402
 from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, require_task  # noqa: E402
 from mjlab.utils.errors import UserError  # noqa: E402
 from mjlab.utils.processes import available_cores  # noqa: E402
@@ -158,11 +158,10 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
     run = _newest_run(folder)
     left = 60.0 * options.minutes - (trained_seconds(run) if run else 0.0)
     if left > 0 and (run is None or end_of(run) not in ENDED):
-        command = [sys.executable, "-m", "mjlab.scripts.train", reference.task]
-        command += [*reference.train_flags, "--agent.seed", str(seed), "--device", options.device]
-        command += ["--log-root", str(folder)]
+        command = train_command(reference.task, reference.train_flags, seed)
+        command += ["--device", options.device, "--log-root", str(folder)]
         if run is not None:
-            command += ["--agent.resume", "True", "--agent.load-run", re.escape(run.name)]
+            command += resume_flags(run)
         begin = time.monotonic()
         status, stopped = run_forwarding_signals(command, left)
         run = _newest_run(folder)

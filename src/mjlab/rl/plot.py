@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 DEFAULT_TAG = "Train/mean_step_reward"
-_LABELS = {
+LABELS = {
     DEFAULT_TAG: "Mean reward per step",
+    "Train/exploring_return": "Return of exploring episodes",
     "Train/mean_reward": "Mean reward of an episode",
     "Train/mean_episode_length": "Mean episode length (steps)",
     "Evaluation/mean_return": "Mean evaluation return",
 }
+"""Labels of axes, by tag."""
 
 Curve = tuple[np.ndarray, np.ndarray]
 
@@ -120,7 +122,7 @@ def plot_run(
         {},
         run_dir / "learning_curve.png" if output is None else output,
         title=run_dir.resolve().name if title is None else title,
-        ylabel=_LABELS.get(tag, tag),
+        ylabel=LABELS.get(tag, tag),
         draw=lambda axes: axes.plot(iterations + 1, values),
     )
 
@@ -162,7 +164,7 @@ def plot_seeds(
     seeds = max(len(runs) for runs in groups.values())
     default = f"Mean over {seeds} seeds (shaded: one sample standard deviation)"
     return plot_curves(
-        curves, output, title=default if title is None else title, ylabel=_LABELS.get(tag, tag)
+        curves, output, title=default if title is None else title, ylabel=LABELS.get(tag, tag)
     )
 
 

@@ -97,6 +97,33 @@ COMMANDS = (
         ),
     ),
     Command(
+        "sweep",
+        "learn",
+        "compare settings, side by side",
+        "mjlab.scripts.sweep:command",
+        "TASK",
+        "Train a task with several settings and seeds side by side, and compare them in a table and a plot.\n"
+        "The same command continues an interrupted sweep. All other flags are those of `train`.\n\n"
+        "flags:\n"
+        "    --over FLAG=A,B,...     values of a flag of `train`; several --over: all combinations\n"
+        "    --over FLAG=LOW..HIGH   range to sample from; LOW..HIGH:log on a logarithmic scale\n"
+        "    --trials N              number of settings to sample; required for ranges\n"
+        "    --seeds N               train each setting with the seeds 1, ..., N (default: 1)\n"
+        "    --jobs N                runs side by side (default: one per GPU, else one per CPU core)\n"
+        "    --folder DIR            folder of the sweep (default: logs/sweeps/<task and flags>)\n"
+        "    --storage URL           database shared by machines (default: SQLite file in the folder)\n"
+        "    --objective TAG         TensorBoard tag to compare (default: last evaluation, else return)\n"
+        "    --minimize              prefer low values of the objective\n"
+        "    --device D              cpu, cuda:0, ... (default: GPUs if available)\n"
+        "    --gpu-ids IDS           GPUs to use, one run each, such as [0,2] (default: all)",
+        (
+            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-4,3e-4,1e-3 "
+            "--seeds 3",
+            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-5..1e-2:log "
+            "--trials 20",
+        ),
+    ),
+    Command(
         "plot-seeds",
         "learn",
         "one curve with its spread",

@@ -36,6 +36,8 @@ FALSE_ALARMS = 0.05
 _TAIL = FALSE_ALARMS / 3
 ENDED = ("solved", "finished")
 """Stop reasons of completed training."""
+# Tag written once per iteration.
+_EVERY_ITERATION = "Perf/collection_time"
 # Points per stored curve: tens of kilobytes per task.
 _POINTS = 60
 # Number of comparison points, equally spaced in samples.
@@ -240,26 +242,46 @@ def trained_seconds(run_dir: Path) -> float:
 
 def _read_sessions(run_dir: Path) -> tuple[dict[int, float], dict[int, dict[str, float]]]:
     """Return iteration times (s) and evaluation metrics, by iteration from 0."""
+    scalars = read_scalars_of_sessions(run_dir)
+    learning = scalars.get("Perf/learning_time", {})
+    collecting = scalars.get(_EVERY_ITERATION, {})
+    seconds = {i: value + learning[i] for i, value in collecting.items()}
+    evaluations: dict[int, dict[str, float]] = {}
+    for tag, curve in scalars.items():
+        group, _, name = tag.partition("/")
+        if group == "Evaluation":
+            for i, value in curve.items():
+                evaluations.setdefault(i, {})[name] = value
+    return seconds, evaluations
+
+
+def read_scalars_of_sessions(run_dir: Path) -> dict[str, dict[int, float]]:
+    """Return the values in the event files of all sessions of a run, by tag and iteration from 0.
+
+    If sessions overlap, the later session counts.
+
+    Raises:
+        UserError: folder of an earlier session not found.
+        ValueError: event files not found.
+    """
     from mjlab.rl.plot import read_all_scalars
 
-    seconds: dict[int, float] = {}
-    evaluations: dict[int, dict[str, float]] = {}
+    scalars: dict[str, dict[int, float]] = {}
     for session in sessions_of(run_dir):
         curves = read_all_scalars(session)
         # Sessions solved at their start have evaluations only.
-        if "Perf/collection_time" in curves:
-            iterations, collecting = curves["Perf/collection_time"]
-            learning = curves["Perf/learning_time"][1]
-            first = int(iterations[0])
-            seconds = {i: value for i, value in seconds.items() if i < first}
-            evaluations = {i: value for i, value in evaluations.items() if i < first}
-            seconds |= dict(zip(iterations.tolist(), (collecting + learning).tolist(), strict=True))
+        if _EVERY_ITERATION in curves:
+            first = int(curves[_EVERY_ITERATION][0][0])
+            scalars = {
+                tag: {i: value for i, value in curve.items() if i < first}
+                for tag, curve in scalars.items()
+            }
         for tag, (iterations, values) in curves.items():
-            group, _, name = tag.partition("/")
-            if group == "Evaluation":
-                for i, value in zip(iterations.tolist(), values.tolist(), strict=True):
-                    evaluations.setdefault(i, {})[name] = value
-    return seconds, evaluations
+            # Steps of the other tags are seconds.
+            if not tag.endswith("/time"):
+                new = zip(iterations.tolist(), values.tolist(), strict=True)
+                scalars.setdefault(tag, {}).update(new)
+    return scalars
 
 
 def thinned(run: RunRecord, points: int = _POINTS) -> RunRecord:

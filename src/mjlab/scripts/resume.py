@@ -95,6 +95,11 @@ def _mismatch(run_dir: Path, task: str, learner: str | None) -> str | None:
     return None
 
 
+def resume_flags(run_dir: Path) -> list[str]:
+    """Return the flags of `train` that resume the run in `run_dir`, in its log root and experiment."""
+    return ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
+
+
 def choices_to_resume(
     task: str, cfg: TrainConfig, requested: Mapping[str, str | None]
 ) -> dict[str, str | None]:

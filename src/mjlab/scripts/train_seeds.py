@@ -27,9 +27,9 @@ def command(argv: list[str], prog: str) -> None:
         print(f"\nSeed {seed} of {count}", flush=True)
         # Averaged curves must have equal length, so runs must not stop when solved. User flags come
         # last and take precedence.
-        arguments = [sys.executable, "-m", "mjlab.scripts.train", argv[0]]
-        arguments += ["--agent.evaluation.stop-when-solved", "False"]
-        arguments += [*flags, "--agent.seed", str(seed), "--agent.run-name", f"seed_{seed}"]
+        to_the_end = ["--agent.evaluation.stop-when-solved", "False"]
+        arguments = train_command(argv[0], [*to_the_end, *flags], seed)
+        arguments += ["--agent.run-name", f"seed_{seed}"]
         before = runs_named(experiment, f"seed_{seed}")
         status, stopped = run_forwarding_signals(arguments)
         # A training process interrupted by a signal also exits with 0.
@@ -54,8 +54,7 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--seeds", nargs="?", default="5", const="")
     args, flags = parser.parse_known_args(words)
-    if not args.seeds.isdigit() or int(args.seeds) < 1:
-        raise UserError(f"--seeds: expected an integer >= 1, got {args.seeds!r}.")
+    count = read_count("--seeds", args.seeds)
     if "-h" in flags or "--help" in flags:
         print(f"{_SEEDS_HELP}\nAll other flags are those of `train`:\n", flush=True)
     cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
@@ -66,7 +65,24 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
                 f"{flag}: expected no value, because runs use the seeds 1, 2, ... and are named after them; "
                 "use --seeds N for the number of seeds, or `train` for one run."
             )
-    return int(args.seeds), flags, cfg.experiment_folder
+    return count, flags, cfg.experiment_folder
+
+
+def read_count(flag: str, text: str) -> int:
+    """Return the value of a flag that counts something.
+
+    Raises:
+        UserError: the text is not an integer >= 1.
+    """
+    if not text.isdigit() or int(text) < 1:
+        raise UserError(f"{flag}: expected an integer >= 1, got {text!r}.")
+    return int(text)
+
+
+def train_command(task: str, flags: list[str], seed: int) -> list[str]:
+    """Return the command that trains `task` with `seed` in another process."""
+    command = [sys.executable, "-m", "mjlab.scripts.train", task]
+    return [*command, *flags, "--agent.seed", str(seed)]
 
 
 def run_forwarding_signals(command: list[str], seconds: float | None = None) -> tuple[int, bool]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from mjlab.scripts.reference import (
     referenced_tasks,
     samples_limit,
 )
+from mjlab.scripts.resume import resume_flags
 from mjlab.scripts.run_folder import read_run_info, runs_named, sessions_of
 from mjlab.utils.errors import BadCallError, UserError
 
@@ -110,7 +110,7 @@ def _prepare(
         run_dir = _newest_run(task, cfg)
         # Raises for a missing session before training instead of after.
         sessions_of(run_dir)
-        train_flags += ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
+        train_flags += resume_flags(run_dir)
         done = run_dir if end_of(run_dir) in ENDED else None
     return cfg, reference, parse_train_flags(task, train_flags, f"{prog} {task}"), done
 

@@ -21,6 +21,8 @@ from mjlab.utils.errors import MjlabError
 
 # Process id of the launcher, set for children that must end with their launcher.
 PARENT_VARIABLE = "MJLAB_PARENT_PID"
+CORES_VARIABLE = "MJLAB_CORES"
+"""Environment variable: upper bound on the CPU cores that this process and its children use."""
 
 _SECONDS_BETWEEN_LOOKS = 0.5
 _OWN_CGROUPS = Path("/proc/self/cgroup")
@@ -135,6 +137,8 @@ def cores_per_process() -> int:
 def available_cores() -> int:
     """Return the number of CPU cores for this process: affinity mask or cgroup quota, rounded up.
 
+    `MJLAB_CORES` limits the number, for several runs side by side.
+
     A container limited to two cores still sees all cores of its host; the scheduler throttles
     threads beyond the quota in the middle of a step.
     """
@@ -149,7 +153,8 @@ def available_cores() -> int:
         for group in (folder, *folder.parents)
         if group.is_relative_to(_CGROUP_ROOT) and (quota := _quota(group, files)) is not None
     ]
-    return max(1, min(cores, math.ceil(min(quotas, default=cores))))
+    limit = environment_integer(CORES_VARIABLE, cores)
+    return max(1, min(cores, limit, math.ceil(min(quotas, default=cores))))
 
 
 def _control_groups() -> Iterator[tuple[Path, tuple[str, ...]]]:

@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Iterable
 from types import FrameType
-from typing import Any
+from typing import IO, Any
 
 _HANGUP = getattr(signal, "SIGHUP", None)
 _BREAK = getattr(signal, "SIGBREAK", None)
@@ -28,12 +28,19 @@ FORWARDED: dict[int, signal.Signals] = {
 SIGINT and SIGTERM."""
 
 
-def start_in_background(command: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
-    """Start `command` so that Ctrl-C in the terminal does not reach it; `send_signal` does."""
+def start_in_background(
+    command: list[str], environment: dict[str, str], output: IO[bytes] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start `command` so that Ctrl-C in the terminal does not reach it; `send_signal` does.
+
+    `output` receives stdout and stderr. None: those of this process.
+    """
+    options: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
-        group = subprocess.CREATE_NEW_PROCESS_GROUP
-        return subprocess.Popen(command, env=environment, creationflags=group)
-    return subprocess.Popen(command, env=environment, start_new_session=True)
+        options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    if output is not None:
+        options |= {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT}
+    return subprocess.Popen(command, env=environment, **options)
 
 
 def send_signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
