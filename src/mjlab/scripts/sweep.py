@@ -223,21 +223,22 @@ def command(argv: list[str], prog: str) -> None:
     sweep = parse_sweep(argv, prog)
     # Imports Optuna; flags are checked before.
     from mjlab.scripts.sweep_results import Comparison
-    from mjlab.scripts.sweep_runs import Study, only_process, train_runs
+    from mjlab.scripts.sweep_runs import Runs, Study, only_process
 
     with only_process(sweep.folder):
         study = Study(sweep)
-        outcome = train_runs(sweep, study)
+        runs = Runs(sweep, study)
+        runs.train()
         Comparison(sweep, study).report()
     words = ["uv", "run", *prog.split(), *argv]
     line = subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
-    if outcome.interrupted:
+    if runs.interrupted:
         print(f"Interrupted; finished runs are kept. To continue:\n    {line}")
         raise KeyboardInterrupt
-    if outcome.failed:
-        logs = ", ".join(map(str, outcome.failed[:3]))
+    if runs.failed:
+        logs = ", ".join(map(str, runs.failed[:3]))
         raise UserError(
-            f"{counted(len(outcome.failed), 'run')} failed; output: {logs}. To retry:\n    {line}"
+            f"{counted(len(runs.failed), 'run')} failed; output: {logs}. To retry:\n    {line}"
         )
 
 

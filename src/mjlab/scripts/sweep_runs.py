@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -17,9 +18,9 @@ import uuid
 import warnings
 from collections import deque
 from collections.abc import Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import optuna
 import sqlalchemy.exc
@@ -245,113 +246,153 @@ def _open(sweep: Sweep) -> optuna.Study:
 # Processes.
 
 
-@dataclass
-class Outcome:
-    """Result of training all runs."""
-
-    interrupted: bool = False
-    """True if a run was interrupted."""
-    failed: list[Path] = field(default_factory=list)
-    """Log files of failed runs."""
-
-
 @dataclass(frozen=True)
 class _Run:
     """Process that trains a seed of a trial."""
 
     trial: FrozenTrial
     seed: int
+    name: str
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     slot: dict[str, str]
 
 
-def train_runs(sweep: Sweep, study: Study) -> Outcome:
-    """Train the runs that are not finished, side by side, until a stop signal.
+class Runs:
+    """Training processes side by side."""
 
-    SIGINT, SIGTERM and SIGHUP are forwarded to all runs, which save a checkpoint; a second signal stops
-    them without saving.
-    """
-    slots = machine_slots(sweep)
-    _print_summary(sweep, slots)
-    outcome = Outcome()
-    signals: list[signal.Signals] = []
-    queue: deque[tuple[FrozenTrial, int]] = deque()
-    left: dict[int, int] = {}
-    running: list[_Run] = []
+    def __init__(self, sweep: Sweep, study: Study) -> None:
+        self._sweep = sweep
+        self._study = study
+        self.interrupted = False
+        """True if a run was interrupted."""
+        self.failed: list[Path] = []
+        """Output of failed runs."""
+        self._slots = machine_slots(sweep)
+        self._signals: list[signal.Signals] = []
+        self._queue: deque[tuple[FrozenTrial, int]] = deque()
+        # Unfinished seeds by trial.
+        self._left: dict[int, int] = {}
+        self._running: list[_Run] = []
 
-    def add(trial: FrozenTrial) -> None:
+    def train(self) -> None:
+        """Train the runs that are not finished, until none is left or a signal arrives.
+
+        SIGINT, SIGTERM and SIGHUP are forwarded to all runs, which save a checkpoint; a second signal
+        stops them without saving. After an error, such as a lost database, runs are saved too.
+        """
+        _print_summary(self._sweep, self._slots)
+        forward = self._signals
+        with handled_signals(lambda number, _: forward.append(FORWARDED[number]), FORWARDED):
+            try:
+                own = self._study.own()
+                for trial in own:
+                    self._add(trial)
+                if kept := len(own) * self._sweep.seeds - len(self._queue):
+                    print(f"Kept     {counted(kept, 'finished run')}", flush=True)
+                self._fill()
+                while self._running:
+                    time.sleep(_SECONDS_BETWEEN_LOOKS)
+                    self._update()
+            finally:
+                if self._running:
+                    self._stop(signal.SIGINT)
+                for run in self._running:
+                    run.process.wait()
+
+    def _update(self) -> None:
+        """Forward signals, and replace the processes that have ended."""
+        while self._signals:
+            self._stop(self._signals.pop(0))
+        for run in [run for run in self._running if run.process.poll() is not None]:
+            self._running.remove(run)
+            self._slots.insert(0, run.slot)
+            self._settle(run)
+            self._fill()
+
+    def _stop(self, number: signal.Signals) -> None:
+        self.interrupted = True
+        print(f"\nSaving {counted(len(self._running), 'run')} ...", flush=True)
+        for run in self._running:
+            send_signal(run.process, number)
+
+    def _add(self, trial: FrozenTrial) -> None:
         """Queue the unfinished seeds of a trial."""
         seeds = [
             seed
-            for seed in range(1, sweep.seeds + 1)
-            if sweep.finished_run(setting_of(trial), seed) is None
+            for seed in range(1, self._sweep.seeds + 1)
+            if self._sweep.finished_run(setting_of(trial), seed) is None
         ]
-        left[trial.number] = len(seeds)
-        queue.extend((trial, seed) for seed in seeds)
+        self._left[trial.number] = len(seeds)
+        self._queue.extend((trial, seed) for seed in seeds)
         if not seeds:
-            study.finish(trial)
+            self._study.finish(trial)
 
-    def fill() -> None:
-        """Start runs on free slots."""
-        while slots and not outcome.interrupted and not signals:
-            while not queue and (trial := study.next()) is not None:
-                add(trial)
-            if not queue:
+    def _fill(self) -> None:
+        """Start runs on the free slots."""
+        while self._slots and not self.interrupted and not self._signals:
+            while not self._queue and (trial := self._study.next()) is not None:
+                self._add(trial)
+            if not self._queue:
                 return
-            running.append(_start(sweep, *queue.popleft(), slots.pop(0)))
+            self._start(*self._queue.popleft(), self._slots.pop(0))
 
-    with handled_signals(lambda number, _: signals.append(FORWARDED[number]), FORWARDED):
-        try:
-            for trial in study.own():
-                add(trial)
-            fill()
-            while running:
-                time.sleep(_SECONDS_BETWEEN_LOOKS)
-                while signals:
-                    outcome.interrupted = True
-                    _stop(running, signals.pop(0))
-                for run in [run for run in running if run.process.poll() is not None]:
-                    running.remove(run)
-                    slots.insert(0, run.slot)
-                    left[run.trial.number] -= 1
-                    _settle(sweep, study, run, outcome, left[run.trial.number])
-                    fill()
-        finally:
-            # After an error, such as a lost database, runs are saved.
-            if running:
-                _stop(running, signal.SIGINT)
-            for run in running:
-                run.process.wait()
-    outcome.interrupted |= bool(signals)
-    return outcome
+    def _start(self, trial: FrozenTrial, seed: int, slot: dict[str, str]) -> None:
+        """Start a run, or resume it from its last checkpoint."""
+        sweep, setting = self._sweep, setting_of(trial)
+        folder = sweep.runs_folder(setting)
+        flags = [*_evaluations(sweep, setting), *train_flags(sweep, setting)]
+        # A process that sees one GPU uses it.
+        flags += ["--gpu-ids", "all"] if "CUDA_VISIBLE_DEVICES" in slot else sweep.machine_flags
+        flags += ["--log-root", str(folder.parent), "--agent.experiment-name", folder.name]
+        flags += ["--agent.run-name", f"seed_{seed}"]
+        saved = [run for run in sweep.sessions(setting, seed) if checkpoints_in(run)]
+        flags += resume_flags(saved[0]) if saved else []
+        command = train_command(sweep.task, flags, seed)
+        name = f"{sweep.describe(setting)}, seed {seed}"
+        print(f"{'Resumed' if saved else 'Started'}  {name}", flush=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        log = open(sweep.log_file(setting, seed), "ab")  # noqa: SIM115
+        environment = {**os.environ, **slot, PARENT_VARIABLE: str(os.getpid())}
+        process = start_in_background(command, environment, log)
+        self._running.append(_Run(trial, seed, name, process, log, slot))
 
-
-def _stop(running: list[_Run], number: signal.Signals) -> None:
-    print(f"\nSaving {counted(len(running), 'run')} ...", flush=True)
-    for run in running:
-        send_signal(run.process, number)
+    def _settle(self, run: _Run) -> None:
+        """Print how a run ended; store the value of its trial after the last seed."""
+        run.log.close()
+        sweep, setting = self._sweep, setting_of(run.trial)
+        newest = next(iter(sweep.sessions(setting, run.seed)), None)
+        info = {} if newest is None else read_run_info(newest)
+        self._left[run.trial.number] -= 1
+        if (value := value_of(sweep, setting, run.seed)) is not None:
+            print(f"Finished {run.name}: {sweep.label} {value:.4g}", flush=True)
+        elif self.interrupted or info.get("ended") == "interrupted":
+            self.interrupted = True
+            print(f"Saved    {run.name}, iteration {info.get('iterations', 0)}", flush=True)
+            return
+        else:
+            self.failed.append(sweep.log_file(setting, run.seed))
+            print(f"Failed   {run.name}: {_last_error(self.failed[-1])}", flush=True)
+        if self._left[run.trial.number] == 0:
+            self._study.finish(run.trial)
 
 
 def machine_slots(sweep: Sweep) -> list[dict[str, str]]:
     """Return the environment variables of runs side by side: one GPU each, or a share of the cores."""
-    num_runs = sweep.num_settings * sweep.seeds
     flags = dict(zip(sweep.machine_flags[::2], sweep.machine_flags[1::2], strict=True))
-    gpus: list[int | str] | None = None
+    gpus: list[int | str] = []
     if "--device" not in flags:
         ids = flags.get("--gpu-ids", "all")
         named = [int(number) for number in re.findall(r"\d+", ids)]
-        gpus, _ = select_gpus(
-            named if ids not in ("all", "None") else "all" if ids == "all" else None
-        )
-    elif flags["--device"] != "cpu":
-        gpus = []
-    default = available_cores() if gpus is None else max(1, len(gpus))
-    jobs = min(sweep.jobs or default, num_runs)
+        gpus = select_gpus("all" if ids == "all" else named or None)[0] or []
+    # A device by name, such as cuda:1, is one.
+    is_gpu = flags.get("--device", "cpu") != "cpu"
+    suited = len(gpus) or (1 if is_gpu else available_cores())
+    jobs = min(sweep.jobs or suited, sweep.num_settings * sweep.seeds)
     share = str(max(1, available_cores() // jobs))
     slots = [{CORES_VARIABLE: share, "OMP_NUM_THREADS": share} for _ in range(jobs)]
-    for number, slot in enumerate(slots if gpus else ()):
-        slot["CUDA_VISIBLE_DEVICES"] = str(gpus[number % len(gpus)])
+    for slot, gpu in zip(slots, itertools.cycle(gpus), strict=False):
+        slot["CUDA_VISIBLE_DEVICES"] = str(gpu)
     return slots
 
 
@@ -364,27 +405,6 @@ def _print_summary(sweep: Sweep, slots: list[dict[str, str]]) -> None:
     print(f"Output:  {sweep.folder / 'runs' / '*' / 'seed_*.log'}")
     print(f"Compare: {sweep.objective}, {'lowest' if sweep.minimize else 'highest'} first")
     print(f"Curves:  uv run tensorboard --logdir {sweep.folder / 'runs'}", flush=True)
-
-
-def _start(sweep: Sweep, trial: FrozenTrial, seed: int, slot: dict[str, str]) -> _Run:
-    """Start a run, or resume it from its last checkpoint."""
-    setting = setting_of(trial)
-    folder, path = sweep.runs_folder(setting), sweep.log_file(setting, seed)
-    flags = [*_evaluations(sweep, setting), *train_flags(sweep, setting)]
-    # A process with a GPU of its own sees no other.
-    flags += ["--gpu-ids", "all"] if "CUDA_VISIBLE_DEVICES" in slot else sweep.machine_flags
-    flags += ["--log-root", str(folder.parent), "--agent.experiment-name", folder.name]
-    flags += ["--agent.run-name", f"seed_{seed}"]
-    saved = [run for run in sweep.sessions(setting, seed) if checkpoints_in(run)]
-    flags += resume_flags(saved[0]) if saved else []
-    folder.mkdir(parents=True, exist_ok=True)
-    print(
-        f"{'Resumed' if saved else 'Started'}  {sweep.describe(setting)}, seed {seed}", flush=True
-    )
-    log = open(path, "ab")  # noqa: SIM115
-    environment = {**os.environ, **slot, PARENT_VARIABLE: str(os.getpid())}
-    process = start_in_background(train_command(sweep.task, flags, seed), environment, log)
-    return _Run(trial, seed, process, log, slot)
 
 
 def _evaluations(sweep: Sweep, setting: Setting) -> list[str]:
@@ -403,28 +423,6 @@ def _evaluations(sweep: Sweep, setting: Setting) -> list[str]:
         "first-iteration": max(0, total - (_EVALUATIONS - 1) * interval),
     }
     return [f"--agent.evaluation.{name}={value}" for name, value in settings.items()]
-
-
-def _settle(sweep: Sweep, study: Study, run: _Run, outcome: Outcome, left: int) -> None:
-    """Print how a run ended; store the value of its trial after the last seed."""
-    run.log.close()
-    setting = setting_of(run.trial)
-    name = f"{sweep.describe(setting)}, seed {run.seed}"
-    path = sweep.log_file(setting, run.seed)
-    newest = next(iter(sweep.sessions(setting, run.seed)), None)
-    info = {} if newest is None else read_run_info(newest)
-    if sweep.finished_run(setting, run.seed) is not None:
-        value = value_of(sweep, setting, run.seed)
-        print(f"Finished {name}: {sweep.label} {value:.4g}", flush=True)
-    elif outcome.interrupted or info.get("ended") == "interrupted":
-        outcome.interrupted = True
-        print(f"Saved    {name}, iteration {info.get('iterations', 0)}", flush=True)
-        return
-    else:
-        outcome.failed.append(path)
-        print(f"Failed   {name}: {_last_error(path)}", flush=True)
-    if left == 0:
-        study.finish(run.trial)
 
 
 def _last_error(path: Path) -> str:

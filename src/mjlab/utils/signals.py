@@ -35,12 +35,16 @@ def start_in_background(
 
     `output` receives stdout and stderr. None: those of this process.
     """
-    options: dict[str, Any] = {"start_new_session": True}
-    if sys.platform == "win32":
-        options = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-    if output is not None:
-        options |= {"stdin": subprocess.DEVNULL, "stdout": output, "stderr": subprocess.STDOUT}
-    return subprocess.Popen(command, env=environment, **options)
+    flags = subprocess.CREATE_NEW_PROCESS_GROUP if sys.platform == "win32" else 0
+    return subprocess.Popen(
+        command,
+        env=environment,
+        stdin=None if output is None else subprocess.DEVNULL,
+        stdout=output,
+        stderr=None if output is None else subprocess.STDOUT,
+        creationflags=flags,
+        start_new_session=not flags,
+    )
 
 
 def send_signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
