@@ -141,6 +141,15 @@ _PLAY: Screen = {
     "task": _TASK,
 }
 
+# Seeds and names of the runs are those of `--seeds`.
+_SEEDS: Screen = {
+    "run": (*_RUN, _ITERATIONS),
+    "watch": _WATCH,
+    "save": (Row("log_root", "DIR"), *_SAVE),
+    "learning": _LEARNING,
+    "task": _TRAINED_TASK,
+}
+
 SCREENS: Mapping[str, Screen] = {
     "train": {
         "run": (*_RUN, Row("agent.seed", "N", "-1 draws one"), _ITERATIONS),
@@ -154,14 +163,8 @@ SCREENS: Mapping[str, Screen] = {
         "learning": _LEARNING,
         "task": _TRAINED_TASK,
     },
-    # Seeds and names of the runs are those of `--seeds`.
-    "train-seeds": {
-        "run": (*_RUN, _ITERATIONS),
-        "watch": _WATCH,
-        "save": (Row("log_root", "DIR"), *_SAVE),
-        "learning": _LEARNING,
-        "task": _TRAINED_TASK,
-    },
+    "train-seeds": _SEEDS,
+    "sweep": {**_SEEDS, "save": _SAVE},
     "play": _PLAY,
     "demo": _PLAY,
     "evaluate": {

@@ -95,9 +95,15 @@ def _mismatch(run_dir: Path, task: str, learner: str | None) -> str | None:
     return None
 
 
-def resume_flags(run_dir: Path) -> list[str]:
-    """Return the flags of `train` that resume the run in `run_dir`, in its log root and experiment."""
-    return ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
+def resume_flags(run_dir: Path, checkpoint: Path | None = None) -> list[str]:
+    """Return the flags of `train` that resume the run in `run_dir`, in its log root and experiment.
+
+    `checkpoint` is a checkpoint of the run. None: newest.
+    """
+    flags = ["--agent.resume", "True", "--agent.load-run", re.escape(run_dir.name)]
+    if checkpoint is not None:
+        flags += ["--agent.load-checkpoint", re.escape(checkpoint.name)]
+    return flags
 
 
 def choices_to_resume(

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import hashlib
 import itertools
 import os
@@ -29,8 +30,8 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.flags import is_given
 from mjlab.scripts.help import lookup
-from mjlab.scripts.reference import ENDED, end_of
-from mjlab.scripts.run_folder import runs_named
+from mjlab.scripts.reference import ENDED
+from mjlab.scripts.run_folder import checkpoints_in, read_run_info, runs_named
 from mjlab.scripts.train_seeds import read_count
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.string import counted
@@ -210,8 +211,21 @@ class Sweep:
         return runs_named(self.runs_folder(setting), f"seed_{seed}")
 
     def finished_run(self, setting: Setting, seed: int) -> Path | None:
-        """Return the last session of a run that was trained to its end; None for others."""
-        return next((run for run in self.sessions(setting, seed) if end_of(run) in ENDED), None)
+        """Return the last session of a run that was trained to its end; None for others.
+
+        A run interrupted in its last iteration lacks the last evaluation.
+        """
+        runs = self.sessions(setting, seed)
+        return next((run for run in runs if read_run_info(run).get("ended") in ENDED), None)
+
+    def last_checkpoint(self, setting: Setting, seed: int) -> Path | None:
+        """Return the checkpoint to resume a run from: the newest with iterations left."""
+        total = train_config(self, setting).agent.max_iterations
+        for run in self.sessions(setting, seed):
+            for checkpoint in reversed(checkpoints_in(run)):
+                if int(checkpoint.stem.removeprefix("model_")) + 1 < total:
+                    return checkpoint
+        return None
 
 
 def _digest(text: str) -> str:
@@ -267,7 +281,7 @@ def parse_sweep(argv: list[str], prog: str) -> Sweep:
     args, flags = parser.parse_known_args(words)
     if "-h" in flags or "--help" in flags:
         print(f"`{prog} --help` shows the flags of the sweep. All others are those of `train`:\n")
-        _parse_train(task, flags, prog)
+        _parse_train(task, tuple(flags), prog)
     axes = tuple(map(Axis.parse, args.over))
     counts = {
         name: None if text is None else read_count(f"--{name}", text)
@@ -288,7 +302,7 @@ def parse_sweep(argv: list[str], prog: str) -> Sweep:
         objective=args.objective,
         minimize=args.minimize,
     )
-    cfg = check_settings(sweep, prog)
+    cfg = check_settings(sweep)
     return dataclasses.replace(
         sweep,
         axes=tuple(_with_type(axis, cfg) for axis in axes),
@@ -320,7 +334,7 @@ def _check_axes(axes: tuple[Axis, ...], flags: list[str], trials: int | None) ->
         )
 
 
-def check_settings(sweep: Sweep, prog: str) -> TrainConfig:
+def check_settings(sweep: Sweep) -> TrainConfig:
     """Parse every combination of values as `train` would; return the config of the first.
 
     Of ranges, the ends are checked.
@@ -330,7 +344,7 @@ def check_settings(sweep: Sweep, prog: str) -> TrainConfig:
     first: TrainConfig | None = None
     for setting in sweep.combinations:
         flags = [*train_flags(sweep, setting), *sweep.machine_flags]
-        cfg = _parse_train(sweep.task, flags, prog)
+        cfg = train_config(sweep, setting)
         try:
             check_typed_flags(cfg, flags)
             check_flags(cfg)
@@ -346,10 +360,17 @@ def train_flags(sweep: Sweep, setting: Setting) -> list[str]:
     return [*sweep.flags, *(f"--{name}={value}" for name, value in setting.items())]
 
 
-def _parse_train(task: str, flags: list[str], prog: str) -> TrainConfig:
+def train_config(sweep: Sweep, setting: Setting) -> TrainConfig:
+    """Return the config that `train` reads from the flags of a setting; exits on invalid flags."""
+    flags = (*train_flags(sweep, setting), *sweep.machine_flags)
+    return _parse_train(sweep.task, flags, "mjlab sweep")
+
+
+@functools.cache
+def _parse_train(task: str, flags: tuple[str, ...], prog: str) -> TrainConfig:
     from mjlab.scripts.train import parse_train_flags
 
-    return parse_train_flags(task, flags, f"{prog} {task}")
+    return parse_train_flags(task, [*flags], f"{prog} {task}")
 
 
 def _with_type(axis: Axis, cfg: TrainConfig) -> Axis:

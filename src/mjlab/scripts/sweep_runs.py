@@ -33,8 +33,8 @@ from optuna.distributions import (
 from optuna.trial import FrozenTrial, TrialState
 
 from mjlab.scripts.resume import resume_flags
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info
-from mjlab.scripts.sweep import Axis, Setting, Sweep, train_flags
+from mjlab.scripts.run_folder import read_run_info
+from mjlab.scripts.sweep import Axis, Setting, Sweep, train_config, train_flags
 from mjlab.scripts.sweep_results import value_of
 from mjlab.scripts.train_seeds import train_command
 from mjlab.utils.errors import UserError
@@ -346,8 +346,8 @@ class Runs:
         flags += ["--gpu-ids", "all"] if "CUDA_VISIBLE_DEVICES" in slot else sweep.machine_flags
         flags += ["--log-root", str(folder.parent), "--agent.experiment-name", folder.name]
         flags += ["--agent.run-name", f"seed_{seed}"]
-        saved = [run for run in sweep.sessions(setting, seed) if checkpoints_in(run)]
-        flags += resume_flags(saved[0]) if saved else []
+        saved = sweep.last_checkpoint(setting, seed)
+        flags += [] if saved is None else resume_flags(saved.parent, saved)
         command = train_command(sweep.task, flags, seed)
         name = f"{sweep.describe(setting)}, seed {seed}"
         print(f"{'Resumed' if saved else 'Started'}  {name}", flush=True)
@@ -412,9 +412,7 @@ def _evaluations(sweep: Sweep, setting: Setting) -> list[str]:
 
     Flags of the user come later and override them.
     """
-    from mjlab.scripts.train import parse_train_flags
-
-    total = parse_train_flags(sweep.task, train_flags(sweep, setting), "sweep").agent.max_iterations
+    total = train_config(sweep, setting).agent.max_iterations
     interval = max(1, total // _EVALUATIONS)
     settings = {
         "stop-when-solved": False,

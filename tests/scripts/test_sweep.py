@@ -1,0 +1,327 @@
+"""`mjlab sweep`: settings and seeds side by side, continued and compared."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from commands import TASK
+
+from mjlab.scripts import cli
+from mjlab.scripts.reference import read_scalars_of_sessions
+from mjlab.scripts.run_folder import read_run_info, write_params, write_run_info
+from mjlab.scripts.sweep import Axis
+from mjlab.scripts.train_config import TrainConfig
+from mjlab.utils.errors import BadCallError
+
+optuna = pytest.importorskip("optuna")
+
+RATE = "agent.algorithm.learning-rate"
+LEARNING = ("--over", f"{RATE}=1e-4,1e-3")
+
+
+class Machine:
+    """Stand-in for the processes of `train`: the return of a run is 1e4 times its learning rate."""
+
+    def __init__(self) -> None:
+        self.commands: list[list[str]] = []
+        self.environments: list[dict[str, str]] = []
+        self.at_once = 0
+        self.interrupts_after = 99
+        self.fails: tuple[str, ...] = ()
+        self._alive = 0
+
+    def start(self, command, environment, output):
+        """Return a process that trains when it is asked for its status."""
+        self.commands.append(command)
+        self.environments.append(environment)
+        self._alive += 1
+        self.at_once = max(self.at_once, self._alive)
+        process = SimpleNamespace(signals=[], wait=lambda: 0)
+        process.send_signal = process.signals.append
+        process.poll = lambda: self._end(process, command, output)
+        return process
+
+    def _end(self, process, command, output) -> int | None:
+        flags = flags_of(command)
+        if len(self.commands) >= self.interrupts_after:
+            if not process.signals:
+                signal.raise_signal(signal.SIGINT)
+                return None
+            ended = "interrupted"
+        else:
+            ended = "failed" if flags[f"--{RATE}"] in self.fails else "finished"
+        self._alive -= 1
+        run_dir = Path(flags["--log-root"], flags["--agent.experiment-name"])
+        run_dir /= f"2026-01-01_{len(self.commands)}_{flags['--agent.run-name']}"
+        write_run(run_dir, ended, 1e4 * float(flags[f"--{RATE}"]))
+        output.write(b"error: the pole broke\n" if ended == "failed" else b"")
+        return int(ended == "failed")
+
+
+def flags_of(command: list[str]) -> dict[str, str]:
+    """Return the flags of a command of `train`, the last of each name."""
+    words = iter(command[4:])
+    pairs = (word.split("=", 1) if "=" in word else (word, next(words)) for word in words)
+    return dict(pairs)
+
+
+def write_run(run_dir: Path, ended: str, value: float) -> None:
+    """Write a run folder as training does."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    run_dir.mkdir(parents=True)
+    agent = TrainConfig.from_task(TASK).agent
+    write_params(run_dir, agent, agent)
+    write_run_info(run_dir, task=TASK, learner="ppo", ended=ended, iterations=3)
+    (run_dir / "model_2.pt").touch()
+    with SummaryWriter(str(run_dir)) as writer:
+        for i in range(3):
+            writer.add_scalar("Perf/collection_time", 1.0, i)
+            writer.add_scalar("Perf/learning_time", 1.0, i)
+            writer.add_scalar("Evaluation/mean_return", value * (i + 1) / 3, i)
+
+
+@pytest.fixture
+def machine(monkeypatch) -> Machine:
+    """Two cores, and processes that do not train."""
+    machine = Machine()
+    monkeypatch.setattr("mjlab.scripts.sweep_runs.start_in_background", machine.start)
+    monkeypatch.setattr(
+        "mjlab.scripts.sweep_runs.send_signal", lambda process, n: process.send_signal(n)
+    )
+    monkeypatch.setattr("mjlab.scripts.sweep_runs.available_cores", lambda: 2)
+    monkeypatch.setattr("mjlab.scripts.sweep_runs._SECONDS_BETWEEN_LOOKS", 0.0)
+    return machine
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory) -> Path:
+    """Return an empty database: creating its tables takes most of the time of a test."""
+    path = tmp_path_factory.mktemp("database") / "study.db"
+    optuna.storages.RDBStorage(f"sqlite:///{path.as_posix()}")
+    return path
+
+
+@pytest.fixture
+def folder(database, tmp_path) -> Path:
+    """Return the folder of a new sweep."""
+    (tmp_path / "mine").mkdir()
+    return Path(shutil.copy(database, tmp_path / "mine")).parent
+
+
+@pytest.fixture
+def sweep(run_main):
+    """Return a function that runs `mjlab sweep`."""
+    flags = ("--num-envs", "16", "--device", "cpu")
+    return lambda *argv: run_main(cli.main, "mjlab", "sweep", TASK, *argv, *flags)
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    """Return the rows of the table."""
+    with (folder / "table.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_combinations_and_seeds_run_side_by_side_once_and_are_compared(sweep, machine, folder):
+    argv = (*LEARNING, "--folder", str(folder))
+    outcome = sweep(*argv, "--seeds", "2")
+    assert outcome.status == 0, outcome.err
+    flags = [flags_of(command) for command in machine.commands]
+    assert [(f[f"--{RATE}"], f["--agent.seed"]) for f in flags] == [
+        ("1e-4", "1"), ("1e-4", "2"), ("1e-3", "1"), ("1e-3", "2"),
+    ]  # fmt: skip
+    assert {f["--num-envs"] for f in flags} == {"16"}
+    assert machine.at_once == 2
+    assert {(e["MJLAB_CORES"], e["OMP_NUM_THREADS"]) for e in machine.environments} == {("1", "1")}
+    best, other = rows_of(folder)
+    assert (best["learning-rate"], float(best["mean_return"]), best["seeds"]) == ("1e-3", 10.0, "2")
+    assert float(other["mean_return"]) == pytest.approx(1.0)
+    assert "| 1e-3 " in (folder / "table.md").read_text(encoding="utf-8")
+    assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert f"--{RATE}=1e-3" in outcome.out.partition("Next")[2]
+    # Again: finished runs are kept, and more seeds are added to them.
+    assert sweep(*argv, "--seeds", "2").status == 0
+    assert len(machine.commands) == 4
+    assert sweep(*argv, "--seeds", "3").status == 0
+    assert [flags_of(command)["--agent.seed"] for command in machine.commands[4:]] == ["3", "3"]
+
+
+def test_ctrl_c_stops_all_runs_and_the_same_command_resumes_them(sweep, machine, folder):
+    argv = (*LEARNING, "--folder", str(folder), "--seeds", "2")
+    machine.interrupts_after = 3
+    outcome = sweep(*argv)
+    assert outcome.status == 130
+    assert f"uv run mjlab sweep {TASK} {' '.join(argv)}" in outcome.out
+    stopped = len(machine.commands)
+    machine.interrupts_after = 99
+    assert sweep(*argv).status == 0
+    resumed = [flags_of(command) for command in machine.commands[stopped:]]
+    assert [f.get("--agent.resume") for f in resumed[:1]] == ["True"]
+    # Each run was begun once.
+    begun = [f for f in map(flags_of, machine.commands) if "--agent.resume" not in f]
+    assert len({(f[f"--{RATE}"], f["--agent.seed"]) for f in begun}) == len(begun) == 4
+    assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
+
+
+def test_a_failed_run_is_named_and_retried_by_the_same_command(sweep, machine, folder):
+    argv = (*LEARNING, "--folder", str(folder))
+    machine.fails = ("1e-4",)
+    outcome = sweep(*argv)
+    assert outcome.status == 1
+    assert "the pole broke" in outcome.out
+    assert str(folder / "runs" / "learning-rate=1e-4" / "seed_1.log") in outcome.message
+    assert [row["state"] for row in rows_of(folder)] == ["", "failed"]
+    machine.fails = ()
+    assert sweep(*argv).status == 0
+    assert [flags_of(command)[f"--{RATE}"] for command in machine.commands] == [
+        "1e-4", "1e-3", "1e-4",
+    ]  # fmt: skip
+    assert len(rows_of(folder)) == 2
+
+
+def test_values_of_ranges_are_sampled(sweep, machine, folder):
+    argv = ("--over", f"{RATE}=1e-5..1e-2:log", "--folder", str(folder))
+    assert sweep(*argv, "--trials", "1").status == 0
+    assert sweep(*argv, "--trials", "3").status == 0
+    sampled = {float(flags_of(command)[f"--{RATE}"]) for command in machine.commands}
+    assert len(sampled) == len(machine.commands) == 3
+    assert all(1e-5 <= rate <= 1e-2 for rate in sampled)
+    returns = [float(row["mean_return"]) for row in rows_of(folder)]
+    assert returns == sorted(returns, reverse=True)
+
+
+def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path):
+    study = f"sqlite:///{(folder / 'study.db').as_posix()}"
+    first, second = (
+        (*LEARNING, "--storage", study, "--jobs", "1", "--folder", str(tmp_path / name / "both"))
+        for name in ("first", "second")
+    )
+    machine.interrupts_after = 1
+    assert sweep(*first).status == 130
+    machine.interrupts_after = 99
+    # The setting of the first machine is left to it.
+    assert sweep(*second).status == 0
+    assert [flags_of(command)[f"--{RATE}"] for command in machine.commands] == ["1e-4", "1e-3"]
+    assert sweep(*first).status == 0
+    assert flags_of(machine.commands[2])["--agent.resume"] == "True"
+    assert len(machine.commands) == 3
+    rows = rows_of(tmp_path / "first" / "both")
+    assert [(row["learning-rate"], row["state"]) for row in rows] == [
+        ("1e-3", "elsewhere"), ("1e-4", ""),
+    ]  # fmt: skip
+
+
+def test_a_sweep_runs_once_at_a_time_and_keeps_its_flags(sweep, machine, folder):
+    from mjlab.scripts.sweep_runs import only_process
+
+    argv = ("--folder", str(folder))
+    with only_process(folder):
+        assert "another process" in sweep(*LEARNING, *argv).message
+    assert sweep(*LEARNING, *argv).status == 0
+    assert "another --folder" in sweep("--over", f"{RATE}=1e-4", *argv).message
+    outcome = sweep(*LEARNING, *argv, "--objective", "Evaluation/mean_retrun")
+    assert "'Evaluation/mean_return'" in outcome.message
+    assert len(machine.commands) == 2
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        ((), "--over"),
+        (("--over", RATE), RATE),
+        (("--over", f"{RATE}=1e-4,,1e-3"), RATE),
+        (("--over", f"{RATE}=1e-2..1e-4", "--trials", "3"), RATE),
+        (("--over", f"{RATE}=0..1:log", "--trials", "3"), RATE),
+        (("--over", f"{RATE}=1e-4..1e-3"), "--trials"),
+        ((*LEARNING, *LEARNING), RATE),
+        ((*LEARNING, f"--{RATE}", "1"), RATE),
+        ((*LEARNING, "--agent.seed", "3"), "--seeds"),
+        (("--over", "agent.resume=True,False"), "agent.resume"),
+        ((*LEARNING, "--jobs", "0"), "--jobs"),
+        (("--over", f"{RATE}=1e-4,nan"), RATE),
+    ],
+)
+def test_a_wrong_flag_is_named_before_anything_runs(sweep, machine, tmp_path, flags, named):
+    outcome = sweep(*flags, "--folder", str(tmp_path / "new"))
+    assert outcome.status in (1, 2)
+    assert named in outcome.message
+    assert not machine.commands
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_misspelt_flag_is_found_before_anything_runs(sweep, machine):
+    outcome = sweep("--over", "agent.algorithm.learning-rat=1")
+    assert outcome.status == 2
+    assert RATE in outcome.err
+    assert not machine.commands
+
+
+def test_values_are_split_outside_brackets():
+    assert Axis.parse("a_b=[1,2],[3]").values == ("[1,2]", "[3]")
+    assert Axis.parse("--a-b=1,1,2") == Axis("a-b", "1,1,2", ("1", "2"))
+    axis = Axis.parse("x=-1.5..2e3")
+    assert (axis.values, axis.is_range, axis.is_log) == (("-1.5", "2e3"), True, False)
+    # Not a range.
+    assert Axis.parse("motion=../a.npz,../b.npz").values == ("../a.npz", "../b.npz")
+    with pytest.raises(BadCallError, match="FLAG=A,B"):
+        Axis.parse("=1")
+
+
+@pytest.mark.parametrize(
+    ("flags", "jobs", "visible", "shares"),
+    [
+        ((), None, ["4", "6"], "4"),
+        (("--gpu-ids", "[1]"), None, ["6"], "8"),
+        ((), 3, ["4", "6", "4"], "2"),
+        (("--device", "cpu"), None, [None] * 4, "2"),
+        (("--device", "cuda:1"), None, [None], "8"),
+    ],
+)
+def test_runs_have_a_gpu_each_or_share_the_cores(monkeypatch, flags, jobs, visible, shares):
+    from mjlab.scripts.sweep_runs import machine_slots
+
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
+    monkeypatch.setattr("mjlab.scripts.sweep_runs.available_cores", lambda: 8)
+    sweep: Any = SimpleNamespace(machine_flags=flags, jobs=jobs, num_settings=2, seeds=2)
+    slots = machine_slots(sweep)
+    assert [slot.get("CUDA_VISIBLE_DEVICES") for slot in slots] == visible
+    assert {slot["MJLAB_CORES"] for slot in slots} == {shares}
+
+
+@pytest.mark.slow
+def test_a_sweep_that_trains_is_interrupted_and_continued(tmp_path):
+    folder = tmp_path / "sweep"
+    command = [sys.executable, "-m", "mjlab.scripts.cli", "sweep", TASK, *LEARNING, "--seeds", "2"]
+    command += ["--folder", str(folder), "--device", "cpu", "--num-envs", "16", "--jobs", "2"]
+    command += ["--agent.num-steps-per-env", "8", "--agent.save-interval", "1"]
+    command += ["--agent.max-iterations", "2", "--agent.evaluation.num-episodes", "4"]
+    process = subprocess.Popen(command, process_group=0, stdout=subprocess.PIPE, text=True)
+    end = time.monotonic() + 120.0
+    while not list(folder.glob("runs/*/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.01)
+    # As a terminal does it: to the whole process group.
+    os.killpg(process.pid, signal.SIGINT)
+    out = process.communicate(timeout=120.0)[0]
+    assert process.returncode == 130, out
+    assert "To continue:" in out
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300.0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
+    for setting in ("1e-4", "1e-3"):
+        for seed in (1, 2):
+            *_, last = sorted((folder / "runs" / f"learning-rate={setting}").glob(f"*seed_{seed}"))
+            assert read_run_info(last)["iterations"] == 2
+            # Exactly the last iteration was evaluated, and no iteration is missing.
+            scalars = read_scalars_of_sessions(last)
+            assert sorted(scalars["Perf/collection_time"]) == [0, 1]
+            assert max(scalars["Evaluation/mean_return"]) == 1
