@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import os
 import shutil
 import signal
@@ -19,7 +20,7 @@ from commands import TASK
 from mjlab.scripts import cli
 from mjlab.scripts.reference import read_scalars_of_sessions
 from mjlab.scripts.run_folder import read_run_info, write_params, write_run_info
-from mjlab.scripts.sweep import Axis
+from mjlab.scripts.sweep import Axis, Sweep
 from mjlab.scripts.train_config import TrainConfig
 from mjlab.utils.errors import BadCallError
 
@@ -296,6 +297,27 @@ def test_runs_have_a_gpu_each_or_share_the_cores(monkeypatch, flags, jobs, visib
     slots = machine_slots(sweep)
     assert [slot.get("CUDA_VISIBLE_DEVICES") for slot in slots] == visible
     assert {slot["MJLAB_CORES"] for slot in slots} == {shares}
+
+
+def test_a_run_is_resumed_from_the_last_checkpoint_with_iterations_left(monkeypatch, tmp_path):
+    """After its last iteration, nothing would be trained, and the last evaluation stay missing."""
+    agent = SimpleNamespace(max_iterations=3)
+    monkeypatch.setattr(
+        "mjlab.scripts.sweep.train_config", lambda sweep, setting: SimpleNamespace(agent=agent)
+    )
+    values: Any = dict.fromkeys(field.name for field in dataclasses.fields(Sweep))
+    sweep = Sweep(**{**values, "axes": (Axis.parse("x=1,2"),), "folder": tmp_path})
+    for name, saved in (("2026-01-01_a_seed_1", (0, 1)), ("2026-01-02_a_seed_1", (2,))):
+        for number in saved:
+            checkpoint = sweep.runs_folder({"x": "1"}) / name / f"model_{number}.pt"
+            checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            checkpoint.touch()
+        write_run_info(checkpoint.parent, ended="interrupted", iterations=3)
+    assert sweep.finished_run({"x": "1"}, 1) is None
+    found = sweep.last_checkpoint({"x": "1"}, 1)
+    assert found is not None
+    assert (found.parent.name, found.name) == ("2026-01-01_a_seed_1", "model_1.pt")
+    assert sweep.last_checkpoint({"x": "2"}, 1) is None
 
 
 @pytest.mark.slow

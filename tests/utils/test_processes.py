@@ -133,3 +133,14 @@ def test_the_affinity_mask_and_the_ranks_limit_the_quota_further(cgroups, launch
 
 def test_a_system_without_control_groups_is_not_limited(cgroups):
     assert available_cores() == 16
+
+
+@pytest.mark.parametrize("limit", [1, 10_000])
+def test_a_variable_limits_the_cores(monkeypatch, limit):
+    monkeypatch.delenv(processes.CORES_VARIABLE, raising=False)
+    cores = processes.available_cores()
+    monkeypatch.setenv(processes.CORES_VARIABLE, str(limit))
+    assert processes.available_cores() == min(cores, limit)
+    monkeypatch.setenv(processes.CORES_VARIABLE, "none")
+    with pytest.raises(ValueError, match="MJLAB_CORES"):
+        processes.available_cores()
