@@ -16,7 +16,8 @@ from mjlab.rl.evaluation import EvaluationResult, MeanAndInterval
 from mjlab.rl.progress import ProgressCfg, clock, duration, sparkline
 from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import display
-from mjlab.scripts.display import TrainingDisplay, next_commands, usual_iteration
+from mjlab.scripts.display import TrainingDisplay, usual_iteration
+from mjlab.scripts.results import next_commands
 from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.utils.string import counted
 
