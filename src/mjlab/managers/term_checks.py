@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 
 from mjlab.sensor import ContactSensor
-from mjlab.utils.errors import WrongTypeError, check_exists
+from mjlab.utils.errors import UnknownNameError, WrongTypeError, check_exists
 
 if TYPE_CHECKING:
+    from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -45,6 +46,12 @@ def check_term(function: Any, env: ManagerBasedRlEnv, params: dict[str, Any]) ->
 
 
 # Scene and commands.
+
+
+def require_entity(env: ManagerBasedRlEnv, name: str) -> Entity:
+    """Return an entity of the scene; raises `KeyError`, also for the name of a sensor."""
+    check_exists("entity", name, env.scene.entities, UnknownNameError)
+    return env.scene.entities[name]
 
 
 def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
