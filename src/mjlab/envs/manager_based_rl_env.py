@@ -47,6 +47,7 @@ from mjlab.managers import (
 )
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
+from mjlab.utils.config_fields import check_fields_exist
 from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
@@ -675,8 +676,10 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     """Check config values that would otherwise fail late.
 
     Raises:
-        ValueError: invalid value; the message names the field, the value and the allowed values.
+        ValueError: invalid value, or an attribute with a misspelled field name; the message names
+            the field, the value and the allowed values.
     """
+    check_fields_exist(type(cfg).__name__, cfg)
     check_count("scene.num_envs", cfg.scene.num_envs)
     check_count("decimation", cfg.decimation)
     timestep = cfg.sim.mujoco.timestep
