@@ -160,6 +160,7 @@ class ManagerBasedRlEnv(Tabular):
             variant_info=self.scene.collect_variant_info(),
         )
         self.scene.initialize(self.sim.mj_model, self.sim.model, self.sim.data)
+        self.scene.check_terrain_scans(self.sim.mj_model)
         self.sim.add_forward_callback(self.scene.invalidate_sensor_caches)
         if self.scene.sensor_context is not None:
             self.sim.set_sensor_context(self.scene.sensor_context)

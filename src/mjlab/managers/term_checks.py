@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
-from mjlab.sensor import ContactSensor
+from mjlab.sensor import ContactSensor, RayCastSensor
+from mjlab.sensor.terrain_scan import check_terrain_scan
 from mjlab.utils.errors import WrongTypeError, check_exists
 
 if TYPE_CHECKING:
@@ -88,6 +89,16 @@ def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any
     threshold = params.get("force_threshold", 0.0)
     if not threshold >= 0.0:
         raise ValueError(f"force_threshold: expected a force >= 0 (N), got {threshold!r}.")
+
+
+def check_height_scan(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check that the rays of a term that measures heights meet the ground and not their robot.
+
+    Sensors of other classes are not checked. Raises `ValueError`; see `check_terrain_scan`.
+    """
+    sensor = env.scene[sensor_name]
+    if isinstance(sensor, RayCastSensor):
+        check_terrain_scan(sensor, env.sim.mj_model)
 
 
 def require_command(env: ManagerBasedRlEnv, name: str | None) -> None:

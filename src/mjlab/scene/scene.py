@@ -30,6 +30,7 @@ from mjlab.sensor import (
     SensorCfg,
     SensorContext,
 )
+from mjlab.sensor.terrain_scan import check_terrain_scan
 from mjlab.sim.config import MujocoCfg
 from mjlab.sim.engine import Stage
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
@@ -293,6 +294,16 @@ class Scene(Tabular):
         if self._cfg.spec_fn is not None:
             stated["SceneCfg.spec_fn"] = stated_options(self._spec)
         report_overruled(cfg, stated, self.entity_options)
+
+    def check_terrain_scans(self, mj_model: mujoco.MjModel) -> None:
+        """Check that terrain scans see the ground, and not their robot. Call after `initialize`.
+
+        Raises:
+            ValueError: the geom groups of a scan do not fit; see `check_terrain_scan`.
+        """
+        for sensor in self._sensors.values():
+            if isinstance(sensor, RayCastSensor) and sensor.scans_terrain:
+                check_terrain_scan(sensor, mj_model)
 
     # Life cycle.
 
