@@ -224,6 +224,11 @@ def arm_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
         },
         commands={"reach": ReachCommandCfg(resampling_time_range=(1.0, 2.0))},
         events={
+            "place": EventTermCfg(
+                func=mdp.reset_root_state_uniform,
+                mode="reset",
+                params={"pose_range": {}, "velocity_range": {}},
+            ),
             "reset": EventTermCfg(
                 func=mdp.reset_joints_by_offset,
                 mode="reset",
