@@ -237,7 +237,7 @@ def arm_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
                     "velocity_range": (0.0, 0.0),
                     "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
                 },
-            )
+            ),
         },
         rewards={
             "reach": RewardTermCfg(func=reach, weight=1.0, params={"std": 0.3}),
