@@ -10,7 +10,7 @@ import pytest
 import torch
 from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
 
-from mjlab.rl import RslRlVecEnvWrapper
+from mjlab.rl import RslRlVecEnvWrapper, evaluation
 from mjlab.rl.evaluation import (
     Episodes,
     EvaluationResult,
@@ -65,6 +65,18 @@ def test_each_environment_is_scored_on_its_first_episode_only():
     assert result.return_interval == pytest.approx((5.0 - half, 5.0 + half))
     assert result.success_rate is None
     assert result.num_unfinished == 0
+
+
+def test_progress_counts_finished_episodes_over_all_rounds(monkeypatch):
+    monkeypatch.setattr(evaluation, "_STEPS_BETWEEN_CHECKS", 1)
+    told = []
+    evaluate_policy(counting(), still, 6, progress=lambda *progress: told.append(progress))
+    # First episodes have 1, 2, 3, 4 steps; the second round has two of them.
+    assert [done for done, _ in told] == [1, 2, 3, 4, 5, 6]
+    fractions = [fraction for _, fraction in told]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
+    assert 1 / 6 < fractions[0] < 0.5
 
 
 def test_returns_are_before_scaling_by_the_step():

@@ -16,7 +16,7 @@ from rsl_rl.utils.logger import Logger
 
 from mjlab.rl import MjlabOnPolicyRunner
 from mjlab.rl.plot import plot_run, read_scalars
-from mjlab.rl.run_logger import RunLogger
+from mjlab.rl.run_logger import IterationStats, RunLogger, mean_length
 
 NUM_ENVS, STEPS = 3, 4
 
@@ -83,11 +83,39 @@ def test_every_tag_of_rsl_rl_is_written_with_its_value_and_step(rnd, entry, caps
         assert written[key] == pytest.approx(value, rel=1e-5), key
 
 
-def finish(logger: Any, it: int) -> None:
-    logger.finish_iteration(
+def finish(logger: Any, it: int) -> IterationStats:
+    return logger.finish_iteration(
         iteration=it, first_iteration=it, total_iterations=9, losses={}, collection_time=0.8,
         learning_time=0.7, rnd_weight=0.1, **REPORT,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("failures", "limit"), [(0.0, 40.0), (0.1, 40.0), (0.01, 10.0), (1.0, 7.0)]
+)
+def test_the_expected_length_is_the_mean_of_a_truncated_geometric_distribution(failures, limit):
+    survived = [(1.0 - failures) ** step for step in range(int(limit))]
+    assert mean_length(failures, limit) == pytest.approx(sum(survived))
+
+
+@pytest.mark.parametrize("with_time_outs", [False, True])
+def test_the_exploring_return_does_not_wait_for_episodes_and_is_free_of_the_time_step(
+    with_time_outs,
+):
+    logger = make_logger(RunLogger, rnd=False)
+    logger._reward_unit, logger._episode_steps = 0.02, 1000
+    done = torch.zeros(NUM_ENVS, dtype=torch.long)
+    extras = {"time_outs": torch.zeros(NUM_ENVS, dtype=torch.bool)} if with_time_outs else {}
+    logger.process_env_step(torch.full((NUM_ENVS,), 0.75 * 0.02), done, extras)
+    stats = finish(logger, 1)
+    assert stats.mean_reward is None
+    assert stats.exploring_return == pytest.approx(750.0)
+    assert stats.exploring_length == 1000
+    # All environments fail, or run out of time, in every step.
+    if with_time_outs:
+        extras["time_outs"] = ~extras["time_outs"]
+    logger.process_env_step(torch.full((NUM_ENVS,), 0.75 * 0.02), done + 1, extras)
+    assert finish(logger, 2).exploring_length == (1000 if with_time_outs else 1)
 
 
 def test_a_resumed_run_goes_on_with_both_parts_of_the_reward():

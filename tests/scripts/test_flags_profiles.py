@@ -274,7 +274,8 @@ def test_a_task_of_ones_own_trains_and_is_evaluated_under_a_profile_made_for_it(
         "--agent.evaluation.min-interval", "2", "--agent.evaluation.num-episodes", "2", *short,
     )  # fmt: skip
     assert trained.status == 0, trained.err
-    assert "Evaluation after 2 iterations" in trained.out
+    assert "Finished: unsolved at iteration 2 of 2" in trained.out
+    assert "missed by" in trained.out
     (params,) = tmp_path.glob("*/*/params/env.yaml")
     assert "decimation: 2" in params.read_text()
     (checkpoint,) = tmp_path.glob("*/*/model_1.pt")

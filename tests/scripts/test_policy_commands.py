@@ -208,6 +208,9 @@ def test_evaluation_prints_a_table_for_people(run, trained):
     for part in ("4 in 4 environments", "Mean return", "95 % interval", "Success      0.0%",
                  "at least 900", "native", "Note         4 of 4 episodes were truncated", "rare failures"):  # fmt: skip
         assert part in outcome.out
+    # The swing-up ends by its time limit only.
+    assert "no termination but time limits" in outcome.out
+    assert "time_out" not in outcome.out
 
 
 def test_one_episode_is_shown_without_an_interval(run):
@@ -215,6 +218,7 @@ def test_one_episode_is_shown_without_an_interval(run):
     assert outcome.status == 0, outcome.err
     (line,) = (line for line in outcome.out.splitlines() if line.startswith("Mean return"))
     assert "no interval" in line
+    assert "1 in 1 environment, " in outcome.out
 
 
 def test_episodes_that_are_cut_off_succeed_by_no_definition(run, with_images):

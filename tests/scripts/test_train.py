@@ -124,7 +124,7 @@ def test_the_start_says_what_runs_where(run, tmp_path):
     physics = next(line for line in outcome.out.splitlines() if line.startswith("Physics:"))
     for part in ("native", "cpu", "1 physics thread"):
         assert part in physics
-    assert "Training finished" in outcome.out
+    assert "Finished" in outcome.out
     assert "model_0.pt" in outcome.out
 
 

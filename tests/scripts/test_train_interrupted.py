@@ -79,7 +79,7 @@ def test_sigterm_saves_exports_and_ends_with_status_0(train, tmp_path):
     out = process.communicate(timeout=PATIENCE)[0]
     assert process.returncode == 0, out
     assert "SIGTERM: finishing this iteration, then saving" in out
-    assert "Training interrupted" in out
+    assert "Interrupted at" in out
     (run_dir,) = (log_root / "cartpole").iterdir()
     info = read_run_info(run_dir)
     assert info["ended"] == "interrupted"

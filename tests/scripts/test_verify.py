@@ -193,7 +193,7 @@ def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):
     # A finished run is compared again, without training.
     again = verify("--seed", "5", "--resume", edit=raise_returns)
     assert again.status == 1
-    assert "Training" not in again.out
+    assert "Finished" not in again.out
     shutil.rmtree(tmp_path / "logs")
     assert verify("--seed", "5").status == 0
     (uninterrupted,) = (tmp_path / "logs" / "cartpole").iterdir()

@@ -15,9 +15,10 @@ import torch
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sensor import ContactSensor, RayCastSensor
 from mjlab.sensor.terrain_scan import check_terrain_scan
-from mjlab.utils.errors import WrongTypeError, check_exists
+from mjlab.utils.errors import UnknownNameError, WrongTypeError, check_exists
 
 if TYPE_CHECKING:
+    from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -79,6 +80,12 @@ def check_constants(function: Any, env: ManagerBasedRlEnv) -> None:
 
 
 # Scene and commands.
+
+
+def require_entity(env: ManagerBasedRlEnv, name: str) -> Entity:
+    """Return an entity of the scene; raises `KeyError`, also for the name of a sensor."""
+    check_exists("entity", name, env.scene.entities, UnknownNameError)
+    return env.scene.entities[name]
 
 
 def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:

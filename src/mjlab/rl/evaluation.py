@@ -38,6 +38,8 @@ logger = logging.getLogger(__name__)
 Policy = Callable[[Any], torch.Tensor]
 PerEnv = Callable[[Any], torch.Tensor]
 """`func(env) -> (num_envs,)`: per-environment value, read at every step."""
+Progress = Callable[[int, float], None]
+"""`func(num_finished, fraction)`: progress of an evaluation."""
 RESULT_FIELDS = ("mean_return", "mean_length", "success_rate", "failure_rate")
 """Fields of `EvaluationResult` that `EvaluationResult.value` accepts, besides metrics."""
 
@@ -64,6 +66,7 @@ def evaluate_policy(
     success_is_survival: bool = False,
     metrics: Mapping[str, PerEnv] | None = None,
     seed: int | None = None,
+    progress: Progress | None = None,
 ) -> EvaluationResult:
     """Play episodes and score them.
 
@@ -92,6 +95,8 @@ def evaluate_policy(
             over the steps of an episode.
         seed: Seed of the evaluation; None: generators are not seeded. With the same seed,
             environments in the same state give the same episodes.
+        progress: Function called every few steps with the number of finished episodes, and with the
+            fraction of the evaluation that is done.
 
     Raises:
         ValueError: `num_episodes` is not positive, or episodes are too long.
@@ -99,11 +104,11 @@ def evaluate_policy(
     num_episodes = env.num_envs if num_episodes is None else num_episodes
     check_positive("num_episodes", num_episodes)
     if max_steps is None:
-        max_steps = int(env.max_episode_length)
-        if not 0 < max_steps <= _LONGEST_EPISODE:
+        max_steps = time_limit(env)
+        if max_steps is None:
             raise ValueError(
                 f"max_steps: expected an episode length of 1 to {_LONGEST_EPISODE} steps, got "
-                f"{max_steps}; set env.episode_length_s, or max_steps."
+                f"{env.max_episode_length}; set env.episode_length_s, or max_steps."
             )
     check_positive("max_steps", max_steps)
     if seed is not None:
@@ -121,7 +126,15 @@ def evaluate_policy(
             manager: Any = getattr(env.unwrapped, "command_manager", None)
             for name in manager.active_terms if manager is not None else ():
                 manager.get_term(name).take_turns_from(first)
-            rounds.append(_play_round(env, policy, count, max_steps, success_func, metrics or {}))
+
+            def report(running: int, step: int, first: int = first, count: int = count) -> None:
+                if progress is not None:
+                    done = first + count - running
+                    progress(done, (done + running * step / max_steps) / num_episodes)
+
+            rounds.append(
+                _play_round(env, policy, count, max_steps, success_func, metrics or {}, report)
+            )
     episodes = functools.reduce(operator.add, rounds)
     successes = episodes.succeeded if success_func is not None else None
     if successes is None and success_is_survival:
@@ -252,6 +265,32 @@ class MeanAndInterval:
     """95 % confidence interval of the mean (Student's t); None for one episode."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """Condition of a solved task: an upper or lower bound on a value of evaluations."""
+
+    name: str
+    """Name of the value, as in `EvaluationResult.value`."""
+    limit: float
+    """Bound."""
+    is_upper: bool
+    """True for an upper bound."""
+
+    def is_met(self, result: EvaluationResult) -> bool:
+        """Return whether `result` meets the bound. NaN does not."""
+        value = result.judged(self.name)
+        return value <= self.limit if self.is_upper else value >= self.limit
+
+    @staticmethod
+    def all_of(cfg: Mapping[str, Any]) -> list[Bound]:
+        """Return the bounds of an `EvaluationCfg` as a dict, the return first."""
+        target = cfg.get("solved_return")
+        bounds = [] if target is None else [Bound("mean_return", target, is_upper=False)]
+        bounds += [Bound(*item, is_upper=True) for item in (cfg.get("solved_below") or {}).items()]
+        bounds += [Bound(*item, is_upper=False) for item in (cfg.get("solved_above") or {}).items()]
+        return bounds
+
+
 class SolvedCheck:
     """Evaluation of the policy during a run, in separate environments, when it may have solved the
     task.
@@ -275,10 +314,9 @@ class SolvedCheck:
         self._algorithm = algorithm
         self._cfg = cfg
         self._seed = seed
-        self._below: dict[str, float] = cfg.get("solved_below") or {}
-        self._above: dict[str, float] = cfg.get("solved_above") or {}
-        target = cfg.get("solved_return")
-        self._has_target = target is not None or bool(self._below or self._above)
+        self._bounds = Bound.all_of(cfg)
+        below: dict[str, float] = cfg.get("solved_below") or {}
+        above: dict[str, float] = cfg.get("solved_above") or {}
         self._min_interval = int(cfg.get("min_interval", 3))
         self._num_episodes = int(cfg.get("num_episodes", 256))
         self._prepare_env = cfg.get("prepare_env")
@@ -287,15 +325,15 @@ class SolvedCheck:
         is_defined = any(cfg.get(name) is not None for name in defining_success)
         if not is_defined and not cfg.get("success_is_survival"):
             known.discard("success_rate")
-        for name in (*self._below, *self._above):
+        for name in (*below, *above):
             if name not in known:
                 raise ValueError(
                     f"EvaluationCfg solved_below, solved_above: {name!r} is not measured; "
                     f"{suggest(name, sorted(known))} Others must be in `metrics`."
                 )
         # Bounds on rates that this number of episodes cannot meet, even without a failure.
-        allowed = {"failure_rate": self._below.get("failure_rate", 1.0)}
-        allowed["success_rate"] = 1.0 - self._above.get("success_rate", 0.0)
+        allowed = {"failure_rate": below.get("failure_rate", 1.0)}
+        allowed["success_rate"] = 1.0 - above.get("success_rate", 0.0)
         for name, failures in allowed.items():
             if failures > 0.0 and self._num_episodes < (needed := episodes_to_show(failures)):
                 logger.warning(
@@ -314,29 +352,16 @@ class SolvedCheck:
             mean_step_reward: Mean weighted reward per step of the last iteration, before scaling by
                 the step's duration.
         """
-        if not self._has_target or iteration - self.last_iteration < self._min_interval:
+        if not self._bounds or iteration - self.last_iteration < self._min_interval:
             return False
         if iteration < self._cfg.get("first_iteration", 0):
             return False
-        trigger = self._cfg.get("trigger_return")
-        if trigger is None:
-            solved_return = self._cfg.get("solved_return")
-            if solved_return is None:
-                return True
-            trigger = self._cfg["trigger_fraction"] * solved_return
-        return mean_step_reward * int(self._env.max_episode_length) >= trigger
+        trigger = trigger_return(self._cfg)
+        return trigger is None or mean_step_reward * int(self._env.max_episode_length) >= trigger
 
     def is_solved_by(self, result: EvaluationResult) -> bool:
         """Return whether `result` meets all conditions of the config."""
-        if not self._has_target:
-            return False
-        target = self._cfg.get("solved_return")
-        if target is not None and result.mean_return < target:
-            return False
-        # Comparisons with NaN are False, so that NaN meets no condition.
-        return all(result.judged(name) <= high for name, high in self._below.items()) and all(
-            result.judged(name) >= low for name, low in self._above.items()
-        )
+        return bool(self._bounds) and all(bound.is_met(result) for bound in self._bounds)
 
     @property
     def stops_training(self) -> bool:
@@ -396,6 +421,17 @@ class SolvedCheck:
         if self._eval_env is not None:
             self._eval_env.close()
             self._eval_env = None
+
+
+def trigger_return(cfg: Mapping[str, Any]) -> float | None:
+    """Return the return of the training data, at full length, that triggers an evaluation.
+
+    `cfg` is an `EvaluationCfg` as a dict. None: evaluations do not depend on it.
+    """
+    trigger = cfg.get("trigger_return")
+    if trigger is None and cfg.get("solved_return") is not None:
+        trigger = cfg["trigger_fraction"] * cfg["solved_return"]
+    return None if trigger == -math.inf else trigger
 
 
 def success_definition(cfg: EvaluationCfg) -> str | None:
@@ -462,6 +498,12 @@ def reward_unit(env: Any) -> float:
     return float(unwrapped.step_dt) if scaled else 1.0
 
 
+def time_limit(env: Any) -> int | None:
+    """Return the time limit of episodes in steps, None for endless episodes."""
+    steps = env.max_episode_length
+    return int(steps) if 0 < steps <= _LONGEST_EPISODE else None
+
+
 @contextmanager
 def _preserved_state(env: RslRlVecEnvWrapper) -> Generator[None]:
     """Hold step and terrain curricula within the block; restore the environments' state after it.
@@ -497,8 +539,12 @@ def _play_round(
     max_steps: int,
     success_func: PerEnv | None,
     metrics: Mapping[str, PerEnv],
+    report: Callable[[int, int], None],
 ) -> Episodes:
-    """Play the first episode of each of the first `count` environments."""
+    """Play the first episode of each of the first `count` environments.
+
+    `report` is called with the number of running episodes and the number of steps.
+    """
     unwrapped = env.unwrapped
 
     def zeros(dtype: torch.dtype) -> torch.Tensor:
@@ -531,8 +577,11 @@ def _play_round(
         running &= dones == 0
         if reset_policy is not None:
             reset_policy(dones)
-        if (step + 1) % _STEPS_BETWEEN_CHECKS == 0 and not running.any():
-            break
+        if (step + 1) % _STEPS_BETWEEN_CHECKS == 0:
+            num_running = int(running.sum())
+            report(num_running, step + 1)
+            if num_running == 0:
+                break
     first = slice(count)
     return Episodes(
         returns=returns[first] / reward_unit(env),

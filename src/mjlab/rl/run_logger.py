@@ -57,6 +57,12 @@ class IterationStats:
     """Mean length of the last 100 finished episodes, in environment steps. None until one finished."""
     mean_step_reward: float
     """Mean weighted reward per step of this iteration, before scaling by the step's duration."""
+    exploring_return: float | None = None
+    """Undiscounted return of an episode with the exploration of this iteration: `mean_step_reward`
+    times `exploring_length`, in the unit of evaluations. None for endless episodes."""
+    exploring_length: float | None = None
+    """Expected length of an episode at this iteration's rate of failures, in environment steps. Unlike
+    `mean_episode_length`, it does not wait for episodes to finish."""
     learning_rate: float
     """Learning rate after this iteration."""
     action_std: float
@@ -72,6 +78,10 @@ class TrainingObserver:
 
     Methods are called on the training thread and should be fast.
     """
+
+    shows_progress = False
+    """True for observers that show the progress of training. Without one, a runner in a notebook adds
+    `mjlab.rl.progress.NotebookProgress`."""
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Handle the start of training; `first_iteration` iterations were finished before."""
@@ -105,16 +115,30 @@ class RunLogger(Logger):
     """rsl_rl's logger, silent on the console and without a GPU synchronization per step.
 
     Step data stays on the device until `finish_iteration` reads all of it at once. Tags in the
-    event files are rsl_rl's and `Train/mean_step_reward`.
+    event files are rsl_rl's, `Train/mean_step_reward` and `Train/exploring_return`.
 
     Runners with a custom loop, written against rsl_rl, call `log` instead.
     """
 
-    def __init__(self, *args: Any, reward_unit: float = 1.0, **kwargs: Any) -> None:
-        """Set up with rsl_rl's arguments; `reward_unit` is the factor from weighted rewards to those
-        of `process_env_step` (the step's duration if rewards are scaled by it)."""
+    def __init__(
+        self,
+        *args: Any,
+        reward_unit: float = 1.0,
+        episode_steps: float | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Set up with rsl_rl's arguments.
+
+        Args:
+            *args: Arguments of rsl_rl.
+            reward_unit: Factor from weighted rewards to those of `process_env_step` (the step's
+                duration if rewards are scaled by it).
+            episode_steps: Time limit of episodes, in environment steps. None: endless.
+            **kwargs: Arguments of rsl_rl.
+        """
         super().__init__(*args, **kwargs)
         self._reward_unit = reward_unit
+        self._episode_steps = episode_steps
         self._uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
         # rsl_rl's default is the repository around the virtual environment.
         self.git_status_repos = []
@@ -131,6 +155,7 @@ class RunLogger(Logger):
             ]
         self._finished: list[tuple[torch.Tensor, ...]] = []
         self._step_rewards: list[torch.Tensor] = []
+        self._failures: list[torch.Tensor] = []
         self._write_failed = False
         self._reported_losses = False
         self._thread_hook = threading.excepthook
@@ -218,6 +243,11 @@ class RunLogger(Logger):
             self.ep_extras.append(logged)
         self._step_rewards.append(rewards.mean())
         done = dones > 0
+        # Without `time_outs` (finite horizon), every end counts.
+        failed = done
+        if "time_outs" in extras:
+            failed = done & ~extras["time_outs"].to(done.device).bool()
+        self._failures.append(failed.float().mean())
         self.cur_reward_sum += rewards
         if intrinsic_rewards is not None:
             self.cur_reward_sum += intrinsic_rewards
@@ -233,7 +263,7 @@ class RunLogger(Logger):
 
         The arguments are those of rsl_rl's `Logger.log`.
         """
-        mean_step_reward = self._collect_rewards()
+        mean_step_reward, _ = self._collect_rewards()
         super().log(it, *args, **kwargs)
         self.write_scalars({"Train/mean_step_reward": mean_step_reward}, it)
 
@@ -257,7 +287,8 @@ class RunLogger(Logger):
         self.tot_time += duration
         self._session_time += duration
         per_iteration = self._session_time / (iteration + 1 - first_iteration)
-        mean_step_reward = self._collect_rewards()
+        mean_step_reward, failures = self._collect_rewards()
+        length = None if self._episode_steps is None else mean_length(failures, self._episode_steps)
         stats = IterationStats(
             iteration=iteration + 1,
             total_iterations=total_iterations,
@@ -269,6 +300,8 @@ class RunLogger(Logger):
             mean_reward=statistics.fmean(self.rewbuffer) if self.rewbuffer else None,
             mean_episode_length=statistics.fmean(self.lenbuffer) if self.lenbuffer else None,
             mean_step_reward=mean_step_reward,
+            exploring_return=None if length is None else mean_step_reward * length,
+            exploring_length=length,
             learning_rate=learning_rate,
             action_std=action_std.mean().item(),
             losses=losses,
@@ -370,17 +403,23 @@ class RunLogger(Logger):
         self.rewbuffer.extend(state["rewards"])
         self.lenbuffer.extend(state["lengths"])
 
-    def _collect_rewards(self) -> float:
-        """Read the step data: add the finished episodes, and return the mean weighted reward."""
+    def _collect_rewards(self) -> tuple[float, float]:
+        """Read the step data: add the finished episodes.
+
+        Returns:
+            Mean weighted reward per step, and fraction of steps that ended in a failure.
+        """
         if not self._finished:
-            return 0.0
+            return 0.0, 0.0
         done, *sums = (torch.stack(column) for column in zip(*self._finished, strict=True))
         for (_, last), of_steps in zip(self._episode_sums, sums, strict=True):
             last.extend(of_steps[done].tolist())
         mean = torch.stack(self._step_rewards).mean().item()
+        failures = torch.stack(self._failures).mean().item()
         self._finished.clear()
         self._step_rewards.clear()
-        return mean / self._reward_unit
+        self._failures.clear()
+        return mean / self._reward_unit, failures
 
     def _environment_means(self) -> dict[str, float]:
         values: dict[str, list[torch.Tensor]] = {}
@@ -406,6 +445,8 @@ class RunLogger(Logger):
             "Perf/learning_time": stats.learning_time,
             "Train/mean_step_reward": stats.mean_step_reward,
         }
+        if stats.exploring_return is not None:
+            scalars["Train/exploring_return"] = stats.exploring_return
         over_time = {}
         if stats.mean_reward is not None and stats.mean_episode_length is not None:
             scalars["Train/mean_reward"] = stats.mean_reward
@@ -434,6 +475,23 @@ class RunLogger(Logger):
             self._stop_writing(args.exc_value)
         else:
             self._thread_hook(args)
+
+
+def mean_length(failures: float, limit: float) -> float:
+    """Return the expected length of an episode, in steps.
+
+    With failures of probability p per step, independent of time, and a time limit of T steps:
+    (1 - (1 - p)^T) / p.
+
+    Args:
+        failures: Probability p of a failure in a step.
+        limit: Time limit T.
+    """
+    if failures <= 0.0:
+        return limit
+    if failures >= 1.0:
+        return 1.0
+    return -math.expm1(limit * math.log1p(-failures)) / failures
 
 
 def write_git_diff(run_dir: Path, source: Path) -> Path | None:

@@ -36,7 +36,7 @@ from mjlab.rl.checkpoint import (
 )
 from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
-from mjlab.rl.evaluation import EvaluationResult, SolvedCheck, reward_unit
+from mjlab.rl.evaluation import EvaluationResult, SolvedCheck, reward_unit, time_limit
 from mjlab.rl.exporter_utils import export_to_onnx, export_with_metadata, get_base_metadata
 from mjlab.rl.networks import (
     check_mini_batches,
@@ -44,6 +44,7 @@ from mjlab.rl.networks import (
     prepare_train_cfg,
     shared_parameters_allowed,
 )
+from mjlab.rl.progress import NotebookProgress, ProgressCfg, in_notebook
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.run_logger import RunLogger, TrainingObserver
 from mjlab.utils.processes import process_rank
@@ -62,7 +63,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     Unlike rsl_rl's runner, it counts total iterations: `learn(10)` is equal, bit for bit, to
     `learn(5)`, `load` in a new process, and `learn(10)`. `current_learning_iteration` is the number
-    of iterations finished. Progress goes to `observers` instead of the console.
+    of iterations finished. Progress goes to `observers` instead of the console; in a notebook, it is
+    shown in one output.
 
     After `learn`, `stop_reason` is `finished`, `solved`, `interrupted` (SIGINT or SIGTERM) or
     `failed`, and `last_evaluation` is the result of the last evaluation, if any. In a solved run,
@@ -106,6 +108,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             gpu_global_rank=self.gpu_global_rank,
             device=self.device,
             reward_unit=reward_unit(self.env),
+            episode_steps=time_limit(self.env),
         )
         self.observers: list[TrainingObserver] = []
         self.stop_reason: str | None = None
@@ -154,6 +157,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             )
         # Checked here, because runners are also built to play, in any number of environments.
         check_mini_batches(self.env.num_envs, self.cfg)
+        if in_notebook() and not any(observer.shows_progress for observer in self.observers):
+            self.observers.append(NotebookProgress(ProgressCfg.of_runner(self)))
         first, total, reason = self.current_learning_iteration, num_learning_iterations, ""
         num_steps, save_interval = self.cfg["num_steps_per_env"], self.cfg["save_interval"]
         check_every_step = self.cfg.get("check_for_nan", True)

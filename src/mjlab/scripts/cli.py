@@ -7,6 +7,7 @@ imported before a command runs, so that `--help` and a mistyped task name answer
 from __future__ import annotations
 
 import importlib
+import io
 import logging
 import os
 import sys
@@ -434,6 +435,9 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     logging.captureWarnings(True)
     # One line per warning, without file and source line.
     warnings.formatwarning = lambda message, category, *_: f"{category.__name__}: {message}"  # ty: ignore[invalid-assignment]
+    # Paths may have characters that the terminal's encoding lacks.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         command(sys.argv[1:])
     except KeyboardInterrupt:

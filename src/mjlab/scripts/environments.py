@@ -53,6 +53,7 @@ def make_env(
 
 def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) -> Any:
     """Return the wrapped training environment; with `--video`, record clips into `run_dir`."""
+    prepare_torch(device)
     records = cfg.video and rank.is_first
     with _reserve_learner_core(cfg, device, rank):
         env: Any = ManagerBasedRlEnv(

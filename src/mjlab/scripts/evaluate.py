@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
@@ -21,7 +25,12 @@ from mjlab.scripts.policy import (
 )
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import check_count
+from mjlab.utils.logging import print_notice
 from mjlab.utils.string import counted
+
+_SECONDS_BETWEEN_DRAWINGS = 0.25
+# Period of plain lines, for log files.
+_SECONDS_BETWEEN_LINES = 10.0
 
 
 @dataclass
@@ -66,17 +75,20 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, profile=cfg.profile)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
-        result = evaluate_policy(
-            env,
-            policy,
-            cfg.num_episodes,
-            max_steps=cfg.max_steps,
-            success_return=required_return(solved),
-            success_func=solved.success_func,
-            success_is_survival=solved.success_is_survival,
-            metrics=solved.metrics,
-            seed=cfg.seed,
-        )
+        with EvaluationProgress(cfg.num_episodes) as progress:
+            result = evaluate_policy(
+                env,
+                policy,
+                cfg.num_episodes,
+                max_steps=cfg.max_steps,
+                success_return=required_return(solved),
+                success_func=solved.success_func,
+                success_is_survival=solved.success_is_survival,
+                metrics=solved.metrics,
+                seed=cfg.seed,
+                progress=progress.update,
+            )
+        failures = _failure_terms(env.unwrapped)
         physics = env.unwrapped.sim.capabilities.description
         num_envs = env.num_envs
     finally:
@@ -90,16 +102,65 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
         "success_definition": success_definition(solved),
         **result.to_dict(),
     }
-    print(json.dumps(metrics, indent=2) if cfg.json else _table(metrics))
+    print(json.dumps(metrics, indent=2) if cfg.json else _table(metrics, failures))
     return metrics
 
 
-def _table(metrics: dict[str, Any]) -> str:
+class EvaluationProgress:
+    """Progress of an evaluation on stderr: a bar on a terminal, elsewhere a line now and then."""
+
+    def __init__(self, num_episodes: int, console: Console | None = None) -> None:
+        self._num_episodes = num_episodes
+        self._bar = Progress(
+            TextColumn("Evaluating"),
+            BarColumn(24),
+            TextColumn("{task.fields[done]} of " + counted(num_episodes, "episode")),
+            TimeRemainingColumn(),
+            console=console or Console(stderr=True),
+            transient=True,
+            auto_refresh=False,
+        )
+        self._task = self._bar.add_task("", total=1.0, done=0)
+        self._last = time.perf_counter()
+
+    def __enter__(self) -> EvaluationProgress:
+        if self._bar.console.is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def update(self, num_finished: int, fraction: float) -> None:
+        """Show the number of finished episodes, and the fraction of the evaluation that is done."""
+        is_terminal = self._bar.console.is_terminal
+        self._bar.update(self._task, completed=fraction, done=num_finished)
+        now = time.perf_counter()
+        if now - self._last < (
+            _SECONDS_BETWEEN_DRAWINGS if is_terminal else _SECONDS_BETWEEN_LINES
+        ):
+            return
+        self._last = now
+        if is_terminal:
+            self._bar.refresh()
+        else:
+            episodes = counted(self._num_episodes, "episode")
+            print_notice(f"Evaluating: {fraction:.0%}, {num_finished} of {episodes} finished")
+
+
+def _failure_terms(env: Any) -> list[str]:
+    """Return the terminations that are failures, not time limits."""
+    manager = env.termination_manager
+    return [name for name in manager.active_terms if not manager.get_term_cfg(name).time_out]
+
+
+def _table(metrics: dict[str, Any], failures: list[str]) -> str:
+    """Format the metrics; `failures` are the terminations that count as failures."""
     lines = [
         f"Task         {metrics['task']}",
         f"Policy       {metrics['policy']}",
         f"Physics      {metrics['physics']}",
-        f"Episodes     {metrics['num_episodes']} in {counted(metrics['num_envs'], 'environment')}, "
+        f"Episodes     {metrics['num_episodes']:,} in {counted(metrics['num_envs'], 'environment')}, "
         f"mean length {metrics['mean_length']:.1f} steps",
         f"Mean return  {metrics['mean_return']:.2f}   {_interval(metrics['return_interval'], '.2f')}"
         f"   range [{metrics['min_return']:.2f}, {metrics['max_return']:.2f}]",
@@ -110,12 +171,15 @@ def _table(metrics: dict[str, Any]) -> str:
             f"Success      {metrics['success_rate']:.1%}   "
             f"{_interval(metrics['success_interval'], '.1%')}   ({metrics['success_definition']})"
         )
-    if metrics["failure_rate"] is not None:
-        ended = [f"{name} {rate:.1%}" for name, rate in metrics["terminations"].items() if rate]
+    if not failures:
+        lines.append("Failures     none: the task has no termination but time limits")
+    elif metrics["failure_rate"] is not None:
+        rates = {name: metrics["terminations"].get(name) for name in failures}
+        ended = ", ".join(f"{name} {rate:.1%}" for name, rate in rates.items() if rate)
         lines.append(
             f"Failures     {metrics['failure_rate']:.1%}   "
-            f"{_interval(metrics['failure_interval'], '.1%')}   "
-            f"(ended by: {', '.join(ended) or 'nothing'})"
+            f"{_interval(metrics['failure_interval'], '.1%')}"
+            + (f"   (ended by: {ended})" if ended else "")
         )
     for name, value in metrics["metrics"].items():
         lines.append(f"{name:<12} {value['mean']:.4g}   {_interval(value['interval'], '.4g')}")

@@ -88,8 +88,15 @@ def name_list(names: Sequence[str], near: Iterable[str]) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number with its noun: "1 environment", "4096 environments"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+    """Return a number with its noun: "1 environment", "4,096 environments"."""
+    return f"{count} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
+def clock(seconds: float) -> str:
+    """Format seconds as `2:41` or `1:02:41`."""
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def suggest(name: str, available: Iterable[str]) -> str:

@@ -1,0 +1,443 @@
+"""Training progress: the value that decides, beside its goal.
+
+`TrainingProgress` collects what observers receive. It renders as a panel (rich, without borders),
+as a line for log files, and as the sentences that end a run. `NotebookProgress` shows the panel in one
+output of a notebook; `mjlab.scripts.display` shows it in terminals.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, ConsoleOptions, Group, RenderableType
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from mjlab.rl.evaluation import Bound, EvaluationResult, trigger_return
+from mjlab.rl.run_logger import IterationStats, TrainingObserver
+from mjlab.utils.string import clock, counted
+
+if TYPE_CHECKING:
+    from mjlab.rl.runner import MjlabOnPolicyRunner
+
+# Updates of a notebook's output take some milliseconds.
+_SECONDS_BETWEEN_OUTPUTS = 0.5
+_NOTEBOOK_WIDTH = 90
+_BARS, _ASCII_BARS = "▁▂▃▄▅▆▇█", "_.-=+*%#"
+_READINGS, _MOST_READINGS = 24, 480
+_ENDS = {"solved": "Finished", "finished": "Finished", "interrupted": "Interrupted"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressCfg:
+    """Facts about a run that its progress is compared with."""
+
+    title: str = "Training"
+    """First line: the task and the number of environments."""
+    evaluation: Mapping[str, Any]
+    """`EvaluationCfg` as a dict."""
+    step_seconds: float | None = None
+    """Duration of an environment step (s)."""
+    episode_steps: float | None = None
+    """Time limit of episodes, in environment steps."""
+    usual_iteration: int | None = None
+    """Iteration at which reference runs of this task were solved. None: unknown."""
+
+    @staticmethod
+    def of_runner(
+        runner: MjlabOnPolicyRunner, title: str = "Training", usual_iteration: int | None = None
+    ) -> ProgressCfg:
+        """Return the facts about the run of `runner`."""
+        env = runner.env
+        return ProgressCfg(
+            title=f"{title}, {counted(env.num_envs, 'environment')}",
+            evaluation=runner.cfg.get("evaluation") or {},
+            step_seconds=getattr(env.unwrapped, "step_dt", None),
+            episode_steps=getattr(env, "max_episode_length", None),
+            usual_iteration=usual_iteration,
+        )
+
+
+class TrainingProgress(TrainingObserver):
+    """State of a training run. Renders as a panel of rich; `line` and `ending` are plain text."""
+
+    shows_progress = True
+
+    def __init__(self, cfg: ProgressCfg) -> None:
+        self.stats: IterationStats | None = None
+        """Statistics of the last iteration."""
+        self.ended: str | None = None
+        """Stop reason, once training has ended."""
+        self._cfg = cfg
+        self._bounds = Bound.all_of(cfg.evaluation)
+        # Iteration and result of the last evaluations, the newest last.
+        self._evaluations: list[tuple[int, EvaluationResult]] = []
+        # Exploring return of every `_stride`-th iteration.
+        self._returns: list[float] = []
+        self._stride = 1
+        self._first = self._total = 0
+        self._started = time.perf_counter()
+        # Duration of this session until its last iteration, and until its end (s).
+        self._trained = self._spent = 0.0
+
+    def on_start(self, first_iteration: int, total_iterations: int) -> None:
+        """Start the clock."""
+        self.stats, self.ended = None, None
+        self._evaluations, self._returns, self._stride = [], [], 1
+        self._first, self._total = first_iteration, total_iterations
+        self._started = time.perf_counter()
+
+    def on_iteration(self, stats: IterationStats) -> None:
+        """Keep the statistics."""
+        self.stats, self._trained = stats, self.spent
+        if stats.iteration % self._stride == 0:
+            self._returns.append(self._exploring(stats))
+        if len(self._returns) > _MOST_READINGS:
+            # Drawn several times per second, so the work must not grow with the run.
+            self._returns, self._stride = self._returns[1::2], 2 * self._stride
+
+    def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Keep the result, and the one before for trends."""
+        self._evaluations = [*self._evaluations[-1:], (iteration, result)]
+
+    def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Replace the result of the evaluation that it confirms or not."""
+        self._evaluations[-1:] = [(iteration, result)]
+
+    def on_end(self, reason: str) -> None:
+        """Keep the stop reason and the time."""
+        self._spent = self.spent
+        self.ended = reason
+
+    # Values.
+
+    @property
+    def iteration(self) -> int:
+        """Number of finished iterations."""
+        return self._first if self.stats is None else self.stats.iteration
+
+    @property
+    def spent(self) -> float:
+        """Duration of this session (s)."""
+        return time.perf_counter() - self._started if self.ended is None else self._spent
+
+    @property
+    def left_at_most(self) -> float | None:
+        """Time until the last iteration (s), evaluations and checkpoints included, None if unknown."""
+        return self._time_until(self._total)
+
+    def _time_until(self, iteration: int) -> float | None:
+        done = self.iteration - self._first
+        return None if done == 0 else self._trained / done * max(iteration - self.iteration, 0)
+
+    @staticmethod
+    def _exploring(stats: IterationStats) -> float:
+        """Return the return of exploring episodes, the reward per step if episodes are endless."""
+        value = stats.exploring_return
+        return stats.mean_step_reward if value is None else value
+
+    def _state(self, bound: Bound) -> str:
+        """Return `met`, or the trend of the last two evaluations."""
+        *earlier, (_, result) = self._evaluations
+        if bound.is_met(result):
+            return "met"
+        if not earlier:
+            return "not met"
+        now, before = result.judged(bound.name), earlier[0][1].judged(bound.name)
+        return "rising" if now > before else "falling" if now < before else "not met"
+
+    def _next_evaluation(self) -> str | None:
+        """Return when the policy is evaluated next, None if the task has no goal."""
+        if not self._bounds or self.stats is None:
+            return None
+        cfg = self._cfg.evaluation
+        last = self._evaluations[-1][0] if self._evaluations else 0
+        after = max(last + int(cfg.get("min_interval", 3)), cfg.get("first_iteration", 0))
+        trigger = trigger_return(cfg)
+        stats = self.stats
+        # Evaluations are triggered by the return at full length, without failures.
+        at_full_length = stats.mean_step_reward * (self._cfg.episode_steps or 0.0)
+        if trigger is None or at_full_length >= trigger:
+            return f"at iteration {max(after, self.iteration + 1)}"
+        length = stats.exploring_length
+        if length is None or length == self._cfg.episode_steps:
+            return f"from exploring return {trigger:,.0f} on"
+        return (
+            f"from exploring return {trigger:,.0f} on, at full length ({at_full_length:,.0f} now)"
+        )
+
+    # Text.
+
+    def line(self) -> str:
+        """Return one line for log files."""
+        stats = self.stats
+        if stats is None:
+            return f"[{self.iteration}/{self._total}] 0:00"
+        name = "step_reward" if stats.exploring_return is None else "return"
+        parts = [f"[{stats.iteration}/{self._total}]", clock(self.spent)]
+        values = [(name, f"{number(self._exploring(stats))}(exploring)")]
+        for bound in self._bounds:
+            value = shown(bound, self._evaluations[-1][1]) if self._evaluations else "none"
+            values.append((bound.name, f"{value}/{limit(bound)}"))
+        # Without separators, for programs that read the line.
+        drop = str.maketrans("", "", " ,")
+        parts += [f"{name}={value.translate(drop)}" for name, value in values]
+        if self._evaluations:
+            parts.append(f"evaluated_at={self._evaluations[-1][0]}")
+        parts.append(f"steps/s={stats.steps_per_second:.0f}")
+        if (left := self.left_at_most) is not None:
+            parts.append(f"left_at_most={clock(left)}")
+        return " ".join(parts)
+
+    def ending(self) -> str:
+        """Return how training ended: solved, or the bounds missed and by how much."""
+        if self.ended == "failed" and self.stats is None:
+            return "Failed before the first iteration."
+        at = f"iteration {self.iteration}"
+        if self.ended != "solved":
+            at += f" of {self._total}"
+        head = _ENDS.get(self.ended or "", "Failed")
+        verdict = self._verdict()
+        if verdict and head == "Finished":
+            return f"{head}: {verdict} at {at}, {duration(self.spent)}. {self._scores()}".rstrip()
+        return f"{head} at {at}, {duration(self.spent)}. {self._scores()}".rstrip()
+
+    def _verdict(self) -> str:
+        if self.ended == "solved" or not self._bounds:
+            return self.ended if self.ended == "solved" else ""
+        met = self._evaluations and all(b.is_met(self._evaluations[-1][1]) for b in self._bounds)
+        return "all bounds met" if met else "unsolved"
+
+    def _scores(self) -> str:
+        """Return the last evaluation beside its bounds; the exploring return without evaluations."""
+        if not self._evaluations:
+            exploring = ""
+            if self.stats is not None:
+                exploring = f"Return {number(self._exploring(self.stats))}, exploring"
+            if not self._bounds:
+                return exploring and f"{exploring}."
+            upcoming = self._next_evaluation()
+            return f"{exploring}; not evaluated" + (f", due {upcoming}." if upcoming else ".")
+        iteration, result = self._evaluations[-1]
+        parts = []
+        for bound in self._bounds:
+            text = f"{label(bound.name)} {shown(bound, result)} of {limit(bound)}"
+            if bound.name != "mean_return":
+                most = "at most" if bound.is_upper else "at least"
+                text = f"{label(bound.name)} {shown(bound, result)} ({most} {limit(bound)})"
+            if not bound.is_met(result):
+                missed = abs(result.judged(bound.name) - bound.limit)
+                text += f", missed by {formatted(bound.name, missed)}"
+            parts.append(text)
+        scores = "; ".join(parts)
+        when = "" if iteration == self.iteration else f" at iteration {iteration}"
+        return f"{scores[:1].upper()}{scores[1:]}; {counted(result.num_episodes, 'episode')}{when}."
+
+    # Panel.
+
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> Iterator[RenderableType]:
+        """Render the panel: progress, the judged values beside their bounds, and speed."""
+        head = Table.grid(expand=True)
+        head.add_column()
+        head.add_column(justify="right")
+        head.add_row(Text(self._cfg.title, style="bold"), clock(self.spent))
+        yield head
+        if self.ended is not None:
+            yield Text(self.ending())
+            return
+        rows = Table.grid(padding=(0, 2))
+        rows.add_column(style="dim", no_wrap=True)
+        rows.add_column()
+        bar = Table.grid(padding=(0, 1))
+        done = ProgressBar(total=max(self._total, 1), completed=self.iteration, width=24)
+        bar.add_row(str(self.iteration), done, str(self._total))
+        rows.add_row(" iteration", bar)
+        rows.add_row("", self._time_left())
+        if self.stats is not None:
+            self._add_values(rows, self.stats, options.ascii_only)
+        rows.add_row("", Text("Ctrl-C saves, then stops.", style="dim"))
+        yield rows
+
+    def _add_values(self, rows: Table, stats: IterationStats, ascii_only: bool) -> None:
+        unit = "reward per step" if stats.exploring_return is None else "return"
+        name, value = f" {unit}", f"{number(self._exploring(stats))}, exploring"
+        by_return = [b for b in self._bounds if b.name == "mean_return"]
+        if by_return:
+            value += f"; {limit(by_return[0])} solves"
+        rows.add_row(name, value)
+        if len(self._returns) > 1:
+            rows.add_row("", sparkline(self._returns, _ASCII_BARS if ascii_only else _BARS))
+        rows.add_row(" episodes", self._episodes(stats))
+        if self._bounds:
+            rows.add_row(" last eval", self._judged())
+            rows.add_row(" next eval", self._next_evaluation())
+        share = stats.learning_time / max(stats.collection_time + stats.learning_time, 1e-9)
+        rows.add_row(
+            " speed", f"{stats.steps_per_second:,.0f} steps/s (learning takes {share:.0%})"
+        )
+
+    def _time_left(self) -> str:
+        left = self.left_at_most
+        if left is None:
+            return "starting ..."
+        text = f"at most {duration(left)} left"
+        usual = self._cfg.usual_iteration
+        if usual is None or usual > self._total:
+            return text
+        until = self._time_until(usual) if usual > self.iteration else None
+        return f"{text}; usually solved near iteration {usual}" + (
+            "" if until is None else f", in {duration(until)}"
+        )
+
+    def _episodes(self, stats: IterationStats) -> str:
+        noise = f"action noise {stats.action_std:.2f}"
+        length, step = stats.exploring_length, self._cfg.step_seconds
+        if length is None or self._cfg.episode_steps is None or step is None:
+            return noise
+        of_seconds = f"{length * step:.1f} of {self._cfg.episode_steps * step:.1f} s"
+        return f"{of_seconds}, {noise}"
+
+    def _judged(self) -> RenderableType:
+        if not self._evaluations:
+            return "none yet"
+        iteration, result = self._evaluations[-1]
+        when = f"iteration {iteration}, {counted(result.num_episodes, 'episode')}"
+        table = Table.grid(padding=(0, 2))
+        for _ in range(4):
+            table.add_column()
+        for bound in self._bounds:
+            state = self._state(bound)
+            most = "at most" if bound.is_upper else "at least"
+            table.add_row(
+                label(bound.name),
+                shown(bound, result),
+                Text(state, style="green" if state == "met" else ""),
+                f"{most} {limit(bound)}",
+            )
+        return Group(table, Text(when, style="dim"))
+
+
+class NotebookProgress(TrainingProgress):
+    """Progress in one output of a notebook, replaced while training runs."""
+
+    def __init__(self, cfg: ProgressCfg) -> None:
+        super().__init__(cfg)
+        self._output: Any = None
+        self._last_output = float("-inf")
+
+    def on_start(self, first_iteration: int, total_iterations: int) -> None:
+        """Open the output."""
+        super().on_start(first_iteration, total_iterations)
+        # Installed wherever notebooks run.
+        from IPython.display import display
+
+        self._last_output = time.perf_counter()
+        self._output = display(self._content(), raw=True, display_id=True)
+
+    def on_iteration(self, stats: IterationStats) -> None:
+        """Update the output, at most twice per second."""
+        super().on_iteration(stats)
+        if time.perf_counter() - self._last_output >= _SECONDS_BETWEEN_OUTPUTS:
+            self._update()
+
+    def on_end(self, reason: str) -> None:
+        """Replace the panel by the result."""
+        super().on_end(reason)
+        self._update()
+
+    def _update(self) -> None:
+        if self._output is not None:
+            self._output.update(self._content(), raw=True)
+        self._last_output = time.perf_counter()
+
+    def _content(self) -> dict[str, str]:
+        text = io.StringIO()
+        Console(
+            file=text,
+            width=_NOTEBOOK_WIDTH,
+            force_terminal=False,
+            force_jupyter=False,
+            color_system=None,
+        ).print(self)
+        plain = text.getvalue().rstrip()
+        style = "line-height:1.25;white-space:pre-wrap"
+        return {
+            "text/plain": plain,
+            "text/html": f'<pre style="{style}">{html.escape(plain)}</pre>',
+        }
+
+
+def in_notebook() -> bool:
+    """Return whether this process is the kernel of a notebook (Jupyter, Colab, VS Code)."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    return getattr(shell, "kernel", None) is not None
+
+
+# Formats.
+
+
+def number(value: float) -> str:
+    """Format a return: `741`, `3,704`, `7.41`."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def duration(seconds: float) -> str:
+    """Format seconds: `8.4 s`, `3:05 min`, `2:10 h`."""
+    if round(seconds, 1) < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes}:{rest:02d} min"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d} h"
+
+
+def label(name: str) -> str:
+    """Return the name of an evaluation's value in words."""
+    return "return" if name == "mean_return" else name.replace("_", " ")
+
+
+def formatted(name: str, value: float) -> str:
+    """Format a value of evaluations; rates in percent."""
+    if name in ("failure_rate", "success_rate"):
+        return f"{100.0 * value:.3g} %"
+    return number(value)
+
+
+def shown(bound: Bound, result: EvaluationResult) -> str:
+    """Format the value that `bound` judges, in full if rounding would hide that it is missed."""
+    value = result.judged(bound.name)
+    text = formatted(bound.name, value)
+    if text == limit(bound) and not bound.is_met(result):
+        return f"{100.0 * value:.6g} %" if text.endswith("%") else f"{value:.7g}"
+    return text
+
+
+def limit(bound: Bound) -> str:
+    """Format the limit of `bound`."""
+    return formatted(bound.name, bound.limit)
+
+
+def sparkline(values: list[float], bars: str = _BARS) -> str:
+    """Return a curve in characters: means of up to 24 parts of `values`, from lowest to highest."""
+    values = [value for value in values if math.isfinite(value)]
+    if not values:
+        return ""
+    parts = min(len(values), _READINGS)
+    edges = [len(values) * i // parts for i in range(parts + 1)]
+    means = [sum(values[a:b]) / (b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    low, high = min(means), max(means)
+    if high == low:
+        return bars[0] * parts
+    return "".join(bars[int((mean - low) / (high - low) * (len(bars) - 1))] for mean in means)

@@ -1,0 +1,63 @@
+"""`evaluate`: its progress and its table. `test_policy_commands.py` has the command itself."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from mjlab.scripts import evaluate
+from mjlab.scripts.evaluate import EvaluationProgress
+
+METRICS = {
+    "task": "Walk",
+    "policy": "zero",
+    "physics": "native",
+    "num_episodes": 4,
+    "num_envs": 4,
+    "mean_length": 10.0,
+    "mean_return": 1.0,
+    "return_interval": (0.0, 2.0),
+    "min_return": 0.0,
+    "max_return": 2.0,
+    "success_rate": None,
+    "failure_interval": (0.0, 0.5),
+    "metrics": {},
+    "notes": [],
+}
+
+
+@pytest.mark.parametrize(
+    ("terms", "failed", "expected"),
+    [
+        ([], 0.0, "Failures     none: the task has no termination but time limits"),
+        (["fell"], 0.0, "Failures     0.0%   95 % interval [0.0%, 50.0%]"),
+        (["fell"], 0.25, "Failures     25.0%   95 % interval [0.0%, 50.0%]   (ended by: fell 25.0%)"),
+    ],
+)  # fmt: skip
+def test_failures_are_listed_by_termination_without_time_limits(terms, failed, expected):
+    ended = {"time_out": 1.0 - failed, "fell": failed}
+    metrics = {**METRICS, "failure_rate": failed, "terminations": ended}
+    assert expected in evaluate._table(metrics, terms).splitlines()
+
+
+def test_a_terminal_shows_a_bar_and_clears_it():
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=90)
+    with EvaluationProgress(1000, console) as progress:
+        progress._last = float("-inf")
+        progress.update(250, 0.3)
+    assert "250 of 1,000 episodes" in out.getvalue()
+    # The line of the bar is erased.
+    assert out.getvalue().endswith("\x1b[2K")
+
+
+def test_elsewhere_lines_are_rare_and_go_to_stderr(capsys):
+    with EvaluationProgress(8, Console(file=io.StringIO())) as progress:
+        progress.update(1, 0.2)
+        assert capsys.readouterr() == ("", "")
+        progress._last -= 60.0
+        progress.update(2, 0.25)
+        progress.update(3, 0.4)
+    assert capsys.readouterr() == ("", "Evaluating: 25%, 2 of 8 episodes finished\n")
