@@ -1,4 +1,7 @@
-"""Swing up a pole from images alone: `uv run python examples/camera_cartpole.py`.
+"""Swing up a pole from images alone.
+
+    uv run python examples/camera_cartpole.py train Example-Camera-Cartpole --profile cpu
+    uv run python examples/camera_cartpole.py play Example-Camera-Cartpole
 
 The actor sees two frames of a camera beside the rail, 24 x 36 pixels; the critic sees the state, which is
 known in simulation. The page `docs/tutorial/camera.md` explains the steps.
@@ -12,8 +15,13 @@ import torch
 
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
-from mjlab.rl.config import RslRlModelCfg, RslRlOnPolicyRunnerCfg, gaussian_distribution
-from mjlab.scripts.train import main
+from mjlab.rl.config import (
+    EvaluationCfg,
+    RslRlModelCfg,
+    RslRlOnPolicyRunnerCfg,
+    gaussian_distribution,
+)
+from mjlab.scripts.cli import main
 from mjlab.sensor import CameraSensorCfg
 from mjlab.tasks.cartpole import cartpole_ppo_runner_cfg, cartpole_swingup_env_cfg
 from mjlab.tasks.cpu_profile import cpu_profile
@@ -89,6 +97,8 @@ def rl_cfg() -> RslRlOnPolicyRunnerCfg:
     cfg.obs_groups = {"actor": ("camera",), "critic": ("critic",)}
     cfg.experiment_name = "camera_cartpole"
     cfg.clip_actions = 1.0
+    # From the state, 900 counts as solved; from images, seed 1 reached 854 after 230 iterations.
+    cfg.evaluation = EvaluationCfg(solved_return=800.0, num_episodes=64)
     return cfg
 
 

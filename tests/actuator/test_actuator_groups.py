@@ -291,6 +291,21 @@ def test_subclass_with_its_own_law_and_parameters_is_fused(make_world):
     torch.testing.assert_close(world.ctrl, torch.stack((gains * knee, 3.0 * hip.expand(3)), 1))
 
 
+@pytest.mark.parametrize(
+    ("gain", "found"), [(torch.ones(1, 1), r"\(1, 1\)"), (torch.ones(1), r"\(1,\)"), (2.0, "2.0")]
+)
+def test_parameters_of_another_shape_are_refused(make_world, gain, found):
+    class Wrong(Soft):
+        def initialize(self, mj_model: Any, model: Any, data: Any, device: str) -> None:
+            super().initialize(mj_model, model, data, device)
+            self.gain = gain
+
+    cfg = SoftCfg(target_names_expr=("hip",), stiffness=1.0, damping=0.0)
+    cfg.kind = Wrong
+    with pytest.raises(ValueError, match=rf"Wrong of .*'hip'.* gain .*\(3, 1\).*got {found}"):
+        make_world(cfg)
+
+
 def test_subclass_with_its_own_compute_is_not_fused(make_world):
     class Halved(IdealPdActuator):
         def compute(self, cmd: ActuatorCmd) -> torch.Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
@@ -75,6 +76,22 @@ def test_assignment_is_equal_weighted_or_chosen() -> None:
 def test_weights_that_make_no_sense_are_refused(assignment, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         VariantEntityCfg(variants=BEADS, assignment=assignment)
+
+
+def test_building_checks_again_but_does_not_repeat_a_subclass() -> None:
+    calls = []
+
+    @dataclass(kw_only=True)
+    class Counting(VariantEntityCfg):
+        def __post_init__(self) -> None:
+            calls.append(self)
+
+    cfg = Counting(variants=BEADS)
+    cfg.build()
+    assert len(calls) == 1
+    cfg.assignment = {"huge": 1.0}
+    with pytest.raises(ValueError, match="assignment 'huge'"):
+        cfg.build()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.managers import CommandManager, CommandTerm, CommandTermCfg
+from mjlab.managers import CommandManager, CommandTerm, CommandTermCfg, SceneEntityCfg
 
 
 class Count(CommandTerm):
@@ -262,3 +262,22 @@ class BrokenCfg(CountCfg):
 def test_an_error_while_a_command_is_built_names_it(env):
     with pytest.raises(KeyError, match="CommandManager term 'goal': no such joint"):
         CommandManager({"goal": BrokenCfg(resampling_time_range=(1.0, 1.0))}, env)
+
+
+@dataclass(kw_only=True)
+class SelectingCfg(CountCfg):
+    asset_cfg: SceneEntityCfg
+
+
+def test_selections_in_the_config_are_resolved_before_the_command_is_built(env):
+    manager, term = make_selecting(env, "joint_b")
+    assert term.cfg.asset_cfg.joint_ids == [1]
+    with pytest.raises(ValueError, match=r"term 'goal', field 'asset_cfg'.*knee"):
+        make_selecting(env, "knee")
+
+
+def make_selecting(env, joint):
+    selection = SceneEntityCfg("robot", joint_names=joint)
+    cfg = SelectingCfg(resampling_time_range=(1.0, 1.0), asset_cfg=selection)
+    manager = CommandManager({"goal": cfg}, env)
+    return manager, manager.get_term("goal")

@@ -123,13 +123,104 @@ def test_selections_in_params_are_resolved(env, kind):
     assert asset_cfg.joint_ids == slice(None), "the caller's config must be unchanged"
 
 
-def test_selections_nested_in_containers_are_left_alone(env):
-    def nested(env, assets):
+@dataclasses.dataclass
+class Feet:
+    asset_cfg: SceneEntityCfg
+
+
+def ids_of(env, selections):
+    return env.value
+
+
+@pytest.mark.parametrize(
+    ("wrap", "unwrap"),
+    [
+        (lambda one: [one], lambda value: value[0]),
+        (lambda one: {"left": (one,)}, lambda value: value["left"][0]),
+        (lambda one: {1: one}, lambda value: value[1]),
+        (Feet, lambda value: value.asset_cfg),
+    ],
+)
+def test_selections_nested_in_params_are_resolved(env, kind, wrap, unwrap):
+    manager_class, make = kind
+    selection = SceneEntityCfg("robot", joint_names="joint_b")
+    cfg = make(ids_of, params={"selections": wrap(selection)})
+    manager = manager_class({"a": cfg}, env)
+    assert unwrap(manager.get_term_cfg("a").params["selections"]).joint_ids == [1]
+    assert selection.joint_ids == slice(None), "the caller's config must be unchanged"
+
+
+DEFAULT = SceneEntityCfg("robot", joint_names="joint_b")
+
+
+def by_default(env, asset_cfg=DEFAULT):
+    return with_asset(env, asset_cfg)
+
+
+class ByDefault:
+    def __init__(self, cfg, env):
+        pass
+
+    def __call__(self, env, *, asset_cfg=DEFAULT):
+        return with_asset(env, asset_cfg)
+
+
+@pytest.mark.parametrize("term", [by_default, ByDefault])
+def test_selections_that_are_default_arguments_are_resolved(env, kind, term):
+    manager_class, make = kind
+    manager = manager_class({"a": make(term)}, env)
+    manager.compute(**({"dt": 0.1} if manager_class is RewardManager else {}))
+    assert manager.get_term_cfg("a").params["asset_cfg"].joint_ids == [1]
+    assert DEFAULT.joint_ids == slice(None), "other environments use the default too"
+
+
+def reads_a_constant(env):
+    return env.value if DEFAULT.joint_ids else None
+
+
+class ReadsAConstant(ByDefault):
+    def __call__(self, env):
+        return env.value if DEFAULT.joint_ids else None
+
+
+def test_ids_of_a_constant_are_an_error_that_names_it(env, kind):
+    manager_class, make = kind
+    for term in (reads_a_constant, ReadsAConstant):
+        with pytest.raises(
+            ValueError, match=r"term 'a'.*DEFAULT\.joint_ids.*pass DEFAULT as a param"
+        ):
+            manager_class({"a": make(term)}, env)
+
+
+def test_other_uses_of_a_constant_are_allowed(env, kind):
+    everything = SceneEntityCfg("robot", joint_names=".*")
+
+    def names(env):
+        return env.value if DEFAULT.name and DEFAULT.joint_names else None
+
+    def all_of(env):
+        return env.value if everything.joint_ids else None
+
+    def resolves(env):
+        DEFAULT.resolve(env.scene)
+        return env.value if DEFAULT.joint_ids else None
+
+    manager_class, make = kind
+
+    def unset(env):
+        return later
+
+    manager_class({f.__name__: make(f) for f in (names, all_of, resolves, unset)}, env)
+    later = env.value
+
+
+def test_a_default_argument_that_matches_nothing_is_an_error(env, kind):
+    def knees(env, asset_cfg=SceneEntityCfg("robot", joint_names="knee")):  # noqa: B008
         return env.value
 
-    assets = [SceneEntityCfg("robot", joint_names="joint_b")]
-    manager = MetricsManager({"a": MetricsTermCfg(func=nested, params={"assets": assets})}, env)
-    assert manager.get_term_cfg("a").params["assets"][0].joint_ids == slice(None)
+    manager_class, make = kind
+    with pytest.raises(ValueError, match=r"term 'a', parameter 'asset_cfg'.*knee"):
+        manager_class({"a": make(knees)}, env)
 
 
 def test_a_selection_that_fails_names_manager_term_and_parameter(env, kind):
@@ -165,12 +256,34 @@ def test_an_unknown_term_lists_the_valid_names(env, kind):
         manager.get_term_cfg("b")
 
 
-def test_parameters_that_do_not_fit_are_refused_when_built(env, kind):
+class Reads:
+    def __init__(self, cfg, env):
+        self.std = cfg.params["std"]
+
+    def __call__(self, env, std, scale=1.0):
+        return env.value
+
+
+@pytest.mark.parametrize(
+    ("term", "params", "message"),
+    [
+        (Counter, {"stepp": 1.0}, r"Counter.*'stepp'; did you mean 'step'\? Available: \['step'\]"),
+        (with_asset, {}, r"with_asset: missing parameter 'asset_cfg'"),
+        (with_asset, {"asset": None}, r"unknown.*'asset'.*'asset_cfg'.*missing.*'asset_cfg'"),
+        (Reads, {"sdt": 1.0}, r"Reads: unknown parameter 'sdt'; did you mean 'std'"),
+        (value, {"weight": 1.0}, r"value: unknown parameter 'weight'; available: \[\]"),
+        (functools.partial(with_asset, asset_cfg=None), {"env": 1}, r"'env'"),
+    ],
+)
+def test_wrong_parameters_are_named_with_those_of_the_term(env, kind, term, params, message):
     manager_class, make = kind
-    with pytest.raises(TypeError, match=r"term 'a'.*stepp"):
-        manager_class({"a": make(Counter, params={"stepp": 1.0})}, env)
-    with pytest.raises(TypeError, match=r"term 'a'.*asset_cfg"):
-        manager_class({"a": make(with_asset)}, env)
+    with pytest.raises(TypeError, match=rf"(?s)term 'a'.*{message}"):
+        manager_class({"a": make(term, params=params)}, env)
+
+
+def test_any_parameter_fits_a_term_that_takes_any(env, kind):
+    manager_class, make = kind
+    manager_class({"a": make(lambda env, **params: env.value, params={"any": 1})}, env)
 
 
 def test_what_is_no_term_is_refused(env, kind):

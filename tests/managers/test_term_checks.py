@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
 
 from mjlab.managers import RewardManager, RewardTermCfg, SceneEntityCfg
-from mjlab.managers.term_checks import checked_when_built
+from mjlab.managers.term_checks import checked_when_built, require_entity
 
 
 @pytest.fixture
@@ -109,3 +112,11 @@ def test_an_unfilled_reward_with_a_weight_is_refused(make_env, seen, kind):
     on, error = unfilled(kind, seen)
     with pytest.raises(error, match="RewardManager term 'a': size is negative"):
         RewardManager({"a": on}, make_env())
+
+
+def test_a_sensor_is_not_an_entity():
+    scene = SimpleNamespace(entities={"robot": "a robot"}, sensors={"contact": "a sensor"})
+    env: Any = SimpleNamespace(scene=scene)
+    assert require_entity(env, "robot") == "a robot"
+    with pytest.raises(KeyError, match=r"entity 'contact'.*\['robot'\]"):
+        require_entity(env, "contact")

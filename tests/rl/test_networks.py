@@ -1,12 +1,13 @@
-"""Checks of mini-batches before training."""
+"""Checks of networks and mini-batches before training."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 
 import pytest
+from rsl_rl.models import MLPModel
 
-from mjlab.rl.config import RslRlModelCfg, RslRlPpoAlgorithmCfg
+from mjlab.rl.config import RslRlModelCfg, RslRlPpoAlgorithmCfg, gaussian_distribution
 
 RECURRENT = asdict(
     RslRlModelCfg(class_name="RNNModel", hidden_dims=(8,), rnn_type="gru", rnn_hidden_dim=8)
@@ -29,3 +30,28 @@ def test_more_mini_batches_than_data_are_refused(make_runner, networks, most):
 
 def test_a_runner_that_only_acts_takes_any_number_of_environments(make_runner):
     make_runner(num_envs=1, algorithm=algorithm(4), critic=RECURRENT)
+
+
+@pytest.mark.parametrize(
+    ("networks", "cure"),
+    [
+        ({}, r"gaussian_distribution\(\)"),
+        ({"class_name": "mjlab.rl.sac_models:SacActorModel"}, r"squashed_gaussian\(\)"),
+    ],
+)
+def test_an_actor_without_distribution_is_refused_when_built(make_runner, networks, cure):
+    actor = asdict(RslRlModelCfg(hidden_dims=(8,), **networks))
+    with pytest.raises(ValueError, match=rf"agent.actor distribution_cfg: .*None; use.*{cure}"):
+        make_runner(actor=actor)
+
+
+class OwnNoise(MLPModel):
+    """Actor of a package, with a distribution that its config does not mention."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, distribution_cfg=gaussian_distribution(), **kwargs)
+
+
+def test_an_actor_of_a_package_may_bring_its_own_distribution(make_runner):
+    actor = asdict(RslRlModelCfg(hidden_dims=(8,), class_name=f"{__name__}:OwnNoise"))
+    make_runner(actor=actor)

@@ -36,16 +36,41 @@ def options_of(model: mujoco.MjModel) -> dict:
 
 
 def test_the_config_decides_and_each_difference_is_reported_with_the_assignment(kit, xml, caplog):
-    scene = build(robot=kit.cfg(xml, 'timestep=".01" cone="elliptic" gravity="0 0 -1"/>'))
+    scene = build(robot=kit.cfg(xml, 'timestep=".01" cone="elliptic" impratio="7"/>'))
     assert reports(scene, MujocoCfg(cone="elliptic"), caplog) == [
         "Option timestep is 0.002, from MujocoCfg; to follow the XML of 'robot', "
         "set sim.mujoco.timestep = 0.01",
-        "Option gravity is (0.0, 0.0, -9.81), from MujocoCfg; to follow the XML of 'robot', "
-        "set sim.mujoco.gravity = (0.0, 0.0, -1.0)",
+        "Option impratio is 1.0, from MujocoCfg; to follow the XML of 'robot', "
+        "set sim.mujoco.impratio = 7.0",
     ]
     sim = Simulation(1, SimulationCfg(), spec=scene.spec, device="cpu")
     assert sim.mj_model.opt.timestep == 0.002
     assert sim.mj_model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+
+
+def test_gravity_of_an_xml_is_a_warning_with_the_assignment(kit, xml, caplog):
+    scene = build(robot=kit.cfg(xml, 'gravity="0 0 -1.62"/>'))
+    with pytest.warns(UserWarning, match="Gravity is .*-9.81.*, not .*-1.62.*'robot'") as seen:
+        assert reports(scene, MujocoCfg(), caplog) == []
+    sim = SimulationCfg()
+    exec(str(seen[0].message).rstrip(".").partition(", set ")[2], {"sim": sim})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert reports(scene, sim.mujoco, caplog) == []
+
+
+@pytest.mark.parametrize("gravity", ["0 0 -9.8", "0 0 -9.80665", "0 0 -9.81"])
+def test_rounding_of_gravity_is_no_warning(kit, gravity, caplog):
+    scene = build(robot=kit.cfg(kit.BOX, f'gravity="{gravity}"/>'))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert reports(scene, MujocoCfg(), caplog) == []
+
+
+def test_an_xml_that_switches_gravity_off_is_a_warning(kit, xml, caplog):
+    scene = build(robot=kit.cfg(xml, '><flag gravity="disable"/></option>'))
+    with pytest.warns(UserWarning, match="Gravity is off in the whole scene.*'robot'"):
+        reports(scene, MujocoCfg(), caplog)
 
 
 def test_the_assignment_that_is_reported_silences_the_report(kit, xml, caplog):

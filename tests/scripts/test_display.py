@@ -13,12 +13,13 @@ from commands import run_script
 from rich.console import Console
 
 from mjlab.rl.evaluation import EvaluationResult, MeanAndInterval
-from mjlab.rl.progress import ProgressCfg, clock, duration, sparkline
+from mjlab.rl.progress import ProgressCfg, duration, sparkline
 from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import display
-from mjlab.scripts.display import TrainingDisplay, next_commands, usual_iteration
+from mjlab.scripts.display import TrainingDisplay, usual_iteration
+from mjlab.scripts.results import next_commands
 from mjlab.scripts.train import TrainConfig, parse_train_flags
-from mjlab.utils.string import counted
+from mjlab.utils.string import clock, counted
 
 SWINGUP = "Mjlab-Cartpole-Swingup"
 GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"

@@ -10,18 +10,22 @@ from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 
 @pytest.mark.parametrize("command", ["train", "play"])
-def test_training_and_playing_prepare_torch_first(monkeypatch, command):
+def test_training_and_playing_prepare_torch_first(monkeypatch, tmp_path, command):
     class Prepared(Exception):
         pass
 
     def prepare(device):
         raise Prepared(device)
 
-    module = "train" if command == "train" else "environments"
-    monkeypatch.setattr(f"mjlab.scripts.{module}.prepare_torch", prepare)
+    monkeypatch.setattr("mjlab.scripts.environments.prepare_torch", prepare)
     task = "Mjlab-Cartpole-Balance"
     with pytest.raises(Prepared, match="cpu"):
         if command == "train":
-            launch_training(task, TrainConfig(load_env_cfg(task), load_rl_cfg(task), device="cpu"))
+            launch_training(
+                task,
+                TrainConfig(
+                    load_env_cfg(task), load_rl_cfg(task), device="cpu", log_root=str(tmp_path)
+                ),
+            )
         else:
             make_env(task, load_env_cfg(task), "cpu")

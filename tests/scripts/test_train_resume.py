@@ -57,7 +57,7 @@ def without_training_state(run_dir: Path) -> None:
 def test_it_has_the_environments_of_the_run_that_it_resumes(first, resume):
     outcome = resume()
     assert outcome.status == 0, outcome.err
-    assert "Resuming with 16 environments" in outcome.out
+    assert "Resuming with --num-envs 16" in outcome.out
     assert num_envs(new_run(first)) == 16
     assert "random numbers restart" not in outcome.err
 

@@ -150,6 +150,11 @@ def test_patterns_that_make_no_sense_are_refused(pattern, message):
         pattern.generate_rays(mujoco.MjModel.from_xml_string(CAMERAS), CPU)
 
 
+def test_rays_of_a_camera_need_the_model():
+    with pytest.raises(ValueError, match="camera 'eye'.*expected the compiled model, got None"):
+        PinholeCameraPatternCfg.from_mujoco_camera("eye").generate_rays(None, CPU)
+
+
 def test_an_intrinsic_matrix_of_another_shape_is_refused():
     with pytest.raises(ValueError, match="nine numbers"):
         PinholeCameraPatternCfg.from_intrinsic_matrix([1.0, 2.0], 4, 4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ from mjlab.terrains import (
     BoxFlatTerrainCfg,
     BoxPyramidStairsTerrainCfg,
     FlatPatchSamplingCfg,
+    HfRandomUniformTerrainCfg,
     SubTerrainCfg,
     TerrainGenerator,
     TerrainGeneratorCfg,
@@ -247,7 +249,7 @@ def test_a_light_shines_down_on_the_whole_grid():
 # Flat patches.
 
 
-def sampling(number: int, radius: float) -> dict[str, FlatPatchSamplingCfg]:
+def sampling(number: Any, radius: float) -> dict[str, FlatPatchSamplingCfg]:
     return {"spawn": FlatPatchSamplingCfg(num_patches=number, patch_radius=radius)}
 
 
@@ -299,6 +301,13 @@ def test_unrequested_flat_patches_are_refused():
         ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
             step_height_range=(0, 0.1), step_width=0.3, border_width=2.0)}},
          r"border_width: .* 2.0\).*got 2.0"),
+        ({"sub_terrains": {"a": BoxFlatTerrainCfg(flat_patch_sampling=sampling(0, 0.5))}},
+         r"'a' \(BoxFlatTerrainCfg\) flat_patch_sampling\['spawn'\] num_patches: .*>= 1, got 0"),
+        ({"sub_terrains": {"a": HfRandomUniformTerrainCfg(
+            noise_range=(0.0, 0.1), flat_patch_sampling=sampling(2.5, 0.5))}},
+         r"num_patches: .*got 2.5"),
+        ({"sub_terrains": {"a": BoxFlatTerrainCfg(flat_patch_sampling=sampling(3, -1.0))}},
+         r"patch_radius: .*got -1.0"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_built_is_refused_before_anything_is(fields, message):

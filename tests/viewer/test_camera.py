@@ -11,6 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from viewer_fakes import FakeEnv
 
+from mjlab.entity import EntityCfg
+from mjlab.scene import Scene, SceneCfg
+from mjlab.sim import Simulation, SimulationCfg
 from mjlab.viewer.camera import CameraView, first_moving_body, nearest_envs, resolve_camera
 from mjlab.viewer.viewer_config import OriginType, ViewerConfig
 
@@ -49,6 +52,25 @@ def test_asset_root_and_body_are_found_by_entity_and_unprefixed_name() -> None:
     assert view.body_id == POLE
     positions = np.arange(MODEL.nbody * 3).reshape(-1, 3)
     np.testing.assert_allclose(view.target(positions), positions[POLE])
+
+
+@pytest.mark.parametrize("body_name", ["hand", "grip/hand"])
+def test_a_body_of_an_attached_part_is_found_by_short_and_full_name(body_name) -> None:
+    part = mujoco.MjSpec()
+    part.worldbody.add_body(name="hand").add_geom(size=(0.1, 0.0, 0.0))
+
+    def spec_fn() -> mujoco.MjSpec:
+        spec = mujoco.MjSpec()
+        base = spec.worldbody.add_body(name="base")
+        spec.attach(part.copy(), prefix="grip/", frame=base.add_frame())
+        return spec
+
+    scene = Scene(SceneCfg(entities={"robot": EntityCfg(spec_fn=spec_fn)}, num_envs=1), "cpu")
+    sim = Simulation(1, SimulationCfg(), scene.compile(), "cpu")
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    cfg = ViewerConfig(origin_type=OriginType.ASSET_BODY, body_name=body_name)
+    view = resolve_camera(cfg, sim.mj_model, scene.entities)
+    assert view.body_id == sim.mj_model.body("robot/grip/hand").id
 
 
 def test_the_entity_may_be_left_out_where_the_scene_has_exactly_one() -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 from viewer_fakes import FakeEnv
 
+from mjlab.utils.errors import UnknownNameError
 from mjlab.viewer import OffscreenRenderer, RenderingUnavailableError, ViewerConfig
 from mjlab.viewer.offscreen_renderer import open_renderer
 from mjlab.viewer.viewer_config import OriginType
@@ -161,8 +162,9 @@ class TestPictures:
         side = picture(env, camera="side")
         assert differs(side, picture(env))
         assert not differs(side, picture(env, camera=0))
-        with pytest.raises(KeyError, match=r"'top'.*\['side'\]"):
-            picture(env, camera="top")
+        for unknown in ("top", 1, -1):
+            with pytest.raises(UnknownNameError, match=rf"'{unknown}'.*\['side'\]"):
+                picture(env, camera=unknown)
 
     def test_neighbors_are_drawn_with_their_own_state(self) -> None:
         env = FakeEnv(2)

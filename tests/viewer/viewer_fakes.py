@@ -132,7 +132,7 @@ class FakeEnv:
         origins[:, 0] = 3.0 * torch.arange(num_envs)
         cartpole = SimpleNamespace(
             body_names=("cart", "pole"),
-            indexing=SimpleNamespace(root_body_id=self.sim.mj_model.body("cartpole/cart").id),
+            indexing=SimpleNamespace(root_body_id=2, body_ids=torch.tensor([2, 3])),
         )
         self.scene = SimpleNamespace(
             entities={"terrain": SimpleNamespace(body_names=("terrain",)), "cartpole": cartpole},

@@ -89,7 +89,7 @@ class _FusedGroup:
         self.source = as_columns(sources.tolist(), device)
         self.ctrl = as_columns(ctrl_ids.tolist(), device)
         self.params = {
-            name: torch.cat([getattr(actuator, name) for actuator in self.actuators], dim=1)
+            name: torch.cat([_parameter(actuator, name) for actuator in self.actuators], dim=1)
             for name in self.actuators[0].param_names
         }
         widths = [len(actuator.target_ids) for actuator in self.actuators]
@@ -110,3 +110,15 @@ class _FusedGroup:
             cmd = ActuatorCmd(*delay_rows(self.line, targets, env_ids), cmd.pos, cmd.vel)
         ctrl = first.control_law(self.params, cmd)
         write_columns(data.data.ctrl, self.ctrl, ctrl, env_ids)
+
+
+def _parameter(actuator: IdealPdActuator, name: str) -> torch.Tensor:
+    """Return a parameter; raises `ValueError` unless it is a tensor, (N, n)."""
+    value, expected = getattr(actuator, name, None), tuple(actuator.stiffness.shape)
+    if not isinstance(value, torch.Tensor) or value.shape != expected:
+        found = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
+        raise ValueError(
+            f"{type(actuator).__name__} of {actuator.target_names} {name} (in param_names): expected a "
+            f"tensor of shape {expected} after initialize, got {found}."
+        )
+    return value

@@ -157,8 +157,8 @@ class VariantEntity(Entity):
 
     def __init__(self, cfg: VariantEntityCfg) -> None:
         """Build and merge all variants. Raises as `VariantEntityCfg.build`."""
-        # The config may have changed since construction.
-        cfg.__post_init__()
+        # The config may have changed since construction; subclasses' methods are not repeated.
+        VariantEntityCfg.__post_init__(cfg)
         names = tuple(cfg.variants)
         if not names:
             raise ValueError(

@@ -15,6 +15,7 @@ import torch
 from mjlab.envs import env_state
 from mjlab.envs.divergence import DivergenceLog
 from mjlab.envs.mdp.events import reset_scene_to_default
+from mjlab.envs.placement import PlacementReport
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
     ActionManager,
@@ -47,6 +48,7 @@ from mjlab.managers import (
 )
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
+from mjlab.utils.config_fields import check_fields_exist
 from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
@@ -159,6 +161,7 @@ class ManagerBasedRlEnv(Tabular):
             variant_info=self.scene.collect_variant_info(),
         )
         self.scene.initialize(self.sim.mj_model, self.sim.model, self.sim.data)
+        self.scene.check_terrain_scans(self.sim.mj_model)
         self.sim.add_forward_callback(self.scene.invalidate_sensor_caches)
         if self.scene.sensor_context is not None:
             self.sim.set_sensor_context(self.scene.sensor_context)
@@ -172,6 +175,7 @@ class ManagerBasedRlEnv(Tabular):
         self.diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._divergence_log = DivergenceLog(self.sim)
+        self._placement = PlacementReport(self.scene)
         # Elapsed time of commands in a step with resets. Allocated here, because tensors created under
         # `inference_mode` lack the version counter that `Lookup` needs.
         self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
@@ -335,6 +339,7 @@ class ManagerBasedRlEnv(Tabular):
         if seed is not None:
             self.seed(seed)
         self._clear_extras()
+        self._placement.begin(resets=True)
         stepped = env_ids[self.episode_length_buf[env_ids] > 0]
         if len(stepped) > 0:
             self.recorder_manager.record_pre_reset(stepped)
@@ -347,6 +352,7 @@ class ManagerBasedRlEnv(Tabular):
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
         self.recorder_manager.record_post_reset(env_ids)
+        self._placement.end()
         return self.obs_buf, self.extras
 
     def step(self, action: torch.Tensor) -> VecEnvStepReturn:
@@ -403,6 +409,7 @@ class ManagerBasedRlEnv(Tabular):
                 "not reset; call env.reset(env_ids=...) first, or set auto_reset=True in the config."
             )
         self._clear_extras()
+        self._placement.begin()
         self.action_manager.process_action(action)
         self._run_physics()
         self.episode_length_buf += 1
@@ -448,6 +455,7 @@ class ManagerBasedRlEnv(Tabular):
         else:
             self._pending_reset |= self.reset_buf
         self.recorder_manager.record_post_step()
+        self._placement.end()
         return (
             self.obs_buf,
             self.reward_buf,
@@ -675,8 +683,10 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     """Check config values that would otherwise fail late.
 
     Raises:
-        ValueError: invalid value; the message names the field, the value and the allowed values.
+        ValueError: invalid value, or an attribute with a misspelled field name; the message names
+            the field, the value and the allowed values.
     """
+    check_fields_exist(type(cfg).__name__, cfg)
     check_count("scene.num_envs", cfg.scene.num_envs)
     check_count("decimation", cfg.decimation)
     timestep = cfg.sim.mujoco.timestep

@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import torch
 
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import check_real, check_term
+from mjlab.managers.term_checks import check_constants, check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
 from mjlab.utils.state import SKIP, plain_scalar, stateful
+from mjlab.utils.string import suggest
 from mjlab.utils.tables import Table, Tabular, function_name
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
 logger = logging.getLogger(__name__)
+_BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 T = TypeVar("T")
 TermT = TypeVar("TermT")
 
@@ -205,35 +207,41 @@ class ManagerBase(Tabular, ABC):
         self._make_callable(name, cfg, leading)
 
     def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
-        """Resolve the top-level `SceneEntityCfg` parameters in the scene."""
+        """Resolve the `SceneEntityCfg` parameters in the scene, also those within containers."""
         for key, value in cfg.params.items():
-            if isinstance(value, SceneEntityCfg):
-                with label_errors(f"{self._label(name)}, parameter {key!r}"):
-                    value.resolve(self._env.scene)
+            self._resolve_selections(f"{self._label(name)}, parameter {key!r}", value)
+
+    def _resolve_selections(self, label: str, value: Any) -> None:
+        """Resolve every `SceneEntityCfg` in a dict, list, tuple or dataclass, in place."""
+        if isinstance(value, SceneEntityCfg):
+            with label_errors(label):
+                value.resolve(self._env.scene)
+            return
+        if isinstance(value, (list, tuple)):
+            inner = list(enumerate(value))
+        else:
+            inner = list(value.items()) if isinstance(value, dict) else _items(value) or ()
+        for key, item in inner:
+            self._resolve_selections(f"{label}[{key!r}]", item)
 
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Replace a class by its instance, and check that the term is callable."""
+        """Replace a class by its instance, and check that the term is callable.
+
+        Default values of parameters that select elements by name become parameters, resolved.
+        """
+        label = self._label(name)
         if inspect.isclass(cfg.func):
-            with label_errors(self._label(name)):
-                cfg.func = cfg.func(cfg=cfg, env=self._env)
-            if not callable(cfg.func):
-                raise WrongTypeError(
-                    f"{self._label(name)}: {type(cfg.func).__name__} has no __call__."
-                )
-        try:
-            signature = inspect.signature(cfg.func)
-        except (ValueError, TypeError):
-            signature = None
+            cfg.func = self._construct(label, cfg, leading)
+        signature = _signature(cfg.func)
         if signature is not None:
-            try:
-                signature.bind(*leading, **cfg.params)
-            except TypeError as error:
-                function = getattr(cfg.func, "__qualname__", type(cfg.func).__name__)
-                raise WrongTypeError(
-                    f"{self._label(name)}: {function}{signature} cannot be called with "
-                    f"({', '.join(leading)}) and the parameters {list(cfg.params)}: {error}."
-                ) from error
-        with label_errors(self._label(name)):
+            check_params(label, cfg.func, signature, leading, cfg.params)
+            for key, parameter in signature.parameters.items():
+                default = parameter.default
+                if isinstance(default, SceneEntityCfg) and default.selects_names:
+                    cfg.params.setdefault(key, copy.deepcopy(default))
+            self._resolve_params(name, cfg)
+        with label_errors(label):
+            check_constants(cfg.func, self._env)
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):
             # Plain classes have run-time state too. Types not created by a class statement, such as
@@ -241,6 +249,23 @@ class ManagerBase(Tabular, ABC):
             with contextlib.suppress(TypeError):
                 stateful(type(cfg.func))
             self._class_terms[name] = cfg.func
+
+    def _construct(self, label: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> Any:
+        """Return the instance of a class-based term."""
+        cls = cfg.func
+        try:
+            with label_errors(label):
+                term = cls(cfg=cfg, env=self._env)
+        except (KeyError, TypeError):
+            # Constructors read `cfg.params` too; name the wrong parameter, if that is the cause.
+            call = getattr(cls, "__call__", None)  # noqa: B004
+            signature = _signature(call)
+            if signature is not None:
+                check_params(label, cls, signature, ("self", *leading), cfg.params)
+            raise
+        if not callable(term):
+            raise WrongTypeError(f"{label}: {cls.__name__} has no __call__.")
+        return term
 
     def _evaluate(self, name: str, cfg: ManagerTermBaseCfg) -> torch.Tensor:
         """Call a term. Raises unless it returns a real tensor with one value per environment."""
@@ -334,6 +359,8 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
 
     def _prepare_terms(self) -> None:
         for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
+            for key, value in _items(term_cfg) or ():
+                self._resolve_selections(f"{self._label(name)}, field {key!r}", value)
             with label_errors(self._label(name)):
                 term = term_cfg.build(self._env)
             if not isinstance(term, self._term_type):
@@ -377,6 +404,53 @@ def label_errors(label: str) -> Generator[None]:
             kind = next(k for k in (KeyError, TypeError, ValueError) if isinstance(error, k))
             labeled = kind(message)
         raise labeled from error
+
+
+def check_params(
+    label: str,
+    function: Any,
+    signature: inspect.Signature,
+    leading: Sequence[str],
+    params: Mapping[str, Any],
+) -> None:
+    """Raise `TypeError` unless a term can be called with its parameters.
+
+    The message names each wrong or missing parameter and lists those of the term.
+
+    Args:
+        label: Name of the term.
+        function: Function, instance or class of the term.
+        signature: Signature of the call.
+        leading: Names of the positional arguments before the parameters.
+        params: Parameters of the term's config.
+    """
+    try:
+        signature.bind(*leading, **params)
+        return
+    except TypeError as error:
+        cause = error
+    owner = getattr(function, "__qualname__", type(function).__name__)
+    parameters = signature.parameters.values()
+    positional = [p.name for p in parameters if p.kind is not p.KEYWORD_ONLY][: len(leading)]
+    accepted = [p for p in parameters if p.kind in _BY_NAME and p.name not in positional]
+    names = [p.name for p in accepted]
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    faults = [] if takes_any else [
+        f"unknown parameter {name!r}; {suggest(name, names)}" for name in params if name not in names
+    ]  # fmt: skip
+    faults += [
+        f"missing parameter {p.name!r}; got {list(params)}."
+        for p in accepted
+        if p.default is p.empty and p.name not in params
+    ]
+    raise WrongTypeError(f"{label} params of {owner}: {' '.join(faults) or cause}") from cause
+
+
+def _signature(function: Any) -> inspect.Signature | None:
+    try:
+        return inspect.signature(function)
+    except (ValueError, TypeError):
+        return None
 
 
 # Config edits.

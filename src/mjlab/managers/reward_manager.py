@@ -146,14 +146,14 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         else:
             return
 
-        def build_and_call(env: Any, **params: Any) -> Any:
+        def build_and_call(env: Any, **_: Any) -> Any:
             cfg.func = func
             try:
                 build_now(name, cfg, leading)
             except Exception:
                 cfg.func = build_and_call
                 raise
-            return cfg.func(env, **params)
+            return cfg.func(env, **cfg.params)
 
         cfg.func = build_and_call
 

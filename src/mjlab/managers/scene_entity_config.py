@@ -117,6 +117,11 @@ class SceneEntityCfg:
             setattr(self, f"{kind}_names", names)
             setattr(self, f"{kind}_ids", ids)
 
+    @property
+    def selects_names(self) -> bool:
+        """True if the selection has patterns of names."""
+        return any(getattr(self, f"{kind}_names") is not None for kind in _FINDERS)
+
     def empty_selections(self) -> list[str]:
         """Return the fields of names, such as `geom_names`, that explicitly select nothing."""
         fields = [f"{kind}_names" for kind in _FINDERS]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import inspect
 import math
 from collections.abc import Callable
 from numbers import Real
@@ -9,10 +12,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
-from mjlab.sensor import ContactSensor
-from mjlab.utils.errors import WrongTypeError, check_exists
+from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.sensor import ContactSensor, RayCastSensor
+from mjlab.sensor.terrain_scan import check_terrain_scan
+from mjlab.utils.errors import UnknownNameError, WrongTypeError, check_exists
 
 if TYPE_CHECKING:
+    from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -44,7 +50,42 @@ def check_term(function: Any, env: ManagerBasedRlEnv, params: dict[str, Any]) ->
         check(env, **params)
 
 
+def check_constants(function: Any, env: ManagerBasedRlEnv) -> None:
+    """Check that a term does not read ids of a `SceneEntityCfg` that is not a parameter.
+
+    Managers resolve parameters only: the ids of a module constant, or of a variable outside the
+    function, select all elements. Raises `ValueError` if its names select others.
+    """
+    call = function if inspect.isroutine(function) else type(function).__call__
+    call = inspect.unwrap(getattr(call, "__func__", call))
+    if not inspect.isfunction(call) or "resolve" in call.__code__.co_names:
+        return
+    try:
+        outside = inspect.getclosurevars(call)
+    except ValueError:
+        # An enclosing function has not assigned a variable yet.
+        return
+    for name, value in {**outside.globals, **outside.nonlocals}.items():
+        if not isinstance(value, SceneEntityCfg) or not value.selects_names:
+            continue
+        resolved = copy.deepcopy(value)
+        with contextlib.suppress(KeyError, ValueError):
+            resolved.resolve(env.scene)
+        for ids in (field for field in call.__code__.co_names if field.endswith("_ids")):
+            if getattr(resolved, ids, None) != getattr(value, ids, None):
+                raise ValueError(
+                    f"{call.__qualname__} {name}.{ids}: expected a resolved selection, got one that "
+                    f"selects all elements of {value.name!r}; pass {name} as a parameter of the term."
+                )
+
+
 # Scene and commands.
+
+
+def require_entity(env: ManagerBasedRlEnv, name: str) -> Entity:
+    """Return an entity of the scene; raises `KeyError`, also for the name of a sensor."""
+    check_exists("entity", name, env.scene.entities, UnknownNameError)
+    return env.scene.entities[name]
 
 
 def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:
@@ -88,6 +129,16 @@ def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any
     threshold = params.get("force_threshold", 0.0)
     if not threshold >= 0.0:
         raise ValueError(f"force_threshold: expected a force >= 0 (N), got {threshold!r}.")
+
+
+def check_height_scan(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
+    """Check that the rays of a term that measures heights meet the ground and not their robot.
+
+    Sensors of other classes are not checked. Raises `ValueError`; see `check_terrain_scan`.
+    """
+    sensor = env.scene[sensor_name]
+    if isinstance(sensor, RayCastSensor):
+        check_terrain_scan(sensor, env.sim.mj_model)
 
 
 def require_command(env: ManagerBasedRlEnv, name: str | None) -> None:

@@ -24,6 +24,7 @@ from mjlab.utils.errors import check_positive
 from mjlab.utils.string import counted
 
 _MODELS = ("actor", "critic", "student", "teacher")
+_PACKAGES = ("mjlab", "rsl_rl")
 _SAC_MODELS = {"actor": SacActorModel, "critic": TwinCriticModel}
 _RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 _CNN_EXAMPLE = (
@@ -88,6 +89,7 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
             "agent.student distribution_cfg: expected a distribution, got None; use "
             "gaussian_distribution(0.1), with the standard deviation of the actions in training."
         )
+    check_actor_distribution(cfg)
     shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
     images = {
         model: _check_model(observations, cfg, model)
@@ -100,6 +102,23 @@ def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
             "algorithm.share_cnn_encoders: expected actor and critic with image encoders for the same "
             f"groups, got {actor or 'none'} for the actor and {critic or 'none'} for the critic; use "
             "the same image groups in obs_groups and a CNN class for both, or share_cnn_encoders=False."
+        )
+
+
+def check_actor_distribution(cfg: Mapping[str, Any]) -> None:
+    """Raise `ValueError` if rsl_rl's or mjlab's algorithms would train a deterministic actor.
+
+    Networks and algorithms of other packages may do without `distribution_cfg`.
+    """
+    actor = cfg.get("actor")
+    if not isinstance(actor, dict) or actor.get("distribution_cfg") is not None:
+        return
+    model, algorithm = (resolve_callable(part["class_name"]) for part in (actor, cfg["algorithm"]))
+    if all(part.__module__.partition(".")[0] in _PACKAGES for part in (model, algorithm)):
+        example = "squashed_gaussian()" if model is SacActorModel else "gaussian_distribution()"
+        raise ValueError(
+            "agent.actor distribution_cfg: expected a distribution to explore with, got None; use "
+            f"RslRlModelCfg(distribution_cfg={example}), with the function of mjlab.rl.config."
         )
 
 

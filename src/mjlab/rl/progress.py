@@ -23,7 +23,7 @@ from rich.text import Text
 
 from mjlab.rl.evaluation import Bound, EvaluationResult, trigger_return
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
-from mjlab.utils.string import counted
+from mjlab.utils.string import clock, counted
 
 if TYPE_CHECKING:
     from mjlab.rl.runner import MjlabOnPolicyRunner
@@ -390,13 +390,6 @@ def in_notebook() -> bool:
 def number(value: float) -> str:
     """Format a return: `741`, `3,704`, `7.41`."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
-def clock(seconds: float) -> str:
-    """Format seconds as `2:41` or `1:02:41`."""
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def duration(seconds: float) -> str:

@@ -30,6 +30,7 @@ from mjlab.sensor import (
     SensorCfg,
     SensorContext,
 )
+from mjlab.sensor.terrain_scan import check_terrain_scan
 from mjlab.sim.config import MujocoCfg
 from mjlab.sim.engine import Stage
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
@@ -45,6 +46,9 @@ TERRAIN = "terrain"
 # Options that `MujocoCfg` overrides, and its flags. Flags are added to those of the XML.
 _OVERRIDDEN = frozenset(field.name for field in dataclasses.fields(MujocoCfg)) - set(BIT_FIELDS)
 _FLAGS = ("disableflags", "enableflags")
+
+# Relative difference of values of standard gravity, such as 9.8, 9.80665 and 9.81 m/s^2.
+_GRAVITY_TOLERANCE = 2e-3
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +77,7 @@ class SceneCfg:
 class Scene(Tabular):
     """Terrain, entities and sensors composed into one `MjSpec`. `initialize` binds a simulation."""
 
-    _transient = {"_env_origins", "_device", "_updated_sensors"}
+    _transient = {"_env_origins", "_device", "_updated_sensors", "origins_were_read"}
 
     def __init__(self, scene_cfg: SceneCfg, device: str) -> None:
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
@@ -117,6 +121,8 @@ class Scene(Tabular):
             scene_cfg.spec_fn(self._spec)
             self.entity_options = drop_overridden(self._spec.option, self.entity_options)
         add_key(self._spec, [entity.initial_state for entity in self._entities.values()])
+        self.origins_were_read = False
+        """True after a read of `env_origins`, until it is set to False."""
         self._env_origins = torch.zeros(scene_cfg.num_envs, 3, dtype=torch.float32, device=device)
 
     # Composition.
@@ -233,6 +239,7 @@ class Scene(Tabular):
     @property
     def env_origins(self) -> torch.Tensor:
         """World positions of the environment origins (m), (N, 3)."""
+        self.origins_were_read = True
         return self._env_origins if self._terrain is None else self._terrain.env_origins
 
     @property
@@ -290,6 +297,16 @@ class Scene(Tabular):
         if self._cfg.spec_fn is not None:
             stated["SceneCfg.spec_fn"] = stated_options(self._spec)
         report_overruled(cfg, stated, self.entity_options)
+
+    def check_terrain_scans(self, mj_model: mujoco.MjModel) -> None:
+        """Check that terrain scans see the ground, and not their robot. Call after `initialize`.
+
+        Raises:
+            ValueError: the geom groups of a scan do not fit; see `check_terrain_scan`.
+        """
+        for sensor in self._sensors.values():
+            if isinstance(sensor, RayCastSensor) and sensor.scans_terrain:
+                check_terrain_scan(sensor, mj_model)
 
     # Life cycle.
 
@@ -499,7 +516,8 @@ def report_overruled(
 ) -> None:
     """Log options that `cfg` overrides, one line each with the assignment to copy.
 
-    Flags that XMLs set in addition to those of `cfg` apply, and are logged too.
+    Flags that XMLs set in addition to those of `cfg` apply, and are logged too. Gravity that an XML
+    changes is a `UserWarning`.
 
     Args:
         cfg: Options in force.
@@ -511,7 +529,9 @@ def report_overruled(
             if name not in _OVERRIDDEN:
                 continue
             current, wanted = getattr(cfg, name), _config_value(name, value)
-            if not np.array_equal(np.asarray(current), np.asarray(wanted)):
+            if name == "gravity":
+                _report_gravity(source, current, wanted)
+            elif not np.array_equal(np.asarray(current), np.asarray(wanted)):
                 _report(source, name, current, wanted)
         for name in _FLAGS:
             bits, known = options.switches.get(name, (0, 0))
@@ -525,17 +545,25 @@ def report_overruled(
             flag for flag in flag_names(name, requests[name].value) if flag not in current
         )
         if added:
-            sources = [f"the XML of {entity!r}" for entity in requests[name].entities]
-            adding = [
-                s
-                for s in sources
-                if set(flag_names(name, stated[s].switches[name][0])) & set(added)
-            ]
+            setters = {
+                source: flag_names(name, stated[source].switches[name][0])
+                for source in (f"the XML of {entity!r}" for entity in requests[name].entities)
+            }
             logger.warning(
                 "Option %s is %r, from MujocoCfg, plus %r, from %s (applied to the whole scene); "
                 "to configure it, set sim.mujoco.%s = %r",
-                name, current, added, " and ".join(adding), name, current + added,
+                name, current, added,
+                " and ".join(source for source in setters if set(setters[source]) & set(added)),
+                name, current + added,
             )  # fmt: skip
+            if name == "disableflags" and "gravity" in added:
+                sources = " and ".join(s for s, flags in setters.items() if "gravity" in flags)
+                warnings.warn(
+                    f"Gravity is off in the whole scene, because of {sources}; remove its flag "
+                    'gravity="disable", or use gravcomp="1" on bodies without weight.',
+                    UserWarning,
+                    stacklevel=4,
+                )
 
 
 def _report(source: str, name: str, current: Any, wanted: Any) -> None:
@@ -543,6 +571,20 @@ def _report(source: str, name: str, current: Any, wanted: Any) -> None:
         "Option %s is %r, from MujocoCfg; to follow %s, set sim.mujoco.%s = %r",
         name, current, source, name, wanted,
     )  # fmt: skip
+
+
+def _report_gravity(source: str, current: Any, wanted: Any) -> None:
+    """Warn about gravity of an XML that the config overrides; log differences of rounding only."""
+    difference = np.linalg.norm(np.subtract(current, wanted))
+    if difference > _GRAVITY_TOLERANCE * max(np.linalg.norm(current), np.linalg.norm(wanted)):
+        warnings.warn(
+            f"Gravity is {tuple(current)} m/s^2, from MujocoCfg, not {wanted} of {source}; to follow "
+            f"it, set sim.mujoco.gravity = {wanted}.",
+            UserWarning,
+            stacklevel=5,
+        )
+    elif difference > 0.0:
+        logger.info("Option gravity is %s, from MujocoCfg, not %s of %s.", current, wanted, source)
 
 
 def show(name: str, value: Any) -> str:

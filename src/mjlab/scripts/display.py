@@ -1,17 +1,14 @@
-"""Terminal display of training: live panel, or plain lines for log files; list of results."""
+"""Terminal display of training: live panel, or plain lines for log files."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import shlex
 import stat
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
@@ -27,27 +24,16 @@ from mjlab.rl.progress import (
     number,
 )
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
-from mjlab.scripts.flags import prepare_env_cfg
-from mjlab.scripts.policy import policy_env_cfg
-from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.scripts.reference import DATA, Kind, Reference, reference_path, referenced_tasks
-from mjlab.sim.warning_log import mujoco_warnings
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
-from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
-    from mjlab.envs import ManagerBasedRlEnv
     from mjlab.scripts.run_folder import NewRunFolder
     from mjlab.scripts.train_config import TrainConfig
 
 # Period of plain lines, for log files.
 _SECONDS_BETWEEN_LINES = 5.0
 _UPDATES_PER_SECOND = 4
-_LOG_ROOT = "logs/rsl_rl"
-# Flags that change the inputs and outputs of the policy, so `play` and `evaluate` need them as well.
-_POLICY_FLAGS = ("--env.observations.", "--env.actions.")
-# Flags that select the run to resume.
-_RESUME_FLAGS = ("--agent.resume", "--agent.load-run", "--agent.load-checkpoint")
 
 
 def show_training(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder) -> None:
@@ -186,91 +172,3 @@ class KeepRunFolder(TrainingObserver):
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Keep the folder."""
         self._folder.keep()
-
-
-def report_divergence(env: ManagerBasedRlEnv) -> None:
-    """Print the number of diverged environments, and MuJoCo's warnings."""
-    episodes = int(env.nan_resets.sum())
-    if episodes > 0:
-        environments = int((env.nan_resets > 0).sum())
-        print(
-            f"Diverged: the physics of {environments} of {counted(env.num_envs, 'environment')}, in "
-            f"{counted(episodes, 'episode')} (Simulation/nan_resets)"
-        )
-    for kind, times in mujoco_warnings().items():
-        print(f"MuJoCo warned {counted(times, 'time')}: {kind}")
-
-
-def write_results(
-    task: str, cfg: TrainConfig, run_dir: Path, device: str, ended: str | None = None
-) -> None:
-    """Plot the learning curve, record the trained policy if `cfg.result_video`, and list the files.
-
-    The last lines are commands for the next step, which depend on the stop reason `ended`.
-    """
-    from mjlab.rl.checkpoint import latest_checkpoint
-    from mjlab.rl.plot import plot_run
-
-    # A run solved at resume has no iterations.
-    with contextlib.suppress(ValueError):
-        plot_run(run_dir, run_dir / "learning_curve.png", title=task)
-    checkpoint = latest_checkpoint(run_dir)
-    if cfg.result_video and checkpoint is not None:
-        from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
-
-        env_cfg = policy_env_cfg(task, cfg.profile, purpose="play")
-        prepare_env_cfg(task, None, env_cfg, checkpoint)
-        try:
-            video = VideoCfg(profile=cfg.profile)
-            record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
-        except RenderingUnavailableError as error:
-            print(f"No video: {error}")
-    print(f"Saved in {_short(run_dir)}:")
-    for pattern in ("model_*.pt", "*.onnx", "*.png", "videos/**/*.mp4"):
-        files = sorted(run_dir.glob(pattern), key=lambda path: path.stat().st_mtime)
-        if files:
-            print(f"    {files[-1].relative_to(run_dir)}")
-    print("Next:")
-    for line in next_commands(task, cfg, run_dir, ended):
-        print(f"    {line}")
-
-
-def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None) -> list[str]:
-    """Return the commands that watch, score and, if interrupted, resume the run in `run_dir`."""
-    from mjlab.rl.checkpoint import latest_checkpoint
-
-    flags = [] if cfg.log_root == _LOG_ROOT else ["--log-root", cfg.log_root]
-    typed = [*flags]
-    # The commands look for the newest policy in the experiment of the task.
-    if cfg.agent.experiment_name != load_rl_cfg(task).experiment_name:
-        typed = [*flags, "--agent.experiment-name", cfg.agent.experiment_name]
-        flags = ["--checkpoint-file", str(_short(latest_checkpoint(run_dir) or run_dir))]
-    words = sys.argv
-    # Not the flags of other commands that train, such as `verify`.
-    if task in words and Path(words[words.index(task) - 1]).stem == "train":
-        typed = words[words.index(task) + 1 :]
-        flags += _picked(typed, lambda name: name.startswith(_POLICY_FLAGS))
-        typed = _picked(typed, lambda name: name not in _RESUME_FLAGS)
-    commands = [["play", task, *flags], ["evaluate", task, *flags]]
-    if ended == "interrupted":
-        commands.insert(0, ["train", task, *typed, "--agent.resume", "True"])
-    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
-    return [join(["uv", "run", *command]) for command in commands]
-
-
-def _picked(flags: list[str], picks: Callable[[str], bool]) -> list[str]:
-    """Return the flags of a command line, with their values, whose names `picks` accepts."""
-    picked: list[str] = []
-    is_picked = False
-    for word in flags:
-        if word.startswith("--"):
-            is_picked = picks(word.partition("=")[0].replace("_", "-"))
-        if is_picked:
-            picked.append(word)
-    return picked
-
-
-def _short(path: Path) -> Path:
-    """Return `path` relative to the working folder if it is inside."""
-    path = path.resolve()
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -14,6 +14,7 @@ from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.rl.learners import learner_of
 from mjlab.scripts.flags import options_of
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls, task_source
+from mjlab.utils.config_fields import check_fields_exist
 from mjlab.utils.processes import ProcessRank, cores_per_process
 from mjlab.utils.random import seed_rng
 from mjlab.utils.torch import prepare_torch
@@ -52,6 +53,7 @@ def make_env(
 
 def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank) -> Any:
     """Return the wrapped training environment; with `--video`, record clips into `run_dir`."""
+    prepare_torch(device)
     records = cfg.video and rank.is_first
     with _reserve_learner_core(cfg, device, rank):
         env: Any = ManagerBasedRlEnv(
@@ -91,7 +93,12 @@ def _reserve_learner_core(cfg: TrainConfig, device: str, rank: ProcessRank) -> G
 def training_runner(
     task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str
 ) -> rl.MjlabOnPolicyRunner:
-    """Return the runner of `task`, with newly initialized networks."""
+    """Return the runner of `task`, with newly initialized networks.
+
+    Raises:
+        ValueError: the agent config does not fit the environments, or has a misspelled field.
+    """
+    check_fields_exist(type(cfg.agent).__name__, cfg.agent)
     runner_cls: Any = load_runner_cls(task) or rl.MjlabOnPolicyRunner
     if cfg.agent.logger == "wandb":
         add_wandb_tags(cfg.agent.wandb_tags)

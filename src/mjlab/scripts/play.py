@@ -21,7 +21,6 @@ from mjlab.scripts.policy import (
 from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.scripts.run_folder import is_run_folder
 from mjlab.utils.errors import UserError, check_count
-from mjlab.utils.string import counted
 from mjlab.utils.torch import threads_for_policy
 from mjlab.viewer.base import run_headless
 from mjlab.viewer.page_server import check_address, open_browser
@@ -111,12 +110,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         with threads_for_policy(policy, env.num_envs, device):
             if cfg.viewer == "none" and cfg.num_steps is not None:
-                result = run_headless(env, policy, cfg.num_steps)
-                print(
-                    f"{counted(result.num_steps, 'step')} in {counted(env.num_envs, 'environment')}, "
-                    f"{counted(result.num_episodes, 'episode')} ended, mean reward per step "
-                    f"{result.mean_step_reward:.4f}"
-                )
+                print(run_headless(env, policy, cfg.num_steps).summary(env.num_envs))
             else:
                 viewer = _make_viewer(task, cfg, env, policy, checkpoint, device)
                 viewer.run(num_steps=cfg.num_steps)

@@ -20,7 +20,6 @@ from mjlab.utils.logging import print_notice
 from mjlab.utils.os import get_checkpoint_path, get_wandb_checkpoint_path
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import draw_seed
-from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.rl import MjlabOnPolicyRunner
@@ -180,7 +179,7 @@ def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
         )
         return
     scene.num_envs = count
-    print(f"Resuming with {counted(count, 'environment')}, as before; --num-envs overrides.")
+    print(f"Resuming with --num-envs {count}, as before; --num-envs overrides.")
 
 
 def choose_seed(checkpoint: Path | None) -> int:

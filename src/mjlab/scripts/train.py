@@ -47,8 +47,6 @@ from mjlab.scripts.run_folder import (
 )
 from mjlab.scripts.train_config import TrainConfig, check_flags, check_typed_flags
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
-from mjlab.utils.string import counted
-from mjlab.utils.torch import prepare_torch
 
 __getattr__ = older_names(__name__)
 
@@ -99,7 +97,6 @@ def launch_training(task: str, cfg: TrainConfig) -> Path:
     with output_of(rank):
         device = training_device(cfg, rank)
     with joined_processes(device), output_of(rank) as output:
-        prepare_torch(device)
         with fail_together():
             check_flags(cfg)
         return _train(task, cfg, device, rank, output)
@@ -112,7 +109,7 @@ def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
 ) -> Path:
     # Imports rsl_rl, which takes seconds; flags are checked before.
-    from mjlab.scripts.display import report_divergence, write_results
+    from mjlab.scripts.results import print_heading, report_divergence, write_results
 
     # One process looks up the checkpoint, before the new run folder could be found.
     checkpoint = broadcast_from_first(lambda: checkpoint_to_resume(task, cfg))
@@ -134,11 +131,7 @@ def _train(
             prepare_env_cfg(task, cfg, cfg.env, checkpoint, fetched_from)
             env = training_env(cfg, device, folder.path, rank)
         try:
-            under = f", profile {cfg.profile}" if cfg.profile else ""
-            under += "" if cfg.learner_name == "ppo" else f", learner {cfg.learner_name}"
-            each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
-            print(f"Task:    {task}, {counted(env.num_envs, 'environment')}{each}{under}")
-            print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
+            print_heading(task, cfg, env, rank)
             with fail_together():
                 runner = training_runner(task, cfg, env, folder.path, device)
                 if checkpoint is not None:

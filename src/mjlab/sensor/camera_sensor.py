@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from mjlab.sim.engine import (
     Images,
     rendered_geoms,
 )
-from mjlab.utils.errors import WrongStateError, check_count, check_one_of
+from mjlab.utils.errors import WrongStateError, check_count
 from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
@@ -113,9 +114,12 @@ class CameraSensor(Sensor[CameraSensorData]):
         for field, allowed in (
             ("data_types", CAMERA_DATA_TYPES), ("enabled_geom_groups", range(NUM_GEOM_GROUPS)),
         ):  # fmt: skip
-            # An empty tuple, with nothing to render, is not allowed either.
-            for value in getattr(cfg, field) or ((),):
-                check_one_of(f"{owner} {field}", value, allowed)
+            values = getattr(cfg, field)
+            is_set = isinstance(values, Collection) and len(values) > 0
+            if not is_set or any(value not in allowed for value in values):
+                raise ValueError(
+                    f"{owner} {field}: expected at least one of {list(allowed)}, got {values!r}."
+                )
         is_perspective = not cfg.orthographic and cfg.camera_name is None
         limit = _MAX_FOVY if is_perspective else math.inf
         if cfg.fovy is not None and not 0.0 < cfg.fovy < limit:

@@ -100,7 +100,8 @@ class PinholeCameraPatternCfg:
         """Return zero offsets and directions; ray `row * width + column`.
 
         Raises:
-            ValueError: image without pixels, field of view outside (0, 180), or unknown camera.
+            ValueError: image without pixels, field of view outside (0, 180), unknown camera, or a
+                camera without `mj_model`.
         """
         width, height, half_x, half_y, center = self._image_plane(mj_model)
         if width < 1 or height < 1:
@@ -121,7 +122,10 @@ class PinholeCameraPatternCfg:
         """Return image width and height (pixels), half extents and center at distance 1."""
         width, height, fovy = self.width, self.height, self.fovy
         if self._camera_name is not None:
-            assert mj_model is not None
+            if mj_model is None:
+                raise ValueError(
+                    f"Rays of camera {self._camera_name!r}: expected the compiled model, got None."
+                )
             names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
             check_exists("camera", self._camera_name, names)
             camera = names.index(self._camera_name)

@@ -5,12 +5,15 @@ Data has N environments, F frames and n rays per frame; ray `f n + r` is ray r o
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 import mujoco
+import numpy as np
 import torch
 
 from mjlab.compat import older_names
@@ -273,6 +276,17 @@ class RayCastSensor(Sensor[RayCastData]):
         bodies = self._frames.body_ids if self.cfg.exclude_parent_body else [-1] * self.num_frames
         return [body for body in bodies for _ in range(self.num_rays_per_frame)]
 
+    @property
+    def frame_bodies(self) -> list[int]:
+        """Id of the body of each frame."""
+        return self._frames.body_ids
+
+    @property
+    def scans_terrain(self) -> bool:
+        """True if all rays point straight down, however the frame tilts."""
+        down = torch.tensor([0.0, 0.0, -1.0], device=self._local_directions.device)
+        return self.cfg.ray_alignment != "base" and bool((self._local_directions == down).all())
+
     # Sensing.
 
     def update(self, dt: float) -> None:
@@ -296,6 +310,26 @@ class RayCastSensor(Sensor[RayCastData]):
         if self._moving_directions:
             rays = self._directions.unflatten(1, shape)
             _rotate_into(rays, self._local_directions, mat, alignment)
+
+    def rays_in_pose(self, host: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """Return origins and unit directions of the rays, (F, n, 3) each, in the pose of `host`."""
+        device, alignment = self._offsets.device, self.cfg.ray_alignment
+        fields = {
+            name: np.array(getattr(host, name), dtype=np.float32).reshape(1, -1, *shape)
+            for names in _FRAMES.values()
+            for name, shape in zip(names, ((3,), (3, 3)), strict=True)
+        }
+        frames = copy.copy(self._frames)
+        frames.bind(
+            SimpleNamespace(**{name: torch.tensor(v, device=device) for name, v in fields.items()})
+        )
+        pos, mat = self._frame_pos[:1].clone(), self._frame_mat[:1].clone()
+        frames.read(pos, mat)
+        shape = (1, self.num_frames, self.num_rays_per_frame, 3)
+        origins, directions = (torch.zeros(shape, device=device) for _ in range(2))
+        _rotate_into(origins, self._offsets, mat, alignment, pos)
+        _rotate_into(directions, self._local_directions, mat, alignment)
+        return origins[0].cpu().double().numpy(), directions[0].cpu().double().numpy()
 
     def raycast_kernel(self, rc: Callable[..., tuple[torch.Tensor, ...]]) -> None:
         """Cast only the prepared rays of this sensor, with `rc`: `Simulation.raycast`."""
@@ -399,6 +433,10 @@ class _Frames:
                     torch.tensor([ids[i] for i in places], device=device),
                 )
             )
+
+    def bind(self, data: Any) -> None:
+        """Read poses from other data fields."""
+        self._data = data
 
     def read(self, pos: torch.Tensor, mat: torch.Tensor) -> None:
         """Copy current positions into `pos` (N, F, 3) and orientations into `mat` (N, F, 3, 3)."""

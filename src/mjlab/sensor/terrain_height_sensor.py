@@ -81,6 +81,11 @@ class TerrainHeightSensor(RayCastSensor):
         self._ground = OneSidedGround(mj_model, data, self.include_geom_groups, device)
 
     @property
+    def scans_terrain(self) -> bool:
+        """True: heights are those of the ground."""
+        return True
+
+    @property
     def data(self) -> TerrainHeightData:
         """Current sensor data."""
         data = super().data

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.compat import older_names
+from mjlab.utils.config_fields import check_fields_exist
 from mjlab.utils.errors import MjlabError, UnknownNameError
 from mjlab.utils.string import suggest
 
@@ -116,6 +117,7 @@ def load_env_cfg(
         UnknownTaskError: unknown task.
         UnknownProfileError: unknown profile.
         TaskImportError: importing the config's function by name failed.
+        ValueError: an attribute set on the config has a misspelled field name.
     """
     if profile is not None:
         return _with_profile(task_name, profile, play)[0]
@@ -142,7 +144,8 @@ def load_rl_cfg(
 
     Raises:
         UnknownTaskError, UnknownProfileError, TaskImportError: see `load_env_cfg`.
-        ValueError: the learner is unknown, or does not support the networks or observations of the task.
+        ValueError: the learner is unknown, or does not support the networks or observations of the
+            task; or an attribute set on the config has a misspelled field name.
     """
     from mjlab.rl.learners import for_task_of, learner_of, with_learner
 
@@ -285,6 +288,8 @@ def _with_profile(
             f"{owner} experiment_name: expected {experiment!r}, got {rl_cfg.experiment_name!r}; "
             "runs of the task are found by this name."
         )
+    for cfg in (env_cfg, rl_cfg):
+        check_fields_exist(type(cfg).__name__, cfg)
     # Copied, because a profile may return a module constant.
     return env_cfg, rl_cfg if rl_cfg is task_cfg else copy.deepcopy(rl_cfg), task_cfg
 
@@ -306,7 +311,10 @@ def _make_cfg(task_name: str, source: Any, **kwargs: Any) -> Any:
         accepted = inspect.signature(source).parameters
         kwargs = {name: value for name, value in kwargs.items() if name in accepted}
     # Return values of functions are copied too, because they may contain module constants.
-    return copy.deepcopy(source(**kwargs) if callable(source) else source)
+    cfg = copy.deepcopy(source(**kwargs) if callable(source) else source)
+    # Checked here, because command lines build a new config from the fields.
+    check_fields_exist(type(cfg).__name__, cfg)
+    return cfg
 
 
 def _resolve(task_name: str, value: Any) -> Any:

@@ -301,6 +301,10 @@ def check_generator(cfg: TerrainGeneratorCfg) -> None:
                 f"{owner} border_width: expected a length in [0, {side / 2}) m (less than half the "
                 f"sub-terrain), got {border}."
             )
+        for key, patch in (sub.flat_patch_sampling or {}).items():
+            field = f"{owner} flat_patch_sampling[{key!r}]"
+            check_count(f"{field} num_patches", patch.num_patches)
+            check_in_range(f"{field} patch_radius", patch.patch_radius, 0.0, math.inf)
 
 
 def check_output(output: TerrainOutput, patches: dict[str, np.ndarray]) -> None:

@@ -92,6 +92,13 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count:,} {noun}s"
 
 
+def clock(seconds: float) -> str:
+    """Format seconds as `2:41` or `1:02:41`."""
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
 def suggest(name: str, available: Iterable[str]) -> str:
     """Return a hint for an unknown `name`: "did you mean 'y'? Available: ['x', 'y']."."""
     names = list(available)

@@ -27,6 +27,7 @@ import torch
 from mjlab.compat import older_names
 from mjlab.utils.errors import check_count, check_positive
 from mjlab.utils.signals import first_interrupt_calls
+from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -443,6 +444,14 @@ class HeadlessResult:
     """Reward per step, averaged over steps and environments."""
     num_episodes: int
     """Number of episodes that ended, over all environments."""
+
+    def summary(self, num_envs: int) -> str:
+        """Return the result of `num_envs` environments in one line."""
+        return (
+            f"{counted(self.num_steps, 'step')} in {counted(num_envs, 'environment')}, "
+            f"{counted(self.num_episodes, 'episode')} ended, mean reward per step "
+            f"{self.mean_step_reward:.4f}"
+        )
 
 
 def run_headless(

@@ -140,7 +140,11 @@ def _followed_body(
     name: Any = only if cfg.entity_name is None else cfg.entity_name
     use = f"for origin_type {cfg.origin_type.name}"
     check_one_of(f"viewer.entity_name {use}", name, entities)
+    entity = entities[name]
     if cfg.origin_type is OriginType.ASSET_ROOT:
-        return int(entities[name].indexing.root_body_id)
-    check_one_of(f"viewer.body_name {use} of {name!r}", cfg.body_name, entities[name].body_names)
-    return model.body(f"{name}/{cfg.body_name}").id
+        return int(entity.indexing.root_body_id)
+    bodies = dict(zip(entity.body_names, entity.indexing.body_ids.tolist(), strict=True))
+    # Names of bodies in attached parts may include the prefix of the part.
+    bodies |= {model.body(i).name.removeprefix(f"{name}/"): i for i in bodies.values()}
+    check_one_of(f"viewer.body_name {use} of {name!r}", cfg.body_name, bodies)
+    return bodies[cfg.body_name]

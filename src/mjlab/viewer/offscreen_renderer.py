@@ -18,7 +18,13 @@ import mujoco
 import numpy as np
 
 from mjlab.utils import graphics
-from mjlab.utils.errors import MjlabError, WrongStateError, check_count
+from mjlab.utils.errors import (
+    MjlabError,
+    UnknownNameError,
+    WrongStateError,
+    check_count,
+    check_exists,
+)
 from mjlab.viewer.camera import nearest_envs, resolve_camera
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import (
@@ -160,7 +166,7 @@ class OffscreenRenderer:
 
         Raises:
             RuntimeError: `initialize` has not been called.
-            KeyError, IndexError: Unknown camera.
+            KeyError: Unknown camera; the message suggests close names.
         """
         scene = self.renderer.scene
         origins = self._scene.env_origins
@@ -168,7 +174,7 @@ class OffscreenRenderer:
         self._load(data, env_idx)
         move_sun(self._model, self._data, self._view.target(self._data.xpos))
         self._view.apply(self._camera, self._data.xpos)
-        shown = self._camera if camera is None else self._model.camera(camera).id
+        shown = self._camera if camera is None else self._camera_id(camera)
         self.renderer.update_scene(self._data, camera=shown, scene_option=self._option)
         if debug_vis_callback is not None and self._visualizer is not None:
             self._visualizer.begin(env_idx, show_all_envs=False)
@@ -197,6 +203,13 @@ class OffscreenRenderer:
             self._renderer.close()
             self._renderer = None
             self._visualizer = None
+
+    def _camera_id(self, camera: str | int) -> int:
+        names = [self._model.camera(i).name for i in range(self._model.ncam)]
+        if camera in range(len(names)):
+            return int(camera)
+        check_exists("camera", str(camera), names, UnknownNameError)
+        return names.index(str(camera))
 
     def _load(self, data: Any, env_idx: int) -> None:
         # Read from the simulation at every frame: fields may have been expanded since the last.

@@ -273,6 +273,11 @@ def test_an_object_that_cannot_move_is_refused_unless_it_stays():
     lifting_command(env, object_pose_range=None)
 
 
+def test_an_object_that_is_not_in_the_scene_is_refused():
+    with pytest.raises(KeyError, match=r"entity 'cueb'; did you mean 'cube'"):
+        lifting_command(entity_name="cueb")
+
+
 def test_the_config_builds_the_term():
     env = StandInEnv()
     cfg = LiftingCommandCfg(entity_name="cube", resampling_time_range=(1.0, 1.0))

@@ -461,9 +461,10 @@ def test_what_does_not_fit_is_refused_when_the_task_is_built(changes, message):
     assert "CommandManager term 'motion'" in str(caught.value)
 
 
-def test_an_unknown_entity_is_named_with_those_of_the_scene():
-    with pytest.raises(KeyError, match="CommandManager term 'motion': .*'dog'.*'robot'"):
-        ManagerBasedRlEnv(task_cfg(entity_name="dog"), device="cpu")
+@pytest.mark.parametrize("name", ["dog", "self_collision"])
+def test_what_is_no_entity_is_named_with_those_of_the_scene(name):
+    with pytest.raises(KeyError, match=f"CommandManager term 'motion': .*'{name}'.*'robot'"):
+        ManagerBasedRlEnv(task_cfg(entity_name=name), device="cpu")
 
 
 def test_a_motion_of_another_rate_is_refused_when_the_task_is_built(tmp_path):

@@ -100,7 +100,7 @@ def with_long_quaternion() -> np.ndarray:
         ),
         (
             {"joint_pos": SQUAT.joint_pos[0]},
-            r"joint_pos: expected numbers \(29, joints\), got .* \(29,\)",
+            r"joint_pos: expected numbers \(frames, joints\), got .* \(29,\)",
         ),
         (
             {"body_quat_w": SQUAT.body_pos_w[:10]},
@@ -219,5 +219,5 @@ def test_motions_that_are_not_there_are_told(text, message):
 
 
 def test_a_folder_without_motions_is_told(tmp_path):
-    with pytest.raises(MotionFileError, match="a folder with motions"):
+    with pytest.raises(MotionFileError, match=r"Folder .*expected motions \(.npz\), got none"):
         find_motions(str(tmp_path))

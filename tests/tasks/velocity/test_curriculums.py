@@ -221,7 +221,8 @@ def test_stages_change_no_config_that_others_hold(make_env):
     ("stage", "message"),
     [
         ({"lin_vel_x": (0.0, 1.0)}, "with 'step'"),
-        ({"step": 7, "lin_vel": (0.0, 1.0)}, "'lin_vel'; did you mean 'lin_vel"),
+        ({"step": 7, "lin_vel": (0.0, 1.0)}, r"\(step 7\) 'lin_vel'; did you mean 'lin_vel"),
+        ({"step": 7, "lin_vel_X": None}, r"\(step 7\) 'lin_vel_X'; did you mean"),
         ({"step": 7, "ang_vel_z": (1.0, -1.0)}, "ang_vel_z of the stage of step 7"),
     ],
 )

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from stand_ins import StandInEnv, velocity_command, yaw_quat
 
 from mjlab.tasks.velocity.mdp import UniformVelocityCommandCfg
+from mjlab.utils.errors import UnknownNameError
 
 ALL = torch.arange(8)
 shares = st.floats(0.0, 1.0)
@@ -333,11 +334,12 @@ def test_what_makes_no_sense_is_refused_when_the_command_is_built(fields, messag
         velocity_command(**fields)
 
 
-def test_an_entity_that_does_not_exist_is_refused_with_those_that_do(make_env):
+@pytest.mark.parametrize("name", ["robto", "feet_ground_contact"])
+def test_what_is_no_entity_is_refused_with_those_that_exist(make_env, name):
     def edit(cfg):
-        cfg.commands["twist"].entity_name = "robto"
+        cfg.commands["twist"].entity_name = name
 
-    with pytest.raises(KeyError, match="'twist': .*'robto'.*'terrain', 'robot'"):
+    with pytest.raises(UnknownNameError, match=rf"'twist': .*'{name}'.*\['terrain', 'robot'\]"):
         make_env(edit=edit)
 
 

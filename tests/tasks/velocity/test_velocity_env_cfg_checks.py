@@ -56,6 +56,15 @@ def test_a_sensor_that_observations_need_is_named_too(make_env, group, term):
         make_env(edit=edit)
 
 
+def test_clearance_without_heights_or_sites_asks_for_its_height_sensor(make_env):
+    def edit(cfg):
+        params = params_of(cfg, "foot_clearance")
+        del params["height_sensor_name"], params["asset_cfg"]
+
+    with pytest.raises(TypeError, match="'foot_clearance': .*missing .*'height_sensor_name'"):
+        make_env(edit=edit)
+
+
 def test_a_sensor_of_another_kind_is_refused_with_those_of_the_right_one(make_env):
     def edit(cfg):
         params_of(cfg, "foot_slip")["sensor_name"] = "foot_height_scan"

@@ -93,3 +93,6 @@ def test_what_is_not_known_yet_is_a_dash_and_titles_are_text() -> None:
     assert "<strong>Mean reward:</strong> —" in content
     assert "&lt;b&gt;" in content
     assert "7 s old" in content
+    assert "1:02:05 left" in content
+    day = progress_html("", STATS | {"time_left": 93_784.0}, age=0.0)
+    assert "26:03:04 left" in day

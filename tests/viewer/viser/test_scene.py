@@ -209,6 +209,10 @@ def test_groups_are_named_by_their_geoms(viser_server) -> None:
         <geom size=".1" group="2" contype="0" conaffinity="0"/>
         <geom size=".1" group="3"/>
         <geom size=".1" group="3" contype="0" conaffinity="0"/>
+        <geom size=".1" group="7"/>
+        <site group="2"/>
+        <site group="6"/>
+        <site group="-1"/>
       </body>
     </worldbody></mujoco>""")
     assert geom_group_meanings(model) == {
@@ -222,3 +226,4 @@ def test_groups_are_named_by_their_geoms(viser_server) -> None:
         if hasattr(handle, "label")
     }
     assert "Visual (group 2)" in boxes
+    assert {label for label in boxes if label.startswith("Group ")} == {"Group 2"}

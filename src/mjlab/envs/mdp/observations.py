@@ -12,6 +12,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.term_checks import check_height_scan, checked_when_built
 from mjlab.sensor.builtin_sensor import BuiltinSensor
 from mjlab.utils.errors import WrongTypeError, check_exists
 from mjlab.utils.indexing import as_columns
@@ -130,6 +131,7 @@ def projected_gravity_from_sensor(env: ManagerBasedRlEnv, sensor_name: str) -> t
     return -builtin_sensor(env, sensor_name)
 
 
+@checked_when_built(check_height_scan)
 def height_scan(
     env: ManagerBasedRlEnv,
     sensor_name: str,

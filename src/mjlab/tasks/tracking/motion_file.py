@@ -231,7 +231,8 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     sizes: dict[str | int, int] = {3: 3, 4: 4}
     for key, axes in _ARRAYS.items():
         value = arrays[key]
-        sizes = dict(zip(axes, value.shape, strict=False)) | sizes
+        if value.ndim == len(axes):
+            sizes = dict(zip(axes, value.shape, strict=True)) | sizes
         expected = tuple(sizes.get(axis, axis) for axis in axes)
         if value.dtype.kind not in "fiu" or value.shape != expected:
             shape = ", ".join(map(str, expected))

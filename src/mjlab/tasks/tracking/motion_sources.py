@@ -48,13 +48,15 @@ def find_motions(text: str) -> list[Path]:
     for part in filter(None, _parts_of(text)):
         path = Path(part).expanduser()
         found = sorted(path.glob("*.npz")) if os.path.isdir(path) else [path]
-        if not os.path.exists(path):
-            found = [shipped[part]] if part in shipped else []
         if not found:
-            raise MotionFileError(
-                f"Unknown motion {part!r}; use a file, a folder with motions (.npz), or a bundled "
-                f"motion: {suggest(part, shipped)}"
-            )
+            raise MotionFileError(f"Folder {path}: expected motions (.npz), got none.")
+        if not os.path.exists(path):
+            if part not in shipped:
+                raise MotionFileError(
+                    f"Unknown motion {part!r}; use a file, a folder with motions (.npz), or a "
+                    f"bundled motion: {suggest(part, shipped)}"
+                )
+            found = [shipped[part]]
         files += found
     if not files:
         raise MotionFileError(

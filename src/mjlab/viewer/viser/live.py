@@ -5,9 +5,9 @@ from __future__ import annotations
 import html
 import time
 from collections.abc import Callable, Mapping
-from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
+from mjlab.utils.string import clock
 from mjlab.viewer.viser.viewer import ViserPlayViewer
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def progress_html(title: str, stats: Stats | None, age: float) -> str:
         f'<div style="width:{100.0 * done / max(total, 1):.1f}%;height:6px;background:#1c7ed6;'
         'border-radius:2px"></div></div>'
     )
-    time_left = timedelta(seconds=int(max(stats["time_left"], 0.0)))
+    time_left = clock(max(stats["time_left"], 0.0))
     rows = [
         ("Iteration", f"{done:,} of {total:,}"),
         ("Mean reward", _number(stats["mean_reward"])),

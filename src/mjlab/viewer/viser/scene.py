@@ -267,7 +267,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
                     label = f"{meaning} (group {group})"
                     self._add_group_switch(label, self.geom_groups_visible, group)
             for title, groups, visible in others:
-                used = sorted({int(group) for group in groups})
+                used = _groups_in_use(groups)
                 if used and used != [0]:
                     with self.server.gui.add_folder(title):
                         for group in used:
@@ -362,7 +362,7 @@ def geom_group_meanings(model: mujoco.MjModel) -> dict[int, str]:
     bodies = [model.body(int(body)).name for body in model.geom_bodyid]
     is_ground = np.array([name in ("world", "terrain") for name in bodies], dtype=bool)
     meanings: dict[int, str] = {}
-    for group in sorted({int(group) for group in model.geom_group}):
+    for group in _groups_in_use(model.geom_group):
         geoms = model.geom_group == group
         parts = {
             "Terrain": (geoms & is_ground).any(),
@@ -371,6 +371,11 @@ def geom_group_meanings(model: mujoco.MjModel) -> dict[int, str]:
         }
         meanings[group] = " and ".join(name for name, found in parts.items() if found).capitalize()
     return meanings
+
+
+def _groups_in_use(groups: np.ndarray) -> list[int]:
+    """Return the groups in use that MuJoCo can hide; models may use others."""
+    return sorted({int(group) for group in groups} & set(range(mujoco.mjNGROUP)))
 
 
 class GeomVariants:

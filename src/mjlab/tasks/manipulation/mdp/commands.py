@@ -15,7 +15,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.term_checks import check_range
+from mjlab.managers.term_checks import check_range, require_entity
 from mjlab.tasks.manipulation.mdp.goal_panel import GoalPanel
 from mjlab.utils.errors import check_one_of, check_positive
 from mjlab.utils.lab_api.math import sample_ranges
@@ -394,7 +394,7 @@ def check_pose_range(within: Any) -> None:
 
 def require_object(env: ManagerBasedRlEnv, name: str, is_moved: bool) -> Entity:
     """Return the entity `name`; raises `ValueError` if it has a fixed base and `is_moved`."""
-    entity: Entity = env.scene[name]
+    entity = require_entity(env, name)
     if is_moved and entity.is_fixed_base:
         raise ValueError(
             f"Entity {name!r}: expected a floating base, got a fixed base; give its root body a "

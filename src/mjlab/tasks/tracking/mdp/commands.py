@@ -14,7 +14,7 @@ import torch
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.lookup import Lookup
-from mjlab.managers.term_checks import check_range
+from mjlab.managers.term_checks import check_range, require_entity
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
     MotionReader,
@@ -564,7 +564,7 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
         ValueError: fixed base, a tracked body not found, or the first tracked body is not the
             floating base.
     """
-    robot: Entity = env.scene[cfg.entity_name]
+    robot = require_entity(env, cfg.entity_name)
     if robot.is_fixed_base:
         raise ValueError(
             f"Entity {cfg.entity_name!r}: expected a floating base, got a fixed base; give its "

@@ -126,8 +126,9 @@ def _check_stages(
         if "step" not in stage:
             raise ValueError(f"velocity_stages: expected a stage with 'step', got {dict(stage)}.")
         for key, bounds in stage.items():
+            kind = f"range in velocity_stages (step {stage['step']})"
+            check_exists(kind, key, ("step", *RANGES))
             if key != "step" and bounds is not None:
-                check_exists("range in velocity_stages", key, RANGES)
                 check_range(f"velocity_stages: {key} of the stage of step {stage['step']}", bounds)
 
 

@@ -338,25 +338,20 @@ def feet_air_time(
     return if_commanded(swinging.sum(dim=1).float(), env, command_name, command_threshold)
 
 
-def _check_feet(
+def _check_clearance(
     env: ManagerBasedRlEnv,
-    sensor_name: str = "",
-    height_sensor_name: str | None = None,
+    height_sensor_name: str,
     command_name: str | None = None,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
     **_: Any,
 ) -> None:
-    """Check the command, and that contacts or heights are those of the selected sites."""
     require_command(env, command_name)
-    if height_sensor_name is None:
-        source = contact_columns(env, sensor_name)
-    else:
-        source = height_columns(env, height_sensor_name)
-    check_same_feet(env, source, site_columns(env, asset_cfg))
+    heights = height_columns(env, height_sensor_name)
+    check_same_feet(env, heights, site_columns(env, asset_cfg))
 
 
 @accepts_older_params
-@checked_when_built(_check_feet)
+@checked_when_built(_check_clearance)
 def feet_clearance(
     env: ManagerBasedRlEnv,
     target_height: float,
@@ -463,7 +458,18 @@ class feet_swing_height:
         self.peak_heights[slice(None) if env_ids is None else env_ids] = 0.0
 
 
-@checked_when_built(_check_feet)
+def _check_slip(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    command_name: str,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+    **_: Any,
+) -> None:
+    require_command(env, command_name)
+    check_same_feet(env, contact_columns(env, sensor_name), site_columns(env, asset_cfg))
+
+
+@checked_when_built(_check_slip)
 def feet_slip(
     env: ManagerBasedRlEnv,
     sensor_name: str,

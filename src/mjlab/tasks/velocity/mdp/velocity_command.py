@@ -11,7 +11,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.term_checks import check_range
+from mjlab.managers.term_checks import check_range, require_entity
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
 from mjlab.utils.errors import check_field, check_in_range
 from mjlab.utils.indexing import as_ids, is_empty
@@ -160,7 +160,7 @@ class UniformVelocityCommand(CommandTerm):
         # Copy the ranges, because curricula edit them at run time.
         super().__init__(dataclasses.replace(cfg, ranges=dataclasses.replace(cfg.ranges)), env)
         check_command_cfg(cfg)
-        self.robot: Entity = env.scene[cfg.entity_name]
+        self.robot: Entity = require_entity(env, cfg.entity_name)
         is_possible = cfg.init_velocity_prob == 0.0 or not self.robot.is_fixed_base
         check_field(cfg, "init_velocity_prob", is_possible, "0 for an entity with a fixed base")
         self.vel_command_b = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)

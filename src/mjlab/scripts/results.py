@@ -1,0 +1,127 @@
+"""Lines printed before and after training, and the files written at its end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjlab.scripts.flags import prepare_env_cfg
+from mjlab.scripts.policy import policy_env_cfg
+from mjlab.scripts.record import VideoCfg, record_policy
+from mjlab.sim.warning_log import mujoco_warnings
+from mjlab.tasks.registry import load_rl_cfg
+from mjlab.utils.string import counted
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.scripts.train_config import TrainConfig
+    from mjlab.utils.processes import ProcessRank
+
+_LOG_ROOT = "logs/rsl_rl"
+# Flags that change the inputs and outputs of the policy, so `play` and `evaluate` need them as well.
+_POLICY_FLAGS = ("--env.observations.", "--env.actions.")
+# Flags that select the run to resume.
+_RESUME_FLAGS = ("--agent.resume", "--agent.load-run", "--agent.load-checkpoint")
+
+
+def print_heading(task: str, cfg: TrainConfig, env: Any, rank: ProcessRank) -> None:
+    """Print the task, the number of environments and the physics."""
+    under = f", profile {cfg.profile}" if cfg.profile else ""
+    under += "" if cfg.learner_name == "ppo" else f", learner {cfg.learner_name}"
+    each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
+    print(f"Task:    {task}, {counted(env.num_envs, 'environment')}{each}{under}")
+    print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
+
+
+def report_divergence(env: ManagerBasedRlEnv) -> None:
+    """Print the number of diverged environments, and MuJoCo's warnings."""
+    episodes = int(env.nan_resets.sum())
+    if episodes > 0:
+        environments = int((env.nan_resets > 0).sum())
+        print(
+            f"Diverged: the physics of {environments} of {counted(env.num_envs, 'environment')}, in "
+            f"{counted(episodes, 'episode')} (Simulation/nan_resets)"
+        )
+    for kind, times in mujoco_warnings().items():
+        print(f"MuJoCo warned {counted(times, 'time')}: {kind}")
+
+
+def write_results(
+    task: str, cfg: TrainConfig, run_dir: Path, device: str, ended: str | None = None
+) -> None:
+    """Plot the learning curve, record the trained policy if `cfg.result_video`, and list the files.
+
+    The last lines are commands for the next step, which depend on the stop reason `ended`.
+    """
+    from mjlab.rl.checkpoint import latest_checkpoint
+    from mjlab.rl.plot import plot_run
+
+    # A run solved at resume has no iterations.
+    with contextlib.suppress(ValueError):
+        plot_run(run_dir, run_dir / "learning_curve.png", title=task)
+    checkpoint = latest_checkpoint(run_dir)
+    if cfg.result_video and checkpoint is not None:
+        from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
+
+        env_cfg = policy_env_cfg(task, cfg.profile, purpose="play")
+        prepare_env_cfg(task, None, env_cfg, checkpoint)
+        try:
+            video = VideoCfg(profile=cfg.profile)
+            record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
+        except RenderingUnavailableError as error:
+            print(f"No video: {error}")
+    print(f"Saved in {_short(run_dir)}:")
+    for pattern in ("model_*.pt", "*.onnx", "*.png", "videos/**/*.mp4"):
+        files = sorted(run_dir.glob(pattern), key=lambda path: path.stat().st_mtime)
+        if files:
+            print(f"    {files[-1].relative_to(run_dir)}")
+    print("Next:")
+    for line in next_commands(task, cfg, run_dir, ended):
+        print(f"    {line}")
+
+
+def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None) -> list[str]:
+    """Return the commands that watch, score and, if interrupted, resume the run in `run_dir`."""
+    from mjlab.rl.checkpoint import latest_checkpoint
+
+    flags = [] if cfg.log_root == _LOG_ROOT else ["--log-root", cfg.log_root]
+    typed = [*flags]
+    # The commands look for the newest policy in the experiment of the task.
+    if cfg.agent.experiment_name != load_rl_cfg(task).experiment_name:
+        typed = [*flags, "--agent.experiment-name", cfg.agent.experiment_name]
+        flags = ["--checkpoint-file", str(_short(latest_checkpoint(run_dir) or run_dir))]
+    words = sys.argv
+    # Not the flags of other commands that train, such as `verify`.
+    if task in words and Path(words[words.index(task) - 1]).stem == "train":
+        typed = words[words.index(task) + 1 :]
+        flags += _picked(typed, lambda name: name.startswith(_POLICY_FLAGS))
+        typed = _picked(typed, lambda name: name not in _RESUME_FLAGS)
+    commands = [["play", task, *flags], ["evaluate", task, *flags]]
+    if ended == "interrupted":
+        commands.insert(0, ["train", task, *typed, "--agent.resume", "True"])
+    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
+    return [join(["uv", "run", *command]) for command in commands]
+
+
+def _picked(flags: list[str], picks: Callable[[str], bool]) -> list[str]:
+    """Return the flags of a command line, with their values, whose names `picks` accepts."""
+    picked: list[str] = []
+    is_picked = False
+    for word in flags:
+        if word.startswith("--"):
+            is_picked = picks(word.partition("=")[0].replace("_", "-"))
+        if is_picked:
+            picked.append(word)
+    return picked
+
+
+def _short(path: Path) -> Path:
+    """Return `path` relative to the working folder if it is inside."""
+    path = path.resolve()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

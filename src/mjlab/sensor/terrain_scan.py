@@ -1,0 +1,91 @@
+"""Check of terrain scans: ray sensors that measure the height of the ground.
+
+A ray stops at the first geom of the sensor's groups. So the ground must be in these groups, and the
+robot must not.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from mjlab.sensor.raycast_sensor import RayCastSensor
+from mjlab.sim.engine import NUM_GEOM_GROUPS
+from mjlab.utils.string import name_list
+
+
+def check_terrain_scan(sensor: RayCastSensor, mj_model: mujoco.MjModel) -> None:
+    """Check that rays can meet the ground and, in the initial pose, do not meet their own entity.
+
+    Ground: geoms of entities without joints, and of the world. The initial pose is that of the last
+    keyframe. Call after `sensor.initialize`.
+
+    Raises:
+        ValueError: the ground is invisible to the rays, or rays meet the entity of their frame.
+    """
+    m = mj_model
+    root = m.body_rootid[m.geom_bodyid]
+    is_moving = np.bincount(m.body_rootid, m.body_dofnum, m.nbody)[root] > 0.0
+    is_own = np.array([root == m.body_rootid[body] for body in sensor.frame_bodies])
+    ground = ~is_moving & ~is_own.any(axis=0)
+    visible = _visible_geoms(m, sensor.include_geom_groups)
+    owner = f"Ray sensor {sensor.cfg.name!r} include_geom_groups"
+    if ground.any() and not (ground & visible).any() and m.nflex == 0:
+        raise ValueError(
+            f"{owner}: expected a group of the ground, {np.unique(m.geom_group[ground]).tolist()}, got "
+            f"{sensor.include_geom_groups}; no ray can meet the ground, in these groups or with alpha 0."
+        )
+    seen = is_own & visible & is_moving
+    if sensor.cfg.exclude_parent_body:
+        seen &= m.geom_bodyid != np.array(sensor.frame_bodies)[:, None]
+    if not seen.any():
+        return
+    met = _geoms_met(sensor, m)
+    own_hits = (met >= 0) & np.take_along_axis(seen, met, axis=1)
+    if own_hits.any():
+        geoms = np.unique(met[own_hits])
+        names = [m.geom(g).name or f"a geom of {m.body(m.geom_bodyid[g]).name}" for g in geoms]
+        taken = {*m.geom_group[ground].tolist(), *(sensor.include_geom_groups or ())}
+        free = min({*range(NUM_GEOM_GROUPS)} - taken, default=NUM_GEOM_GROUPS - 1)
+        raise ValueError(
+            f"{owner}: expected groups without geoms of the robot below the sensor, got "
+            f"{sensor.include_geom_groups}; {own_hits.sum()} of {own_hits.size} rays meet the robot in "
+            f"its initial pose, at {name_list(list(dict.fromkeys(names)), near=[])}. Move its geoms, of groups {np.unique(m.geom_group[geoms]).tolist()}, to another group, e.g. "
+            f"EntityCfg.geoms = (GeomCfg(geom_names_expr=('.*',), group={free}),), and leave that group "
+            "out of include_geom_groups."
+        )
+
+
+def _visible_geoms(m: mujoco.MjModel, groups: tuple[int, ...] | None) -> np.ndarray:
+    """Return the geoms that rays of these groups can meet, (ngeom,) bool."""
+    has_material = m.geom_matid >= 0
+    alpha = m.geom_rgba[:, 3].copy()
+    alpha[has_material] = m.mat_rgba[m.geom_matid[has_material], 3]
+    is_included = np.isin(
+        m.geom_group.clip(0, NUM_GEOM_GROUPS - 1),
+        range(NUM_GEOM_GROUPS) if groups is None else groups,
+    )
+    return is_included & (alpha > 0.0)
+
+
+def _geoms_met(sensor: RayCastSensor, m: mujoco.MjModel) -> np.ndarray:
+    """Return the moving geom that each ray meets in the initial pose, (F, n). -1: none.
+
+    Static geoms are left out, because a robot whose initial height is 0 stands in the ground.
+    """
+    d = mujoco.MjData(m)
+    if m.nkey:
+        mujoco.mj_resetDataKeyframe(m, d, m.nkey - 1)
+    mujoco.mj_kinematics(m, d)
+    groups = sensor.include_geom_groups
+    mask = np.isin(range(NUM_GEOM_GROUPS), range(NUM_GEOM_GROUPS) if groups is None else groups)
+    origins, directions = sensor.rays_in_pose(d)
+    bodies = np.reshape(sensor.excluded_bodies, origins.shape[:2])
+    met = np.full(origins.shape[:2], -1)
+    for ray in np.ndindex(met.shape):
+        geom = np.zeros(1, dtype=np.int32)
+        reach = mujoco.mj_ray(
+            m, d, origins[ray], directions[ray], mask.astype(np.uint8), False, bodies[ray], geom
+        )
+        met[ray] = geom[0] if 0.0 <= reach <= sensor.cfg.max_distance else -1
+    return met
