@@ -33,7 +33,7 @@ _INSTALLERS |= {"dest", "python-version", "implementation", "platform"}
 _INSTALLERS |= {"python-platform", "no-header", "no-annotate"}
 _INSTALLERS |= {"torch-backend"}
 # TensorBoard, ruff, sphinx-build, and the commands of Isaac Lab.
-_OTHERS = {"logdir", "check", "keep-going", "headless", "task"}
+_OTHERS = {"logdir", "project", "check", "keep-going", "headless", "task"}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 
@@ -117,6 +117,13 @@ def _flags_of_gpu() -> set[str]:
     return set(_FLAG.findall(said))
 
 
+def _flags_of_sweep() -> set[str]:
+    from mjlab.scripts.cli import COMMANDS
+
+    (command,) = (command for command in COMMANDS if command.name == "sweep")
+    return set(_FLAG.findall(command.details))
+
+
 def _has(config: object, path: list[str]) -> bool:
     if not path:
         return True
@@ -140,7 +147,7 @@ def _unknown(command: str, text: str) -> set[str]:
 
 def test_flags_are_fields_of_the_commands() -> None:
     unknown = set()
-    elsewhere = _ELSEWHERE | _TORCHRUN | _INSTALLERS | _OTHERS | _flags_of_gpu()
+    elsewhere = _ELSEWHERE | _TORCHRUN | _INSTALLERS | _OTHERS | _flags_of_gpu() | _flags_of_sweep()
     for page in PAGES:
         code = _code(page.read_text(encoding="utf-8"))
         flags = set.intersection(*(_unknown(command, code) for command in _flags_of()))
