@@ -150,6 +150,12 @@ def test_selections_nested_in_params_are_resolved(env, kind, wrap, unwrap):
     assert selection.joint_ids == slice(None), "the caller's config must be unchanged"
 
 
+def test_a_nested_entity_without_names_may_be_absent(env, kind):
+    manager_class, make = kind
+    cfg = make(ids_of, params={"selections": [SceneEntityCfg("ball")]})
+    assert manager_class({"a": cfg}, env).get_term_cfg("a").params["selections"][0].name == "ball"
+
+
 DEFAULT = SceneEntityCfg("robot", joint_names="joint_b")
 
 

@@ -64,6 +64,13 @@ def test_other_attributes_are_reported_in_one_warning_once():
     assert "cfg.sim.dt (SimulationCfg)" in str(seen[0].message)
 
 
+def test_a_numbered_attribute_is_not_misspelled():
+    cfg = make_cfg()
+    cfg.seed2 = 3  # ty: ignore
+    with pytest.warns(UserWarning, match=r"cfg\.seed2"):
+        check_fields_exist("cfg", cfg)
+
+
 @dataclass
 class OwnCfg(SceneCfg):
     """Config of a package that keeps values of its own."""

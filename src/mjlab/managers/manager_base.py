@@ -211,18 +211,20 @@ class ManagerBase(Tabular, ABC):
         for key, value in cfg.params.items():
             self._resolve_selections(f"{self._label(name)}, parameter {key!r}", value)
 
-    def _resolve_selections(self, label: str, value: Any) -> None:
+    def _resolve_selections(self, label: str, value: Any, is_nested: bool = False) -> None:
         """Resolve every `SceneEntityCfg` in a dict, list, tuple or dataclass, in place."""
         if isinstance(value, SceneEntityCfg):
-            with label_errors(label):
-                value.resolve(self._env.scene)
+            # A nested selection without names needs no ids, and its entity may be optional.
+            if value.selects_names or not is_nested:
+                with label_errors(label):
+                    value.resolve(self._env.scene)
             return
         if isinstance(value, (list, tuple)):
             inner = list(enumerate(value))
         else:
             inner = list(value.items()) if isinstance(value, dict) else _items(value) or ()
         for key, item in inner:
-            self._resolve_selections(f"{label}[{key!r}]", item)
+            self._resolve_selections(f"{label}[{key!r}]", item, is_nested=True)
 
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
         """Replace a class by its instance, and check that the term is callable.

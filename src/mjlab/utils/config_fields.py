@@ -16,6 +16,7 @@ from typing import Any
 
 # Similarity of a misspelled name to its field: "wieght" and "weight" have 0.83.
 _CLOSE = 0.8
+_DIGITS = "0123456789_"
 
 
 def check_fields_exist(owner: str, cfg: Any) -> None:
@@ -36,7 +37,9 @@ def check_fields_exist(owner: str, cfg: Any) -> None:
     for path, part in _configs(owner, cfg, set()):
         fields = [field.name for field in dataclasses.fields(part)]
         for name in (name for name in _attributes(part) if name not in fields):
-            close = difflib.get_close_matches(name, fields, cutoff=_CLOSE)
+            # `seed2` beside `seed` is numbered, not misspelled.
+            others = [field for field in fields if field.rstrip(_DIGITS) != name.rstrip(_DIGITS)]
+            close = difflib.get_close_matches(name, others, cutoff=_CLOSE)
             if close:
                 raise ValueError(
                     f"{path}.{name}: {type(part).__name__} has no such field; did you mean "
