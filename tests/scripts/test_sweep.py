@@ -20,7 +20,7 @@ from commands import TASK
 from mjlab.scripts import cli
 from mjlab.scripts.reference import read_scalars_of_sessions
 from mjlab.scripts.run_folder import read_run_info, write_params, write_run_info
-from mjlab.scripts.sweep import Axis, Sweep
+from mjlab.scripts.sweep_settings import Axis, Sweep
 from mjlab.scripts.train_config import TrainConfig
 from mjlab.utils.errors import BadCallError
 
@@ -223,7 +223,7 @@ def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path
 
 
 def test_a_sweep_runs_once_at_a_time_and_keeps_its_flags(sweep, machine, folder):
-    from mjlab.scripts.sweep_runs import only_process
+    from mjlab.scripts.sweep_study import only_process
 
     argv = ("--folder", str(folder))
     with only_process(folder):
@@ -303,7 +303,8 @@ def test_a_run_is_resumed_from_the_last_checkpoint_with_iterations_left(monkeypa
     """After its last iteration, nothing would be trained, and the last evaluation stay missing."""
     agent = SimpleNamespace(max_iterations=3)
     monkeypatch.setattr(
-        "mjlab.scripts.sweep.train_config", lambda sweep, setting: SimpleNamespace(agent=agent)
+        "mjlab.scripts.sweep_settings.train_config",
+        lambda sweep, setting: SimpleNamespace(agent=agent),
     )
     values: Any = dict.fromkeys(field.name for field in dataclasses.fields(Sweep))
     sweep = Sweep(**{**values, "axes": (Axis.parse("x=1,2"),), "folder": tmp_path})

@@ -16,22 +16,24 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
-import hashlib
-import itertools
 import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mjlab.scripts.flags import is_given
 from mjlab.scripts.help import lookup
-from mjlab.scripts.reference import ENDED
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info, runs_named
+from mjlab.scripts.sweep_settings import (
+    MAX_NAME,
+    Axis,
+    Sweep,
+    digest,
+    parse_train,
+    train_config,
+    train_flags,
+)
 from mjlab.scripts.train_seeds import read_count
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.string import counted
@@ -61,175 +63,6 @@ _RESERVED = {
 _MACHINE = ("--device", "--gpu-ids")
 # Episodes without a time limit have no return.
 _LONGEST_EPISODE_S = 1e6
-_MAX_NAME = 80
-
-Setting = dict[str, str]
-"""Values of the swept flags, as on the command line."""
-
-
-@dataclass(frozen=True)
-class Axis:
-    """Swept flag with its values or its range."""
-
-    name: str
-    """Flag without dashes at its start, such as `agent.algorithm.learning-rate`."""
-    text: str
-    """Values or range, as on the command line."""
-    values: tuple[str, ...]
-    """Values; the ends of a range."""
-    is_range: bool = False
-    """Sample between the two values."""
-    is_log: bool = False
-    """Sample on a logarithmic scale."""
-    is_integer: bool = False
-    """Sample integers."""
-
-    @classmethod
-    def parse(cls, argument: str) -> Axis:
-        """Return the axis of `--over argument`.
-
-        Raises:
-            BadCallError: the argument is not FLAG=VALUES, or the ends of a range are not in order.
-        """
-        name, equals, text = argument.partition("=")
-        name = name.strip().lstrip("-").replace("_", "-")
-        scale = text.removesuffix(":log")
-        ends = tuple(scale.split(".."))
-        if len(ends) == 2 and all(map(_is_number, ends)):
-            low, high = map(float, ends)
-            is_log = scale != text
-            if not low < high or (is_log and low <= 0.0):
-                raise BadCallError(
-                    f"--over {name}: expected LOW..HIGH with LOW < HIGH, and LOW > 0 for :log, got "
-                    f"{text!r}."
-                )
-            return cls(name, text, ends, is_range=True, is_log=is_log)
-        values = [value.strip() for value in _split(text)]
-        if not name or not equals or not all(values):
-            raise BadCallError(
-                f"--over: expected FLAG=A,B,... or FLAG=LOW..HIGH, got {argument!r}; use e.g. "
-                "--over agent.algorithm.learning-rate=1e-4,3e-4."
-            )
-        return cls(name, text, tuple(dict.fromkeys(values)))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _split(text: str) -> Iterator[str]:
-    """Yield the parts of `text` between commas outside brackets."""
-    depth, begin = 0, 0
-    for position, character in enumerate(text):
-        depth += (character in "([{") - (character in ")]}")
-        if character == "," and depth == 0:
-            yield text[begin:position]
-            begin = position + 1
-    yield text[begin:]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sweep:
-    """Settings to compare."""
-
-    task: str
-    """Name of the task."""
-    axes: tuple[Axis, ...]
-    """Swept flags."""
-    flags: tuple[str, ...]
-    """Flags of all runs."""
-    machine_flags: tuple[str, ...]
-    """Flags of all runs that select devices of this machine."""
-    seeds: int
-    """Number of seeds per setting."""
-    trials: int | None
-    """Number of settings to sample. None: all combinations."""
-    jobs: int | None
-    """Number of runs side by side. None: as many as the machine suits."""
-    folder: Path
-    """Folder of the sweep."""
-    storage: str | None
-    """URL of the database. None: SQLite file in the folder."""
-    objective: str | None
-    """TensorBoard tag to compare. None: default of the task."""
-    minimize: bool
-    """Prefer low values of the objective."""
-
-    @property
-    def combinations(self) -> list[Setting]:
-        """All combinations of the values; of ranges, the ends."""
-        names = [axis.name for axis in self.axes]
-        products = itertools.product(*(axis.values for axis in self.axes))
-        return [dict(zip(names, values, strict=True)) for values in products]
-
-    @property
-    def num_settings(self) -> int:
-        """Number of settings on all machines."""
-        return len(self.combinations) if self.trials is None else self.trials
-
-    @property
-    def definition(self) -> dict[str, Any]:
-        """Properties that stay the same while a sweep continues."""
-        over = {axis.name: axis.text for axis in self.axes}
-        return {"task": self.task, "over": over, "flags": [*self.flags]}
-
-    @property
-    def label(self) -> str:
-        """Objective without its group, `mean_return`."""
-        assert self.objective is not None
-        return self.objective.rpartition("/")[2]
-
-    def short(self, name: str) -> str:
-        """Return the last part of a swept flag, or the flag if two have the same last part."""
-        last = name.rpartition(".")[2]
-        return (
-            last if [axis.name.rpartition(".")[2] for axis in self.axes].count(last) == 1 else name
-        )
-
-    def describe(self, setting: Setting) -> str:
-        """Return a setting as text: `learning-rate=1e-4, gamma=0.99`."""
-        return ", ".join(f"{self.short(name)}={value}" for name, value in setting.items())
-
-    def runs_folder(self, setting: Setting) -> Path:
-        """Return the folder of the runs of a setting."""
-        name = self.describe(setting).replace(", ", ",")
-        clean = re.sub(r"[^\w.=,+-]", "_", name, flags=re.ASCII)
-        if clean != name or len(clean) > _MAX_NAME:
-            clean = f"{clean[:_MAX_NAME]}-{_digest(name)}"
-        return self.folder / "runs" / clean
-
-    def log_file(self, setting: Setting, seed: int) -> Path:
-        """Return the file with the output of a run."""
-        return self.runs_folder(setting) / f"seed_{seed}.log"
-
-    def sessions(self, setting: Setting, seed: int) -> list[Path]:
-        """Return the run folders of a seed, the newest first."""
-        return runs_named(self.runs_folder(setting), f"seed_{seed}")
-
-    def finished_run(self, setting: Setting, seed: int) -> Path | None:
-        """Return the last session of a run that was trained to its end; None for others.
-
-        A run interrupted in its last iteration lacks the last evaluation.
-        """
-        runs = self.sessions(setting, seed)
-        return next((run for run in runs if read_run_info(run).get("ended") in ENDED), None)
-
-    def last_checkpoint(self, setting: Setting, seed: int) -> Path | None:
-        """Return the checkpoint to resume a run from: the newest with iterations left."""
-        total = train_config(self, setting).agent.max_iterations
-        for run in self.sessions(setting, seed):
-            for checkpoint in reversed(checkpoints_in(run)):
-                if int(checkpoint.stem.removeprefix("model_")) + 1 < total:
-                    return checkpoint
-        return None
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:6]
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -237,7 +70,8 @@ def command(argv: list[str], prog: str) -> None:
     sweep = parse_sweep(argv, prog)
     # Imports Optuna; flags are checked before.
     from mjlab.scripts.sweep_results import Comparison
-    from mjlab.scripts.sweep_runs import Runs, Study, only_process
+    from mjlab.scripts.sweep_runs import Runs
+    from mjlab.scripts.sweep_study import Study, only_process
 
     with only_process(sweep.folder):
         study = Study(sweep)
@@ -281,7 +115,7 @@ def parse_sweep(argv: list[str], prog: str) -> Sweep:
     args, flags = parser.parse_known_args(words)
     if "-h" in flags or "--help" in flags:
         print(f"`{prog} --help` shows the flags of the sweep. All others are those of `train`:\n")
-        _parse_train(task, tuple(flags), prog)
+        parse_train(task, tuple(flags), prog)
     axes = tuple(map(Axis.parse, args.over))
     counts = {
         name: None if text is None else read_count(f"--{name}", text)
@@ -344,8 +178,8 @@ def check_settings(sweep: Sweep) -> TrainConfig:
     first: TrainConfig | None = None
     for setting in sweep.combinations:
         flags = [*train_flags(sweep, setting), *sweep.machine_flags]
-        cfg = train_config(sweep, setting)
         try:
+            cfg = train_config(sweep, setting)
             check_typed_flags(cfg, flags)
             check_flags(cfg)
         except (UserError, ValueError) as error:
@@ -353,24 +187,6 @@ def check_settings(sweep: Sweep) -> TrainConfig:
         first = first or cfg
     assert first is not None
     return first
-
-
-def train_flags(sweep: Sweep, setting: Setting) -> list[str]:
-    """Return the flags of `train` for a setting, as the user would type them, without the device."""
-    return [*sweep.flags, *(f"--{name}={value}" for name, value in setting.items())]
-
-
-def train_config(sweep: Sweep, setting: Setting) -> TrainConfig:
-    """Return the config that `train` reads from the flags of a setting; exits on invalid flags."""
-    flags = (*train_flags(sweep, setting), *sweep.machine_flags)
-    return _parse_train(sweep.task, flags, "mjlab sweep")
-
-
-@functools.cache
-def _parse_train(task: str, flags: tuple[str, ...], prog: str) -> TrainConfig:
-    from mjlab.scripts.train import parse_train_flags
-
-    return parse_train_flags(task, [*flags], f"{prog} {task}")
 
 
 def _with_type(axis: Axis, cfg: TrainConfig) -> Axis:
@@ -385,7 +201,7 @@ def _with_type(axis: Axis, cfg: TrainConfig) -> Axis:
 def _name(sweep: Sweep) -> str:
     """Return the folder name of a sweep: the same for the same task, --over and flags."""
     keys = "_".join(sweep.short(axis.name) for axis in sweep.axes)
-    return f"{sweep.task}_{keys}"[:_MAX_NAME] + f"_{_digest(repr(sweep.definition))}"
+    return f"{sweep.task}_{keys}"[:MAX_NAME] + f"_{digest(repr(sweep.definition))}"
 
 
 def default_objective(cfg: TrainConfig) -> str:

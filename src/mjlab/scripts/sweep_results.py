@@ -1,4 +1,4 @@
-"""Comparison of the settings of a sweep: objective, table and plot."""
+"""Comparison of the settings of a sweep: table and plot."""
 
 from __future__ import annotations
 
@@ -14,60 +14,21 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from mjlab.rl.plot import LABELS, Curve, plot_curves
-from mjlab.scripts.reference import read_scalars_of_sessions, trained_seconds
+from mjlab.rl.plot import LABELS, plot_curves
+from mjlab.scripts.reference import trained_seconds
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
-from mjlab.utils.errors import UserError
+from mjlab.scripts.sweep_study import Study, curve_of, setting_of, value_of
 from mjlab.utils.os import write_atomically
-from mjlab.utils.string import suggest
 from mjlab.utils.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from optuna.trial import FrozenTrial
 
-    from mjlab.scripts.sweep import Setting, Sweep
-    from mjlab.scripts.sweep_runs import Study
+    from mjlab.scripts.sweep_settings import Setting, Sweep
 
-# Fraction of the iterations that the objective averages, unless it is that of evaluations.
-_LAST_PART = 0.1
 # Number of settings with a color and a legend entry.
 _COLORS = 10
-
-
-def value_of(sweep: Sweep, setting: Setting, seed: int) -> float | None:
-    """Return the objective of a finished run: last evaluation, or mean over the last iterations.
-
-    None for an unfinished run.
-
-    Raises:
-        UserError: the run did not log the objective.
-    """
-    run_dir = sweep.finished_run(setting, seed)
-    if run_dir is None:
-        return None
-    _, values = curve_of(sweep, run_dir)
-    assert sweep.objective is not None
-    count = 1 if sweep.objective.startswith("Evaluation/") else _LAST_PART * len(values)
-    return float(values[-max(1, math.ceil(count)) :].mean())
-
-
-def curve_of(sweep: Sweep, run_dir: Path) -> Curve:
-    """Return iterations, from 1, and the objective of all sessions of a run, each (P,).
-
-    Raises:
-        UserError: the run did not log the objective.
-    """
-    scalars = read_scalars_of_sessions(run_dir)
-    assert sweep.objective is not None
-    if sweep.objective not in scalars:
-        raise UserError(
-            f"--objective: unknown tag {sweep.objective!r} in {run_dir}; "
-            f"{suggest(sweep.objective, sorted(scalars))}"
-        )
-    curve = sorted(scalars[sweep.objective].items())
-    return np.array([i + 1 for i, _ in curve]), np.array([value for _, value in curve], dtype=float)
 
 
 @dataclass(frozen=True)
@@ -100,7 +61,7 @@ class Comparison:
         rows: dict[tuple[str, ...], _Row] = {}
         for trial in study.trials:
             if trial.state.name not in ("WAITING", "PRUNED"):
-                setting = dict(trial.user_attrs["setting"])
+                setting = setting_of(trial)
                 # A retry comes after the failed trial of the same setting.
                 rows[tuple(setting.values())] = self._row(setting, trial, study.is_own(trial))
         sign = 1.0 if sweep.minimize else -1.0
@@ -108,7 +69,7 @@ class Comparison:
             rows.values(), key=lambda row: (not row.values, sign * row.mean if row.values else 0.0)
         )
 
-    def _row(self, setting: Setting, trial: Any, is_own: bool) -> _Row:
+    def _row(self, setting: Setting, trial: FrozenTrial, is_own: bool) -> _Row:
         if not is_own:
             values = [] if trial.value is None else [trial.value]
             return _Row(setting, values, [], "elsewhere" if values else "elsewhere, running")
@@ -182,7 +143,9 @@ class Comparison:
         best = self._rows[0]
         print(f"Next, with the best, {sweep.describe(best.setting)}:")
         swept = [f"--{name}={value}" for name, value in best.setting.items()]
-        commands = [["train", sweep.task, *sweep.flags, *swept]]
+        # --gpu-ids would train one run on several GPUs.
+        device = sweep.machine_flags if "--device" in sweep.machine_flags else ()
+        commands = [["train", sweep.task, *sweep.flags, *swept, *device]]
         if best.runs:
             sign = 1.0 if sweep.minimize else -1.0
             run = min(zip(best.values, best.runs, strict=True), key=lambda pair: sign * pair[0])[1]

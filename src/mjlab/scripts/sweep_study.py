@@ -1,0 +1,266 @@
+"""Optuna's study of a sweep: the settings to train, and their values."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import socket
+import sqlite3
+import statistics
+import uuid
+import warnings
+from collections.abc import Generator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import optuna
+import sqlalchemy.exc
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
+from optuna.trial import FrozenTrial, TrialState
+
+from mjlab.scripts.reference import read_scalars_of_sessions
+from mjlab.scripts.sweep_settings import Axis, Setting, Sweep
+from mjlab.utils.errors import UserError
+from mjlab.utils.os import write_atomically
+from mjlab.utils.string import suggest
+
+if TYPE_CHECKING:
+    from mjlab.rl.plot import Curve
+
+_FILE = "sweep.json"
+# User attributes of trials.
+_SETTING, _OWNER = "setting", "folder"
+# Fraction of the iterations that the objective averages, unless it is that of evaluations.
+_LAST_PART = 0.1
+
+
+@contextlib.contextmanager
+def only_process(folder: Path) -> Generator[None]:
+    """Create `folder` and hold its lock within the block. The lock ends with the process.
+
+    Raises:
+        UserError: another process holds the lock.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    # Portable, unlike fcntl.
+    lock = sqlite3.connect(folder / "lock.db", timeout=0.0, isolation_level=None)
+    with contextlib.closing(lock):
+        try:
+            lock.execute("BEGIN EXCLUSIVE")
+        except sqlite3.OperationalError as error:
+            raise UserError(
+                f"{folder}: expected a sweep that is not running, got one in another process "
+                f"({error}); wait for it, or use --folder for another sweep."
+            ) from error
+        yield
+
+
+class Study:
+    """Optuna's study of a sweep: the settings to train here, and the values of all machines."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        """Create or load the study.
+
+        Raises:
+            UserError: the database cannot be opened, or the study has other flags.
+        """
+        self._sweep = sweep
+        # Trials belong to the folder with their runs: other machines do not continue them.
+        self._owner = _check_definition(sweep)
+        self._study = _open(sweep)
+        self._distributions = {axis.name: _distribution(axis) for axis in sweep.axes}
+        self._failed_now = 0
+        self._enqueue_missing()
+
+    @property
+    def trials(self) -> list[FrozenTrial]:
+        """Trials with a setting, of all machines."""
+        trials = self._study.get_trials(deepcopy=False)
+        return [trial for trial in trials if _SETTING in trial.user_attrs]
+
+    def is_own(self, trial: FrozenTrial) -> bool:
+        """Return True if the runs of a trial are in the folder of this sweep."""
+        return trial.user_attrs.get(_OWNER) == self._owner
+
+    def own(self) -> list[FrozenTrial]:
+        """Return the trials begun here, by earlier commands as well, that did not fail."""
+        states = (TrialState.RUNNING, TrialState.COMPLETE)
+        return [trial for trial in self.trials if self.is_own(trial) and trial.state in states]
+
+    def next(self) -> FrozenTrial | None:
+        """Return a new trial to train here, or None if the sweep has no more."""
+        while self._has_more():
+            trial = self._study.ask(self._distributions)
+            setting = {name: _text(value) for name, value in trial.params.items()}
+            # In the order of --over.
+            setting = {axis.name: setting[axis.name] for axis in self._sweep.axes}
+            trial.set_user_attr(_SETTING, setting)
+            trial.set_user_attr(_OWNER, self._owner)
+            others = [one for one in self._with_setting(setting) if one.number < trial.number]
+            # Two machines that start together both enqueue the grid.
+            if self._sweep.trials is None and others:
+                self._study.tell(trial.number, state=TrialState.PRUNED)
+                continue
+            return next(one for one in self.trials if one.number == trial.number)
+        return None
+
+    def finish(self, trial: FrozenTrial) -> None:
+        """Store the value of a trial, if it has no value yet: mean over seeds; failed if not finite."""
+        setting = setting_of(trial)
+        seeds = range(1, self._sweep.seeds + 1)
+        values = [value_of(self._sweep, setting, seed) for seed in seeds]
+        found = [value for value in values if value is not None and math.isfinite(value)]
+        if len(found) < len(values):
+            self.fail(trial)
+            return
+        self._study.tell(trial.number, statistics.fmean(found), skip_if_finished=True)
+
+    def fail(self, trial: FrozenTrial) -> None:
+        """Mark a trial as failed; the next command retries it."""
+        self._failed_now += 1
+        self._study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+
+    def _with_setting(self, setting: Setting) -> list[FrozenTrial]:
+        """Return the trials of a setting that did not fail and are not duplicates."""
+        states = (TrialState.RUNNING, TrialState.COMPLETE, TrialState.WAITING)
+        return [
+            trial for trial in self.trials if trial.state in states and setting_of(trial) == setting
+        ]
+
+    def _enqueue_missing(self) -> None:
+        """Enqueue the combinations, and the failed settings, without a trial that did not fail."""
+        failed = [trial for trial in self.trials if trial.state == TrialState.FAIL]
+        if self._sweep.trials is None:
+            missing = [(setting, dict(setting)) for setting in self._sweep.combinations]
+        else:
+            missing = [(setting_of(trial), trial.params) for trial in failed]
+        for setting, params in missing:
+            if not self._with_setting(setting):
+                self._study.enqueue_trial(params, user_attrs={_SETTING: setting})
+
+    def _has_more(self) -> bool:
+        trials = self._study.get_trials(deepcopy=False)
+        if any(trial.state == TrialState.WAITING for trial in trials):
+            return True
+        sampled = [trial for trial in trials if trial.state != TrialState.FAIL]
+        wanted = self._sweep.trials
+        return wanted is not None and len(sampled) + self._failed_now < wanted
+
+
+def setting_of(trial: FrozenTrial) -> Setting:
+    """Return the setting of a trial."""
+    return dict(trial.user_attrs[_SETTING])
+
+
+def _text(value: Any) -> str:
+    """Return a sampled value as on the command line, with six digits."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _distribution(axis: Axis) -> BaseDistribution:
+    if not axis.is_range:
+        return CategoricalDistribution(axis.values)
+    low, high = map(float, axis.values)
+    if axis.is_integer:
+        return IntDistribution(int(low), int(high), log=axis.is_log)
+    return FloatDistribution(low, high, log=axis.is_log)
+
+
+def _check_definition(sweep: Sweep) -> str:
+    """Return the identifier of the sweep's folder.
+
+    Raises:
+        UserError: the folder is of a sweep with other flags.
+    """
+    path = sweep.folder / _FILE
+    if not path.is_file():
+        content = {**sweep.definition, "id": f"{socket.gethostname()}-{uuid.uuid4().hex[:8]}"}
+        write_atomically(path, f"{json.dumps(content, indent=2)}\n".encode())
+    content = json.loads(path.read_text(encoding="utf-8"))
+    _check_same(f"--folder {sweep.folder}", content, sweep)
+    return content["id"]
+
+
+def _check_same(owner: str, content: dict[str, Any], sweep: Sweep) -> None:
+    for name, new in sweep.definition.items():
+        if (old := content.get(name, new)) != new:
+            raise UserError(
+                f"{owner}: expected the {name} of its sweep, {old}, got {new}; use another --folder."
+            )
+
+
+def _open(sweep: Sweep) -> optuna.Study:
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    url = sweep.storage or f"sqlite:///{(sweep.folder / 'study.db').as_posix()}"
+    sampler: optuna.samplers.BaseSampler = optuna.samplers.RandomSampler()
+    if sweep.trials is not None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            # Running trials count as bad, so that samples next to them are not drawn.
+            sampler = optuna.samplers.TPESampler(constant_liar=True)
+    try:
+        study = optuna.create_study(
+            storage=url,
+            # The runs can be compared by several objectives.
+            study_name=f"{sweep.folder.resolve().name} {'-' if sweep.minimize else '+'}{sweep.objective}",
+            direction="minimize" if sweep.minimize else "maximize",
+            sampler=sampler,
+            load_if_exists=True,
+        )
+        for name, value in sweep.definition.items():
+            if name not in study.user_attrs:
+                study.set_user_attr(name, value)
+    except (
+        ImportError,
+        ValueError,
+        optuna.exceptions.OptunaError,
+        sqlalchemy.exc.SQLAlchemyError,
+    ) as error:
+        where = "study.db" if sweep.storage is None else "--storage"
+        raise UserError(
+            f"{where}: cannot open the database: {str(error).splitlines()[0]}; use a URL such as "
+            "postgresql://user@host/database with its driver installed, or leave out --storage."
+        ) from error
+    _check_same(f"Study {study.study_name!r}", study.user_attrs, sweep)
+    return study
+
+
+def value_of(sweep: Sweep, setting: Setting, seed: int) -> float | None:
+    """Return the objective of a finished run: last evaluation, or mean over the last iterations.
+
+    None for an unfinished run.
+
+    Raises:
+        UserError: the run did not log the objective.
+    """
+    run_dir = sweep.finished_run(setting, seed)
+    if run_dir is None:
+        return None
+    _, values = curve_of(sweep, run_dir)
+    assert sweep.objective is not None
+    count = 1 if sweep.objective.startswith("Evaluation/") else _LAST_PART * len(values)
+    return float(values[-max(1, math.ceil(count)) :].mean())
+
+
+def curve_of(sweep: Sweep, run_dir: Path) -> Curve:
+    """Return iterations, from 1, and the objective of all sessions of a run, each (P,).
+
+    Raises:
+        UserError: the run did not log the objective.
+    """
+    scalars = read_scalars_of_sessions(run_dir)
+    assert sweep.objective is not None
+    if sweep.objective not in scalars:
+        raise UserError(
+            f"--objective: unknown tag {sweep.objective!r} in {run_dir}; "
+            f"{suggest(sweep.objective, sorted(scalars))}"
+        )
+    curve = sorted(scalars[sweep.objective].items())
+    return np.array([i + 1 for i, _ in curve]), np.array([value for _, value in curve], dtype=float)
