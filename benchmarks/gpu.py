@@ -84,7 +84,7 @@ class Record:
         """Return what has been written of the part so far, if anything."""
         record = cls(folder, part)
         try:
-            record.content = json.loads((folder / f"{part}.json").read_text())
+            record.content = json.loads((folder / f"{part}.json").read_text(encoding="utf-8"))
             record.rows = [Row(**row) for row in record.content["rows"]]
         except (OSError, ValueError, KeyError, TypeError):
             return None
@@ -133,7 +133,7 @@ def table(folder: Path) -> str:
 def _write_whole(path: Path, text: str) -> None:
     """Write a file whole or not at all: the process may end at any moment."""
     draft = path.with_name(f"{path.name}.{os.getpid()}")
-    draft.write_text(text)
+    draft.write_text(text, encoding="utf-8")
     draft.replace(path)
 
 

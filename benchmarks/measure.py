@@ -65,9 +65,9 @@ def write(rows: list[Row]) -> None:
     }
     RESULTS.mkdir(exist_ok=True)
     about = ", ".join(f"{name} {value}" for name, value in machine.items())
-    (RESULTS / "table.md").write_text(f"{show(rows)}\n\nMeasured: {about}.\n")
+    (RESULTS / "table.md").write_text(f"{show(rows)}\n\nMeasured: {about}.\n", encoding="utf-8")
     content = {"machine": machine, "rows": [asdict(row) for row in rows]}
-    (RESULTS / "table.json").write_text(json.dumps(content, indent=2) + "\n")
+    (RESULTS / "table.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def processor() -> str:

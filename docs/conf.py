@@ -39,6 +39,8 @@ copybutton_exclude = ".linenos, .gp, .go"
 
 html_theme = "furo"
 html_title = f"mjlab {release}"
+html_static_path = ["_static"]
+html_css_files = ["mjlab.css"]
 
 html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#2f6690", "color-brand-content": "#2f6690"},

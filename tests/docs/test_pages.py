@@ -31,9 +31,27 @@ _ELSEWHERE = {"help", "seeds", "keyword", "output", "tag", "title", "group"}
 _INSTALLERS = {"extra", "overrides", "no-deps", "no-index", "only-binary", "find-links", "target"}
 _INSTALLERS |= {"dest", "python-version", "implementation", "platform"}
 _INSTALLERS |= {"python-platform", "no-header", "no-annotate"}
-_INSTALLERS |= {"torch-backend"}
+_INSTALLERS |= {
+    "torch-backend",
+    "clear",
+    "python",
+    "no-config",
+    "no-hashes",
+    "no-emit-project",
+    "no-emit-package",
+}
 # TensorBoard, ruff, sphinx-build, and the commands of Isaac Lab.
-_OTHERS = {"logdir", "project", "check", "keep-going", "headless", "task"}
+_OTHERS = {
+    "logdir",
+    "project",
+    "check",
+    "fix",
+    "preview",
+    "select",
+    "keep-going",
+    "headless",
+    "task",
+}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 
@@ -61,16 +79,34 @@ def test_make_targets_exist(page: Path) -> None:
 
 def test_commands_of_the_targets_are_those_of_the_makefile() -> None:
     page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| `make ([\w-]+)` \| `([^`]+)`", page, re.MULTILINE)
+    rows = re.findall(r"^\| `make ([\w-]+)` \| (?:`([^`]+)`|the lines below)", page, re.MULTILINE)
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8").replace("\\\n", " ")
     makefile = makefile.replace("$(DEV)", "$(UV) run --group dev").replace("$(UV)", "uv")
     targets = set(re.findall(r"^([a-z-]+):.*##", makefile, re.MULTILINE))
-    assert targets - {"help", "format", "test-gpu-script", "test-mujoco-next"} == dict(rows).keys()
+    assert targets - {"help"} == dict(rows).keys()
     for target, command in rows:
         recipe = re.search(rf"^{target}:.*\n((?:\t.*\n)+)", makefile, re.MULTILINE)
         assert recipe is not None
         text = recipe[1].replace("$(PYTHON)", "python").replace("$(DEVICE)", "cuda:0")
         assert command in text, target
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=_ids)
+def test_links_have_a_text_and_lead_to_files_and_headings(page: Path) -> None:
+    """On GitHub as well as in the built documentation, which fills in titles and knows labels."""
+    links = re.findall(
+        r"\[([^\]\n]*)\]\((?!\w+:)([^)#\s]*)(?:#([^)\s]*))?\)", page.read_text("utf-8")
+    )
+    for text, target, anchor in links:
+        linked = page.parent / target if target else page
+        assert text, (target, anchor)
+        assert linked.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)", linked.read_text("utf-8"), re.MULTILINE)
+            slugs = {
+                re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings
+            }
+            assert anchor in slugs, (target, anchor)
 
 
 @cache

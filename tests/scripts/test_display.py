@@ -246,6 +246,12 @@ def test_an_interrupted_run_is_resumed_by_the_flags_it_had(words, is_train, monk
     assert play == ["uv", "run", "play", SWINGUP, *(observed if is_train else [])]
 
 
+def test_the_next_commands_of_a_script_are_called_through_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["examples/mine.py", "train", SWINGUP])
+    play, _ = next_commands(SWINGUP, TrainConfig.from_task(SWINGUP), tmp_path, "solved")
+    assert play == f"uv run python examples/mine.py play {SWINGUP}"
+
+
 @pytest.mark.parametrize("name", ["cartpole", "elsewhere"])
 def test_the_printed_commands_find_the_policy(trained, name):
     cfg = parse_train_flags(SWINGUP, ["--log-root", str(trained.parents[1])], "train")

@@ -60,18 +60,11 @@ def test_urdf_and_binary_models_are_loaded(tmp_path: Path, file: Path) -> None:
     assert load_model(str(binary)).nu == 1
 
 
-def test_meshes_of_ros_packages_are_found(tmp_path: Path) -> None:
-    meshes = tmp_path / "two_description" / "meshes"
-    meshes.mkdir(parents=True)
-    corners = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
-    faces = ("1 3 2", "1 2 4", "1 4 3", "2 3 4")
-    lines = [*(f"v {corner}" for corner in corners), *(f"f {face}" for face in faces)]
-    (meshes / "part.obj").write_text("\n".join(lines), encoding="utf-8")
-    urdf = tmp_path / "two_description" / "urdf" / "two.urdf"
-    urdf.parent.mkdir()
-    mesh = '<mesh filename="package://two_description/meshes/part.obj"/>'
-    urdf.write_text(URDF.format(geometry=mesh), encoding="utf-8")
-    assert load_model(str(urdf)).nmesh == 1
+def test_a_model_without_geoms_is_shown(tmp_path: Path, viser_server) -> None:
+    body = '<body><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="hinge"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    page = ModelPage(viser_server, "bare", model, lambda: model)
+    assert list(page.joints) == ["hinge"]
 
 
 def test_robots_and_tasks_are_loaded_with_a_ground() -> None:

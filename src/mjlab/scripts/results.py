@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import mjlab
 from mjlab.scripts.flags import prepare_env_cfg
 from mjlab.scripts.policy import policy_env_cfg
 from mjlab.scripts.record import VideoCfg, record_policy
@@ -106,7 +107,14 @@ def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None)
     if ended == "interrupted":
         commands.insert(0, ["train", task, *typed, "--agent.resume", "True"])
     join = subprocess.list2cmdline if os.name == "nt" else shlex.join
-    return [join(["uv", "run", *command]) for command in commands]
+    return [join(["uv", "run", *_program(), *command]) for command in commands]
+
+
+def _program() -> list[str]:
+    """Return the words before the subcommand: the user's script, which may register the task."""
+    script = Path(sys.argv[0])
+    is_own = script.suffix == ".py" and Path(mjlab.__file__).parent not in script.resolve().parents
+    return ["python", sys.argv[0]] if is_own else []
 
 
 def _picked(flags: list[str], picks: Callable[[str], bool]) -> list[str]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from xml.etree import ElementTree
 
 import mujoco
 import viser
@@ -17,6 +16,7 @@ import viser
 from mjlab.scripts.export_scene import ROBOTS, scene_and_options
 from mjlab.scripts.flags import parse_flags
 from mjlab.utils.errors import MjlabError, UserError
+from mjlab.utils.urdf import read_urdf
 from mjlab.viewer.camera import whole_model_view
 from mjlab.viewer.page_server import check_address, open_browser, page_url, serve_page
 from mjlab.viewer.viser.look import set_theme
@@ -112,7 +112,8 @@ def _load_file(path: Path) -> mujoco.MjModel:
     try:
         if path.suffix.lower() == ".mjb":
             return mujoco.MjModel.from_binary_path(str(path))
-        spec = _read_spec(path)
+        is_urdf = path.suffix.lower() == ".urdf"
+        spec = read_urdf(path) if is_urdf else mujoco.MjSpec.from_file(str(path))
         # A robot without ground would fall out of view once the physics runs.
         is_free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in spec.joints)
         if is_free and not spec.worldbody.geoms:
@@ -122,38 +123,6 @@ def _load_file(path: Path) -> mujoco.MjModel:
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{path}: MuJoCo cannot load the model: {reason}") from error
-
-
-def _read_spec(path: Path) -> mujoco.MjSpec:
-    """Return the spec of an MJCF or URDF, with the visual geoms and package paths of a URDF.
-
-    MuJoCo drops the visual geoms of a URDF, and knows no ROS packages: `package://NAME/FILE` becomes the
-    first existing FILE or NAME/FILE below the folders above the URDF.
-    """
-    if path.suffix.lower() != ".urdf":
-        return mujoco.MjSpec.from_file(str(path))
-    try:
-        robot = ElementTree.fromstring(path.read_text(encoding="utf-8"))
-    except ElementTree.ParseError as error:
-        raise ValueError(f"not an XML file: {error}") from error
-    if robot.find("mujoco") is not None:
-        return mujoco.MjSpec.from_file(str(path))
-    for mesh in robot.iter("mesh"):
-        name = mesh.get("filename", "")
-        package, _, file = name.removeprefix("package://").partition("/")
-        folders = [path.resolve().parent] if file == "" else path.resolve().parents
-        tried = [folder / part for folder in folders for part in (file, f"{package}/{file}")]
-        if not name.startswith("package://"):
-            tried = [path.resolve().parent / name.removeprefix("file://")]
-        found = [candidate for candidate in tried if candidate.is_file()]
-        if not found:
-            raise ValueError(
-                f"mesh {name!r} not found; looked for {tried[0]} and in the folders above, for packages"
-            )
-        mesh.set("filename", str(found[0]))
-    options = ElementTree.SubElement(robot, "mujoco")
-    ElementTree.SubElement(options, "compiler", discardvisual="false", strippath="false")
-    return mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
 
 
 class ModelPage:
@@ -214,6 +183,8 @@ class ModelPage:
 
     def _build(self, model: mujoco.MjModel) -> None:
         gui = self._server.gui
+        # Frames and joints of a model without geoms would have no size.
+        model.stat.meansize = max(model.stat.meansize, 0.01 * model.stat.extent, 1e-4)
         self.model, self.data = model, mujoco.MjData(model)
         self.joints: dict[str, viser.GuiSliderHandle[float]] = {}
         self.actuators: dict[str, viser.GuiSliderHandle[float]] = {}

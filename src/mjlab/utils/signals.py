@@ -28,6 +28,11 @@ FORWARDED: dict[int, signal.Signals] = {
 SIGINT and SIGTERM."""
 
 
+NEW_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+"""`creationflags` of a process that Ctrl-C in the terminal does not reach, on Windows; elsewhere
+`start_new_session=True` does that."""
+
+
 def start_in_background(
     command: list[str], environment: dict[str, str], output: IO[bytes] | None = None
 ) -> subprocess.Popen[bytes]:
@@ -35,15 +40,14 @@ def start_in_background(
 
     `output` receives stdout and stderr. None: those of this process.
     """
-    flags = subprocess.CREATE_NEW_PROCESS_GROUP if sys.platform == "win32" else 0
     return subprocess.Popen(
         command,
         env=environment,
         stdin=None if output is None else subprocess.DEVNULL,
         stdout=output,
         stderr=None if output is None else subprocess.STDOUT,
-        creationflags=flags,
-        start_new_session=not flags,
+        creationflags=NEW_GROUP,
+        start_new_session=True,
     )
 
 

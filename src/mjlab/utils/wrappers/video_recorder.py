@@ -19,6 +19,7 @@ import numpy as np
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.utils.errors import check_count, check_one_of
 from mjlab.utils.os import create_locked, remove_temporary_files, rename_locked, temporary_path
+from mjlab.utils.signals import NEW_GROUP
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 if TYPE_CHECKING:
@@ -302,7 +303,8 @@ class ClipWriter:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._messages,
-            # Ctrl+C must reach only this program, which then finishes the clip.
+            # This program finishes the clip after Ctrl-C.
+            creationflags=NEW_GROUP,
             start_new_session=True,
         )
         atexit.register(self.close)
