@@ -72,6 +72,12 @@ def test_robots_and_tasks_are_loaded_with_a_ground() -> None:
     assert load_model("Mjlab-Cartpole-Swingup").joint("cartpole/slider") is not None
 
 
+def test_a_folder_does_not_hide_the_robot_of_its_name(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "yam").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_model("yam").nu > 0
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -87,6 +93,7 @@ def test_robots_and_tasks_are_loaded_with_a_ground() -> None:
             "'package://x/b.stl' not found",
         ),
         ("robot.pdf", "", "robot.pdf"),
+        ("robot.mjcf", MJCF, "ends in .xml, .urdf"),
     ],
 )
 def test_what_cannot_be_loaded_is_named(tmp_path: Path, name: str, text, message: str) -> None:
@@ -136,3 +143,33 @@ def test_reload_reads_the_file_and_keeps_the_model_if_it_is_damaged(
     page.reload()
     page.advance(0.0)
     assert page.joints["elbow"].max == pytest.approx(np.pi / 6)
+
+
+def test_joints_and_actuators_without_a_name_have_sliders(viser_server) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='.1'/><body pos='1 0 0'><joint name='j'/>"
+        "<geom size='.1'/></body></body></worldbody><actuator><motor joint='j'/></actuator></mujoco>"
+    )
+    page = ModelPage(viser_server, "unnamed", model, lambda: model)
+    page.set_value("0", "qpos", 0.5)
+    page.set_value("0", "ctrl", 0.25)
+    page.advance(0.0)
+    assert page.data.qpos.tolist() == [0.5, 0.0]
+    assert page.data.ctrl.tolist() == [0.25]
+    page.set_pose("initial")
+    assert page.joints["0"].value == page.actuators["0"].value == 0.0
+
+
+def test_physics_that_diverges_is_paused_with_the_reason(viser_server) -> None:
+    gain = "<general joint='j' gainprm='1e9' biastype='affine' biasprm='0 -1e9 1e9'/>"
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint name='j' axis='0 1 0' pos='0 0 .3'/><geom size='.1'/></body>"
+        f"</worldbody><actuator>{gain}</actuator></mujoco>"
+    )
+    page = ModelPage(viser_server, "stiff", model, lambda: model)
+    page.set_value("0", "ctrl", 1.0)
+    page.playing.value = True
+    page.advance(1.0)
+    assert not page.playing.value
+    assert "diverged" in page.message.content
+    assert page.data.qpos.tolist() == [0.0]

@@ -22,7 +22,7 @@ from mjlab.viewer.page_server import check_address, open_browser, page_url, serv
 from mjlab.viewer.viser.look import set_theme
 from mjlab.viewer.viser.scene import MjlabViserScene
 
-_SUFFIXES = (".xml", ".mjcf", ".urdf", ".mjb", ".mjz", ".zip")
+_SUFFIXES = (".xml", ".urdf", ".mjb", ".mjz", ".zip")
 _FRAME_TIME = 1.0 / 30.0
 _MAX_LISTED = 60
 # Distance of the camera, in extents of the model.
@@ -30,6 +30,11 @@ _DISTANCE = 1.8
 # Limits of sliders for joints and actuators without a range.
 _HINGE_LIMIT, _SLIDE_LIMIT, _CTRL_LIMIT = 3.1416, 1.0, 1.0
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 _KEY, _JOINT, _ACTUATOR = (
     mujoco.mjtObj.mjOBJ_KEY,
     mujoco.mjtObj.mjOBJ_JOINT,
@@ -86,7 +91,7 @@ def load_model(target: str) -> mujoco.MjModel:
         UserError: not found, or MuJoCo cannot compile it; the message has the path and the reason.
     """
     path = Path(target)
-    if path.suffix.lower() in _SUFFIXES or path.exists():
+    if path.suffix.lower() in _SUFFIXES or path.is_file():
         return _load_file(path)
     from mjlab.scene import Scene
     from mjlab.terrains import TerrainEntityCfg
@@ -109,6 +114,10 @@ def load_model(target: str) -> mujoco.MjModel:
 def _load_file(path: Path) -> mujoco.MjModel:
     if not path.is_file():
         raise UserError(f"View {path}: expected a file ({', '.join(_SUFFIXES)}), found none.")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise UserError(
+            f"View {path}: expected a name that ends in {', '.join(_SUFFIXES)}; rename it."
+        )
     try:
         if path.suffix.lower() == ".mjb":
             return mujoco.MjModel.from_binary_path(str(path))
@@ -151,6 +160,8 @@ class ModelPage:
         self._lock = threading.RLock()
         self._next: mujoco.MjModel | None = None
         self._changed = threading.Event()
+        # Simulated time that displayed time is ahead (s).
+        self._ahead = 0.0
         set_theme(server)
         self._build(model)
 
@@ -172,14 +183,26 @@ class ModelPage:
                 self._server.scene.reset()
                 self._build(model)
             if self.playing.value:
-                end = self.data.time + seconds
-                while self.data.time < end:
+                self._ahead += seconds
+                while self._ahead >= self.model.opt.timestep and self.playing.value:
+                    self._ahead -= self.model.opt.timestep
                     mujoco.mj_step(self.model, self.data)
+                    self._stop_if_diverged()
                 self._changed.set()
             if self._changed.is_set() or self.scene.needs_update:
                 self._changed.clear()
                 mujoco.mj_forward(self.model, self.data)
                 self.scene.update_from_mjdata(self.data)
+
+    def _stop_if_diverged(self) -> None:
+        # MuJoCo resets diverged states, and counts them.
+        if any(self.data.warning[kind].number for kind in _DIVERGED):
+            self.playing.value, self._ahead = False, 0.0
+            self.message.content = (
+                f"**The physics diverged** at a timestep of {self.model.opt.timestep:g} s, and is paused. A "
+                "smaller timestep, an armature, or weaker gains may help."
+            )
+            self.set_pose(self.pose.value)
 
     def _build(self, model: mujoco.MjModel) -> None:
         gui = self._server.gui
@@ -228,17 +251,19 @@ class ModelPage:
             else:
                 mujoco.mj_resetDataKeyframe(self.model, self.data, key)
             for joint, slider in self.joints.items():
-                slider.value = float(self.data.joint(joint).qpos[0])
+                slider.value = float(self.data.joint(_index(self.model, _JOINT, joint)).qpos[0])
             for actuator, slider in self.actuators.items():
-                slider.value = float(self.data.actuator(actuator).ctrl[0])
+                slider.value = float(
+                    self.data.actuator(_index(self.model, _ACTUATOR, actuator)).ctrl[0]
+                )
             self._changed.set()
 
     def _add_joint_sliders(self) -> None:
         model = self.model
         with self._server.gui.add_folder("Joints (rad, m)"):
             for joint in range(model.njnt):
-                kind, name = int(model.jnt_type[joint]), model.joint(joint).name
-                if kind not in (_HINGE, _SLIDE) or not name:
+                kind, name = int(model.jnt_type[joint]), _name(model, _JOINT, joint)
+                if kind not in (_HINGE, _SLIDE):
                     continue
                 limit = _HINGE_LIMIT if kind == _HINGE else _SLIDE_LIMIT
                 bounds = model.jnt_range[joint] if model.jnt_limited[joint] else (-limit, limit)
@@ -248,15 +273,15 @@ class ModelPage:
         model = self.model
         with self._server.gui.add_folder("Actuators (ctrl)"):
             for actuator in range(model.nu):
-                name, joint = model.actuator(actuator).name, int(model.actuator_trnid[actuator, 0])
+                name = _name(model, _ACTUATOR, actuator)
+                joint = int(model.actuator_trnid[actuator, 0])
                 drives_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
                 bounds: Any = (-_CTRL_LIMIT, _CTRL_LIMIT)
                 if model.actuator_ctrllimited[actuator]:
                     bounds = model.actuator_ctrlrange[actuator]
                 elif drives_joint and model.jnt_limited[joint]:
                     bounds = model.jnt_range[joint]
-                if name:
-                    self.actuators[name] = self._add_slider(name, bounds, "ctrl")
+                self.actuators[name] = self._add_slider(name, bounds, "ctrl")
 
     def _add_slider(self, name: str, bounds: Any, target: str) -> viser.GuiSliderHandle[float]:
         """Add a slider that writes `qpos` of a joint or `ctrl` of an actuator."""
@@ -277,9 +302,9 @@ class ModelPage:
         """Set `qpos` of a joint or `ctrl` of an actuator by name."""
         with self._lock:
             if target == "qpos":
-                self.data.joint(name).qpos = value
+                self.data.joint(_index(self.model, _JOINT, name)).qpos = value
             else:
-                self.data.actuator(name).ctrl = value
+                self.data.actuator(_index(self.model, _ACTUATOR, name)).ctrl = value
             self._changed.set()
 
 
@@ -309,3 +334,9 @@ def describe_model(title: str, model: mujoco.MjModel) -> str:
 
 def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
     return mujoco.mj_id2name(model, kind, index) or f"{index}"
+
+
+def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
+    """Return the index of the element that `_name` names."""
+    index = mujoco.mj_name2id(model, kind, name)
+    return index if index >= 0 else int(name)
