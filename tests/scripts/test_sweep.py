@@ -39,6 +39,7 @@ class Machine:
         self.at_once = 0
         self.interrupts_after = 99
         self.fails: tuple[str, ...] = ()
+        self.writes = True
         self._alive = 0
 
     def start(self, command, environment, output):
@@ -47,7 +48,7 @@ class Machine:
         self.environments.append(environment)
         self._alive += 1
         self.at_once = max(self.at_once, self._alive)
-        process = SimpleNamespace(signals=[], wait=lambda: 0)
+        process = SimpleNamespace(signals=[], wait=lambda: 0, returncode=None)
         process.send_signal = process.signals.append
         process.poll = lambda: self._end(process, command, output)
         return process
@@ -64,9 +65,11 @@ class Machine:
         self._alive -= 1
         run_dir = Path(flags["--log-root"], flags["--agent.experiment-name"])
         run_dir /= f"2026-01-01_{len(self.commands)}_{flags['--agent.run-name']}"
-        write_run(run_dir, ended, 1e4 * float(flags[f"--{RATE}"]))
+        if self.writes:
+            write_run(run_dir, ended, 1e4 * float(flags[f"--{RATE}"]))
         output.write(b"error: the pole broke\n" if ended == "failed" else b"")
-        return int(ended == "failed")
+        process.returncode = int(ended == "failed")
+        return process.returncode
 
 
 def flags_of(command: list[str]) -> dict[str, str]:
@@ -188,6 +191,27 @@ def test_a_failed_run_is_named_and_retried_by_the_same_command(sweep, machine, f
         "1e-4", "1e-3", "1e-4",
     ]  # fmt: skip
     assert len(rows_of(folder)) == 2
+
+
+def test_a_run_whose_resumption_fails_is_not_called_saved(sweep, machine, folder):
+    argv = ("--over", f"{RATE}=1e-4,1e-3", "--folder", str(folder), "--jobs", "1")
+    machine.interrupts_after = 1
+    assert sweep(*argv).status == 130
+    # Its folder still says that the run was interrupted.
+    machine.interrupts_after, machine.fails, machine.writes = 99, ("1e-4",), False
+    outcome = sweep(*argv)
+    assert outcome.status == 1
+    assert "Failed   learning-rate=1e-4" in outcome.out
+    assert "Saved" not in outcome.out
+
+
+def test_integers_of_a_range_are_trained_once_each(sweep, machine, folder):
+    flag = "agent.algorithm.num-learning-epochs"
+    argv = ("--over", f"{flag}=2..4", "--trials", "8", f"--{RATE}", "1e-3")
+    assert sweep(*argv, "--folder", str(folder)).status == 0
+    epochs = [flags_of(command)[f"--{flag}"] for command in machine.commands]
+    assert len(epochs) == len(set(epochs))
+    assert set(epochs) <= {"2", "3", "4"}
 
 
 def test_values_of_ranges_are_sampled(sweep, machine, folder):

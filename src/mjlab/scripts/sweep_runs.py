@@ -80,7 +80,8 @@ class Runs:
                     time.sleep(_SECONDS_BETWEEN_LOOKS)
                     self._update()
             finally:
-                if self._running:
+                # A second signal would stop runs that are saving.
+                if self._running and not self.interrupted:
                     self._stop(signal.SIGINT)
                 for run in self._running:
                     run.process.wait()
@@ -151,9 +152,12 @@ class Runs:
         self._left[run.trial.number] -= 1
         if (value := value_of(sweep, setting, run.seed)) is not None:
             print(f"Finished {run.name}: {sweep.label} {value:.4g}", flush=True)
-        elif self.interrupted or info.get("ended") == "interrupted":
+        elif run.process.returncode == 0 and info.get("ended") == "interrupted":
             self.interrupted = True
             print(f"Saved    {run.name}, iteration {info.get('iterations', 0)}", flush=True)
+            return
+        elif self.interrupted:
+            print(f"Stopped  {run.name} without saving", flush=True)
             return
         else:
             self.failed.append(sweep.log_file(setting, run.seed))

@@ -104,8 +104,8 @@ class Study:
             trial.set_user_attr(_SETTING, setting)
             trial.set_user_attr(_OWNER, self._owner)
             others = [one for one in self._with_setting(setting) if one.number < trial.number]
-            # Two machines that start together both enqueue the grid.
-            if self._sweep.trials is None and others:
+            # Two machines that start together both enqueue the grid, and few integers repeat.
+            if others:
                 self._study.tell(trial.number, state=TrialState.PRUNED)
                 continue
             return next(one for one in self.trials if one.number == trial.number)
