@@ -207,6 +207,10 @@ def test_other_uses_of_a_constant_are_allowed(env, kind):
     def all_of(env):
         return env.value if everything.joint_ids else None
 
+    def other_ids(env):
+        ids, _ = env.scene["robot"].find_joints(DEFAULT.joint_names)
+        return env.value if ids and everything.joint_ids else None
+
     def resolves(env):
         DEFAULT.resolve(env.scene)
         return env.value if DEFAULT.joint_ids else None
@@ -216,7 +220,7 @@ def test_other_uses_of_a_constant_are_allowed(env, kind):
     def unset(env):
         return later
 
-    manager_class({f.__name__: make(f) for f in (names, all_of, resolves, unset)}, env)
+    manager_class({f.__name__: make(f) for f in (names, all_of, other_ids, resolves, unset)}, env)
     later = env.value
 
 

@@ -10,6 +10,7 @@ import torch
 
 from mjlab.managers import RewardManager, RewardTermCfg, SceneEntityCfg
 from mjlab.managers.term_checks import checked_when_built, require_entity
+from mjlab.sensor import ContactSensor
 
 
 @pytest.fixture
@@ -115,8 +116,11 @@ def test_an_unfilled_reward_with_a_weight_is_refused(make_env, seen, kind):
 
 
 def test_a_sensor_is_not_an_entity():
-    scene = SimpleNamespace(entities={"robot": "a robot"}, sensors={"contact": "a sensor"})
-    env: Any = SimpleNamespace(scene=scene)
+    class FakeScene(dict):
+        entities = {"robot": "a robot"}
+
+    sensor = object.__new__(ContactSensor)
+    env: Any = SimpleNamespace(scene=FakeScene(robot="a robot", contact=sensor))
     assert require_entity(env, "robot") == "a robot"
     with pytest.raises(KeyError, match=r"entity 'contact'.*\['robot'\]"):
         require_entity(env, "contact")

@@ -102,6 +102,27 @@ def test_attributes_that_the_class_or_its_methods_name_are_allowed():
         check_fields_exist("cfg", dataclasses.replace(cfg))
 
 
+@dataclass
+class MisspelledCfg(SceneCfg):
+    def __post_init__(self) -> None:
+        self.env_spacign = 3.0
+
+
+def test_a_field_misspelled_in_a_method_of_its_class_is_an_error():
+    cfg = make_cfg()
+    cfg.scene = MisspelledCfg()
+    with pytest.raises(ValueError, match=r"cfg\.scene\.env_spacign.*'env_spacing'"):
+        check_fields_exist("cfg", cfg)
+
+
+@pytest.mark.parametrize("name", ["my_events", "commands_cfg", "max_episode_length_s"])
+def test_names_with_a_further_word_are_attributes_of_packages(name):
+    cfg = make_cfg()
+    setattr(cfg, name, 1)
+    with pytest.warns(UserWarning, match=name):
+        check_fields_exist("cfg", cfg)
+
+
 @pytest.mark.parametrize("task", list_tasks())
 def test_registered_tasks_are_silent(task):
     with warnings.catch_warnings():

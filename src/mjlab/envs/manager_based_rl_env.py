@@ -194,7 +194,9 @@ class ManagerBasedRlEnv(Tabular):
                 expanded_fields=self.sim.expanded_fields,
             )
         self.metadata["render_fps"] = 1.0 / self.step_dt
+        self._placement.begin()
         self.load_managers()
+        self._placement.end_building()
         # Expanding model fields invalidated the simulation's graphs.
         self.sim.create_graph()
         self.setup_manager_visualizers()

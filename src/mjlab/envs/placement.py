@@ -22,16 +22,21 @@ class PlacementReport:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._is_done = self._was_reset = False
+        self._is_done = self._was_reset = self._were_kept = False
 
     def begin(self, resets: bool = False) -> None:
         """Forget earlier reads of the origins, e.g. by a viewer. Called before terms."""
         self._scene.origins_were_read = False
         self._was_reset |= resets
 
+    def end_building(self) -> None:
+        """Note reads by constructors of terms, which may keep the origins. Called after `begin`."""
+        self._were_kept = self._scene.origins_were_read
+
     def end(self) -> None:
         """Warn if terms read the origins since `begin`. Called after all terms."""
-        if self._is_done or not (self._was_reset and self._scene.origins_were_read):
+        were_read = self._scene.origins_were_read or self._were_kept
+        if self._is_done or not (self._was_reset and were_read):
             return
         self._is_done = True
         names = unplaced_bases(self._scene)
@@ -40,7 +45,8 @@ class PlacementReport:
                 f"The fixed base of {', '.join(map(repr, names))} is at the same position in all "
                 "environments, but terms read scene.env_origins; place it with an event of mode "
                 "'reset', such as mdp.reset_scene_to_default, or mdp.reset_root_state_uniform with "
-                f"pose_range={{}} and asset_cfg=SceneEntityCfg({names[0]!r}).",
+                f"pose_range={{}} and asset_cfg=SceneEntityCfg({names[0]!r}). Scenery that all environments "
+                "share can stay.",
                 UserWarning,
                 stacklevel=3,
             )

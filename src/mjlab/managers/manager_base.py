@@ -362,7 +362,9 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
     def _prepare_terms(self) -> None:
         for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
             for key, value in _items(term_cfg) or ():
-                self._resolve_selections(f"{self._label(name)}, field {key!r}", value)
+                self._resolve_selections(
+                    f"{self._label(name)}, field {key!r}", value, is_nested=True
+                )
             with label_errors(self._label(name)):
                 term = term_cfg.build(self._env)
             if not isinstance(term, self._term_type):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import dis
 import inspect
+import itertools
 import math
 from collections.abc import Callable
 from numbers import Real
@@ -13,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.sensor import ContactSensor, RayCastSensor
+from mjlab.sensor import ContactSensor, RayCastSensor, Sensor
 from mjlab.sensor.terrain_scan import check_terrain_scan
 from mjlab.utils.errors import UnknownNameError, WrongTypeError, check_exists
 
@@ -71,7 +73,7 @@ def check_constants(function: Any, env: ManagerBasedRlEnv) -> None:
         resolved = copy.deepcopy(value)
         with contextlib.suppress(KeyError, ValueError):
             resolved.resolve(env.scene)
-        for ids in (field for field in call.__code__.co_names if field.endswith("_ids")):
+        for ids in _ids_read_of(name, call):
             if getattr(resolved, ids, None) != getattr(value, ids, None):
                 raise ValueError(
                     f"{call.__qualname__} {name}.{ids}: expected a resolved selection, got one that "
@@ -79,13 +81,29 @@ def check_constants(function: Any, env: ManagerBasedRlEnv) -> None:
                 )
 
 
+def _ids_read_of(name: str, function: Any) -> list[str]:
+    """Return the ids, such as `joint_ids`, that a function reads of a variable outside it."""
+    pairs = itertools.pairwise(dis.get_instructions(function))
+    return [
+        second.argval
+        for first, second in pairs
+        if first.opname in ("LOAD_GLOBAL", "LOAD_DEREF")
+        and first.argval == name
+        and second.opname == "LOAD_ATTR"
+        and second.argval.endswith("_ids")
+    ]
+
+
 # Scene and commands.
 
 
 def require_entity(env: ManagerBasedRlEnv, name: str) -> Entity:
     """Return an entity of the scene; raises `KeyError`, also for the name of a sensor."""
-    check_exists("entity", name, env.scene.entities, UnknownNameError)
-    return env.scene.entities[name]
+    # By name: scenes in tests of packages may be plain dicts.
+    entity: Any = env.scene[name]
+    if isinstance(entity, Sensor):
+        check_exists("entity", name, env.scene.entities, UnknownNameError)
+    return entity
 
 
 def require_sensor(env: ManagerBasedRlEnv, name: str, kind: type[S]) -> S:

@@ -516,8 +516,8 @@ def report_overruled(
 ) -> None:
     """Log options that `cfg` overrides, one line each with the assignment to copy.
 
-    Flags that XMLs set in addition to those of `cfg` apply, and are logged too. Gravity that an XML
-    changes is a `UserWarning`.
+    Flags that XMLs set in addition to those of `cfg` apply, and are logged too. Gravity of an XML
+    that is overridden is a `UserWarning`.
 
     Args:
         cfg: Options in force.

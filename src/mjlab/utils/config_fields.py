@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import dis
 import functools
 import inspect
 import warnings
@@ -36,16 +37,19 @@ def check_fields_exist(owner: str, cfg: Any) -> None:
     unknown = []
     for path, part in _configs(owner, cfg, set()):
         fields = [field.name for field in dataclasses.fields(part)]
+        assigned = _names_in_methods(type(part), reads=False)
         for name in (name for name in _attributes(part) if name not in fields):
-            # `seed2` beside `seed` is numbered, not misspelled.
-            others = [field for field in fields if field.rstrip(_DIGITS) != name.rstrip(_DIGITS)]
-            close = difflib.get_close_matches(name, others, cutoff=_CLOSE)
+            close = _misspelled(name, fields)
+            # A class may assign `self.motion_files` beside a field `motion_file`.
+            if name in assigned:
+                close = [field for field in close if field.rstrip("s") != name.rstrip("s")]
             if close:
                 raise ValueError(
                     f"{path}.{name}: {type(part).__name__} has no such field; did you mean "
                     f"{' or '.join(map(repr, close))}?"
                 )
-            unknown.append(f"{path}.{name} ({type(part).__name__})")
+            if name not in assigned:
+                unknown.append(f"{path}.{name} ({type(part).__name__})")
     if unknown:
         _warn_once(
             f"Attributes that are not fields of their configs, and that mjlab does not read: "
@@ -85,15 +89,36 @@ def _configs(path: str, value: Any, seen: set[int]) -> Iterator[tuple[str, Any]]
 
 
 def _attributes(cfg: Any) -> list[str]:
-    """Return the public attributes of an instance that neither its class nor a method of it names."""
+    """Return the public attributes of an instance that neither its class has nor a method of it reads."""
     names = [name for name in getattr(cfg, "__dict__", ()) if not name.startswith("_")]
     names = [name for name in names if not hasattr(type(cfg), name)]
     fields = {field.name for field in dataclasses.fields(cfg)}
     if fields.issuperset(names):
         return []
-    methods = [inspect.unwrap(m) for base in type(cfg).__mro__ for m in _functions(base)]
-    used = {name for method in methods for name in _names_in(method.__code__)}
-    return [name for name in names if name not in used]
+    return [name for name in names if name not in _names_in_methods(type(cfg), reads=True)]
+
+
+def _misspelled(name: str, fields: list[str]) -> list[str]:
+    """Return the fields that `name` may misspell."""
+    # `seed2` beside `seed` is numbered, and `my_events` beside `events` another name.
+    words = set(name.split("_"))
+    others = [
+        field
+        for field in fields
+        if field.rstrip(_DIGITS) != name.rstrip(_DIGITS) and not set(field.split("_")) < words
+    ]
+    return difflib.get_close_matches(name, others, cutoff=_CLOSE)
+
+
+def _names_in_methods(cls: type, reads: bool) -> set[str]:
+    """Return the attribute names and strings that the methods of a class read, or else those assigned."""
+    methods = [inspect.unwrap(method) for base in cls.__mro__ for method in _functions(base)]
+    return {
+        name
+        for method in methods
+        for name, is_stored in _names_in(method.__code__)
+        if is_stored != reads
+    }
 
 
 def _functions(cls: type) -> Iterator[Any]:
@@ -103,11 +128,15 @@ def _functions(cls: type) -> Iterator[Any]:
             yield function
 
 
-def _names_in(code: CodeType) -> Iterator[str]:
-    """Yield attribute names and strings in the code of a function."""
-    yield from code.co_names
+def _names_in(code: CodeType) -> Iterator[tuple[str, bool]]:
+    """Yield attribute names and strings in the code of a function, and True for assigned ones."""
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "STORE_ATTR":
+            yield instruction.argval, True
+        elif instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            yield instruction.argval, False
     for constant in code.co_consts:
         if isinstance(constant, str):
-            yield constant
+            yield constant, False
         elif isinstance(constant, CodeType):
             yield from _names_in(constant)
