@@ -82,6 +82,32 @@ def test_a_clip_ends_by_itself(page, monkeypatch) -> None:
     assert not panel.is_recording
 
 
+def test_a_clip_is_sent_while_the_view_is_paused(page) -> None:
+    viewer, panel, client = page
+    press(panel, client)
+    show(viewer)
+    viewer.pause()
+    press(panel, client)
+    viewer._next_scene = 0.0
+    viewer.sync_env_to_viewer()
+    assert client.downloads["clip.mp4"]
+
+
+def test_a_full_disk_ends_the_clip_and_not_the_view(page, monkeypatch) -> None:
+    viewer, panel, client = page
+
+    def fail(*_: Any) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(clip.ClipWriter, "add", fail)
+    press(panel, client)
+    show(viewer)
+    assert client.notes == ["No clip is recorded: no space left"]
+    assert not panel.is_recording
+    show(viewer)
+    assert not client.downloads
+
+
 def test_a_machine_that_cannot_render_says_so_on_the_page(page, monkeypatch) -> None:
     viewer, panel, client = page
 

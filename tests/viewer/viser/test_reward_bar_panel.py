@@ -22,6 +22,9 @@ def test_bars_are_cut_with_a_warning_and_compare_with_the_largest(viser_server, 
     assert "width:100.0%" in panel._html.content
     assert "width:50.0%" in panel._html.content
     assert "b&lt;" in panel._html.content
+    assert ">c<" not in panel._html.content
+    # The sum is of all terms.
+    assert f"{101.0:+.4f}" in panel._html.content
 
 
 @pytest.mark.parametrize(("update_dt", "mean"), [(0.1, 94.5), (0.25, 97.5), (3.0, 99.0)])

@@ -152,14 +152,14 @@ def test_each_sensor_that_draws_has_a_switch(viser_server) -> None:
     viewer = make(viser_server)
     show(viewer)
     hits = next(box for box in checkboxes(viser_server) if box.label == "hits")
-    assert hits.value
+    assert not hits.value
     assert not any(box.label == "silent" for box in checkboxes(viser_server))
     spheres = viewer.scene._debug_handles["sphere"]
-    assert len(spheres.batched_positions) == 2
-    hits.value = False
+    assert len(spheres.batched_positions) == 1
+    hits.value = True
     assert viewer._update_reasons == {UpdateReason.SCENE_REQUEST}
     show(viewer)
-    assert len(spheres.batched_positions) == 1
+    assert len(spheres.batched_positions) == 2
 
 
 def checkboxes(server) -> list:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import tempfile
 from pathlib import Path
@@ -68,15 +69,21 @@ class ClipPanel:
         recording, client = self._recording, self._client
         if recording is None or client is None:
             return
-        if self._requested and client.client_id in self._scene.server.get_clients():
-            recording.add(client.camera, self._scene.env_idx, self._scene.offset)
-        if recording.num_frames >= _MAX_SECONDS * self._fps or not self._requested:
-            self._finish(recording, client)
+        try:
+            if self._requested and client.client_id in self._scene.server.get_clients():
+                recording.add(client.camera, self._scene.env_idx, self._scene.offset)
+            if recording.num_frames >= _MAX_SECONDS * self._fps or not self._requested:
+                self._finish(recording, client)
+        except OSError as error:
+            # A full disk ends the clip, not the view.
+            self.close()
+            self._fail(client, error)
 
     def close(self) -> None:
         """Discard a running recording."""
         if self._recording is not None:
-            self._recording.close()
+            with contextlib.suppress(OSError):
+                self._recording.close()
             self._recording = None
 
     def _on_click(self, event: viser.GuiEvent) -> None:
@@ -84,16 +91,21 @@ class ClipPanel:
             self._client = event.client if not self._requested else self._client
             self._requested = not self._requested
             self._button.label = _LABELS[self._requested]
+            # Of a paused view, too.
+            self._scene.request_update()
 
     def _start(self) -> None:
         try:
             self._recording = _Recording(self._env, self._fps)
-        except RenderingUnavailableError as error:
-            self._requested = False
-            self._button.label = _LABELS[False]
-            log.warning("No clip is recorded. %s", error)
-            if self._client is not None:
-                self._client.add_notification("No clip is recorded", str(error), color="red")
+        except (RenderingUnavailableError, OSError) as error:
+            self._fail(self._client, error)
+
+    def _fail(self, client: viser.ClientHandle | None, error: Exception) -> None:
+        self._requested = False
+        self._button.label = _LABELS[False]
+        log.warning("No clip is recorded. %s", error)
+        if client is not None:
+            client.add_notification("No clip is recorded", str(error), color="red")
 
     def _finish(self, recording: _Recording, client: viser.ClientHandle) -> None:
         self._requested, self._recording = False, None
@@ -146,8 +158,7 @@ class _Recording:
 
     def close(self) -> bytes:
         """Finish the clip and return the file; empty without frames."""
-        self._renderer.close()
-        path = self._writer.close()
-        content = b"" if path is None else path.read_bytes()
-        self._folder.cleanup()
-        return content
+        with self._folder:
+            self._renderer.close()
+            path = self._writer.close()
+            return b"" if path is None else path.read_bytes()

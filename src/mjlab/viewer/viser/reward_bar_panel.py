@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import logging
 from collections.abc import Callable, Iterable, Sequence
 
@@ -39,15 +40,16 @@ class RewardBarPanel:
             max_terms: Maximum number of terms shown. More terms log a warning.
             is_shown: Function of the name; False hides a term, for example one of weight zero.
         """
-        if len(term_names) > max_terms:
+        shown = [name for name in term_names if is_shown(name)]
+        if len(shown) > max_terms:
             log.warning(
                 "The reward has %d terms and bars show the first %d; increase "
                 "viewer.reward_bar_max_terms to see more.",
-                len(term_names),
+                len(shown),
                 max_terms,
             )
-        self._names = term_names[:max_terms]
-        self._is_shown = is_shown
+        self._max_terms, self._is_shown = max_terms, is_shown
+        self._names = term_names
         self._history = TermHistory(max(1, round(_WINDOW_S / update_dt)))
         self._html = server.gui.add_html("")
         self._shown = ""
@@ -65,13 +67,15 @@ class RewardBarPanel:
     def refresh(self) -> None:
         """Show the means of the recorded values."""
         means = {name: self._history.mean(name) for name in self._names if self._is_shown(name)}
+        total = sum(means.values())
+        means = dict(itertools.islice(means.items(), self._max_terms))
         largest = max((abs(value) for value in means.values()), default=0.0) or 1.0
         rows = "".join(_row(name, value, largest) for name, value in means.items())
         content = (
             '<div style="padding:0.25em 1em;font-size:0.8em">'
             f"<div><strong>Mean of the last {self._history.length} steps</strong></div>"
             '<div style="display:flex;justify-content:space-between"><span>sum</span>'
-            f"<strong>{sum(means.values()):+.4f}</strong></div>{rows}</div>"
+            f"<strong>{total:+.4f}</strong></div>{rows}</div>"
         )
         if content != self._shown:
             self._shown = self._html.content = content

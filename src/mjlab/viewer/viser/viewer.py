@@ -179,11 +179,12 @@ class ViserPlayViewer(BaseViewer):
         # Reading a field makes the engine provide it.
         for name in ("xpos", "xmat", *(("mocap_pos", "mocap_quat") if model.nmocap > 0 else ())):
             getattr(env.sim.data, name)
-        for manager, part in env.manager_visualizers.items():
-            if manager != "command_manager":
-                # Too many arrows say nothing; the switches under Debug Viz show them.
-                for name, _ in part.get_visualizable_terms():
-                    part.set_debug_vis(name, False)
+        # Too many arrows say nothing; the switches under Debug Viz show them.
+        managers = env.manager_visualizers.items()
+        hidden = [part for manager, part in managers if manager != "command_manager"]
+        for part in (*hidden, env.sensor_visualizers):
+            for name, _ in part.get_visualizable_terms():
+                part.set_debug_vis(name, False)
         self._create_gui()
         log.debug("Viewer URL: %s", self.url)
 
