@@ -292,7 +292,7 @@ def test_subclass_with_its_own_law_and_parameters_is_fused(make_world):
 
 
 @pytest.mark.parametrize(
-    ("gain", "found"), [(torch.ones(1, 1), r"\(1, 1\)"), (torch.ones(1), r"\(1,\)"), (2.0, "2.0")]
+    ("gain", "found"), [(torch.ones(2, 1), r"\(2, 1\)"), (torch.ones(4), r"\(4,\)"), (2.0, "2.0")]
 )
 def test_parameters_of_another_shape_are_refused(make_world, gain, found):
     class Wrong(Soft):
@@ -304,6 +304,20 @@ def test_parameters_of_another_shape_are_refused(make_world, gain, found):
     cfg.kind = Wrong
     with pytest.raises(ValueError, match=rf"Wrong of .*'hip'.* gain .*\(3, 1\).*got {found}"):
         make_world(cfg)
+
+
+def test_parameters_that_broadcast_are_accepted(make_world):
+    class Shared(Soft):
+        def initialize(self, mj_model: Any, model: Any, data: Any, device: str) -> None:
+            super().initialize(mj_model, model, data, device)
+            self.gain = torch.full((1, 1), 2.0)
+
+    cfg = SoftCfg(target_names_expr=("hip",), stiffness=1.0, damping=0.0)
+    cfg.kind = Shared
+    world = make_world(cfg)
+    world.entity.set_joint_position_target(torch.ones(3, 3))
+    world.entity.write_data_to_sim()
+    torch.testing.assert_close(world.ctrl, 2.0 * torch.tanh(torch.ones(3, 1)))
 
 
 def test_subclass_with_its_own_compute_is_not_fused(make_world):

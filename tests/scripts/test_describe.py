@@ -126,6 +126,8 @@ def test_flags_select_profile_play_and_form(run_main):
     assert play == describe(task, DescribeConfig(profile="cpu", play=True)).as_json()
     assert play["profile"] == "cpu"
     assert play["play"] is True
+    outcome = run_main(main, "mjlab", "describe", task, "--profile", "cpu", "--json")
+    assert json.loads(outcome.out)["num_envs"] == load_env_cfg(task, profile="cpu").scene.num_envs
     train = describe(task).as_json()
     assert any(row["noise"] for row in train["observations"])
     assert not any(row["noise"] for row in play["observations"] if row["group"] == "actor")

@@ -34,6 +34,8 @@ METRICS = {
         ([], 0.0, "Failures     none: the task has no termination but time limits"),
         (["fell"], 0.0, "Failures     0.0%   95 % interval [0.0%, 50.0%]"),
         (["fell"], 0.25, "Failures     25.0%   95 % interval [0.0%, 50.0%]   (ended by: fell 25.0%)"),
+        # Diverged physics ends episodes without a termination.
+        ([], 0.25, "Failures     25.0%   95 % interval [0.0%, 50.0%]   (ended by: diverged physics)"),
     ],
 )  # fmt: skip
 def test_failures_are_listed_by_termination_without_time_limits(terms, failed, expected):

@@ -68,6 +68,7 @@ class Flags:
     bounds: tuple[tuple[float, float], ...] = ()
     weights: torch.Tensor | None = None
     axis: tuple[int, int] = (0, 1)
+    joints: str | tuple[str, ...] = ".*"
 
 
 def parsed(*flags: str) -> Flags:
@@ -78,6 +79,14 @@ def test_brackets_follow_the_type_at_every_depth():
     flags = parsed("--pairs", "([1,2],(3,4))", "--bounds", "[[0.0,1.0],[2.0,3.0]]")
     assert flags.pairs == [(1, 2), (3, 4)]
     assert flags.bounds == ((0.0, 1.0), (2.0, 3.0))
+
+
+def test_patterns_are_one_string_or_a_sequence_in_brackets():
+    assert parsed("--joints", ".*_knee").joints == ".*_knee"
+    assert parsed("--joints", "[abc]_knee").joints == "[abc]_knee"
+    assert parsed("--joints", "('hip','knee')").joints == ("hip", "knee")
+    assert parsed("--joints", "['knee']").joints == ("knee",)
+    assert parsed("--joints", "()").joints == ()
 
 
 def test_tensors_are_read_and_defaults_are_kept():

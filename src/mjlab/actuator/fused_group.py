@@ -113,12 +113,13 @@ class _FusedGroup:
 
 
 def _parameter(actuator: IdealPdActuator, name: str) -> torch.Tensor:
-    """Return a parameter; raises `ValueError` unless it is a tensor, (N, n)."""
+    """Return a parameter, (N, n); raises `ValueError` unless it is a tensor that broadcasts to it."""
     value, expected = getattr(actuator, name, None), tuple(actuator.stiffness.shape)
-    if not isinstance(value, torch.Tensor) or value.shape != expected:
+    try:
+        return torch.broadcast_to(value, expected)  # ty: ignore
+    except (RuntimeError, TypeError):
         found = tuple(value.shape) if isinstance(value, torch.Tensor) else repr(value)
         raise ValueError(
             f"{type(actuator).__name__} of {actuator.target_names} {name} (in param_names): expected a "
             f"tensor of shape {expected} after initialize, got {found}."
-        )
-    return value
+        ) from None

@@ -16,6 +16,7 @@ from mjlab.scripts.flags import (
     with_task_options,
 )
 from mjlab.scripts.policy import policy_env_cfg
+from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.tables import WIDTH, json_value, tables_text
 
@@ -91,7 +92,9 @@ def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:
 
 
 def _env_cfg(task: str, choice: ConfigChoice) -> ManagerBasedRlEnvCfg:
-    return policy_env_cfg(task, choice.profile, purpose="play" if choice.play else "train")
+    if choice.play:
+        return policy_env_cfg(task, choice.profile, purpose="play")
+    return load_env_cfg(task, profile=choice.profile)
 
 
 class TaskDescription:

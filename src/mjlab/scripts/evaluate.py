@@ -171,11 +171,13 @@ def _table(metrics: dict[str, Any], failures: list[str]) -> str:
             f"Success      {metrics['success_rate']:.1%}   "
             f"{_interval(metrics['success_interval'], '.1%')}   ({metrics['success_definition']})"
         )
-    if not failures:
+    if not failures and not metrics["failure_rate"]:
         lines.append("Failures     none: the task has no termination but time limits")
     elif metrics["failure_rate"] is not None:
         rates = {name: metrics["terminations"].get(name) for name in failures}
         ended = ", ".join(f"{name} {rate:.1%}" for name, rate in rates.items() if rate)
+        # Diverged episodes fail without a termination.
+        ended = ended or ("diverged physics" if metrics["failure_rate"] else "")
         lines.append(
             f"Failures     {metrics['failure_rate']:.1%}   "
             f"{_interval(metrics['failure_interval'], '.1%')}"

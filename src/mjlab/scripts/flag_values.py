@@ -5,7 +5,8 @@ from __future__ import annotations
 import ast
 import dataclasses
 import sys
-from typing import TYPE_CHECKING, Any, get_args, get_origin
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin
 
 from tyro.constructors import (
     ConstructorRegistry,
@@ -59,7 +60,12 @@ class _SequenceRule:
         self._in_tyro_rule = False
 
     def __call__(self, info: PrimitiveTypeInfo) -> _Spec:
-        if self._in_tyro_rule or info.type_origin not in _SEQUENCES:
+        members = get_args(info.type) if info.type_origin in (Union, UnionType) else ()
+        # The string would take brackets too.
+        sequence = next(
+            (m for m in members if str in members and get_origin(m) in _SEQUENCES), None
+        )
+        if self._in_tyro_rule or not (sequence or info.type_origin in _SEQUENCES):
             return None
         self._in_tyro_rule = True
         try:
@@ -69,6 +75,13 @@ class _SequenceRule:
         if not isinstance(spec, PrimitiveConstructorSpec):
             return spec
         read = spec.instance_from_str
+        if sequence is not None:
+            return dataclasses.replace(
+                spec,
+                instance_from_str=lambda args: (
+                    read(args) if (value := _sequence(sequence, args)) is None else value
+                ),
+            )
         return dataclasses.replace(
             spec, instance_from_str=lambda args: read([_bracketed(info.type, a) for a in args])
         )
@@ -80,6 +93,15 @@ def _bracketed(declared: Any, text: str) -> str:
     except (ValueError, SyntaxError):
         return text
     return repr(_converted(declared, value)) if isinstance(value, _SEQUENCES) else text
+
+
+def _sequence(declared: Any, args: list[str]) -> Any:
+    """Return a value in brackets as the sequence type `declared`, or None for other values."""
+    try:
+        value = ast.literal_eval(args[0]) if len(args) == 1 else None
+    except (ValueError, SyntaxError):
+        return None
+    return _converted(declared, value) if isinstance(value, _SEQUENCES) else None
 
 
 def _converted(declared: Any, value: Any) -> Any:

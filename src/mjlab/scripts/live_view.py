@@ -64,14 +64,14 @@ def show(pickled: bytes, exchange: Exchange, host: str, port: int) -> None:
         file.write(page_url(server).encode())
     # Shown at once to a browser that connects: building takes seconds while training uses the cores.
     note = server.gui.add_markdown("Building the view …")
+    notes: list[Any] = []
+    is_built = False
 
     @server.on_client_connect
     def _(client: Any) -> None:
         if not is_built:
             notes.append(client.add_notification("Building the view", "", loading=True))
 
-    notes: list[Any] = []
-    is_built = False
     while not server.get_clients():
         time.sleep(_POLL_PERIOD)
     exchange.watched.touch()
