@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 
@@ -13,6 +14,7 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.envs import manager_based_rl_env as env_checks
 from mjlab.envs import manager_based_rl_env as env_module
 from mjlab.envs.manager_based_rl_env import as_reset_ids, check_device
+from mjlab.managers import EventTermCfg, RewardTermCfg, SceneEntityCfg
 from mjlab.managers.action_manager import as_action
 from mjlab.tasks.registry import load_env_cfg
 
@@ -75,6 +77,79 @@ def test_whole_numbers_of_numpy_are_whole_numbers():
     cfg = cartpole()
     cfg.decimation, cfg.scene.num_envs = np.int64(2), np.int32(3)
     env_checks.check_env_cfg(cfg)
+
+
+# Selections that no manager resolves.
+
+SLIDER = SceneEntityCfg("cartpole", joint_names="slider")
+
+
+def read_constant(env):
+    return env.scene["cartpole"].data.joint_pos[:, SLIDER.joint_ids].sum(dim=-1)
+
+
+def read_through_helper(env):
+    return read_constant(env)
+
+
+class ReadsAttribute:
+    selection = SLIDER
+
+    def __init__(self, cfg, env):
+        pass
+
+    def __call__(self, env):
+        return env.scene["cartpole"].data.joint_pos[:, self.selection.joint_ids].sum(dim=-1)
+
+
+class ReadsAbsentParameter:
+    def __init__(self, cfg, env):
+        self.ids = cfg.params.get("asset_cfg", SLIDER).joint_ids
+
+    def __call__(self, env):
+        return torch.zeros(env.num_envs)
+
+
+def resolve_copy(env):
+    selection = copy.deepcopy(SLIDER)
+    selection.resolve(env.scene)
+    return env.scene["cartpole"].data.joint_pos[:, selection.joint_ids].sum(dim=-1)
+
+
+def assert_unresolved(cfg):
+    with pytest.raises(ValueError, match=r"'cartpole' joint_ids.*joint_names='slider'.*resolve"):
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        env.reset()
+        env.step(torch.zeros(NUM_ENVS, 1))
+
+
+@pytest.mark.parametrize(
+    "term", [read_constant, read_through_helper, ReadsAttribute, ReadsAbsentParameter]
+)
+def test_a_term_that_reads_unresolved_ids_is_an_error(term):
+    cfg = cartpole()
+    cfg.rewards["new"] = RewardTermCfg(func=term, weight=1.0)
+    assert_unresolved(cfg)
+
+
+@pytest.mark.parametrize("mode", ["startup", "reset", "interval"])
+def test_an_event_that_reads_unresolved_ids_is_an_error(mode):
+    cfg = cartpole()
+    interval = (0.0, 0.0) if mode == "interval" else None
+    cfg.events["new"] = EventTermCfg(
+        func=lambda env, env_ids: read_constant(env), mode=mode, interval_range_s=interval
+    )
+    assert_unresolved(cfg)
+
+
+def test_a_term_that_resolves_its_own_selection_runs():
+    cfg = cartpole()
+    cfg.rewards["new"] = RewardTermCfg(func=resolve_copy, weight=1.0)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    env.step(torch.zeros(NUM_ENVS, 1))
+    env.close()
+    assert SLIDER.joint_ids == slice(None), "no term runs"
 
 
 # The device.

@@ -40,6 +40,11 @@ def distance(env):
     return offset.norm(dim=-1)
 
 
+def distance_by_terrain(env):
+    offset = env.scene["arm"].data.root_link_pos_w - env.scene.terrain.env_origins
+    return offset.norm(dim=-1)
+
+
 def joints(env):
     return env.scene["arm"].data.joint_pos
 
@@ -70,11 +75,13 @@ def run(env, steps=2) -> list[str]:
         for _ in range(steps):
             env.step(torch.zeros(env.num_envs, env.action_manager.total_action_dim))
         env.reset()
+    assert all(one.filename == __file__ for one in seen)
     return [str(one.message) for one in seen]
 
 
-def test_a_base_that_is_not_placed_is_reported_once():
-    env = make()
+@pytest.mark.parametrize("reward", [distance, distance_by_terrain])
+def test_a_base_that_is_not_placed_is_reported_once(reward):
+    env = make(reward=reward)
     (message,) = run(env)
     assert "'arm'" in message
     assert "reset_root_state_uniform" in message

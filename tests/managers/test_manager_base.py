@@ -180,50 +180,6 @@ def test_selections_that_are_default_arguments_are_resolved(env, kind, term):
     assert DEFAULT.joint_ids == slice(None), "other environments use the default too"
 
 
-def reads_a_constant(env):
-    return env.value if DEFAULT.joint_ids else None
-
-
-class ReadsAConstant(ByDefault):
-    def __call__(self, env):
-        return env.value if DEFAULT.joint_ids else None
-
-
-def test_ids_of_a_constant_are_an_error_that_names_it(env, kind):
-    manager_class, make = kind
-    for term in (reads_a_constant, ReadsAConstant):
-        with pytest.raises(
-            ValueError, match=r"term 'a'.*DEFAULT\.joint_ids.*pass DEFAULT as a param"
-        ):
-            manager_class({"a": make(term)}, env)
-
-
-def test_other_uses_of_a_constant_are_allowed(env, kind):
-    everything = SceneEntityCfg("robot", joint_names=".*")
-
-    def names(env):
-        return env.value if DEFAULT.name and DEFAULT.joint_names else None
-
-    def all_of(env):
-        return env.value if everything.joint_ids else None
-
-    def other_ids(env):
-        ids, _ = env.scene["robot"].find_joints(DEFAULT.joint_names)
-        return env.value if ids and everything.joint_ids else None
-
-    def resolves(env):
-        DEFAULT.resolve(env.scene)
-        return env.value if DEFAULT.joint_ids else None
-
-    manager_class, make = kind
-
-    def unset(env):
-        return later
-
-    manager_class({f.__name__: make(f) for f in (names, all_of, other_ids, resolves, unset)}, env)
-    later = env.value
-
-
 def test_a_default_argument_that_matches_nothing_is_an_error(env, kind):
     def knees(env, asset_cfg=SceneEntityCfg("robot", joint_names="knee")):  # noqa: B008
         return env.value

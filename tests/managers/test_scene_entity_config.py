@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
+import pickle
 
 import pytest
 
 from mjlab.managers import SceneEntityCfg
+from mjlab.managers.scene_entity_config import selections_checked
 
 KINDS = (
     "joint",
@@ -130,3 +133,55 @@ def test_a_sensor_can_be_named_but_not_selected_from(env):
     SceneEntityCfg("camera").resolve(env.scene)
     with pytest.raises(ValueError, match="'camera': .*joint, got SimpleNamespace"):
         SceneEntityCfg("camera", joint_names="a").resolve(env.scene)
+
+
+# Ids that were never resolved.
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_unresolved_ids_are_an_error_while_terms_run(env, kind):
+    cfg = SceneEntityCfg("robot", **{f"{kind}_names": f"{kind}_b"})
+    with (
+        selections_checked(env.scene),
+        pytest.raises(
+            ValueError, match=f"'robot' {kind}_ids: .*{kind}_names='{kind}_b'.*parameter"
+        ),
+    ):
+        getattr(cfg, f"{kind}_ids")
+    assert getattr(cfg, f"{kind}_ids") == slice(None), "no term runs"
+
+
+def test_ids_that_select_what_their_names_say_can_be_read(env):
+    everything = SceneEntityCfg("robot", joint_names="joint_.*")
+    resolved = SceneEntityCfg("robot", joint_names="joint_b")
+    resolved.resolve(env.scene)
+    # The fields of a kind do not concern another kind.
+    bodies = SceneEntityCfg("robot", joint_names="joint_b")
+    with selections_checked(env.scene):
+        assert everything.joint_ids == slice(None)
+        assert resolved.joint_ids == copy.deepcopy(resolved).joint_ids == [1]
+        assert bodies.body_ids == slice(None)
+        bodies.resolve(env.scene)
+        assert bodies.joint_ids == [1]
+
+
+def test_unresolved_selections_can_be_copied_compared_and_printed_while_terms_run(env):
+    cfg = SceneEntityCfg("robot", joint_names="joint_b")
+    with selections_checked(env.scene):
+        for same in (
+            copy.deepcopy(cfg),
+            dataclasses.replace(cfg),
+            SceneEntityCfg(**dataclasses.asdict(cfg)),
+            pickle.loads(pickle.dumps(cfg)),
+        ):
+            assert same == cfg
+            assert repr(same) == repr(cfg)
+
+
+def test_checks_of_several_scenes_nest(env):
+    cfg = SceneEntityCfg("robot", joint_names="joint_b")
+    with selections_checked(env.scene):
+        with selections_checked(None):
+            assert cfg.joint_ids == slice(None)
+        with pytest.raises(ValueError, match="joint_ids"):
+            _ = cfg.joint_ids

@@ -46,6 +46,7 @@ from mjlab.managers import (
     TerminationTermCfg,
     look_up,
 )
+from mjlab.managers.scene_entity_config import selections_checked
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
 from mjlab.utils.config_fields import check_fields_exist
@@ -195,7 +196,8 @@ class ManagerBasedRlEnv(Tabular):
             )
         self.metadata["render_fps"] = 1.0 / self.step_dt
         self._placement.begin()
-        self.load_managers()
+        with selections_checked(self.scene):
+            self.load_managers()
         self._placement.end_building()
         # Expanding model fields invalidated the simulation's graphs.
         self.sim.create_graph()
@@ -340,21 +342,20 @@ class ManagerBasedRlEnv(Tabular):
         env_ids = as_reset_ids(env_ids, self.num_envs, self.device)
         if seed is not None:
             self.seed(seed)
-        self._clear_extras()
-        self._placement.begin(resets=True)
-        stepped = env_ids[self.episode_length_buf[env_ids] > 0]
-        if len(stepped) > 0:
-            self.recorder_manager.record_pre_reset(stepped)
-        moved = self.scene.take_moved_envs()
-        self._reset_idx(env_ids)
-        self.scene.write_data_to_sim(env_ids)
-        self._forward(env_ids, moved)
-        self.command_manager.compute(dt=0.0, env_ids=env_ids)
-        self.scene.take_moved_envs()
-        self.sim.sense()
-        self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
-        self.recorder_manager.record_post_reset(env_ids)
-        self._placement.end()
+        with self._checking_terms(resets=True):
+            self._clear_extras()
+            stepped = env_ids[self.episode_length_buf[env_ids] > 0]
+            if len(stepped) > 0:
+                self.recorder_manager.record_pre_reset(stepped)
+            moved = self.scene.take_moved_envs()
+            self._reset_idx(env_ids)
+            self.scene.write_data_to_sim(env_ids)
+            self._forward(env_ids, moved)
+            self.command_manager.compute(dt=0.0, env_ids=env_ids)
+            self.scene.take_moved_envs()
+            self.sim.sense()
+            self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
+            self.recorder_manager.record_post_reset(env_ids)
         return self.obs_buf, self.extras
 
     def step(self, action: torch.Tensor) -> VecEnvStepReturn:
@@ -410,54 +411,53 @@ class ManagerBasedRlEnv(Tabular):
                 f"step: environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were "
                 "not reset; call env.reset(env_ids=...) first, or set auto_reset=True in the config."
             )
-        self._clear_extras()
-        self._placement.begin()
-        self.action_manager.process_action(action)
-        self._run_physics()
-        self.episode_length_buf += 1
-        if not self._holds_common_steps:
-            self.common_step_counter += 1
-        self._evaluate_step()
+        with self._checking_terms():
+            self._clear_extras()
+            self.action_manager.process_action(action)
+            self._run_physics()
+            self.episode_length_buf += 1
+            if not self._holds_common_steps:
+                self.common_step_counter += 1
+            self._evaluate_step()
 
-        # Events.
-        self._look_ahead()
-        self._divergence_log.end_step(self.diverged, self.common_step_counter)
-        for mode in ("step", "interval"):
-            if mode in self.event_manager.available_modes:
-                self.event_manager.apply(mode=mode, dt=self.step_dt)
+            # Events.
+            self._look_ahead()
+            self._divergence_log.end_step(self.diverged, self.common_step_counter)
+            for mode in ("step", "interval"):
+                if mode in self.event_manager.available_modes:
+                    self.event_manager.apply(mode=mode, dt=self.step_dt)
 
-        # Resets.
-        moved = self.scene.take_moved_envs()
-        if self.observes_ends and self.cfg.auto_reset:
-            self._observe_ends(moved)
-        reset_ids = self.reset_buf.new_empty(0, dtype=torch.long)
-        if self.cfg.auto_reset:
-            reset_ids = self._ended.ids_of(self.reset_buf)
-        command_dt: float | torch.Tensor = self.step_dt
-        if len(reset_ids) > 0:
-            self.recorder_manager.record_pre_reset(reset_ids)
-            self._reset_idx(reset_ids)
-            self.scene.write_data_to_sim(reset_ids)
-            # Commands of new episodes do not advance in time.
-            command_dt = self._command_dts.fill_(command_dt).index_fill_(0, reset_ids, 0.0)
-            if self._looks_ahead:
-                # Resets resampled the timers. Synchronizing here is shorter than after `forward`.
-                look_up(self.command_manager.plan_lookups(command_dt))
-
-        # Commands and observations.
-        self._forward(reset_ids, moved)
-        self.command_manager.compute(dt=command_dt)
-        # Moves by resets are up to date after `forward`; commands update their own moves.
-        self.scene.take_moved_envs()
-        self.sim.sense()
-        self.obs_buf = self.observation_manager.compute(update_history=True)
-        if self.cfg.auto_reset:
+            # Resets.
+            moved = self.scene.take_moved_envs()
+            if self.observes_ends and self.cfg.auto_reset:
+                self._observe_ends(moved)
+            reset_ids = self.reset_buf.new_empty(0, dtype=torch.long)
+            if self.cfg.auto_reset:
+                reset_ids = self._ended.ids_of(self.reset_buf)
+            command_dt: float | torch.Tensor = self.step_dt
             if len(reset_ids) > 0:
-                self.recorder_manager.record_post_reset(reset_ids)
-        else:
-            self._pending_reset |= self.reset_buf
-        self.recorder_manager.record_post_step()
-        self._placement.end()
+                self.recorder_manager.record_pre_reset(reset_ids)
+                self._reset_idx(reset_ids)
+                self.scene.write_data_to_sim(reset_ids)
+                # Commands of new episodes do not advance in time.
+                command_dt = self._command_dts.fill_(command_dt).index_fill_(0, reset_ids, 0.0)
+                if self._looks_ahead:
+                    # Resets resampled the timers. Synchronizing here is shorter than after `forward`.
+                    look_up(self.command_manager.plan_lookups(command_dt))
+
+            # Commands and observations.
+            self._forward(reset_ids, moved)
+            self.command_manager.compute(dt=command_dt)
+            # Moves by resets are up to date after `forward`; commands update their own moves.
+            self.scene.take_moved_envs()
+            self.sim.sense()
+            self.obs_buf = self.observation_manager.compute(update_history=True)
+            if self.cfg.auto_reset:
+                if len(reset_ids) > 0:
+                    self.recorder_manager.record_post_reset(reset_ids)
+            else:
+                self._pending_reset |= self.reset_buf
+            self.recorder_manager.record_post_step()
         return (
             self.obs_buf,
             self.reward_buf,
@@ -540,6 +540,14 @@ class ManagerBasedRlEnv(Tabular):
                 ended, excluded = self._observed_ends()
                 lookups.append(self._observed.plan(ended & ~excluded, ended, excluded))
         look_up(lookups)
+
+    @contextlib.contextmanager
+    def _checking_terms(self, resets: bool = False) -> Generator[None]:
+        """Check that terms within the block read no unresolved selections and no unused origins."""
+        self._placement.begin(resets)
+        with selections_checked(self.scene):
+            yield
+        self._placement.end()
 
     def _clear_extras(self) -> None:
         self.extras["log"] = {}

@@ -21,22 +21,24 @@ class PlacementReport:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self._scene = scene
+        self._scene, self._terrain = scene, scene.terrain
         self._is_done = self._was_reset = self._were_kept = False
 
     def begin(self, resets: bool = False) -> None:
         """Forget earlier reads of the origins, e.g. by a viewer. Called before terms."""
-        self._scene.origins_were_read = False
+        if self._terrain is not None:
+            self._terrain.origins_were_read = False
         self._was_reset |= resets
 
     def end_building(self) -> None:
         """Note reads by constructors of terms, which may keep the origins. Called after `begin`."""
-        self._were_kept = self._scene.origins_were_read
+        self._were_kept = self._terrain is not None and self._terrain.origins_were_read
 
     def end(self) -> None:
         """Warn if terms read the origins since `begin`. Called after all terms."""
-        were_read = self._scene.origins_were_read or self._were_kept
-        if self._is_done or not (self._was_reset and were_read):
+        if self._is_done or self._terrain is None or not self._was_reset:
+            return
+        if not (self._terrain.origins_were_read or self._were_kept):
             return
         self._is_done = True
         names = unplaced_bases(self._scene)
@@ -48,7 +50,7 @@ class PlacementReport:
                 f"pose_range={{}} and asset_cfg=SceneEntityCfg({names[0]!r}). Scenery that all environments "
                 "share can stay.",
                 UserWarning,
-                stacklevel=3,
+                stacklevel=5,  # Caller of `step` or `reset`, which call this in a context manager.
             )
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import torch
 
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import check_constants, check_real, check_term
+from mjlab.managers.term_checks import check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
 from mjlab.utils.state import SKIP, plain_scalar, stateful
@@ -243,7 +243,6 @@ class ManagerBase(Tabular, ABC):
                     cfg.params.setdefault(key, copy.deepcopy(default))
             self._resolve_params(name, cfg)
         with label_errors(label):
-            check_constants(cfg.func, self._env)
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):
             # Plain classes have run-time state too. Types not created by a class statement, such as

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import re
+import sys
+from collections.abc import Generator
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -86,6 +91,8 @@ class SceneEntityCfg:
     preserve_order: bool = False
     """Order the selection by pattern instead of the entity's natural order."""
 
+    _is_resolved = False
+
     def __str__(self) -> str:
         """Return the entity and its selected elements: `robot`, `robot joint hip`, `robot 12 joints`."""
         parts = [self.name]
@@ -116,6 +123,7 @@ class SceneEntityCfg:
             names, ids = self._resolve_kind(kind, names, ids, entity)
             setattr(self, f"{kind}_names", names)
             setattr(self, f"{kind}_ids", ids)
+        self._is_resolved = True
 
     @property
     def selects_names(self) -> bool:
@@ -168,3 +176,61 @@ class SceneEntityCfg:
                 f"{kind}_names {all_names}, got {outside}."
             )
         return [all_names[i] for i in ids]
+
+
+# Scene whose terms are being built or run.
+_scene: ContextVar[Scene | None] = ContextVar("scene", default=None)
+
+
+@contextlib.contextmanager
+def selections_checked(scene: Scene | None) -> Generator[None]:
+    """Within the block, reading ids of a selection with names that was never resolved is an error.
+
+    These ids would silently select all elements: managers resolve parameters, but neither constants
+    nor selections that a term creates. No error if the names do select all elements.
+
+    Raises:
+        ValueError: such ids were read; the message names the selection and the cure.
+    """
+    token = _scene.set(scene)
+    try:
+        yield
+    finally:
+        _scene.reset(token)
+
+
+class _Ids:
+    """Field of ids of a kind of element. Reading it is checked within `selections_checked`."""
+
+    def __init__(self, kind: str) -> None:
+        self._ids, self._names = f"{kind}_ids", f"{kind}_names"
+
+    def __get__(self, cfg: Any, owner: type | None = None) -> Any:
+        state = getattr(cfg, "__dict__", {})
+        if cfg is None or self._ids not in state:
+            raise AttributeError(f"{owner} has no {self._ids}")
+        ids = state[self._ids]
+        if type(ids) is slice and not cfg._is_resolved and state[self._names] is not None:
+            # Copies and representations are made of unresolved selections, too.
+            reader = sys._getframe(1).f_globals.get("__name__")
+            if (scene := _scene.get()) is not None and reader not in (__name__, "dataclasses"):
+                self._check(cfg, ids, scene)
+        return ids
+
+    def __set__(self, cfg: Any, ids: Any) -> None:
+        cfg.__dict__[self._ids] = ids
+
+    def _check(self, cfg: SceneEntityCfg, ids: slice, scene: Scene) -> None:
+        resolved = copy.deepcopy(cfg)
+        resolved.resolve(scene)
+        if getattr(resolved, self._ids) != ids:
+            names = getattr(cfg, self._names)
+            raise ValueError(
+                f"SceneEntityCfg of {cfg.name!r} {self._ids}: expected a resolved selection, got one that "
+                f"selects all and not {self._names}={names!r}; pass it as a parameter of the term, or "
+                "call its resolve(env.scene) first."
+            )
+
+
+for _kind in _FINDERS:
+    setattr(SceneEntityCfg, f"{_kind}_ids", _Ids(_kind))

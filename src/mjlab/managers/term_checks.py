@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
-import dis
-import inspect
-import itertools
 import math
 from collections.abc import Callable
 from numbers import Real
@@ -14,7 +10,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
-from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sensor import ContactSensor, RayCastSensor, Sensor
 from mjlab.sensor.terrain_scan import check_terrain_scan
 from mjlab.utils.errors import UnknownNameError, WrongTypeError, check_exists
@@ -52,57 +47,18 @@ def check_term(function: Any, env: ManagerBasedRlEnv, params: dict[str, Any]) ->
         check(env, **params)
 
 
-def check_constants(function: Any, env: ManagerBasedRlEnv) -> None:
-    """Check that a term does not read ids of a `SceneEntityCfg` that is not a parameter.
-
-    Managers resolve parameters only: the ids of a module constant, or of a variable outside the
-    function, select all elements. Raises `ValueError` if its names select others.
-    """
-    call = function if inspect.isroutine(function) else type(function).__call__
-    call = inspect.unwrap(getattr(call, "__func__", call))
-    if not inspect.isfunction(call) or "resolve" in call.__code__.co_names:
-        return
-    try:
-        outside = inspect.getclosurevars(call)
-    except ValueError:
-        # An enclosing function has not assigned a variable yet.
-        return
-    for name, value in {**outside.globals, **outside.nonlocals}.items():
-        if not isinstance(value, SceneEntityCfg) or not value.selects_names:
-            continue
-        resolved = copy.deepcopy(value)
-        with contextlib.suppress(KeyError, ValueError):
-            resolved.resolve(env.scene)
-        for ids in _ids_read_of(name, call):
-            if getattr(resolved, ids, None) != getattr(value, ids, None):
-                raise ValueError(
-                    f"{call.__qualname__} {name}.{ids}: expected a resolved selection, got one that "
-                    f"selects all elements of {value.name!r}; pass {name} as a parameter of the term."
-                )
-
-
-def _ids_read_of(name: str, function: Any) -> list[str]:
-    """Return the ids, such as `joint_ids`, that a function reads of a variable outside it."""
-    pairs = itertools.pairwise(dis.get_instructions(function))
-    return [
-        second.argval
-        for first, second in pairs
-        if first.opname in ("LOAD_GLOBAL", "LOAD_DEREF")
-        and first.argval == name
-        and second.opname == "LOAD_ATTR"
-        and second.argval.endswith("_ids")
-    ]
-
-
 # Scene and commands.
 
 
 def require_entity(env: ManagerBasedRlEnv, name: str) -> Entity:
     """Return an entity of the scene; raises `KeyError`, also for the name of a sensor."""
-    # By name: scenes in tests of packages may be plain dicts.
-    entity: Any = env.scene[name]
-    if isinstance(entity, Sensor):
-        check_exists("entity", name, env.scene.entities, UnknownNameError)
+    # Scenes in tests of packages may be plain dicts.
+    scene: Any = env.scene
+    entity: Any = None
+    with contextlib.suppress(KeyError):
+        entity = scene[name]
+    if entity is None or isinstance(entity, Sensor):
+        check_exists("entity", name, getattr(scene, "entities", scene), UnknownNameError)
     return entity
 
 

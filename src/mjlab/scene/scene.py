@@ -77,7 +77,7 @@ class SceneCfg:
 class Scene(Tabular):
     """Terrain, entities and sensors composed into one `MjSpec`. `initialize` binds a simulation."""
 
-    _transient = {"_env_origins", "_device", "_updated_sensors", "origins_were_read"}
+    _transient = {"_env_origins", "_device", "_updated_sensors"}
 
     def __init__(self, scene_cfg: SceneCfg, device: str) -> None:
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
@@ -121,8 +121,6 @@ class Scene(Tabular):
             scene_cfg.spec_fn(self._spec)
             self.entity_options = drop_overridden(self._spec.option, self.entity_options)
         add_key(self._spec, [entity.initial_state for entity in self._entities.values()])
-        self.origins_were_read = False
-        """True after a read of `env_origins`, until it is set to False."""
         self._env_origins = torch.zeros(scene_cfg.num_envs, 3, dtype=torch.float32, device=device)
 
     # Composition.
@@ -239,7 +237,6 @@ class Scene(Tabular):
     @property
     def env_origins(self) -> torch.Tensor:
         """World positions of the environment origins (m), (N, 3)."""
-        self.origins_were_read = True
         return self._env_origins if self._terrain is None else self._terrain.env_origins
 
     @property
