@@ -120,6 +120,8 @@ def main(args: Args) -> None:
     runs = dict(item.split("=", 1) for item in args.run)
     for name in args.names:
         clip = CLIPS[name]
+        if clip.policy is None and name not in runs:
+            raise SystemExit(f"--run: expected {name}=FOLDER of a run of {clip.task}.")
         policy = clip.policy or latest_checkpoint(Path(runs[name]))
         if policy is None:
             raise SystemExit(f"{runs[name]}: expected a checkpoint, found none.")

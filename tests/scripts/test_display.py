@@ -43,6 +43,12 @@ STATS = IterationStats(
 )
 
 
+@pytest.fixture(autouse=True)
+def typed_train(monkeypatch):
+    """The next commands follow the one that was typed, here by pytest or `python -m pytest`."""
+    monkeypatch.setattr(sys, "argv", ["train", SWINGUP])
+
+
 def outcome(error: float = 0.31, failures: float = 0.075, mean_return: float = 845.0):
     return EvaluationResult(
         num_episodes=256,
@@ -188,6 +194,18 @@ def test_lines_are_rare_but_the_first_and_the_last_are_there(monkeypatch):
     shown.iterate(*range(1, 11))
     lines = [line for line in shown.text.splitlines() if line.startswith("[")]
     assert [line.split()[0] for line in lines] == ["[1/10]", "[10/10]"]
+
+
+def test_the_line_of_the_iteration_that_solved_the_task_is_there_once(monkeypatch):
+    monkeypatch.setattr(display, "_SECONDS_BETWEEN_LINES", 1000.0)
+    shown = Shown(RETURN)
+    shown.iterate(*range(1, 8))
+    shown.panel.on_evaluation(7, outcome(), solved=True)
+    shown.panel.on_confirmation(7, outcome(), solved=True)
+    shown.panel.on_end("solved")
+    words = [line.split()[0] for line in shown.text.splitlines()]
+    assert [word for word in words if word.startswith("[")] == ["[1/10]", "[7/10]"]
+    assert words.index("[7/10]") < words.index("Evaluation")
 
 
 def test_a_log_file_gets_no_control_codes_and_words_of_key_and_value():

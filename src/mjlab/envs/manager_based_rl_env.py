@@ -53,6 +53,7 @@ from mjlab.utils.config_fields import check_fields_exist
 from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
+from mjlab.utils.string import counted
 from mjlab.viewer.viewer_config import ViewerConfig
 
 if TYPE_CHECKING:
@@ -249,7 +250,7 @@ class ManagerBasedRlEnv(Tabular):
         return self
 
     def __repr__(self) -> str:
-        count = f"{self.num_envs} environment{'s' if self.num_envs != 1 else ''}"
+        count = counted(self.num_envs, "environment")
         return f"<{type(self).__name__}: {count} on {self.device}; {self.describe_time()}>"
 
     def describe_time(self) -> str:

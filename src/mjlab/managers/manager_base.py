@@ -25,7 +25,7 @@ from mjlab.managers.term_checks import check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
 from mjlab.utils.state import SKIP, plain_scalar, stateful
-from mjlab.utils.string import suggest
+from mjlab.utils.string import counted, suggest
 from mjlab.utils.tables import Table, Tabular, function_name
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class ManagerBase(Tabular, ABC):
 
     def __repr__(self) -> str:
         count = sum(len(table.rows) for table in self.tables())
-        return f"<{type(self).__name__}> with {count} active terms"
+        return f"<{type(self).__name__}> with {counted(count, 'active term')}"
 
     def tables(self) -> list[Table]:
         """Return the table of the active terms."""

@@ -39,6 +39,7 @@ from mjlab.utils.indexing import EnvIds
 from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
 from mjlab.utils.spec import attach, compile_composed, export_spec, make_asset_paths_absolute
 from mjlab.utils.state import stateful
+from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, Tabular, settings_of
 
 TERRAIN = "terrain"
@@ -159,7 +160,7 @@ class Scene(Tabular):
 
     def __repr__(self) -> str:
         names = ", ".join(self._entities)
-        return f"<{type(self).__name__}: {names}; {len(self._sensors)} sensors>"
+        return f"<{type(self).__name__}: {names}; {counted(len(self._sensors), 'sensor')}>"
 
     def tables(self) -> list[Table]:
         """Return the tables of entities and of sensors."""
@@ -538,29 +539,28 @@ def report_overruled(
                 _report(source, name, current, kept)
     for name in (name for name in _FLAGS if name in requests):
         current = tuple(getattr(cfg, name))
-        added = tuple(
-            flag for flag in flag_names(name, requests[name].value) if flag not in current
-        )
+        added = [flag for flag in flag_names(name, requests[name].value) if flag not in current]
+        setters = {
+            source: flag_names(name, stated[source].switches[name][0])
+            for source in (f"the XML of {entity!r}" for entity in requests[name].entities)
+        }
+        if name == "disableflags" and "gravity" in added:
+            added.remove("gravity")
+            sources = " and ".join(s for s, flags in setters.items() if "gravity" in flags)
+            warnings.warn(
+                f"Gravity is off in the whole scene, because of {sources}; remove its flag "
+                'gravity="disable", or use gravcomp="1" on bodies without weight.',
+                UserWarning,
+                stacklevel=4,
+            )
         if added:
-            setters = {
-                source: flag_names(name, stated[source].switches[name][0])
-                for source in (f"the XML of {entity!r}" for entity in requests[name].entities)
-            }
             logger.warning(
                 "Option %s is %r, from MujocoCfg, plus %r, from %s (applied to the whole scene); "
                 "to configure it, set sim.mujoco.%s = %r",
-                name, current, added,
+                name, current, tuple(added),
                 " and ".join(source for source in setters if set(setters[source]) & set(added)),
-                name, current + added,
+                name, (*current, *added),
             )  # fmt: skip
-            if name == "disableflags" and "gravity" in added:
-                sources = " and ".join(s for s, flags in setters.items() if "gravity" in flags)
-                warnings.warn(
-                    f"Gravity is off in the whole scene, because of {sources}; remove its flag "
-                    'gravity="disable", or use gravcomp="1" on bodies without weight.',
-                    UserWarning,
-                    stacklevel=4,
-                )
 
 
 def _report(source: str, name: str, current: Any, wanted: Any) -> None:

@@ -18,6 +18,7 @@ from mjlab.scripts.flags import (
 from mjlab.scripts.policy import policy_env_cfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
+from mjlab.utils.string import counted
 from mjlab.utils.tables import WIDTH, json_value, tables_text
 
 _MIN_WIDTH = 80
@@ -127,8 +128,7 @@ class TaskDescription:
         }
         variant = [f"profile {cfg.profile}"] * (cfg.profile is not None) + ["play"] * cfg.play
         self._name = ", ".join([task, *variant])
-        plural = "s" if num_envs != 1 else ""
-        self._summary = f"{num_envs} environment{plural} by default; {env.describe_time()}."
+        self._summary = f"{counted(num_envs, 'environment')} by default; {env.describe_time()}."
 
     def as_json(self) -> dict[str, Any]:
         """Return sizes and times, and the rows of each table, as JSON values."""

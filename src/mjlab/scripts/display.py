@@ -26,6 +26,7 @@ from mjlab.rl.progress import (
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.scripts.reference import DATA, Kind, Reference, reference_path, referenced_tasks
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.scripts.run_folder import NewRunFolder
@@ -68,6 +69,7 @@ class TrainingDisplay(TrainingProgress):
         self._console = console or _PipeSafeConsole(markup=False, highlight=False)
         self._live: Live | None = None
         self._last_line = float("-inf")
+        self._has_news = False
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Open the panel. `first_iteration` is the number of iterations already finished."""
@@ -83,16 +85,21 @@ class TrainingDisplay(TrainingProgress):
         """Keep the statistics, and print a line if one is due."""
         super().on_iteration(stats)
         now = time.perf_counter()
+        self._has_news = True
         last = stats.iteration == stats.total_iterations
         if self._live is None and (last or now - self._last_line >= _SECONDS_BETWEEN_LINES):
             self._last_line = now
-            self._print(self.line())
+            self._print_line()
 
     def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
         """Print the result of the evaluation that decides whether training stops."""
         super().on_confirmation(iteration, result, solved)
+        if self._live is None:
+            self._print_line()
         if self._live is None or not solved:
-            metrics = [f"return {number(result.mean_return)} in {result.num_episodes} episodes"]
+            metrics = [
+                f"return {number(result.mean_return)} in {counted(result.num_episodes, 'episode')}"
+            ]
             metrics += [f"{label(name)} {number(v.mean)}" for name, v in result.metrics.items()]
             if result.failure_rate and result.failure_interval is not None:
                 low, high = result.failure_interval
@@ -117,8 +124,16 @@ class TrainingDisplay(TrainingProgress):
         if self._live is not None:
             self._live.stop()
             self._live = None
+        else:
+            self._print_line()
         self._print(self.ending())
         sys.stdout.flush()
+
+    def _print_line(self) -> None:
+        """Print the line of the last iteration, once."""
+        if self._has_news:
+            self._has_news = False
+            self._print(self.line())
 
     def _print(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
