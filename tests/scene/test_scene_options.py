@@ -70,7 +70,7 @@ def test_rounding_of_gravity_is_no_warning(kit, gravity, caplog):
 def test_an_xml_that_switches_gravity_off_is_a_warning(kit, xml, caplog):
     scene = build(robot=kit.cfg(xml, '><flag gravity="disable"/></option>'))
     with pytest.warns(UserWarning, match="Gravity is off in the whole scene.*'robot'"):
-        reports(scene, MujocoCfg(), caplog)
+        assert reports(scene, MujocoCfg(), caplog) == []
 
 
 def test_the_assignment_that_is_reported_silences_the_report(kit, xml, caplog):

@@ -224,11 +224,6 @@ def arm_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
         },
         commands={"reach": ReachCommandCfg(resampling_time_range=(1.0, 2.0))},
         events={
-            "place": EventTermCfg(
-                func=mdp.reset_root_state_uniform,
-                mode="reset",
-                params={"pose_range": {}, "velocity_range": {}},
-            ),
             "reset": EventTermCfg(
                 func=mdp.reset_joints_by_offset,
                 mode="reset",
@@ -237,7 +232,7 @@ def arm_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
                     "velocity_range": (0.0, 0.0),
                     "asset_cfg": SceneEntityCfg("robot", joint_names=(".*",)),
                 },
-            ),
+            )
         },
         rewards={
             "reach": RewardTermCfg(func=reach, weight=1.0, params={"std": 0.3}),

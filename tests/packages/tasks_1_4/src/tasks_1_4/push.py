@@ -161,11 +161,6 @@ def make_push_env_cfg() -> ManagerBasedRlEnvCfg:
         commands={"place": PlaceCommandCfg(resampling_time_range=(4.0, 4.0))},
         events={
             "check_variants": EventTermCfg(func=check_variants, mode="startup"),
-            "place_robot": EventTermCfg(
-                func=mdp.reset_root_state_uniform,
-                mode="reset",
-                params={"pose_range": {}, "velocity_range": {}},
-            ),
             "reset_joints": EventTermCfg(
                 func=mdp.reset_joints_by_offset,
                 mode="reset",
