@@ -350,9 +350,13 @@ class Board:
     def __init__(self) -> None:
         self.points: list = []
         self.arrows: list = []
+        self.legend: list = []
 
     def get_env_indices(self, num_envs: int) -> tuple[int, ...]:
         return (1,)
+
+    def add_legend(self, color, meaning) -> None:
+        self.legend.append(meaning)
 
     def add_sphere(self, center, radius, color, label) -> None:
         self.points.append(center)

@@ -452,9 +452,13 @@ class Board:
 
     def __init__(self):
         self.items = []
+        self.legend = {}
 
     def get_env_indices(self, num_envs):
         return (1,)
+
+    def add_legend(self, color, meaning):
+        self.legend[color] = meaning
 
     def add_sphere(self, center, radius, color, label=None):
         self.items.append((label, np.round(center, 4).tolist(), round(radius, 4), color))
@@ -486,6 +490,7 @@ def test_hits_rays_and_normals_are_drawn_for_the_environment_in_view():
         ("scan_normal_0", [0, 0, 0.2], 0.01, (1, 1, 1, 1)),
         ("scan_ray_1", [0, 0, -0.2], 0.01, (0, 0, 1, 1)),
     ]
+    assert {item[-1] for item in board.items} == set(board.legend)
 
 
 # In an environment.

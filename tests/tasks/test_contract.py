@@ -7,7 +7,7 @@ import dataclasses
 import io
 import pickle
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ import pytest
 import torch
 import yaml
 
-from mjlab.envs import ManagerBasedRlEnv
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg
 from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.utils.os import dump_yaml
 from mjlab.utils.random import rng_state, set_rng_state
+from mjlab.viewer.debug_visualizer import NullDebugVisualizer
 
 # Odd, so that no other dimension of a tensor is likely to be the same.
 NUM_ENVS = 7
@@ -35,6 +36,7 @@ def making(
     seed: int = 1,
     noisy: bool = True,
     whole_terrain: bool = False,
+    edit: Callable[[ManagerBasedRlEnvCfg], None] = lambda cfg: None,
 ) -> Iterator[ManagerBasedRlEnv]:
     cfg = load_env_cfg(task, play=play)
     cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_ENVS, seed, "native"
@@ -48,6 +50,7 @@ def making(
         for group in cfg.observations.values():
             if group is not None:
                 group.enable_corruption = False
+    edit(cfg)
     env = ManagerBasedRlEnv(cfg, device="cpu")
     try:
         yield env
@@ -249,6 +252,48 @@ def test_editing_a_loaded_config_does_not_show_in_the_next(task, play):
     rl.seed = -1
     assert load_rl_cfg(task).obs_groups
     assert load_rl_cfg(task).seed != -1
+
+
+class Board(NullDebugVisualizer):
+    """Records the colors of what is drawn in all environments, and of the legend."""
+
+    def __init__(self):
+        super().__init__()
+        self.drawn, self.legend = set(), set()
+
+    def get_env_indices(self, num_envs):
+        return range(num_envs)
+
+    def add_arrow(self, start, end, color, width=0.015, label=None):
+        self.drawn.add(tuple(color))
+
+    def add_sphere(self, center, radius, color, label=None):
+        self.drawn.add(tuple(color))
+
+    def add_legend(self, color, meaning):
+        assert meaning
+        self.legend.add(tuple(color))
+
+
+def test_the_legend_explains_the_colors_of_all_that_can_be_drawn(task):
+    with making(task, edit=draw_all) as env:
+        env.reset()
+        board = Board()
+        for action in actions(env, 3):
+            env.step(action)
+            env.update_visualizers(board)
+    assert board.drawn <= board.legend
+
+
+def draw_all(cfg):
+    for sensor in cfg.scene.sensors:
+        for field in ("debug", "debug_vis"):
+            if hasattr(sensor, field):
+                setattr(sensor, field, True)
+        if hasattr(sensor, "viz"):
+            sensor.viz.show_rays = sensor.viz.show_normals = True
+    for command in cfg.commands.values():
+        command.debug_vis = True
 
 
 def test_the_observation_groups_share_no_term_config(task):

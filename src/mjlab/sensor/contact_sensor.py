@@ -417,6 +417,8 @@ class ContactSensor(Sensor[ContactData]):
         fields = self._split(self._block(), to_world=self.cfg.reduce != "netforce")
         force = fields["force"]
         size = visualizer.meansize
+        visualizer.add_legend(_POINT_COLOR, f"contact points of {self.cfg.name}")
+        visualizer.add_legend(_FORCE_COLOR, f"contact forces of {self.cfg.name}")
         for env in visualizer.get_env_indices(force.shape[0]):
             points = fields["pos"][env].double().cpu().numpy()
             forces = force[env].double().cpu().numpy()

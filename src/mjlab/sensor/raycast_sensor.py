@@ -378,6 +378,12 @@ class RayCastSensor(Sensor[RayCastData]):
         if not self.cfg.debug_vis:
             return
         viz, name, size = self.cfg.viz, self.cfg.name, visualizer.meansize
+        visualizer.add_legend(viz.hit_sphere_color, f"hit points of {name}")
+        if viz.show_rays:
+            visualizer.add_legend(viz.hit_color, f"rays of {name} that hit")
+            visualizer.add_legend(viz.miss_color, f"rays of {name} that miss")
+        if viz.show_normals:
+            visualizer.add_legend(viz.normal_color, f"normals of {name}")
         miss_length = min(0.5, 0.05 * self.cfg.max_distance)
         data = self.data
         rays = (self._origins, self._directions, data.hit_pos_w, data.normals_w, data.distances)

@@ -55,6 +55,7 @@ def test_a_viz_cfg_is_accepted_and_used(make_world: Any) -> None:
     arrows: list[Any] = []
     visualizer = SimpleNamespace(
         get_env_indices=lambda count: range(count),
+        add_legend=lambda color, meaning: None,
         add_arrow=lambda start, end, color, width: arrows.append((start, end, color)),
     )
     manager.get_term_cfg("impulse").func.debug_vis(visualizer)
@@ -80,6 +81,7 @@ def test_drawing_defaults_are_those_of_the_interface(make_world: Any) -> None:
         arrows: list[Any] = []
         visualizer = SimpleNamespace(
             get_env_indices=range,
+            add_legend=lambda color, meaning: None,
             add_arrow=lambda *args, width, drawn=arrows: drawn.append((*args, width)),
         )
         manager.get_term_cfg("impulse").func.debug_vis(visualizer)
@@ -93,7 +95,9 @@ def test_weak_and_inactive_impulses_are_not_drawn(make_world: Any) -> None:
     world = make_world()
     drawn: list[Any] = []
     visualizer = SimpleNamespace(
-        get_env_indices=lambda count: range(count), add_arrow=lambda *a, **k: drawn.append(a)
+        get_env_indices=lambda count: range(count),
+        add_legend=lambda color, meaning: None,
+        add_arrow=lambda *a, **k: drawn.append(a),
     )
     manager = make_term(world, viz_cfg=SimpleNamespace(min_force=100.0))
     manager.get_term_cfg("impulse").func.debug_vis(visualizer)

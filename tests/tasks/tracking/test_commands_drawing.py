@@ -25,6 +25,9 @@ class Board:
     def get_env_indices(self, num_envs):
         return [i for i in self._indices if i < num_envs]
 
+    def add_legend(self, color, meaning):
+        pass
+
     def add_ghost_mesh(self, qpos, model, alpha):
         self.ghosts.append((qpos.copy(), model, alpha))
 

@@ -89,7 +89,9 @@ def test_upright_draws_what_it_compares_and_forgets_it_at_a_reset():
     built(env, **params)
     arrows: list[list[float]] = []
     visualizer: Any = SimpleNamespace(
-        get_env_indices=range, add_arrow=lambda start, end, color: arrows.append(end.tolist())
+        get_env_indices=range,
+        add_legend=lambda *_: None,
+        add_arrow=lambda start, end, color: arrows.append(end.tolist()),
     )
     built.reset(torch.tensor([1]))
     built.debug_vis(visualizer)

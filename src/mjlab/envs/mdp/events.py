@@ -320,6 +320,7 @@ class apply_body_impulse:
     def debug_vis(self, visualizer: DebugVisualizer) -> None:
         """Draw an arrow per active force."""
         data = self._asset.data
+        visualizer.add_legend(self._viz.rgba, "applied force")
         for env_idx in visualizer.get_env_indices(self._env.num_envs):
             if not self._active[env_idx]:
                 continue

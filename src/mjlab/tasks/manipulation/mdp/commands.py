@@ -215,6 +215,7 @@ class GoalCommand(CommandTerm):
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
         color = self.cfg.viz.target_color if hasattr(self.cfg, "viz") else _GOAL_COLOR
+        visualizer.add_legend(color, "goal")
         for index in visualizer.get_env_indices(self.num_envs):
             visualizer.add_sphere(self.target_pos[index].cpu().numpy(), _GOAL_RADIUS, color)
 
@@ -381,6 +382,7 @@ class MultiCubeLiftingCommand(GoalCommand):
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
         super()._debug_vis_impl(visualizer)
         target = self.target_object_pos()
+        visualizer.add_legend(_MARK_COLOR, "object to lift")
         for index in visualizer.get_env_indices(self.num_envs):
             mark = target[index].cpu().numpy() + (0.0, 0.0, _MARK_HEIGHT)
             visualizer.add_sphere(mark, _MARK_RADIUS, _MARK_COLOR)

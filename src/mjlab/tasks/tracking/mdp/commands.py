@@ -609,6 +609,7 @@ class MotionDrawing:
 
     def _draw_ghosts(self, visualizer: DebugVisualizer, indices: Sequence[int]) -> None:
         command, viz = self._command, self._command.cfg.viz
+        visualizer.add_legend(viz.ghost_color, "reference motion")
         if self._ghost is None:
             self._ghost = ghost_model(command.robot, viz.ghost_color)
         model = self._ghost

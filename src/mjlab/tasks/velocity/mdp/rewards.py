@@ -57,6 +57,8 @@ __all__ = [
 ]
 
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
+_NORMAL_COLOR = (0.2, 0.8, 0.2, 0.8)
+_BODY_Z_COLOR = (0.2, 0.4, 1.0, 0.8)
 
 
 def check_command(
@@ -162,6 +164,8 @@ class upright:
         """Draw the reference direction (green) and the body z axis (blue)."""
         data = self._env.scene[self._asset_cfg.name].data
         quat = body_quat(data, self._body)
+        visualizer.add_legend(_NORMAL_COLOR, "terrain normal")
+        visualizer.add_legend(_BODY_Z_COLOR, "body z axis")
         for index in visualizer.get_env_indices(self._env.num_envs):
             start = data.root_link_pos_w[index]
             if self._body is not None:
@@ -169,8 +173,8 @@ class upright:
             body_z = quat_apply(quat[index : index + 1], self._up)[0]
             base = start.cpu().numpy()
             for direction, color in (
-                (self._normal[index], (0.2, 0.8, 0.2, 0.8)),
-                (body_z, (0.2, 0.4, 1.0, 0.8)),
+                (self._normal[index], _NORMAL_COLOR),
+                (body_z, _BODY_Z_COLOR),
             ):
                 visualizer.add_arrow(base, base + 0.3 * direction.cpu().numpy(), color)
 
