@@ -23,6 +23,12 @@ from mjlab.rl.checkpoint import latest_checkpoint
 from mjlab.scripts.demo import DEMOS
 from mjlab.scripts.environments import make_env
 from mjlab.scripts.policy import make_policy, policy_env_cfg
+from mjlab.terrains import (
+    BoxInvertedPyramidStairsTerrainCfg,
+    SubTerrainCfg,
+    TerrainEntityCfg,
+    TerrainGeneratorCfg,
+)
 from mjlab.viewer.model_sync import compute_poses, copy_state, host_model
 from mjlab.viewer.native.visualizer import add_moving_geoms
 from mjlab.viewer.offscreen_renderer import open_renderer
@@ -33,6 +39,7 @@ _WIDTH, _HEIGHT, _FPS = 480, 270, 25
 _OVERSAMPLING = 2
 _MAX_BYTES = 500_000
 _HORIZON = (0.93, 0.94, 0.96)
+_BOX = (0.68, 0.71, 0.75, 1.0)
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,8 @@ class Clip:
     """Distance between environments (m)."""
     command: dict[str, tuple[float, float]] | None = None
     """Ranges of the velocity command; None: those of the task."""
+    terrain: SubTerrainCfg | None = None
+    """Terrain below the robot. None: that of the task."""
     motion: str | None = None
     """Motion of a tracking task."""
     start: float = 0.0
@@ -82,6 +91,15 @@ CLIPS = {
         DEMOS["go1"].task, None, DEMOS["go1"].policy, num_envs=6, spacing=0.9,
         command={"lin_vel_x": (0.9, 0.9), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
         start=2.0, seconds=3.0, body="robot/trunk", lookat=(0.0, 0.0, 0.2), distance=3.0, azimuth=145.0,
+    ),
+    "go1_stairs": Clip(
+        DEMOS["go1"].task, None, DEMOS["go1"].policy,
+        command={"lin_vel_x": (1.0, 1.0), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
+        terrain=BoxInvertedPyramidStairsTerrainCfg(
+            size=(6.0, 6.0), step_height_range=(0.03, 0.03), step_width=0.3, platform_width=1.8
+        ),
+        start=0.9, seconds=3.0, body="robot/trunk", lookat=(0.0, 0.0, 0.05), distance=2.0, azimuth=105.0,
+        elevation=-14.0,
     ),
     "g1": Clip(
         DEMOS["g1"].task, "cpu", DEMOS["g1"].policy, num_envs=2, spacing=1.2,
@@ -162,6 +180,12 @@ def record(clip: Clip, policy: Path, seed: int) -> list[np.ndarray]:
         command.rel_standing_envs = 0.0
         reset: Any = cfg.events["reset_base"]
         reset.params["pose_range"] = {}
+    if clip.terrain is not None:
+        generator = TerrainGeneratorCfg(
+            size=clip.terrain.size, border_width=10.0, color_scheme="none",
+            sub_terrains={"terrain": clip.terrain},
+        )  # fmt: skip
+        cfg.scene.terrain = TerrainEntityCfg(terrain_type="generator", terrain_generator=generator)
     if clip.motion is not None:
         motion: Any = cfg.commands["motion"]
         motion.motion_file = clip.motion
@@ -177,6 +201,11 @@ def film(clip: Clip, env: Any, policy: Any) -> list[np.ndarray]:
     """Step the environments and render each of them into one scene."""
     sim = env.unwrapped.sim
     model = host_model(sim.mj_model)
+    # Boxes have no texture.
+    boxes = (model.body_weldid[model.geom_bodyid] == 0) & (
+        model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+    )
+    model.geom_rgba[boxes], model.geom_matid[boxes] = _BOX, -1
     # Shadows are sharp only near the target.
     model.stat.extent = 2.0 * clip.distance
     model.vis.map.shadowclip = 0.9

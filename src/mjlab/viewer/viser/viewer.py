@@ -373,9 +373,10 @@ class SimulationControls:
 
 def legend_html(legend: Mapping[str, Color]) -> str:
     """Return the colors of the drawings and their meanings as HTML."""
-    squares = "".join(
-        f'<span style="margin-right:1em;white-space:nowrap"><span style="color:rgb'
-        f'({",".join(str(round(255 * part)) for part in color[:3])})">\u25a0</span> '
+    # Lines break at the spaces between entries.
+    squares = " ".join(
+        f'<span style="margin-right:1em;white-space:nowrap"><span style="color:rgba'
+        f'({",".join(str(round(255 * part)) for part in color[:3])},{color[3]:.3g})">\u25a0</span> '
         f"{html.escape(meaning)}</span>"
         for meaning, color in legend.items()
     )
