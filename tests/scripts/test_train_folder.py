@@ -115,6 +115,7 @@ def test_an_experiment_may_be_a_folder_in_a_folder(attempt, tmp_path):
     assert len(list((tmp_path / "logs" / "group" / "mine").glob("*_a..b/model_1.pt"))) == 1
 
 
+@pytest.mark.slow
 def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
     # As on a file system that turned read-only, the event file can no longer be written.
     program = (

@@ -333,6 +333,7 @@ def test_only_what_is_asked_for_is_replaced(maker):
     assert not maker.trained
 
 
+@pytest.mark.slow
 def test_a_seed_whose_time_is_over_is_reported_and_goes_on_with_more_time(empty, made):
     assert empty.make(seeds=1, minutes=1e-3)
     (record,) = empty.reference.seeds
@@ -348,7 +349,7 @@ def test_a_seed_whose_time_is_over_is_reported_and_goes_on_with_more_time(empty,
     assert record.evaluation["mean_return"] == whole.evaluation["mean_return"]
 
 
-@pytest.mark.parametrize("first_evaluation", [1, 3])
+@pytest.mark.parametrize("first_evaluation", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_ctrl_c_ends_the_series_and_the_seed_is_resumed(empty, monkeypatch, first_evaluation):
     flags = [*TINY, "--agent.evaluation.min-interval", str(first_evaluation)]
 
@@ -367,6 +368,7 @@ def test_ctrl_c_ends_the_series_and_the_seed_is_resumed(empty, monkeypatch, firs
     assert empty.reference.seeds[0].run.ended == "finished"
 
 
+@pytest.mark.slow
 def test_an_interrupted_seed_of_other_code_is_trained_from_the_start(empty, monkeypatch):
     assert empty.make(seeds=1, minutes=1e-3)
     empty.commit("second")
