@@ -27,7 +27,8 @@ class Client:
         self.downloads: dict[str, bytes] = {}
         self.notes: list[str] = []
 
-    def send_file_download(self, name: str, content: bytes) -> None:
+    def send_file_download(self, name: str, content: bytes, save_immediately: bool) -> None:
+        assert save_immediately
         self.downloads[name] = content
 
     def add_notification(self, title: str, body: str, **_: Any) -> None:
@@ -54,6 +55,14 @@ def press(panel: Any, client: Client) -> None:
     panel._on_click(SimpleNamespace(client=client))
 
 
+def finish(viewer: ViserPlayViewer, panel: Any) -> None:
+    """Wait for the thread that renders, and update the page."""
+    show(viewer)
+    panel._recording.join()
+    viewer._next_scene = 0.0
+    viewer.sync_env_to_viewer()
+
+
 def test_a_clip_has_a_frame_per_shown_step_and_is_downloaded(page, tmp_path) -> None:
     viewer, panel, client = page
     press(panel, client)
@@ -61,7 +70,7 @@ def test_a_clip_has_a_frame_per_shown_step_and_is_downloaded(page, tmp_path) -> 
         show(viewer)
     assert panel.is_recording
     press(panel, client)
-    show(viewer)
+    finish(viewer, panel)
     assert not panel.is_recording
     file = tmp_path / "clip.mp4"
     file.write_bytes(client.downloads["clip.mp4"])
@@ -76,8 +85,9 @@ def test_a_clip_ends_by_itself(page, monkeypatch) -> None:
     viewer, panel, client = page
     monkeypatch.setattr(clip, "_MAX_SECONDS", 0.05)
     press(panel, client)
-    for _ in range(4):
-        show(viewer)
+    show(viewer)
+    show(viewer)
+    finish(viewer, panel)
     assert "clip.mp4" in client.downloads
     assert not panel.is_recording
 
@@ -88,8 +98,7 @@ def test_a_clip_is_sent_while_the_view_is_paused(page) -> None:
     show(viewer)
     viewer.pause()
     press(panel, client)
-    viewer._next_scene = 0.0
-    viewer.sync_env_to_viewer()
+    finish(viewer, panel)
     assert client.downloads["clip.mp4"]
 
 
@@ -102,6 +111,8 @@ def test_a_full_disk_ends_the_clip_and_not_the_view(page, monkeypatch) -> None:
     monkeypatch.setattr(clip.ClipWriter, "add", fail)
     press(panel, client)
     show(viewer)
+    press(panel, client)
+    finish(viewer, panel)
     assert client.notes == ["No clip is recorded: no space left"]
     assert not panel.is_recording
     show(viewer)
@@ -116,7 +127,17 @@ def test_a_machine_that_cannot_render_says_so_on_the_page(page, monkeypatch) -> 
 
     monkeypatch.setattr(clip, "open_renderer", fail)
     press(panel, client)
-    show(viewer)
-    show(viewer)
+    finish(viewer, panel)
     assert client.notes == ["No clip is recorded: no EGL library"]
     assert not client.downloads
+
+
+def test_a_page_that_is_closed_while_it_records_leaves_no_thread_and_no_file(page) -> None:
+    viewer, panel, client = page
+    press(panel, client)
+    show(viewer)
+    recording = panel._recording
+    viewer.close()
+    assert not recording.is_alive()
+    assert not recording.content
+    assert not panel.is_recording
