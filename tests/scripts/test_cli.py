@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import io
+import logging
 import os
 import subprocess
 import sys
@@ -212,3 +214,27 @@ def test_idle_threads_of_torch_sleep_in_commands_that_are_run_as_modules(argv, p
     command = [sys.executable, "-c", code]
     told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert told.stdout.strip() == str(policy)
+
+
+def test_log_messages_go_to_the_stderr_of_the_moment(monkeypatch):
+    """The panel of training redirects it, so that messages appear above the panel."""
+    handler = cli._StderrHandler()
+    panel = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", panel)
+    handler.emit(logging.makeLogRecord({"msg": "NaN loss"}))
+    assert panel.getvalue() == "NaN loss\n"
+
+
+def test_a_warning_is_printed_once_however_many_environments_are_built():
+    program = (
+        "import warnings\n"
+        "from mjlab.scripts.cli import run_command\n"
+        "def command(argv):\n"
+        "    for _ in range(2):\n"
+        "        with warnings.catch_warnings():\n"
+        "            warnings.simplefilter('always')\n"
+        "            warnings.warn('base left behind')\n"
+        "run_command(command)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert run.stderr == "UserWarning: base left behind\n"

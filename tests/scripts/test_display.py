@@ -127,8 +127,8 @@ def test_other_bounds_have_the_last_evaluation_beside_them_and_its_trend():
         (RETURN, "finished", outcome(), ["Finished: unsolved", "Return 845 of 900, missed by 55"]),
         (RETURN, "finished", outcome(mean_return=899.9), ["899.9 of 900, missed by 0.1"]),
         (RETURN, "finished", outcome(mean_return=950.0), ["Finished: all bounds met"]),
-        (RETURN, "finished", None, ["unsolved", "741, exploring", "not evaluated"]),
-        (BOUNDS, "finished", outcome(), ["unsolved", "0.31 (at most 0.25), missed by 0.06", "missed by 2.5 %"]),
+        (RETURN, "finished", None, ["unsolved", "741, exploring", "not evaluated", "Goal: return at least 900"]),
+        (BOUNDS, "finished", outcome(), ["unsolved", "0.31 (at most 0.25), missed by 0.06", "missed by 2.5 points"]),
         ({}, "finished", None, ["Finished at iteration 10 of 10, ", "Return 741, exploring."]),
         (RETURN, "interrupted", None, ["Interrupted at iteration 10 of 10"]),
         (RETURN, "failed", None, ["Failed at iteration 10 of 10"]),
@@ -145,6 +145,24 @@ def test_the_end_says_which_bound_was_missed_by_how_much(
     shown.panel.on_end(reason)
     *_, ending = shown.text.splitlines()
     assert [part for part in parts if part not in ending] == []
+
+
+def test_rates_are_shown_as_observed_beside_what_is_judged():
+    shown = Shown(BOUNDS, terminal=False)
+    shown.iterate(10)
+    none_failed = dataclasses.replace(outcome(failures=0.0), failure_interval=(0.0, 0.0876))
+    shown.panel.on_evaluation(10, none_failed, solved=False)
+    assert "failure_rate=0%(judged:4.38%)/5%" in shown.panel.line()
+    shown.panel.on_end("finished")
+    *_, ending = shown.text.splitlines()
+    assert "ailure rate 0 % (judged: 4.38 %) (at most 5 %)" in ending
+
+
+def test_dumb_terminals_get_lines(monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    shown = Shown(RETURN, terminal=True)
+    shown.iterate(10)
+    assert "[10/10]" in shown.text
 
 
 def test_a_run_that_fails_before_it_starts_is_shown_as_failed(capsys):

@@ -224,8 +224,13 @@ class TrainingProgress(TrainingObserver):
                 exploring = f"Return {number(self._exploring(self.stats))}, exploring"
             if not self._bounds:
                 return exploring and f"{exploring}."
+            goals = [
+                f"{label(bound.name)} {'at most' if bound.is_upper else 'at least'} {limit(bound)}"
+                for bound in self._bounds
+            ]
             upcoming = self._next_evaluation()
-            return f"{exploring}; not evaluated" + (f", due {upcoming}." if upcoming else ".")
+            when = f" (evaluations start {upcoming})" if upcoming else ""
+            return f"{exploring}; not evaluated{when}. Goal: {', '.join(goals)}."
         iteration, result = self._evaluations[-1]
         parts = []
         for bound in self._bounds:
@@ -235,7 +240,7 @@ class TrainingProgress(TrainingObserver):
                 text = f"{label(bound.name)} {shown(bound, result)} ({most} {limit(bound)})"
             if not bound.is_met(result):
                 missed = abs(result.judged(bound.name) - bound.limit)
-                text += f", missed by {formatted(bound.name, missed)}"
+                text += f", missed by {formatted(bound.name, missed).replace('%', 'points')}"
             parts.append(text)
         scores = "; ".join(parts)
         when = "" if iteration == self.iteration else f" at iteration {iteration}"
@@ -416,11 +421,17 @@ def formatted(name: str, value: float) -> str:
 
 
 def shown(bound: Bound, result: EvaluationResult) -> str:
-    """Format the value that `bound` judges, in full if rounding would hide that it is missed."""
+    """Format a value of evaluations, in full if rounding would hide that `bound` is missed.
+
+    For rates, the observed one, then the one that is judged: `7.5 % (judged: 11.2 %)`.
+    """
     value = result.judged(bound.name)
     text = formatted(bound.name, value)
     if text == limit(bound) and not bound.is_met(result):
-        return f"{100.0 * value:.6g} %" if text.endswith("%") else f"{value:.7g}"
+        text = f"{100.0 * value:.6g} %" if text.endswith("%") else f"{value:.7g}"
+    observed = formatted(bound.name, result.value(bound.name))
+    if text.endswith("%") and observed != text:
+        return f"{observed} (judged: {text})"
     return text
 
 

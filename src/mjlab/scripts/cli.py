@@ -449,6 +449,30 @@ def viz_nan() -> None:
 # Errors.
 
 
+class _StderrHandler(logging.StreamHandler):
+    """Writes to the current `sys.stderr`, which prints above the panel while training shows one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a message."""
+        self.stream = sys.stderr
+        super().emit(record)
+
+
+class _Once(logging.Filter):
+    """Passes each message once per process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return True for a message that is new."""
+        message = record.getMessage()
+        is_new = message not in self._passed
+        self._passed.add(message)
+        return is_new
+
+
 def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     """Run `command` with the command line's arguments and exit.
 
@@ -457,9 +481,11 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
     """
     prepare_threads()
     # Plain library messages.
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stderr)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[_StderrHandler()])
     logging.getLogger("mjlab").setLevel(logging.INFO)
     logging.captureWarnings(True)
+    # The environment of evaluations would repeat the warnings of the one that trains.
+    logging.getLogger("py.warnings").addFilter(_Once())
     # One line per warning, without file and source line.
     warnings.formatwarning = lambda message, category, *_: f"{category.__name__}: {message}"  # ty: ignore[invalid-assignment]
     # Paths may have characters that the terminal's encoding lacks.

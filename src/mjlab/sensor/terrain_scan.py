@@ -45,14 +45,19 @@ def check_terrain_scan(sensor: RayCastSensor, mj_model: mujoco.MjModel) -> None:
     if own_hits.any():
         geoms = np.unique(met[own_hits])
         names = [m.geom(g).name or f"a geom of {m.body(m.geom_bodyid[g]).name}" for g in geoms]
-        taken = {*m.geom_group[ground].tolist(), *(sensor.include_geom_groups or ())}
-        free = min({*range(NUM_GEOM_GROUPS)} - taken, default=NUM_GEOM_GROUPS - 1)
+        grounds = tuple(np.unique(m.geom_group[ground]).tolist())
+        cure = f"Set include_geom_groups={grounds}, the groups of the ground"
+        if np.isin(m.geom_group[geoms], grounds).any():
+            # Viewers hide groups from 3 on.
+            free = min({*range(NUM_GEOM_GROUPS)} - {*grounds}, default=NUM_GEOM_GROUPS - 1)
+            cure += (
+                f", and move the geoms of the robot to another group: EntityCfg.geoms = "
+                f"(GeomCfg(geom_names_expr=('.*',), group={free}),)"
+            )
         raise ValueError(
             f"{owner}: expected groups without geoms of the robot below the sensor, got "
             f"{sensor.include_geom_groups}; {own_hits.sum()} of {own_hits.size} rays meet the robot in "
-            f"its initial pose, at {name_list(list(dict.fromkeys(names)), near=[])}. Move its geoms, of groups {np.unique(m.geom_group[geoms]).tolist()}, to another group, e.g. "
-            f"EntityCfg.geoms = (GeomCfg(geom_names_expr=('.*',), group={free}),), and leave that group "
-            "out of include_geom_groups."
+            f"its initial pose, at {name_list(list(dict.fromkeys(names)), near=[])}. {cure}."
         )
 
 
