@@ -148,7 +148,8 @@ def test_a_name_of_several_flags_is_answered_with_them(run):
 @pytest.mark.parametrize(
     ("flags", "topic"),
     [([], None), (["--video"], None), (["-h"], ""), (["--help", "--video"], ""),
-     (["--profile", "cpu", "--help", "agent"], "agent"), (["--help=env.sim"], "env.sim")],
+     (["--profile", "cpu", "--help", "agent"], "agent"), (["--help=env.sim"], "env.sim"),
+     (["--help", "--env.seed"], "env.seed"), (["--help", "--profile", "cpu"], "")],
 )  # fmt: skip
 def test_the_topic_follows_the_flag(flags, topic):
     assert requested_topic(flags) == topic

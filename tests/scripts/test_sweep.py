@@ -177,6 +177,19 @@ def test_ctrl_c_stops_all_runs_and_the_same_command_resumes_them(sweep, machine,
     assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
 
 
+def test_a_closed_terminal_does_not_keep_runs_from_saving(sweep, machine, folder, monkeypatch):
+    def print_(*words: Any, **options: Any) -> None:
+        if "Saving" in words[0]:
+            raise OSError(5, "Input/output error")
+        print(*words, **options)
+
+    monkeypatch.setattr("mjlab.scripts.sweep_runs.print", print_, raising=False)
+    machine.interrupts_after = 2
+    outcome = sweep(*LEARNING, "--folder", str(folder), "--jobs", "2")
+    assert outcome.status == 130
+    assert "Saved" in outcome.out
+
+
 def test_a_failed_run_is_named_and_retried_by_the_same_command(sweep, machine, folder):
     argv = (*LEARNING, "--folder", str(folder))
     machine.fails = ("1e-4",)

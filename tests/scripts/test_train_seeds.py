@@ -32,8 +32,11 @@ def commands(monkeypatch) -> list[list[str]]:
     return seen
 
 
-def test_each_seed_trains_once_and_to_the_end(run, commands):
-    assert run("train_seeds", TASK, "--seeds", "3", "--num-envs", "64").status == 0
+def test_each_seed_trains_once_and_to_the_end(run, commands, monkeypatch):
+    monkeypatch.setattr("mjlab.scripts.train_seeds.select_gpus", lambda ids: (None, 0))
+    outcome = run("train_seeds", TASK, "--seeds", "3", "--num-envs", "64")
+    assert outcome.status == 0
+    assert outcome.err.count("No GPU is visible") == 1
     assert len(commands) == 3
     for seed, command in enumerate(commands, start=1):
         assert command[:4] == [sys.executable, "-m", "mjlab.scripts.train", TASK]
@@ -41,6 +44,7 @@ def test_each_seed_trains_once_and_to_the_end(run, commands):
         assert flags == {
             "--agent.evaluation.stop-when-solved": "False",
             "--num-envs": "64",
+            "--device": "cpu",
             "--agent.seed": str(seed),
             "--agent.run-name": f"seed_{seed}",
         }

@@ -173,3 +173,15 @@ def test_physics_that_diverges_is_paused_with_the_reason(viser_server) -> None:
     assert not page.playing.value
     assert "diverged" in page.message.content
     assert page.data.qpos.tolist() == [0.0]
+
+
+def test_sliders_follow_the_physics(viser_server) -> None:
+    xml = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" range="-170 170"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    page = ModelPage(viser_server, "pendulum", model, lambda: model)
+    page.playing.value = True
+    for _ in range(10):
+        page.advance(0.03)
+    # Updated some times per second.
+    assert 0.05 < page.joints["hinge"].value <= page.data.qpos[0]

@@ -13,6 +13,8 @@ from mjlab.utils.processes import ProcessRank, process_rank
 if TYPE_CHECKING:
     from mjlab.scripts.train_config import TrainConfig
 
+NO_GPU = "No GPU is visible; using the CPU."
+
 
 def resolve_device(device: str | None) -> str:
     """Return the torch device: `device`, or for None a GPU if available, else the CPU.
@@ -59,7 +61,7 @@ def training_device(cfg: TrainConfig, rank: ProcessRank) -> str:
     """
     device = _single_process_device(cfg) if rank.is_alone else _device_of(cfg, rank)
     if device == "cpu" and cfg.device is None and cfg.gpu_ids and rank.is_first:
-        print_notice("No GPU is visible; using the CPU.")
+        print_notice(NO_GPU)
     if device.startswith("cuda"):
         # EGL counts all GPUs of the machine, torch only visible GPUs.
         physical = egl_device_id(int(device.partition(":")[2] or 0))

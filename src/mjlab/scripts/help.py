@@ -34,7 +34,8 @@ TERM_DICTS = frozenset(
 )  # fmt: skip
 """Fields with terms by name; None removes a term. Observation terms are in `terms` of their group."""
 # Branches whose parts can be named without the branch: `rewards` for `env.rewards`.
-_SHORTENED = ("", f"{OPTIONS}.", "env.", "agent.")
+# `seed` is that of the agent, which sets the environment's.
+_SHORTENED = ("", f"{OPTIONS}.", "agent.", "env.")
 
 
 @dataclass(frozen=True)
@@ -199,8 +200,12 @@ def requested_topic(flags: Sequence[str]) -> str | None:
     for position, word in enumerate(flags):
         name, _, topic = word.partition("=")
         if name in ("-h", "--help"):
-            following = [w for w in flags[position + 1 : position + 2] if not w.startswith("-")]
-            return topic or "".join(following)
+            following = "".join(flags[position + 1 : position + 2])
+            # `--help --agent.seed` asks for a flag; in `--help --profile cpu` the profile is one.
+            is_flag = following.startswith("--") and "." in following
+            if following.startswith("-") and not is_flag:
+                following = ""
+            return topic or following.lstrip("-").partition("=")[0]
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import re
@@ -83,24 +84,30 @@ class Runs:
                 # A second signal would stop runs that are saving.
                 if self._running and not self.interrupted:
                     self._stop(signal.SIGINT)
-                for run in self._running:
-                    run.process.wait()
+                while any(run.process.poll() is None for run in self._running):
+                    time.sleep(_SECONDS_BETWEEN_LOOKS)
+                    self._forward_signals()
 
     def _update(self) -> None:
         """Forward signals, and replace the processes that have ended."""
-        while self._signals:
-            self._stop(self._signals.pop(0))
+        self._forward_signals()
         for run in [run for run in self._running if run.process.poll() is not None]:
             self._running.remove(run)
             self._slots.insert(0, run.slot)
             self._settle(run)
             self._fill()
 
+    def _forward_signals(self) -> None:
+        while self._signals:
+            self._stop(self._signals.pop(0))
+
     def _stop(self, number: signal.Signals) -> None:
         self.interrupted = True
-        print(f"\nSaving {counted(len(self._running), 'run')} ...", flush=True)
         for run in self._running:
             send_signal(run.process, number)
+        # A terminal that was closed takes no output.
+        with contextlib.suppress(OSError):
+            print(f"\nSaving {counted(len(self._running), 'run')} ...", flush=True)
 
     def _add(self, trial: FrozenTrial) -> None:
         """Queue the unfinished seeds of a trial."""

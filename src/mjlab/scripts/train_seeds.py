@@ -11,9 +11,12 @@ from pathlib import Path
 from types import FrameType
 
 from mjlab.scripts.cli import run_alias
+from mjlab.scripts.devices import NO_GPU
 from mjlab.scripts.flags import is_given
 from mjlab.scripts.run_folder import read_run_info, runs_named
 from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.gpu import select_gpus
+from mjlab.utils.logging import print_notice
 from mjlab.utils.processes import PARENT_VARIABLE
 from mjlab.utils.signals import FORWARDED, handled_signals, send_signal, start_in_background
 
@@ -65,6 +68,10 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
                 f"{flag}: expected no value, because runs use the seeds 1, 2, ... and are named after them; "
                 "use --seeds N for the number of seeds, or `train` for one run."
             )
+    if cfg.device is None and cfg.gpu_ids and select_gpus(cfg.gpu_ids)[0] is None:
+        # Once, not once per seed.
+        print_notice(NO_GPU)
+        flags = [*flags, "--device", "cpu"]
     return count, flags, cfg.experiment_folder
 
 

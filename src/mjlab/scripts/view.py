@@ -24,6 +24,7 @@ from mjlab.viewer.viser.scene import MjlabViserScene
 
 _SUFFIXES = (".xml", ".urdf", ".mjb", ".mjz", ".zip")
 _FRAME_TIME = 1.0 / 30.0
+_SECONDS_BETWEEN_SLIDERS = 0.2
 _MAX_LISTED = 60
 # Distance of the camera, in extents of the model.
 _DISTANCE = 1.8
@@ -162,6 +163,8 @@ class ModelPage:
         self._changed = threading.Event()
         # Simulated time that displayed time is ahead (s).
         self._ahead = 0.0
+        # Time since the joint sliders were updated (s).
+        self._shown_ago = 0.0
         set_theme(server)
         self._build(model)
 
@@ -189,6 +192,9 @@ class ModelPage:
                     mujoco.mj_step(self.model, self.data)
                     self._stop_if_diverged()
                 self._changed.set()
+                self._shown_ago += seconds
+                if self._shown_ago >= _SECONDS_BETWEEN_SLIDERS:
+                    self._show_joints()
             if self._changed.is_set() or self.scene.needs_update:
                 self._changed.clear()
                 mujoco.mj_forward(self.model, self.data)
@@ -221,7 +227,8 @@ class ModelPage:
             self.playing = gui.add_checkbox("Run physics", False)
             gui.add_button("Reload", icon=viser.Icon.REFRESH).on_click(lambda _: self.reload())
             keys = [_name(model, _KEY, key) for key in range(model.nkey)]
-            self.pose = gui.add_dropdown("Pose", ["initial", *keys])
+            first = keys[0] if keys else "initial"
+            self.pose = gui.add_dropdown("Pose", ["initial", *keys], initial_value=first)
             gui.add_button("Set pose").on_click(lambda _: self.set_pose(self.pose.value))
             with gui.add_folder("Scene"):
                 self.scene.create_scene_gui(show_debug_viz_control=False)
@@ -231,7 +238,7 @@ class ModelPage:
         with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
             self.scene.create_overlay_gui()
         self.scene.create_groups_gui(tabs)
-        self.set_pose(keys[0] if keys else "initial")
+        self.set_pose(first)
 
     def reload(self) -> None:
         """Load the model again; a damaged one leaves the page as it is, with the message."""
@@ -250,13 +257,18 @@ class ModelPage:
                 mujoco.mj_resetData(self.model, self.data)
             else:
                 mujoco.mj_resetDataKeyframe(self.model, self.data, key)
-            for joint, slider in self.joints.items():
-                slider.value = float(self.data.joint(_index(self.model, _JOINT, joint)).qpos[0])
+            self._show_joints()
             for actuator, slider in self.actuators.items():
                 slider.value = float(
                     self.data.actuator(_index(self.model, _ACTUATOR, actuator)).ctrl[0]
                 )
             self._changed.set()
+
+    def _show_joints(self) -> None:
+        self._shown_ago = 0.0
+        for joint, slider in self.joints.items():
+            value = float(self.data.joint(_index(self.model, _JOINT, joint)).qpos[0])
+            slider.value = min(max(value, slider.min), slider.max)
 
     def _add_joint_sliders(self) -> None:
         model = self.model

@@ -268,7 +268,8 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
                     self._add_group_switch(label, self.geom_groups_visible, group)
             for title, groups, visible in others:
                 used = _groups_in_use(groups)
-                if used and used != [0]:
+                # Sites are drawn by default, so that even a single group needs a switch.
+                if used and (used != [0] or title == "Sites"):
                     with self.server.gui.add_folder(title):
                         for group in used:
                             self._add_group_switch(f"Group {group}", visible, group)
