@@ -201,11 +201,12 @@ def film(clip: Clip, env: Any, policy: Any) -> list[np.ndarray]:
     """Step the environments and render each of them into one scene."""
     sim = env.unwrapped.sim
     model = host_model(sim.mj_model)
-    # Boxes have no texture.
-    boxes = (model.body_weldid[model.geom_bodyid] == 0) & (
-        model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
-    )
-    model.geom_rgba[boxes], model.geom_matid[boxes] = _BOX, -1
+    if clip.terrain is not None:
+        # Unlike planes, boxes of terrain have no texture.
+        boxes = (model.body_weldid[model.geom_bodyid] == 0) & (
+            model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+        )
+        model.geom_rgba[boxes], model.geom_matid[boxes] = _BOX, -1
     # Shadows are sharp only near the target.
     model.stat.extent = 2.0 * clip.distance
     model.vis.map.shadowclip = 0.9

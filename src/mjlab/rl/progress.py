@@ -224,10 +224,7 @@ class TrainingProgress(TrainingObserver):
                 exploring = f"Return {number(self._exploring(self.stats))}, exploring"
             if not self._bounds:
                 return exploring and f"{exploring}."
-            goals = [
-                f"{label(bound.name)} {'at most' if bound.is_upper else 'at least'} {limit(bound)}"
-                for bound in self._bounds
-            ]
+            goals = [f"{label(bound.name)} {required(bound)}" for bound in self._bounds]
             upcoming = self._next_evaluation()
             when = f" (evaluations start {upcoming})" if upcoming else ""
             return f"{exploring}; not evaluated{when}. Goal: {', '.join(goals)}."
@@ -236,8 +233,7 @@ class TrainingProgress(TrainingObserver):
         for bound in self._bounds:
             text = f"{label(bound.name)} {shown(bound, result)} of {limit(bound)}"
             if bound.name != "mean_return":
-                most = "at most" if bound.is_upper else "at least"
-                text = f"{label(bound.name)} {shown(bound, result)} ({most} {limit(bound)})"
+                text = f"{label(bound.name)} {shown(bound, result)} ({required(bound)})"
             if not bound.is_met(result):
                 missed = abs(result.judged(bound.name) - bound.limit)
                 text += f", missed by {formatted(bound.name, missed).replace('%', 'points')}"
@@ -322,12 +318,11 @@ class TrainingProgress(TrainingObserver):
             table.add_column()
         for bound in self._bounds:
             state = self._state(bound)
-            most = "at most" if bound.is_upper else "at least"
             table.add_row(
                 label(bound.name),
                 shown(bound, result),
                 Text(state, style="green" if state == "met" else ""),
-                f"{most} {limit(bound)}",
+                required(bound),
             )
         return Group(table, Text(when, style="dim"))
 
@@ -438,6 +433,11 @@ def shown(bound: Bound, result: EvaluationResult) -> str:
 def limit(bound: Bound) -> str:
     """Format the limit of `bound`."""
     return formatted(bound.name, bound.limit)
+
+
+def required(bound: Bound) -> str:
+    """Format `bound`: `at most 5 %`."""
+    return f"at {'most' if bound.is_upper else 'least'} {limit(bound)}"
 
 
 def sparkline(values: list[float], bars: str = _BARS) -> str:

@@ -74,7 +74,7 @@ class TrainingDisplay(TrainingProgress):
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Open the panel. `first_iteration` is the number of iterations already finished."""
         super().on_start(first_iteration, total_iterations)
-        if self._console.is_terminal and not self._console.is_dumb_terminal:
+        if self._console.is_interactive:
             # Drawn by a thread: iterations can be shorter than a drawing.
             self._live = Live(
                 self, console=self._console, refresh_per_second=_UPDATES_PER_SECOND, transient=True

@@ -121,12 +121,10 @@ class EvaluationProgress:
             auto_refresh=False,
         )
         self._task = self._bar.add_task("", total=1.0, done=0)
-        out = self._bar.console
-        self._draws = out.is_terminal and not out.is_dumb_terminal
         self._last = time.perf_counter()
 
     def __enter__(self) -> EvaluationProgress:
-        if self._draws:
+        if self._bar.console.is_interactive:
             self._bar.start()
         return self
 
@@ -135,14 +133,13 @@ class EvaluationProgress:
 
     def update(self, num_finished: int, fraction: float) -> None:
         """Show the number of finished episodes, and the fraction of the evaluation that is done."""
+        draws = self._bar.console.is_interactive
         self._bar.update(self._task, completed=fraction, done=num_finished)
         now = time.perf_counter()
-        if now - self._last < (
-            _SECONDS_BETWEEN_DRAWINGS if self._draws else _SECONDS_BETWEEN_LINES
-        ):
+        if now - self._last < (_SECONDS_BETWEEN_DRAWINGS if draws else _SECONDS_BETWEEN_LINES):
             return
         self._last = now
-        if self._draws:
+        if draws:
             self._bar.refresh()
         else:
             episodes = counted(self._num_episodes, "episode")

@@ -81,7 +81,7 @@ class ClipPanel:
         if recording is None:
             return
         is_connected = client.client_id in self._scene.server.get_clients()
-        if not recording.is_alive():
+        if recording.is_done:
             self._deliver(recording, client if is_connected else None)
         elif self._requested:
             if is_connected:
@@ -143,6 +143,8 @@ class _Recording(threading.Thread):
         """The file, once the thread has ended; empty without frames."""
         self.error: Exception | None = None
         """Why there is no clip."""
+        self.is_done = False
+        """True once `content` or `error` is final."""
         self._env, self._fps, self._notify = env, fps, notify
         self._model = host_model(env.sim.mj_model)
         self._data = mujoco.MjData(self._model)
@@ -196,11 +198,13 @@ class _Recording(threading.Thread):
             # A missing library or a full disk ends the clip, not the view.
             self.error = error
         finally:
+            # Before the last notice: a paused view is updated by notices only.
+            self.is_done = True
             self._notify()
 
     def _render(self) -> None:
         # A model of its own: `add` writes the other from the viewer's thread.
-        model = host_model(self._model)
+        model = host_model(self._env.sim.mj_model)
         visual = model.vis
         visual.global_.offwidth = max(visual.global_.offwidth, _WIDTH)
         visual.global_.offheight = max(visual.global_.offheight, _HEIGHT)
