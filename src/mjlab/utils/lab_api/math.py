@@ -4,18 +4,21 @@ Functions are batched over leading axes. Quaternions are (w, x, y, z) with the H
 are in radians; rotation vectors are axis times angle. Pinhole cameras look along +z with x to the right
 and y down: with intrinsic matrix K, pixel (u, v) at depth z is the point z K^-1 (u, v, 1). Pixel (0, 0)
 is the upper left one; u counts along a row.
+
+Functions that take and return tensors compile with `torch.jit.script`.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 
-from mjlab.utils.errors import check_count, check_one_of
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.torch import constant_tensor
 
 __all__ = [
@@ -100,12 +103,13 @@ def quat_mul(q1: torch.Tensor, q2: torch.Tensor) -> torch.Tensor:
     """Return q1 * q2: rotate by q2, then by q1. `ValueError` unless the shapes are equal."""
     if q1.shape != q2.shape:
         raise ValueError(
-            f"quat_mul: expected equal shapes, got {tuple(q1.shape)} and {tuple(q2.shape)}; expand "
+            f"quat_mul: expected equal shapes, got {list(q1.shape)} and {list(q2.shape)}; expand "
             "one of them."
         )
     # Each component of q1 times all of q2: 16 operations, instead of 29 component by component.
     product = q1[..., :1] * q2
-    w, x, y, z = (product[..., k] for k in range(4))
+    # Not `unbind`: autograd does not allow writes to its views.
+    w, x, y, z = product[..., 0], product[..., 1], product[..., 2], product[..., 3]
     xw, xx, xy, xz = (q1[..., 1:2] * q2).unbind(-1)
     w -= xx
     x += xw
@@ -150,12 +154,12 @@ def quat_apply(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
 
     Returns a tensor of the shape of `vec`. Raises `ValueError` for incompatible shapes.
     """
-    return _rotate(_fit_to(quat, vec), vec, sign=1.0)
+    return _rotate(_fit_to(quat, vec), vec, sign=1)
 
 
 def quat_apply_inverse(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
     """Rotate vectors by the inverse: R(q)' v. Arguments and errors as in `quat_apply`."""
-    return _rotate(_fit_to(quat, vec), vec, sign=-1.0)
+    return _rotate(_fit_to(quat, vec), vec, sign=-1)
 
 
 quat_rotate = quat_apply
@@ -175,12 +179,12 @@ def yaw_quat(quat: torch.Tensor) -> torch.Tensor:
     return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
 
 
-def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: float) -> torch.Tensor:
+def _rotate(quat: torch.Tensor, vec: torch.Tensor, sign: int) -> torch.Tensor:
     """Return v + 2 (s w c + xyz x c) with c = xyz x v; sign s = -1 gives the inverse rotation."""
     w, xyz = quat[..., :1], quat[..., 1:]
     cross = torch.linalg.cross(xyz, vec)
     change = torch.linalg.cross(xyz, cross).addcmul_(w, cross, value=sign)
-    return torch.add(vec, change, alpha=2.0)
+    return torch.add(vec, change, alpha=2)
 
 
 def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
@@ -190,16 +194,17 @@ def _fit_to(quat: torch.Tensor, vec: torch.Tensor) -> torch.Tensor:
             return quat
         num_quats = quat.numel() // 4
         if num_quats == 1:
-            return quat.reshape(*(1,) * (vec.dim() - 1), 4)
+            return quat.reshape([1] * (vec.dim() - 1) + [4])
         if num_quats == vec.numel() // 3:
-            return quat.reshape(*vec.shape[:-1], 4)
-        if quat.dim() == vec.dim() and all(
-            size in (1, wanted) for size, wanted in zip(quat.shape[:-1], vec.shape, strict=False)
-        ):
+            return quat.reshape(list(vec.shape[:-1]) + [4])
+        fits = quat.dim() == vec.dim()
+        for axis in range(vec.dim() - 1):
+            fits = fits and quat.shape[axis] in [1, vec.shape[axis]]
+        if fits:
             return quat
     raise ValueError(
         "Expected vectors (..., 3) and quaternions (..., 4), one per vector or one for all, got "
-        f"shapes {tuple(vec.shape)} and {tuple(quat.shape)}."
+        f"shapes {list(vec.shape)} and {list(quat.shape)}."
     )
 
 
@@ -257,10 +262,10 @@ def quat_slerp(q1: torch.Tensor, q2: torch.Tensor, tau: float) -> torch.Tensor:
     (Nearly) equal rotations give q1. The arguments are unchanged. Raises `ValueError` for wrong
     shapes.
     """
-    if q1.shape != (4,) or q2.shape != (4,):
+    if list(q1.shape) != [4] or list(q2.shape) != [4]:
         raise ValueError(
-            f"quat_slerp: expected two quaternions of shape (4,), got {tuple(q1.shape)} and "
-            f"{tuple(q2.shape)}."
+            f"quat_slerp: expected two quaternions of shape (4,), got {list(q1.shape)} and "
+            f"{list(q2.shape)}."
         )
     if tau == 0.0:
         return q1.clone()
@@ -315,29 +320,27 @@ def quat_from_matrix(matrix: torch.Tensor) -> torch.Tensor:
     The component of largest magnitude is positive, so w can be negative. Raises `ValueError` for a
     wrong shape.
     """
-    if matrix.shape[-2:] != (3, 3):
-        raise ValueError(f"matrix: expected shape (..., 3, 3), got {tuple(matrix.shape)}.")
+    if list(matrix.shape[-2:]) != [3, 3]:
+        raise ValueError(f"matrix: expected shape (..., 3, 3), got {list(matrix.shape)}.")
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.flatten(-2).unbind(-1)
     # Row i of 4 q q' is 4 q_i q. Each row gives q; the row with the largest q_i is the most precise.
-    products = torch.stack(
-        (
-            *(1.0 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01),
-            *(m21 - m12, 1.0 + m00 - m11 - m22, m10 + m01, m02 + m20),
-            *(m02 - m20, m10 + m01, 1.0 - m00 + m11 - m22, m12 + m21),
-            *(m10 - m01, m02 + m20, m12 + m21, 1.0 - m00 - m11 + m22),
-        ),
-        dim=-1,
-    ).unflatten(-1, (4, 4))
+    rows = (
+        [1.0 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01]
+        + [m21 - m12, 1.0 + m00 - m11 - m22, m10 + m01, m02 + m20]
+        + [m02 - m20, m10 + m01, 1.0 - m00 + m11 - m22, m12 + m21]
+        + [m10 - m01, m02 + m20, m12 + m21, 1.0 - m00 - m11 + m22]
+    )
+    products = torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
     largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
-    index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    index = largest[..., None, None].expand_as(products[..., :1, :])
     return normalize(products.gather(-2, index).squeeze(-2))
 
 
 def quat_from_euler_xyz(roll: torch.Tensor, pitch: torch.Tensor, yaw: torch.Tensor) -> torch.Tensor:
     """Return the quaternions (..., 4) of Rz(yaw) Ry(pitch) Rx(roll); angles (...) in rad."""
     half = 0.5 * torch.stack(torch.broadcast_tensors(roll, pitch, yaw))
-    cr, cp, cy = torch.cos(half)
-    sr, sp, sy = torch.sin(half)
+    cr, cp, cy = torch.cos(half).unbind()
+    sr, sp, sy = torch.sin(half).unbind()
     # Products of yaw and pitch.
     cc, cs, sc, ss = cy * cp, cy * sp, sy * cp, sy * sp
     return torch.stack(
@@ -372,28 +375,31 @@ def matrix_from_euler(euler_angles: torch.Tensor, convention: str) -> torch.Tens
     Raises `ValueError` for an invalid convention or a wrong last size.
     """
     if euler_angles.shape[-1] != 3:
-        raise ValueError(f"euler_angles: expected shape (..., 3), got {tuple(euler_angles.shape)}.")
-    is_valid = len(convention) == 3 and set(convention) <= set("XYZ")
-    if not is_valid or convention[1] in (convention[0], convention[2]):
+        raise ValueError(f"euler_angles: expected shape (..., 3), got {list(euler_angles.shape)}.")
+    is_valid = len(convention) == 3
+    for letter in convention:
+        is_valid = is_valid and letter in "XYZ"
+    if not is_valid or convention[1] == convention[0] or convention[1] == convention[2]:
         raise ValueError(
             "convention: expected three letters of X, Y and Z, adjacent letters different, such as "
-            f"'XYZ' or 'ZXZ', got {convention!r}."
+            f"'XYZ' or 'ZXZ', got '{convention}'."
         )
-    first, second, third = (
-        _axis_rotation(axis, angle)
-        for axis, angle in zip(convention, euler_angles.unbind(-1), strict=True)
-    )
-    return matrix_product(matrix_product(first, second), third)
+    angles = euler_angles.unbind(-1)
+    product = _axis_rotation(convention[0], angles[0])
+    for k in range(1, 3):
+        product = matrix_product(product, _axis_rotation(convention[k], angles[k]))
+    return product
 
 
 def _axis_rotation(axis: str, angle: torch.Tensor) -> torch.Tensor:
     c, s = torch.cos(angle), torch.sin(angle)
     one, zero = torch.ones_like(angle), torch.zeros_like(angle)
-    entries = {
-        "X": (one, zero, zero, zero, c, -s, zero, s, c),
-        "Y": (c, zero, s, zero, one, zero, -s, zero, c),
-        "Z": (c, -s, zero, s, c, zero, zero, zero, one),
-    }[axis]
+    if axis == "X":
+        entries = (one, zero, zero, zero, c, -s, zero, s, c)
+    elif axis == "Y":
+        entries = (c, zero, s, zero, one, zero, -s, zero, c)
+    else:
+        entries = (c, -s, zero, s, c, zero, zero, zero, one)
     return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
 
@@ -405,15 +411,22 @@ def convert_camera_frame_orientation_convention(
     """Convert a camera orientation (..., 4) between conventions of camera axes.
 
     "opengl" looks along -z with +y up, "ros" along +z with -y up, "world" along +x with +z up.
-    Raises `ValueError` for an unknown convention.
+    Unknown conventions are taken as "opengl" with a warning, as in mjlab 1.6.
     """
-    check_one_of("origin", origin, _IN_OPENGL)
-    check_one_of("target", target, _IN_OPENGL)
     if origin == target:
         return orientation.clone()
+    for name in (origin, target):
+        if name not in _IN_OPENGL:
+            warnings.warn(
+                f"Camera convention: expected one of {list(_IN_OPENGL)}, got {name!r}; 'opengl' "
+                "is used.",
+                UserWarning,
+                stacklevel=2,
+            )
     # Table rows are rows of matrices from coordinates of a convention to OpenGL coordinates.
-    from_origin = orientation.new_tensor(_IN_OPENGL[origin])
-    from_target = orientation.new_tensor(_IN_OPENGL[target])
+    opengl = _IN_OPENGL["opengl"]
+    from_origin = orientation.new_tensor(_IN_OPENGL.get(origin, opengl))
+    from_target = orientation.new_tensor(_IN_OPENGL.get(target, opengl))
     turned = matrix_product(matrix_from_quat(orientation), from_origin.T)
     return quat_from_matrix(matrix_product(turned, from_target))
 
@@ -533,17 +546,15 @@ def transform_points(
 
     Returns (P, 3), or (N, P, 3) if any argument has N.
     """
-    is_batched = points.dim() == 3 or any(
-        part is not None and part.dim() == 2 for part in (pos, quat)
-    )
-    for part in (pos, quat):
-        if part is not None and part.dim() == 2 and points.dim() == 2:
-            points = points.expand(part.shape[0], *points.shape)
     if quat is not None:
-        per_point = quat.unsqueeze(-2) if quat.dim() == 2 else quat
-        points = quat_apply(per_point.expand(*points.shape[:-1], 4), points)
+        if quat.dim() == 2:
+            quat = quat.unsqueeze(-2)
+            points = points if points.dim() == 3 else points.unsqueeze(0)
+        else:
+            quat = quat.reshape([1] * (points.dim() - 1) + [4])
+        points = _rotate(quat, points, sign=1)
     if pos is not None:
-        points = points + (pos.unsqueeze(-2) if is_batched and pos.dim() == 2 else pos)
+        points = points + (pos.unsqueeze(-2) if pos.dim() == 2 else pos)
     return points
 
 
@@ -565,12 +576,13 @@ def make_pose(pos: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
 
     Raises `ValueError` if the leading sizes differ.
     """
-    if pos.shape[:-1] != rot.shape[:-2] or pos.shape[-1] != 3 or rot.shape[-2:] != (3, 3):
+    sizes = list(pos.shape[:-1])
+    if pos.shape[-1] != 3 or list(rot.shape) != sizes + [3, 3]:
         raise ValueError(
             "make_pose: expected positions (..., 3) and rotations (..., 3, 3) with equal leading "
-            f"sizes, got {tuple(pos.shape)} and {tuple(rot.shape)}."
+            f"sizes, got {list(pos.shape)} and {list(rot.shape)}."
         )
-    pose = torch.zeros(*pos.shape[:-1], 4, 4, dtype=pos.dtype, device=pos.device)
+    pose = torch.zeros(sizes + [4, 4], dtype=pos.dtype, device=pos.device)
     pose[..., :3, :3] = rot
     pose[..., :3, 3] = pos
     pose[..., 3, 3] = 1.0
@@ -620,11 +632,14 @@ def interpolate_rotations(
 
     Raises `ValueError` if `num_steps` < 1.
     """
-    check_count("num_steps", num_steps)
+    if num_steps < 1:
+        raise ValueError(f"num_steps: expected an integer >= 1, got {num_steps}.")
     fractions = [step / num_steps for step in range(num_steps)]
     if axis_angle:
         vector = axis_angle_from_quat(quat_from_matrix(matrix_product(R2, R1.transpose(-1, -2))))
-        angle = torch.linalg.vector_norm(vector) * R1.new_tensor(fractions)
+        angle = torch.linalg.vector_norm(vector) * torch.tensor(
+            fractions, dtype=R1.dtype, device=R1.device
+        )
         turns = matrix_from_quat(quat_from_angle_axis(angle, vector.expand(num_steps, 3)))
         steps = matrix_product(turns, R1)
     else:
@@ -654,7 +669,8 @@ def interpolate_poses(
     """
     if (num_steps is None) == (step_size is None):
         raise ValueError(f"Expected either num_steps or step_size, got {num_steps}, {step_size}.")
-    (pos_1, rot_1), (pos_2, rot_2) = unmake_pose(pose_1), unmake_pose(pose_2)
+    pos_1, rot_1 = unmake_pose(pose_1)
+    pos_2, rot_2 = unmake_pose(pose_2)
     if num_steps is None:
         num_steps = math.ceil(float(torch.linalg.vector_norm(pos_2 - pos_1)) / (step_size or 1.0))
     intervals = num_steps + 1
@@ -727,8 +743,8 @@ def matrix_product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
 
 
 def skew_symmetric_matrix(vec: torch.Tensor) -> torch.Tensor:
-    """Return the skew-symmetric matrix S with S u = vec x u, (..., 3, 3)."""
-    x, y, z = vec.unbind(-1)
+    """Return the skew-symmetric matrices S with S u = vec x u, (..., 3, 3); (1, 3, 3) of a (3,)."""
+    x, y, z = torch.atleast_2d(vec).unbind(-1)
     zero = torch.zeros_like(x)
     rows = (zero, -z, y, z, zero, -x, -y, x, zero)
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
@@ -807,7 +823,8 @@ def random_orientation(num: int, device: str) -> torch.Tensor:
 def random_yaw_orientation(num: int, device: str) -> torch.Tensor:
     """Sample quaternions (num, 4) of rotations about z with uniform angle."""
     zero = torch.zeros(num, dtype=torch.float32, device=device)
-    return quat_from_euler_xyz(zero, zero, sample_uniform(0.0, 2.0 * torch.pi, num, device))
+    yaw = torch.rand(num, dtype=torch.float32, device=device) * (2.0 * torch.pi)
+    return quat_from_euler_xyz(zero, zero, yaw)
 
 
 def _shape(size: Size) -> tuple[int, ...]:
@@ -831,7 +848,7 @@ def project_points(points: torch.Tensor, intrinsics: torch.Tensor) -> torch.Tens
         ValueError: `points` has a wrong number of dimensions.
     """
     if points.ndim not in (2, 3):
-        raise ValueError(f"points: expected (P, 3) or (N, P, 3), got {tuple(points.shape)}.")
+        raise ValueError(f"points: expected (P, 3) or (N, P, 3), got {list(points.shape)}.")
     # Not a matrix product, because GPUs may compute it in TF32.
     scaled = (intrinsics.unsqueeze(-3) * points.unsqueeze(-2)).sum(-1)
     scaled = scaled if scaled.ndim == 3 else scaled.unsqueeze(0)
@@ -884,7 +901,7 @@ def _without_channel(depth: torch.Tensor) -> torch.Tensor:
     if depth.ndim not in (2, 3, 4) or (depth.ndim == 4 and depth.shape[-1] != 1):
         raise ValueError(
             "depth: expected (H, W), (H, W, 1), (N, H, W) or (N, H, W, 1), "
-            f"got {tuple(depth.shape)}."
+            f"got {list(depth.shape)}."
         )
     has_channel = depth.ndim == 4 or (depth.ndim == 3 and depth.shape[-1] == 1)
     return depth.squeeze(-1) if has_channel else depth
