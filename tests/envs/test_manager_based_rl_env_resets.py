@@ -246,3 +246,36 @@ def test_the_timer_of_a_command_starts_with_the_episode_and_not_a_step_before(ma
     torch.testing.assert_close(timer[[0, 2]], torch.full((2,), 2.0 - 2 * env.step_dt))
     act(env, 0.0)
     torch.testing.assert_close(timer[1], torch.tensor(2.0 - env.step_dt))
+
+
+class LowPass(mm.ManagerTermBase):
+    """Filter of a constant one."""
+
+    def __init__(self, cfg: mm.ObservationTermCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(env)
+        self.y = torch.zeros(env.num_envs, 1)
+
+    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
+        self.y[slice(None) if env_ids is None else env_ids] = 0.0
+
+    def __call__(self, env: ManagerBasedRlEnv) -> torch.Tensor:
+        self.y += 0.5 * (1.0 - self.y)
+        return self.y.clone()
+
+
+def test_a_filter_advances_with_its_own_environment(make):
+    group = mm.ObservationGroupCfg({"y": mm.ObservationTermCfg(func=LowPass)})
+    env = make(config(observations={"actor": group}))
+    seen = []
+    for step in range(4):
+        obs = act(env, 0.0)[0]
+        if step == 1:
+            obs = env.reset(env_ids=torch.tensor([1]))[0]
+            assert torch.equal(env.get_observations()["actor"], obs["actor"])
+        seen.append(obs["actor"].flatten().tolist())
+    assert seen == [
+        [0.75, 0.75, 0.75],
+        [0.875, 0.5, 0.875],
+        [0.9375, 0.75, 0.9375],
+        [0.96875, 0.875, 0.96875],
+    ]

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
+from collections import deque
+from dataclasses import dataclass, field
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.managers import ObservationGroupCfg, ObservationManager, ObservationTermCfg
+from mjlab.managers import (
+    ManagerTermBase,
+    ObservationGroupCfg,
+    ObservationManager,
+    ObservationTermCfg,
+)
+from mjlab.utils.buffers import CircularBuffer
 from mjlab.utils.noise import (
     ConstantNoiseCfg,
+    NoiseCfg,
     NoiseModel,
     NoiseModelCfg,
     NoiseModelWithAdditiveBiasCfg,
@@ -361,12 +373,272 @@ def test_a_result_is_kept_until_the_next_step_or_reset(env):
     assert manager.compute() is not kept
 
 
-def test_the_first_observation_fills_an_empty_history_only_once(env):
+def test_only_steps_fill_an_empty_history(env):
     manager = make(env, ObservationTermCfg(func=state, history_length=2))
     manager.compute()
     env.state = env.state + 1.0
-    assert manager.compute_group("g")[0].tolist() == [0.0, 1.0, 0.0, 1.0], "no step was made"
-    assert manager.compute(update_history=True)["g"][0].tolist() == [0.0, 1.0, 1.0, 2.0]
+    assert manager.compute_group("g")[0].tolist() == [1.0, 2.0, 1.0, 2.0]
+    env.state = env.state + 1.0
+    assert manager.compute(update_history=True)["g"][0].tolist() == [2.0, 3.0, 2.0, 3.0]
+
+
+# State that advances once per step.
+
+
+class Tally:
+    """Helper object that counts the calls of each environment."""
+
+    def __init__(self, num_envs):
+        self.values = torch.zeros(num_envs, 1)
+
+    def add(self):
+        self.values = self.values + 1.0
+
+
+class Counting(ManagerTermBase):
+    """Count calls since the reset; `kind` is the place of the count."""
+
+    def __init__(self, cfg, env):
+        super().__init__(env)
+        n = env.num_envs
+        self.tensor = torch.zeros(n, 1)
+        self.array = np.zeros((n, 1))
+        self.helper = Tally(n)
+        self.pair = [Tally(n), Tally(n)]
+        self.numbers = [0.0] * n
+        self.frames = deque([torch.zeros(n, 1)] * 3, maxlen=3)
+        self.items = {"a": (torch.zeros(n, 1), SimpleNamespace(count=torch.zeros(n, 1)))}
+        self.rings = CircularBuffer(n, n, "cpu")
+        self.columns = torch.zeros(5, n, 1)
+
+    def reset(self, env_ids=None):
+        for values in (
+            *(self.tensor, self.array, self.helper.values, self.pair[1].values),
+            *(self.items["a"][0], self.items["a"][1].count, *self.frames),
+        ):
+            values[env_ids] = 0.0
+        for k in range(self.num_envs)[env_ids] if isinstance(env_ids, slice) else env_ids.tolist():
+            self.numbers[k] = 0.0
+        self.rings.reset(env_ids)
+        self.columns[:, env_ids] = 0.0
+
+    def __call__(self, env, kind):
+        if kind == "tensor":
+            self.tensor += 1.0
+            return self.tensor
+        if kind == "array":
+            self.array += 1.0
+            return torch.from_numpy(self.array).float()
+        if kind == "helper":
+            self.helper.add()
+            return self.helper.values
+        if kind == "pair":
+            self.pair[1].add()
+            return self.pair[1].values
+        if kind == "numbers":
+            self.numbers = [number + 1.0 for number in self.numbers]
+            return torch.tensor(self.numbers)[:, None]
+        if kind == "frames":
+            self.frames.append(self.frames[-1] + 1.0)
+            return self.frames[-1]
+        if kind == "items":
+            first, second = self.items["a"]
+            second.count += 1.0
+            self.items["a"] = (first + 1.0, second)
+            return 0.5 * (self.items["a"][0] + second.count)
+        if kind == "rings":
+            self.rings.append((self.rings.current_length[:, None] + 1.0).clamp(max=env.num_envs))
+            return self.rings[0]
+        self.columns += 1.0
+        return self.columns[-1]
+
+
+KINDS = ("tensor", "array", "helper", "pair", "numbers", "frames", "items", "rings", "columns")
+
+
+class Drift(NoiseModel):
+    """Noise that grows by one per call."""
+
+    def __init__(self, cfg, num_envs, device):
+        super().__init__(cfg, num_envs, device)
+        self.bias = torch.zeros(num_envs, 1)
+
+    def reset(self, env_ids=None):
+        self.bias[slice(None) if env_ids is None else env_ids] = 0.0
+
+    def __call__(self, data):
+        self.bias += 1.0
+        return data + self.bias
+
+
+@dataclass(kw_only=True)
+class DriftCfg(NoiseModelCfg, class_type=Drift):
+    noise_cfg: NoiseCfg = field(default_factory=ConstantNoiseCfg)
+
+
+def counting_terms():
+    terms: dict[str, ObservationTermCfg | None] = {
+        kind: ObservationTermCfg(func=Counting, params={"kind": kind}) for kind in KINDS
+    }
+    zeros = ObservationTermCfg(func=lambda env: torch.zeros(env.num_envs, 1), noise=DriftCfg())
+    terms["drift"] = zeros
+    terms["delayed"] = dataclasses.replace(zeros, delay_min_lag=1, delay_max_lag=1)
+    terms["history"] = dataclasses.replace(zeros, history_length=2)
+    tally = Tally(4)
+    tally.add()
+
+    def shared(env, tally):
+        tally.add()
+        return tally.values - 2.0
+
+    terms["parameter"] = ObservationTermCfg(func=shared, params={"tally": tally})
+    return terms
+
+
+def trace(env, concatenate, between=lambda manager, count: None):
+    """Return the observations of environment 0 in four steps."""
+    group = ObservationGroupCfg(
+        counting_terms(), enable_corruption=True, concatenate_terms=concatenate
+    )
+    manager = ObservationManager({"g": group}, env)
+    manager.reset()
+    seen = []
+    for count in range(4):
+        obs = manager.compute(update_history=True)["g"]
+        between(manager, count)
+        parts = [obs] if concatenate else list(obs.values())
+        seen.append([value for part in parts for value in part[0].tolist()])
+    return seen
+
+
+def reset_others(manager, count):
+    if count in (0, 2):
+        ids = torch.tensor([1, 3])
+        before = manager.compute()["g"]
+        manager.reset(ids)
+        manager.compute()
+        manager.compute_group("g")
+        after = manager.compute(update_history=True, env_ids=ids)["g"]
+        for old, new in zip(
+            *(o.values() if isinstance(o, dict) else [o] for o in (before, after)), strict=True
+        ):
+            assert torch.equal(old[0], new[0])
+
+
+SIDE_PATHS = {
+    "compute_group": lambda manager, _: manager.compute_group("g"),
+    "viewer": lambda manager, _: manager.get_active_iterable_terms(0),
+    "preview": lambda manager, _: manager.preview(),
+    "partial reset": reset_others,
+    "nothing to reset": lambda manager, _: manager.compute(
+        True, torch.tensor([], dtype=torch.long)
+    ),
+}
+
+
+@pytest.mark.parametrize("concatenate", [True, False])
+@pytest.mark.parametrize("path", SIDE_PATHS)
+def test_side_paths_advance_no_other_state(env, path, concatenate):
+    assert trace(env, concatenate, SIDE_PATHS[path]) == trace(env, concatenate)
+
+
+def test_every_kind_of_state_advances_per_step(env):
+    steps = trace(env, True)
+    plain = len(KINDS)
+    assert [step[:plain] for step in steps] == [[k] * plain for k in (1.0, 2.0, 3.0, 4.0)]
+    assert [step[plain:] for step in steps] == [
+        [1.0, 1.0, 1.0, 1.0, 1.0],
+        [2.0, 1.0, 1.0, 2.0, 2.0],
+        [3.0, 2.0, 2.0, 3.0, 3.0],
+        [4.0, 3.0, 3.0, 4.0, 4.0],
+    ]
+
+
+def test_a_partial_reset_starts_the_state_of_its_rows(env):
+    group = ObservationGroupCfg(counting_terms(), enable_corruption=True)
+    del group.terms["parameter"]
+    manager = ObservationManager({"g": group}, env)
+    manager.reset()
+    for _ in range(3):
+        manager.compute(update_history=True)
+    ids = torch.tensor([2])
+    manager.reset(ids)
+    assert set(manager.compute(update_history=True, env_ids=ids)["g"][2].tolist()) == {1.0}
+    obs = manager.compute(update_history=True)["g"]
+    assert obs[2, : len(KINDS)].tolist() == [2.0] * len(KINDS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_compute_group_shows_the_last_values(env, kind):
+    manager = make(env, ObservationTermCfg(func=Counting, params={"kind": kind}))
+    manager.reset()
+    for _ in range(2):
+        manager.compute(update_history=True)
+    assert manager.compute_group("g").tolist() == [[2.0]] * 4
+    manager.reset(torch.tensor([1]))
+    assert (
+        manager.compute_group("g").tolist()
+        == manager.compute()["g"].tolist()
+        == [[2.0], [1.0], [2.0], [2.0]]
+    )
+
+
+def test_counters_do_not_count_partial_resets(env):
+    class Clock(ManagerTermBase):
+        def __init__(self, cfg, env):
+            super().__init__(env)
+            self.count = 0
+
+        def __call__(self, env):
+            self.count += 1
+            return torch.full((env.num_envs, 1), float(self.count))
+
+    manager = make(env, ObservationTermCfg(func=Clock))
+    first = manager.compute(update_history=True)["g"][0].item()
+    manager.compute(update_history=True, env_ids=torch.tensor([1]))
+    assert manager.compute(update_history=True)["g"][0].item() == first + 1.0
+    manager.compute(update_history=True, env_ids=torch.arange(4))
+    assert manager.compute(update_history=True)["g"][0].item() == first + 3.0
+
+
+def test_side_paths_keep_random_numbers(env):
+    class Random(ManagerTermBase):
+        def __init__(self, cfg, env):
+            super().__init__(env)
+            self.torch = torch.Generator().manual_seed(1)
+            self.numpy = np.random.default_rng(1)
+
+        def __call__(self, env):
+            draws = torch.rand(env.num_envs, 1, generator=self.torch)
+            return draws + float(self.numpy.random()) + torch.rand(env.num_envs, 1)
+
+    def draws(between):
+        torch.manual_seed(0)
+        noise = UniformNoiseCfg()
+        terms = {"t": ObservationTermCfg(func=Random, noise=noise, delay_max_lag=3)}
+        manager = ObservationManager(
+            {"g": ObservationGroupCfg({**terms}, enable_corruption=True)}, env
+        )
+        manager.reset()
+        values = []
+        for _ in range(4):
+            between(manager)
+            values.append(manager.compute(update_history=True)["g"])
+            between(manager)
+        return torch.cat(values, dim=1)
+
+    expected = draws(lambda manager: None)
+    assert torch.equal(draws(lambda manager: manager.compute_group("g")), expected)
+    assert torch.equal(draws(lambda manager: manager.compute()), expected)
+
+
+def test_other_rows_show_current_values_of_stateless_terms(env):
+    manager = make(env)
+    manager.compute(update_history=True)
+    env.state = env.state + 5.0
+    ids = torch.tensor([1])
+    manager.reset(ids)
+    assert torch.equal(manager.compute(update_history=True, env_ids=ids)["g"], env.state)
 
 
 def test_filling_histories_of_some_needs_update_history(env):

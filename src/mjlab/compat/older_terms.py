@@ -10,7 +10,6 @@ Foot terms of releases 1.1 and 1.2 read site heights above z = 0 instead of a he
 from __future__ import annotations
 
 import copy
-import functools
 import inspect
 import warnings
 from collections.abc import Callable, Generator
@@ -25,7 +24,7 @@ from mjlab.tasks.velocity.mdp import rewards as feet_rewards
 from mjlab.tasks.velocity.mdp.observations import Source, check_same_feet, site_columns
 from mjlab.tasks.velocity.mdp.rewards import if_commanded
 from mjlab.utils.indexing import as_columns, as_ids
-from mjlab.utils.state import capture_state, restore_state
+from mjlab.utils.state import changes_undone
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
@@ -110,19 +109,13 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
         yield
         return
     data = term._env.sim.data
-    attributes = set(vars(term))
-    before = capture_state(term, generators=False)
     physics = {name: getattr(data, name).clone() for name in _PHYSICS}
-    yield
-    after = capture_state(term, generators=False)
-    restore_state(term, _merge_rows(before, after, env_ids, term.num_envs))
-    for name in set(vars(term)) - attributes:
-        if _hides_class_state(term, name):
-            delattr(term, name)
+    with changes_undone([term], env_ids, term.num_envs, generators=False):
+        yield
     moved = False
     for name, old in physics.items():
         field = getattr(data, name)
-        kept = _merge_rows(old, field, env_ids, term.num_envs)
+        kept = old.index_copy(0, env_ids, field[env_ids])
         moved |= not torch.equal(kept, field)
         field.copy_(kept)
     if moved:
@@ -130,37 +123,6 @@ def _other_envs_kept(term: Any, env_ids: Any) -> Generator[None]:
         # outside `env_ids` stay those of the last substep.
         term._env.sim.forward(stage="vel")
         term._env.sim.forward(env_ids)
-
-
-def _hides_class_state(term: Any, name: str) -> bool:
-    """Return True if an attribute of `term` hides a class attribute, such as a step counter.
-
-    False for tensors with one row per environment, as for attributes without a class attribute.
-    """
-    value = getattr(term, name)
-    if isinstance(value, torch.Tensor) and value.shape[:1] == (term.num_envs,):
-        return False
-    cached = isinstance(getattr(type(term), name, None), functools.cached_property)
-    return hasattr(type(term), name) and not cached
-
-
-def _merge_rows(before: Any, after: Any, env_ids: torch.Tensor, num_envs: int) -> Any:
-    """Return `before`, with rows `env_ids` of its per-environment tensors taken from `after`."""
-    if isinstance(before, torch.Tensor) and isinstance(after, torch.Tensor):
-        if before.shape != after.shape or before.shape[:1] != (num_envs,):
-            return before
-        merged = before.clone()
-        merged[env_ids] = after[env_ids]
-        return merged
-    if isinstance(before, dict) and isinstance(after, dict):
-        return {
-            key: _merge_rows(value, after.get(key), env_ids, num_envs)
-            for key, value in before.items()
-        }
-    if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
-        pairs = zip(before, after, strict=True)
-        return [_merge_rows(old, new, env_ids, num_envs) for old, new in pairs]
-    return before
 
 
 def _check_sites(

@@ -332,8 +332,8 @@ class ManagerBasedRlEnv(Tabular):
     ) -> tuple[VecEnvObs, dict[str, Any]]:
         """Start new episodes in `env_ids` (None: all); return observations and extras.
 
-        A `seed` reseeds every random number generator. All environments are observed; only
-        `env_ids` advance their delay and history buffers. Forces and accelerations are current in
+        A `seed` reseeds every random number generator. All environments are observed, but only
+        `env_ids` advance the state of observation terms; see `ObservationManager.compute`. Forces and accelerations are current in
         `env_ids`, and those of the last substep in other environments, as after `step`; before
         the first substep they are current everywhere.
 

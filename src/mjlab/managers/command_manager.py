@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,17 +11,21 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import accept_older_methods
+from mjlab.entity import Entity
 from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import (
     BuiltTermsManager,
     DebugVisSwitches,
+    ManagerBase,
     ManagerTermBase,
     NullManager,
 )
 from mjlab.managers.nonfinite import finite_mean
+from mjlab.sensor import Sensor
 from mjlab.utils.errors import UnsupportedError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import sample_uniform
+from mjlab.utils.state import changes_undone
 from mjlab.utils.tables import Table, format_shape, settings_of
 
 if TYPE_CHECKING:
@@ -59,9 +64,9 @@ class CommandTerm(ManagerTermBase):
     Attributes:
         time_left: Time until the next resample (s), (num_envs,).
         command_counter: Number of commands in this episode, (num_envs,) int64.
-        metrics: Name to values (num_envs,). Resets log their means and zero them.
+        metrics: Name to values (num_envs, ...). Resets log their means and zero them.
 
-    Raises `ValueError` if the config's time range is negative or has min > max.
+    Raises `ValueError` if the config's time range has min > max.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -72,10 +77,17 @@ class CommandTerm(ManagerTermBase):
         super().__init__(env)
         self.cfg = cfg
         low, high = cfg.resampling_time_range
-        if not 0.0 <= low <= high:
+        if not low <= high:
             raise ValueError(
-                f"{self.name} resampling_time_range: expected 0 <= shortest <= longest (s), got "
+                f"{self.name} resampling_time_range: expected shortest <= longest (s), got "
                 f"{(low, high)}."
+            )
+        if low < 0.0:
+            warnings.warn(
+                f"{self.name} resampling_time_range: expected times >= 0 (s), got {(low, high)}; "
+                "a time below 0 resamples at the next step.",
+                UserWarning,
+                stacklevel=2,
             )
         self.metrics: dict[str, torch.Tensor] = {}
         self.time_left = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
@@ -110,13 +122,15 @@ class CommandTerm(ManagerTermBase):
                 due = (self.time_left <= 0.0).nonzero().flatten()
         else:
             # `_update_metrics` updates all environments. Metrics that accumulate would count a step
-            # that the other environments have not made, so their values are restored.
-            before = {name: (values, values.clone()) for name, values in self.metrics.items()}
-            self._update_metrics()
-            for name, (values, kept) in before.items():
-                kept[env_ids] = self.metrics[name][env_ids]
-                # The original tensor is kept even if the update replaced it.
-                self.metrics[name] = values.copy_(kept)
+            # that the other environments have not made.
+            with changes_undone(
+                [self] if len(env_ids) < self.num_envs else [],
+                env_ids,
+                self.num_envs,
+                generators=False,
+                shared=(Entity, ManagerBase, Sensor),
+            ):
+                self._update_metrics()
             self.time_left[env_ids] -= dt
             due = env_ids[self.time_left[env_ids] <= 0.0]
         if len(due) > 0:
@@ -142,7 +156,10 @@ class CommandTerm(ManagerTermBase):
             return {}
         log: dict[str, float] = {}
         if self.metrics:
-            values = torch.stack(tuple(self.metrics.values()))[:, ids].float()
+            metrics = [
+                m if m.ndim == 1 else m.flatten(1).float().mean(1) for m in self.metrics.values()
+            ]
+            values = torch.stack(metrics)[:, ids].float()
             is_measured = self._is_measured(ids)
             if is_measured is not None:
                 values.masked_fill_(~is_measured, torch.nan)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
+import functools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,15 +14,19 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from mjlab.compat import offers_older_attributes
+from mjlab.entity import Entity
+from mjlab.managers.action_manager import ActionTerm
+from mjlab.managers.command_manager import CommandTerm
 from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
 from mjlab.managers.term_checks import check_real, is_interval
+from mjlab.sensor import Sensor
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.errors import WrongTypeError, check_count, check_exists, check_one_of
-from mjlab.utils.indexing import is_empty
+from mjlab.utils.indexing import as_ids, as_index, is_empty
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
-from mjlab.utils.state import capture_state, is_stateful, restore_state, stateful
+from mjlab.utils.state import changes_undone, stateful
 from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, format_shape, function_name
 
@@ -30,6 +36,9 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 NanPolicy = Literal["disabled", "warn", "sanitize", "error"]
 Observation = torch.Tensor | dict[str, torch.Tensor]
+
+# Objects that terms refer to and do not own.
+_SHARED = (ActionTerm, CommandTerm, Entity, ManagerBase, Sensor)
 
 
 @dataclass
@@ -112,9 +121,12 @@ class ObservationManager(ManagerBase):
     """Computes all observation groups. Groups that are None or have no terms are skipped.
 
     Every term function is called once during construction, to infer its shape.
+
+    Only `compute` and `compute_group` with `update_history` advance state: delays, histories, noise
+    models, class-based terms (their attributes, and the objects that these own), and random numbers.
     """
 
-    _transient = {"_stateful_terms"}
+    _transient = {"_new_ids"}
     _title = "observations"
 
     def __init__(
@@ -128,9 +140,10 @@ class ObservationManager(ManagerBase):
                 self.cfg[name] = dataclasses.replace(group, terms=terms)
         self._groups: dict[str, ObservationGroup] = {}
         self._obs_buffer: dict[str, Observation] | None = None
+        # Environments reset since the last step.
+        self._new_ids: list[torch.Tensor | slice | None] = []
+        self._is_current = False
         super().__init__(env)
-        terms = (term for group in self._groups.values() for term in group.terms.values())
-        self._stateful_terms = [term for term in terms if term.has_state]
 
     def tables(self) -> list[Table]:
         """Return the table of the active terms; `noise` is None in groups without corruption."""
@@ -201,10 +214,12 @@ class ObservationManager(ManagerBase):
         """Return the observation of every group as a new tensor.
 
         Args:
-            update_history: Append values to the histories. If False, a result computed since the
-                last reset is returned unchanged.
-            env_ids: Environments that start an episode: only their delays and histories are
-                filled. All environments are observed either way.
+            update_history: Advance the state of the terms by one step. If False, a result computed
+                since the last reset is returned unchanged.
+            env_ids: Environments that start an episode: only their state advances.
+
+        Environments that do not advance show the last values of terms whose state a call changes,
+        and current values of other terms.
 
         Raises `ValueError` for `env_ids` without `update_history`.
         """
@@ -213,26 +228,19 @@ class ObservationManager(ManagerBase):
                 "ObservationManager.compute env_ids: expected update_history=True, because env_ids "
                 "fills histories, got False."
             )
-        if update_history or self._obs_buffer is None:
-            self._obs_buffer = {
-                name: group.compute(update_history, env_ids) for name, group in self._groups.items()
-            }
+        if update_history or self._obs_buffer is None or not self._is_current:
+            self._obs_buffer = self._compute(self._groups, update_history, env_ids)
+            self._is_current = True
+            if update_history:
+                self._new_ids = []
         return self._obs_buffer
 
     def preview(self) -> dict[str, Observation]:
-        """Return the result of `compute(update_history=True)` without side effects.
-
-        The states of delays, histories, noise models, class-based terms and random number
-        generators are restored.
-        """
-        terms = [term for term in self._class_terms.values() if is_stateful(term)]
-        parts = [*self._stateful_terms, *terms]
-        before = [capture_state(part) for part in parts]
-        with preserved_rng():
-            previewed = {name: group.compute(True, None) for name, group in self._groups.items()}
-        for part, state in zip(parts, before, strict=True):
-            restore_state(part, state)
-        return previewed
+        """Return the result of `compute(update_history=True)` without side effects."""
+        terms = self._terms(self._groups)
+        roots = [*terms, *(term.state for term in terms)]
+        with preserved_rng(), changes_undone(roots, shared=_SHARED):
+            return {name: group.compute(True, None) for name, group in self._groups.items()}
 
     def compute_group(
         self,
@@ -245,14 +253,16 @@ class ObservationManager(ManagerBase):
         Raises `ValueError`, listing the valid names, if the group is unknown.
         """
         check_exists("observation group", group_name, self._groups)
-        return self._groups[group_name].compute(update_history, env_ids)
+        groups = {group_name: self._groups[group_name]}
+        return self._compute(groups, update_history, env_ids)[group_name]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
         """Reset terms, delays, histories and noise models of `env_ids` (None: all). Logs nothing."""
-        self._obs_buffer = None
+        self._is_current = False
         super().reset(env_ids)
         if not is_empty(env_ids):
-            for term in self._stateful_terms:
+            self._new_ids.append(env_ids)
+            for term in self._terms(self._groups):
                 term.reset(env_ids)
         return {}
 
@@ -274,6 +284,47 @@ class ObservationManager(ManagerBase):
             for group_name, group in self._groups.items()
             for term_name, value in group.split(observations[group_name]).items()
         ]
+
+    def _terms(self, groups: Mapping[str, ObservationGroup]) -> list[ObservationTerm]:
+        return [term for group in groups.values() for term in group.terms.values()]
+
+    def _compute(
+        self,
+        groups: Mapping[str, ObservationGroup],
+        update_history: bool,
+        env_ids: torch.Tensor | None,
+    ) -> dict[str, Observation]:
+        if update_history and env_ids is None:
+            return {name: group.compute(True, None) for name, group in groups.items()}
+        # Environments that advance.
+        ids = as_ids([] if env_ids is None else env_ids, self.num_envs, self.device)
+        others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        others[ids] = False
+        if not others.any():
+            return {name: group.compute(True, ids) for name, group in groups.items()}
+        # Environments without an observation of their episode.
+        for new_ids in self._new_ids:
+            others[as_index(new_ids)] = False
+        terms = self._terms(groups)
+        roots: list[Any] = [term.state for term in terms]
+        with contextlib.ExitStack() as stack:
+            if not update_history:
+                stack.enter_context(preserved_rng())
+                roots += terms
+            kept = changes_undone(
+                roots, ids, self.num_envs, generators=not update_history, shared=_SHARED
+            )
+            advanced = stack.enter_context(kept)
+            computed = {
+                name: group.compute(update_history, env_ids) for name, group in groups.items()
+            }
+        last = self._obs_buffer or {}
+        changed = {terms[k].label for k in advanced if k < len(terms)}
+        for name in groups.keys() & last.keys():
+            now, before = (groups[name].split(obs[name]) for obs in (computed, last))
+            for key in [k for k in now if f"{name}/{k}" in changed]:
+                now[key][others] = before[key][others]
+        return computed
 
     def _prepare_terms(self) -> None:
         for name, group_cfg in self._enabled(self.cfg, ObservationGroupCfg):
@@ -429,7 +480,8 @@ class ObservationTerm:
         """Return the value, (num_envs, *shape); it may be a view of simulation memory.
 
         Args:
-            update_history: Append the value to the history.
+            update_history: Append the value to delay and history. If False, it only fills those of
+                environments without a value since their reset.
             env_ids: Environments that start an episode: their delay and history are filled with
                 the value; other environments keep theirs. None: a step of all environments.
         """
@@ -453,18 +505,22 @@ class ObservationTerm:
             value = value * cfg.scale
         if self._nan_policy != "disabled":
             value = apply_nan_policy(value, self._nan_policy, self.label)
+        is_step = update_history and env_ids is None
         if self._delay is not None:
-            if env_ids is not None and self._delay.is_initialized:
-                self._delay.backfill(value, env_ids)
-                value = self._delay.peek()
-            else:
+            if is_step or not self._delay.is_initialized:
                 self._delay.append(value)
                 value = self._delay.compute()
+            else:
+                ids = self._delay.empty_rows if env_ids is None else env_ids
+                self._delay.backfill(value, ids)
+                value = self._delay.peek()
         if self._history is not None:
-            if env_ids is not None and self._history.is_initialized:
-                self._history.backfill(value, env_ids)
-            elif update_history or not self._history.is_initialized:
+            if is_step or not self._history.is_initialized:
                 self._history.append(value)
+            else:
+                self._history.backfill(
+                    value, self._history.empty_rows if env_ids is None else env_ids
+                )
             frames = self._history.buffer
             value = frames.flatten(1) if cfg.flatten_history_dim else frames
         return value
@@ -485,9 +541,13 @@ class ObservationTerm:
         )
 
     @property
-    def has_state(self) -> bool:
-        """True if the term has state to reset."""
-        return any(part is not None for part in (self._noise_model, self._delay, self._history))
+    def state(self) -> dict[str, Any]:
+        """Objects that a call may change, but for delay and history."""
+        func = self.cfg.func
+        while isinstance(func, functools.partial):
+            func = func.func
+        owner = getattr(func, "__self__", func)
+        return {"func": owner, "params": self.cfg.params, "noise_model": self._noise_model}
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> None:
         """Clear delay and history and reset the noise model of `env_ids` (None: all)."""

@@ -1,16 +1,22 @@
-"""Capture and restore the run-time state of an object tree, for bitwise exact resume.
+"""Capture and restore the run-time state of an object tree: checkpoints, and calls without effect.
 
 Managers, terms, buffers and actuators keep their run-time state in plain attributes. Instead of
 requiring a `state_dict` of each class (and of users' terms), this module walks the attributes of
 objects whose class is marked `stateful` and saves all data: tensors, arrays, numbers, strings,
-random generators, and lists, tuples, deques and dicts of these.
+random generators, and lists, tuples, deques and dicts of these. `changes_undone` also walks objects
+of other classes, because it needs no names for them in a file.
 """
 
 from __future__ import annotations
 
+import contextlib
 import enum
+import inspect
 import logging
+import sys
 from collections import deque
+from collections.abc import Generator, Sequence
+from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,6 +30,7 @@ _CLASS_KEY = "__class__"
 # Attributes for device and size of an object, set by the new run.
 _SETTINGS = frozenset({"device", "_device", "num_envs", "_num_envs"})
 _TRANSIENT = "_transient"
+_ROW_DIMS = "_row_dims"
 # Exact types only: a torch.Size or named tuple describes an object, not its run-time state.
 _SEQUENCES = (list, tuple, deque)
 
@@ -82,6 +89,48 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
             )  # fmt: skip
             continue
         obj.__dict__[name] = _restored(current, value)
+
+
+@contextlib.contextmanager
+def changes_undone(
+    roots: Sequence[Any],
+    env_ids: torch.Tensor | None = None,
+    num_envs: int = 0,
+    *,
+    generators: bool = True,
+    shared: tuple[type, ...] = (),
+) -> Generator[list[int]]:
+    """Undo the changes of the block to the objects in `roots`, except rows `env_ids`.
+
+    Attributes, items and values of objects, containers, tensors and arrays are restored, and
+    references to these stay valid. Rows are those of tensors and arrays with `num_envs` as first or
+    second dimension, and items of sequences with one item per environment. Other state, such as
+    counters and running means, is restored completely.
+
+    Args:
+        roots: Objects whose state is kept, with all that they own.
+        env_ids: Environments that keep their changes, (n,) int64. None: no environment.
+        num_envs: Number of environments.
+        generators: Restore random number generators.
+        shared: Classes of objects that the roots refer to but do not own.
+
+    Yields a list. After the block it holds the indices of the roots whose state outside `env_ids`
+    changed; it stays empty without `env_ids`.
+    """
+    tables = [_noted(root, {}, shared) for root in roots]
+    changed: list[int] = []
+    try:
+        yield changed
+    finally:
+        if env_ids is not None:
+            rows = _Rows(env_ids, num_envs, shared)
+            for k, (root, table) in enumerate(zip(roots, tables, strict=True)):
+                if rows.take(table, root, root, set()):
+                    changed.append(k)
+        with torch.no_grad():
+            for table in tables:
+                for value, kept in table.values():
+                    _put_back(value, kept, table, generators)
 
 
 def shape_differences(saved: Any, current: Any, path: str = "") -> list[str]:
@@ -217,3 +266,171 @@ def _transient_names(cls: type) -> set[str]:
     for base in cls.__mro__:
         names |= set(base.__dict__.get(_TRANSIENT, ()))
     return names
+
+
+# State of objects in the same process: original objects with copies of their contents, by `id`.
+_Table = dict[int, tuple[Any, Any]]
+
+
+def _noted(value: Any, table: _Table, shared: tuple[type, ...]) -> _Table:
+    """Add `value` and all that it owns to `table`."""
+    if id(value) in table:
+        return table
+    if isinstance(value, torch.Tensor):
+        if _owns_its_values(value) and not isinstance(value, torch.nn.Parameter):
+            table[id(value)] = value, value.detach().clone()
+    elif isinstance(value, np.ndarray):
+        if value.dtype.kind in "biuf":
+            table[id(value)] = value, value.copy()
+    elif isinstance(value, torch.Generator):
+        table[id(value)] = value, value.get_state()
+    elif isinstance(value, np.random.Generator):
+        table[id(value)] = value, value.bit_generator.state
+    elif (parts := _parts(value, shared)) is not None:
+        table[id(value)] = value, parts
+        for part in parts.values():
+            _noted(part, table, shared)
+    return table
+
+
+def _parts(value: Any, shared: tuple[type, ...]) -> dict[Any, Any] | None:
+    """Return items or attributes of a container or an object; None for other values."""
+    if isinstance(value, (list, tuple, deque, set)):
+        return dict(enumerate(value))
+    if isinstance(value, dict):
+        return dict(value)
+    if not _is_owned(value, shared):
+        return None
+    transient = _transient_names(type(value))
+    return {name: part for name, part in vars(value).items() if name not in transient}
+
+
+def _is_owned(value: Any, shared: tuple[type, ...]) -> bool:
+    if isinstance(value, shared):
+        return False
+    if is_stateful(value) or isinstance(value, SimpleNamespace):
+        return True
+    if not hasattr(value, "__dict__") or isinstance(value, (type, ModuleType, enum.Enum)):
+        return False
+    # The environment, configs and MuJoCo objects, also of subclasses, belong to others.
+    homes = {base.__module__.partition(".")[0] for base in type(value).__mro__}
+    is_library = type(value).__module__.partition(".")[0] in sys.stdlib_module_names
+    return not (is_library or inspect.isroutine(value) or homes & {"mjlab", "mujoco", "warp"})
+
+
+def _put_back(value: Any, kept: Any, table: _Table, generators: bool) -> None:
+    """Restore the contents `kept` of an original object."""
+    if isinstance(value, torch.Tensor):
+        if not _is_locked(value):
+            value.copy_(kept)
+    elif isinstance(value, np.ndarray):
+        value[...] = kept
+    elif isinstance(value, torch.Generator):
+        if generators:
+            value.set_state(kept)
+    elif isinstance(value, np.random.Generator):
+        if generators:
+            value.bit_generator.state = kept
+    elif not isinstance(value, tuple):
+        # Tensors that cannot be written are replaced.
+        parts = {
+            name: table[id(part)][1] if _is_locked(part) and id(part) in table else part
+            for name, part in kept.items()
+        }
+        if isinstance(value, list):
+            value[:] = parts.values()
+        elif isinstance(value, deque):
+            value.clear()
+            value.extend(parts.values())
+        elif isinstance(value, set):
+            value.clear()
+            value.update(parts.values())
+        elif isinstance(value, dict):
+            value.clear()
+            value.update(parts)
+        else:
+            held = vars(value)
+            for name in held.keys() - parts.keys() - _transient_names(type(value)):
+                del held[name]
+            held.update(parts)
+
+
+def _is_locked(value: Any) -> bool:
+    """Return True for inference tensors outside `inference_mode`."""
+    is_inference = isinstance(value, torch.Tensor) and value.is_inference()
+    return is_inference and not torch.is_inference_mode_enabled()
+
+
+class _Rows:
+    """Moves rows of environments from current objects into the noted contents of originals."""
+
+    def __init__(self, env_ids: torch.Tensor, num_envs: int, shared: tuple[type, ...]) -> None:
+        self._ids, self._num_envs, self._shared = env_ids.cpu(), num_envs, shared
+        self._others = torch.ones(num_envs, dtype=torch.bool).index_fill(0, self._ids, False)
+
+    def take(
+        self, table: _Table, old: Any, now: Any, seen: set[int], dim: int | None = None
+    ) -> bool:
+        """Take the rows of `old` from `now`; return True if other values differ."""
+        if id(old) not in table:
+            both = plain_scalar(old), plain_scalar(now)
+            return old is not now and (SKIP in both or both[0] != both[1])
+        if id(old) in seen:
+            return False
+        seen.add(id(old))
+        kept = table[id(old)][1]
+        if isinstance(old, (torch.Tensor, np.ndarray)):
+            return self._take_values(kept, now, dim)
+        current = _parts(now, self._shared) if type(now) is type(old) else None
+        if current is None:
+            return isinstance(kept, dict)
+        differs = current.keys() != kept.keys()
+        if isinstance(old, (list, tuple, deque)) and self._is_per_env(kept, current):
+            for k in self._ids.tolist():
+                _forget(table, kept[k])
+                kept[k] = current[k]
+        dims = getattr(type(old), _ROW_DIMS, {})
+        for name, part in list(kept.items()):
+            now = current.get(name)
+            differs |= self.take(table, part, now, seen, dims.get(name))
+            if part is None and self._is_created(now):
+                kept[name] = now
+        kept |= {k: v for k, v in current.items() if k not in kept and self._is_created(v)}
+        return differs
+
+    def _take_values(self, kept: Any, now: Any, dim: int | None) -> bool:
+        if type(now) is not type(kept) or (now.shape, now.dtype) != (kept.shape, kept.dtype):
+            return True
+        dim = self._dim(now) if dim is None else dim
+        both = torch.as_tensor(kept), torch.as_tensor(now)
+        if dim is None:
+            return not torch.equal(*both)
+        old, new = (values.movedim(dim, 0) for values in both)
+        ids, others = self._ids.to(old.device), self._others.to(old.device)
+        differs = not torch.equal(old[others], new[others])
+        old[ids] = new[ids]
+        return differs
+
+    def _dim(self, value: Any) -> int | None:
+        """Return the dimension of rows of a tensor or array; None if it has none."""
+        if not isinstance(value, (torch.Tensor, np.ndarray)):
+            return None
+        sizes = tuple(value.shape[:2])
+        return sizes.index(self._num_envs) if self._num_envs in sizes else None
+
+    def _is_created(self, value: Any) -> bool:
+        """Return True for per-environment values to keep, if the block created them."""
+        return len(self._ids) > 0 and self._dim(value) is not None
+
+    def _is_per_env(self, kept: dict[Any, Any], current: dict[Any, Any]) -> bool:
+        if not len(kept) == len(current) == self._num_envs:
+            return False
+        noted = [_noted(part, {}, self._shared) for part in kept.values()]
+        return all(self._dim(value) is None for table in noted for value, _ in table.values())
+
+
+def _forget(table: _Table, value: Any) -> None:
+    """Remove `value` and all that it owns from `table`."""
+    _, kept = table.pop(id(value), (None, None))
+    for part in kept.values() if isinstance(kept, dict) else ():
+        _forget(table, part)

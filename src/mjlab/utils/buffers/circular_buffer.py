@@ -21,6 +21,8 @@ class CircularBuffer:
     """
 
     _transient = frozenset({"_rows", "_max_len", "_batch_size"})
+    # Dimension of the rows, for `changes_undone`.
+    _row_dims = {"_buffer": 1}
 
     def __init__(self, max_len: int, batch_size: int, device: str) -> None:
         """Create an empty buffer. Raises `ValueError` if `max_len` < 1."""
@@ -61,6 +63,11 @@ class CircularBuffer:
     def is_initialized(self) -> bool:
         """True once a frame has been appended, so that shape and type are known."""
         return self._buffer is not None
+
+    @property
+    def empty_rows(self) -> torch.Tensor:
+        """True for rows without a frame since their reset, (batch_size,) bool."""
+        return self._num_pushes == 0
 
     @property
     def buffer(self) -> torch.Tensor:

@@ -92,6 +92,11 @@ class DelayBuffer:
         return self._buffer.is_initialized
 
     @property
+    def empty_rows(self) -> torch.Tensor:
+        """True for rows without a frame since their reset, (batch_size,) bool."""
+        return self._buffer.empty_rows
+
+    @property
     def current_lags(self) -> torch.Tensor:
         """Lags in use, (batch_size,) int64."""
         return self._current_lags
