@@ -16,7 +16,7 @@ from mjlab.rl.config import (
     RslRlOffPolicyRunnerCfg,
     RslRlOnPolicyRunnerCfg,
 )
-from mjlab.rl.learners import acting_cfg, learner_of, with_learner
+from mjlab.rl.learners import acting_cfg, learner_of, train_dict, with_learner
 from mjlab.rl.networks import check_networks
 
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
@@ -79,9 +79,21 @@ def test_recurrent_networks_and_those_of_images_have_no_config_of_sac(model, mes
 def test_to_act_takes_the_least_replay():
     cfg = RslRlOffPolicyRunnerCfg()
     acting = acting_cfg(cfg)
-    assert acting.pop("algorithm") == {**asdict(cfg.algorithm), "replay_steps": 1}
+    assert acting.pop("algorithm") == {**train_dict(cfg)["algorithm"], "replay_steps": 1}
     assert acting == {key: value for key, value in asdict(cfg).items() if key != "algorithm"}
-    assert acting_cfg(RslRlOnPolicyRunnerCfg()) == asdict(RslRlOnPolicyRunnerCfg())
+    cfg = RslRlOnPolicyRunnerCfg(save_git_diff=False)
+    assert acting_cfg(cfg) == train_dict(cfg)
+
+
+def test_additions_are_passed_if_changed():
+    cfg = RslRlOnPolicyRunnerCfg()
+    added = {"torch_compile_mode", "save_git_diff", "upload_git_diff", "evaluation"}
+    assert set(asdict(cfg)) - set(train_dict(cfg)) == added
+    cfg.evaluation.solved_return, cfg.algorithm.use_mixed_precision = 900.0, True
+    made = train_dict(cfg)
+    assert made["evaluation"]["solved_return"] == 900.0
+    assert made["algorithm"]["use_mixed_precision"] is True
+    assert "symmetry_cfg" not in made["algorithm"]
 
 
 def test_sac_refuses_images_and_networks_of_others():

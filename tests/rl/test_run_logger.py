@@ -164,6 +164,8 @@ def test_the_type_is_known_once_there_is_a_writer(make_runner, tmp_path: Path):
     silent = make_runner()
     silent.logger.init_logging_writer()
     assert silent.logger.logger_type is None
+    silent.logger.logger_type = "tensorboard"
+    assert silent.logger.logger_type == "tensorboard"
 
 
 class SavesBeside(MjlabOnPolicyRunner):

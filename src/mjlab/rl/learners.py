@@ -7,6 +7,7 @@ from dataclasses import asdict, fields, replace
 from typing import Any, Literal, get_args
 
 from mjlab.rl.config import (
+    EvaluationCfg,
     RslRlBaseRunnerCfg,
     RslRlDistillationRunnerCfg,
     RslRlModelCfg,
@@ -20,6 +21,14 @@ Learner = Literal["ppo", "sac", "distillation"]
 _MIRROR_FUNCTION = "data_augmentation_func"
 # Fields of a run with learner-specific values.
 _PACE = frozenset(("num_steps_per_env", "max_iterations", "save_interval"))
+# Keys that releases 1.x do not have, with their defaults.
+_ADDED: dict[str, Any] = {
+    "torch_compile_mode": None,
+    "save_git_diff": True,
+    "upload_git_diff": False,
+    "evaluation": asdict(EvaluationCfg()),
+}
+_ADDED_TO_ALGORITHM = {"symmetry_cfg": None, "use_mixed_precision": False}
 
 
 def learner_of(cfg: RslRlBaseRunnerCfg) -> Learner:
@@ -96,9 +105,26 @@ def for_task_of(cfg: RslRlBaseRunnerCfg, other: RslRlBaseRunnerCfg) -> RslRlBase
     return cfg
 
 
+def train_dict(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
+    """Return `cfg` as the dict of a runner, without unchanged additions to releases 1.x."""
+    made = asdict(cfg)
+    drop_unchanged_additions(made)
+    return made
+
+
+def drop_unchanged_additions(cfg: dict[str, Any]) -> None:
+    """Remove keys that releases 1.x do not have from a runner's dict, in place, if unchanged.
+
+    Runners and algorithms of other packages may reject keys that they do not know.
+    """
+    for part, added in ((cfg, _ADDED), (cfg["algorithm"], _ADDED_TO_ALGORITHM)):
+        for name in [name for name in added if name in part and part[name] == added[name]]:
+            del part[name]
+
+
 def acting_cfg(cfg: RslRlBaseRunnerCfg) -> dict[str, Any]:
     """Return `cfg` as the dict of a runner that acts but does not learn: with a replay of one step."""
-    acting = asdict(cfg)
+    acting = train_dict(cfg)
     if learner_of(cfg) == "sac":
         acting["algorithm"]["replay_steps"] = 1
     return acting

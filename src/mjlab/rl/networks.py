@@ -18,6 +18,7 @@ from rsl_rl.modules import CNN
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
+from mjlab.rl.learners import drop_unchanged_additions
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.rl.spatial_softmax import SPATIAL_SOFTMAX_KEYS, cnn_cfg_by_group
 from mjlab.utils.errors import check_positive
@@ -52,6 +53,7 @@ def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
     Raises:
         ValueError: see `check_networks` and `check_symmetry`.
     """
+    drop_unchanged_additions(cfg)
     observations = env.get_observations()
     for name in _MODELS:
         if not isinstance(model := cfg.get(name), dict):

@@ -137,6 +137,9 @@ class RunLogger(Logger):
             **kwargs: Arguments of rsl_rl.
         """
         super().__init__(*args, **kwargs)
+        self.logger_type: str | None = None
+        """Logging service, by its config name (`tensorboard`, `wandb`, ...). None before
+        `init_logging_writer`, and in processes that do not write."""
         self._reward_unit = reward_unit
         self._episode_steps = episode_steps
         self._uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
@@ -159,18 +162,6 @@ class RunLogger(Logger):
         self._write_failed = False
         self._reported_losses = False
         self._thread_hook = threading.excepthook
-
-    @property
-    def logger_type(self) -> str | None:
-        """Logging service, by its config name (`tensorboard`, `wandb`, ...).
-
-        None before `init_logging_writer`, and in processes that do not write.
-        """
-        if self.writer is None:
-            return None
-        service = self.cfg.get("logger", "tensorboard")
-        name = service if isinstance(service, str) else service["class_name"]
-        return _LOGGER_TYPES.get(name, name)
 
     def init_logging_writer(self) -> None:
         """Open the event file, and write the git diffs of `git_status_repos`.
@@ -214,6 +205,9 @@ class RunLogger(Logger):
                 # Runners read the service from their config.
                 self.cfg["logger"] = service
                 self.git_status_repos = sources
+        if self.writer is not None:
+            name = service if isinstance(service, str) else service["class_name"]
+            self.logger_type = _LOGGER_TYPES.get(name, name)
         if self.log_dir is not None and not self.disable_logs:
             keeps_diff = self.cfg.get("save_git_diff", True)
             for source in self.git_status_repos if keeps_diff else ():

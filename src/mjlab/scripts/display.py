@@ -26,6 +26,7 @@ from mjlab.rl.progress import (
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.scripts.reference import DATA, Kind, Reference, reference_path, referenced_tasks
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.utils.logging import print_notice
 from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
@@ -40,8 +41,14 @@ _UPDATES_PER_SECOND = 4
 def show_training(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder) -> None:
     """Add observers to `runner` that show training in the terminal, and with `--live` in the browser.
 
-    Training that starts keeps `folder`.
+    Training that starts keeps `folder`. Runners of other packages, without observers, print by
+    themselves.
     """
+    if not hasattr(runner, "observers"):
+        folder.keep()
+        if cfg.live:
+            print_notice("--live: not shown, because the runner of this task has no observers.")
+        return
     if cfg.live:
         from mjlab.scripts.live import LiveView
 

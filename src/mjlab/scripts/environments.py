@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Generator
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab import rl
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from mjlab.rl.learners import learner_of
+from mjlab.rl.learners import learner_of, train_dict
 from mjlab.scripts.flags import options_of
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls, task_source
 from mjlab.utils.config_fields import check_fields_exist
@@ -106,7 +105,7 @@ def training_runner(
     # to build the environment.
     seed_rng(cfg.agent.seed)
     runner_kwargs = options_of(task, cfg).runner_kwargs()
-    runner = runner_cls(env, asdict(cfg.agent), str(run_dir), device, **runner_kwargs)
+    runner = runner_cls(env, train_dict(cfg.agent), str(run_dir), device, **runner_kwargs)
     if (source := task_source(task)) is not None and hasattr(runner, "add_git_repo_to_log"):
         runner.add_git_repo_to_log(source)
     return runner

@@ -260,11 +260,11 @@ def load_policy(
         return load_onnx_policy(checkpoint, env, device)
     from mjlab.rl import MjlabOnPolicyRunner
 
-    learner = learner_of_checkpoint(checkpoint)
+    learner = None if has_foreign_runner(task) else learner_of_checkpoint(checkpoint)
     agent_cfg = _agent_cfg(task, checkpoint, profile, learner)
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
     try:
-        runner = runner_cls(env, agent_cfg, None, device)
+        runner = runner_cls(env, agent_cfg, device=device)
     except (RuntimeError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"{checkpoint}: building its networks from params/agent.yaml failed: {error}"
@@ -272,6 +272,17 @@ def load_policy(
     network = "student" if learner == "distillation" else "actor"
     runner.load(str(checkpoint), load_cfg={network: True}, strict=True, map_location=device)
     return runner.get_inference_policy(device=device)
+
+
+def has_foreign_runner(task: str) -> bool:
+    """Return True if the runner of `task` is not derived from mjlab's.
+
+    Its checkpoints may have any format.
+    """
+    from mjlab.rl import MjlabOnPolicyRunner
+
+    runner_cls = load_runner_cls(task)
+    return isinstance(runner_cls, type) and not issubclass(runner_cls, MjlabOnPolicyRunner)
 
 
 def constant_policy(env: Any, kind: str) -> Any:

@@ -159,16 +159,15 @@ def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
     """Set the number of environments to that of the resumed run, unless set by flags.
 
     Fewer environments can ruin a policy of several hours within a few iterations.
-
-    Raises:
-        CheckpointError: the checkpoint cannot be read.
     """
     scene = cfg.env.scene
     default = load_env_cfg(task, profile=cfg.profile).scene.num_envs
     if cfg.num_envs is not None or scene.num_envs != default:
         return
-    # Runs of other tools lack the training state, but may have saved their config.
-    state = load_checkpoint(checkpoint).get("training_state")
+    # Runs of other tools and runners lack the training state, but may have saved their config.
+    state = None
+    with contextlib.suppress(CheckpointError):
+        state = load_checkpoint(checkpoint).get("training_state")
     saved: Any = [state, read_params(checkpoint.parent, "env").get("scene")]
     counts = [holder.get("num_envs") for holder in saved if isinstance(holder, dict)]
     count = next((n for n in counts if isinstance(n, int) and n >= 1), None)

@@ -28,7 +28,7 @@ from mjlab.scripts.flags import (
     suggest_profile,
     with_task_options,
 )
-from mjlab.scripts.policy import prepare_teacher
+from mjlab.scripts.policy import has_foreign_runner, prepare_teacher
 from mjlab.scripts.resume import (
     check_learner_resumes,
     checkpoint_to_resume,
@@ -117,7 +117,8 @@ def _train(
         cfg.agent.seed = broadcast_from_first(lambda: choose_seed(checkpoint))
     cfg.apply_short_forms(rank)
     if checkpoint is not None:
-        check_learner_resumes(cfg, checkpoint)
+        if not has_foreign_runner(task):
+            check_learner_resumes(cfg, checkpoint)
         restore_num_envs(task, cfg, checkpoint)
     else:
         suggest_profile(task, cfg.profile, device)
@@ -139,9 +140,11 @@ def _train(
                 elif (teacher := getattr(cfg.agent, "teacher_checkpoint", None)) is not None:
                     runner.load_teacher(teacher)
             if checkpoint is not None:
-                if is_finished(cfg, runner, checkpoint):
+                # Foreign runners train `max_iterations` more iterations.
+                if not has_foreign_runner(task) and is_finished(cfg, runner, checkpoint):
                     return checkpoint.parent
-                print(f"Resumed: {checkpoint}, iteration {runner.current_learning_iteration}")
+                iteration = getattr(runner, "current_learning_iteration", "unknown")
+                print(f"Resumed: {checkpoint}, iteration {iteration}")
             print(f"Run:     {folder.path}", flush=True)
             if rank.is_first:
                 info = {"profile": cfg.profile, "learner": cfg.learner_name, "command": sys.argv}
@@ -150,14 +153,14 @@ def _train(
                     write_resumed(folder.path, checkpoint)
                 write_params(folder.path, cfg.env, cfg.agent)
             try:
-                _learn(task, cfg, runner, folder)
+                ended = _learn(task, cfg, runner, folder)
             finally:
                 if rank.is_first:
                     report_divergence(env.unwrapped)
         finally:
             env.close()
     if rank.is_first:
-        write_results(task, cfg, folder.path, device, runner.stop_reason)
+        write_results(task, cfg, folder.path, device, ended)
     return folder.path
 
 
@@ -175,27 +178,28 @@ def _run_folder(
         yield new if rank.is_first else SharedRunFolder(path)
 
 
-def _learn(
-    task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder | SharedRunFolder
-) -> None:
-    if isinstance(folder, SharedRunFolder):
-        runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
-        return
-    from mjlab.scripts.display import show_training
+def _learn(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder | SharedRunFolder) -> str:
+    """Train; return the stop reason."""
+    is_shared = isinstance(folder, SharedRunFolder)
+    if not is_shared:
+        from mjlab.scripts.display import show_training
 
-    show_training(task, cfg, runner, folder)
+        show_training(task, cfg, runner, folder)
+    ended = "failed"
     try:
-        runner.learn(cfg.agent.max_iterations, init_at_random_ep_len=True)
+        runner.learn(num_learning_iterations=cfg.agent.max_iterations, init_at_random_ep_len=True)
         # A custom runner may have a custom loop that does not call `on_start`.
         folder.keep()
+        ended = "finished"
     finally:
-        # On a full disk, do not mask the error that names the intact checkpoint.
-        with contextlib.suppress(OSError):
-            write_run_info(
-                folder.path,
-                ended=runner.stop_reason,
-                iterations=runner.current_learning_iteration,
-            )
+        # Runners of other packages may have neither.
+        ended = getattr(runner, "stop_reason", None) or ended
+        iterations = getattr(runner, "current_learning_iteration", cfg.agent.max_iterations)
+        if not is_shared:
+            # On a full disk, do not mask the error that names the intact checkpoint.
+            with contextlib.suppress(OSError):
+                write_run_info(folder.path, ended=ended, iterations=iterations)
+    return ended
 
 
 def main() -> None:
