@@ -71,13 +71,15 @@ def export(path: Path, activation: str = "elu", **metadata: str) -> Path:
     return path
 
 
-def with_batch_of_one(path: Path) -> Path:
-    """Give the file a fixed batch size of 1, which exports had before they took any."""
+def as_earlier(path: Path, batch: int | str) -> Path:
+    """Write the file as earlier releases did: batch size 1 or dynamic, and no word about the graph."""
     model = onnx.load(str(path))
     for value in (*model.graph.input, *model.graph.output):
-        for dim in value.type.tensor_type.shape.dim:
-            if dim.dim_param == "batch":
-                dim.dim_value = 1
+        dim = value.type.tensor_type.shape.dim[int(value.name[1:] in ("_in", "_out"))]
+        if isinstance(batch, str):
+            dim.dim_param = batch
+        assert isinstance(batch, str) or dim.dim_value == batch
+    del model.metadata_props[:]
     onnx.save(model, str(path))
     return path
 
@@ -91,16 +93,17 @@ def test_it_computes_what_torch_does(tmp_path: Path, activation: str) -> None:
     policy = OnnxPolicy(path)
     torch.testing.assert_close(policy(rows), expected, rtol=1e-4, atol=1e-5)
     assert (policy.num_observations, policy.num_actions) == (5, 3)
-    earlier = OnnxPolicy(with_batch_of_one(path))
-    torch.testing.assert_close(earlier(rows), expected, rtol=1e-4, atol=1e-5)
-    assert (earlier.num_observations, earlier.num_actions) == (5, 3)
+    for batch in (1, "batch"):
+        earlier = OnnxPolicy(as_earlier(path, batch))
+        torch.testing.assert_close(earlier(rows), expected, rtol=1e-4, atol=1e-5)
+        assert (earlier.num_observations, earlier.num_actions) == (5, 3)
 
 
-@pytest.mark.parametrize("is_fixed", [False, True])
+@pytest.mark.parametrize("batch", [None, 1, "batch"])
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
 def test_memory_is_kept_for_each_environment_and_forgotten_at_the_end_of_its_episode(
-    tmp_path: Path, kind: str, layers: int, is_fixed: bool
+    tmp_path: Path, kind: str, layers: int, batch: int | str | None
 ) -> None:
     torch.manual_seed(1)
     observations = TensorDict({"actor": torch.zeros(3, 5)}, batch_size=[3])
@@ -109,8 +112,8 @@ def test_memory_is_kept_for_each_environment_and_forgotten_at_the_end_of_its_epi
         rnn_num_layers=layers,
     )  # fmt: skip
     export_to_onnx(model.as_onnx(), tmp_path / "p.onnx")
-    if is_fixed:
-        with_batch_of_one(tmp_path / "p.onnx")
+    if batch is not None:
+        as_earlier(tmp_path / "p.onnx", batch)
     policy = OnnxPolicy(tmp_path / "p.onnx")
     session = onnxruntime.InferenceSession(str(tmp_path / "p.onnx"))
     memories = [item.name for item in session.get_inputs()][1:]

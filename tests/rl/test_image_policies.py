@@ -106,7 +106,7 @@ def trained(env: RslRlVecEnvWrapper, tmp_path: Path) -> Trained:
 
 
 def onnxruntime_actions(path: Path, groups: tuple[str, ...], observations: Any) -> np.ndarray:
-    """Actions of all environments."""
+    """Actions of all environments, one run for each."""
     session = onnxruntime.InferenceSession(str(path))
     images = [name for name in groups if observations[name].ndim == 4]
     flat = [observations[name] for name in groups if name not in images]
@@ -114,7 +114,11 @@ def onnxruntime_actions(path: Path, groups: tuple[str, ...], observations: Any) 
     if flat:
         given["obs"] = torch.cat(flat, dim=-1)
     assert {entry.name for entry in session.get_inputs()} == set(given)
-    return session.run(None, {name: value.numpy() for name, value in given.items()})[0]
+    rows = [
+        session.run(None, {name: value[row : row + 1].numpy() for name, value in given.items()})[0]
+        for row in range(len(observations))
+    ]
+    return np.concatenate(rows)
 
 
 SETTINGS = {

@@ -80,7 +80,7 @@ def test_to_act_takes_the_least_replay():
     cfg = RslRlOffPolicyRunnerCfg()
     acting = acting_cfg(cfg)
     assert acting.pop("algorithm") == {**train_dict(cfg)["algorithm"], "replay_steps": 1}
-    assert acting == {key: value for key, value in asdict(cfg).items() if key != "algorithm"}
+    assert acting == {key: value for key, value in train_dict(cfg).items() if key != "algorithm"}
     cfg = RslRlOnPolicyRunnerCfg(save_git_diff=False)
     assert acting_cfg(cfg) == train_dict(cfg)
 

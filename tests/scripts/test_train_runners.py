@@ -136,7 +136,8 @@ def test_files_of_a_runner_resume_and_play(run, own_task, tmp_path):
     outcome, folder = trains(run, tmp_path, "--agent.resume", "True")
     assert outcome.status == 0, outcome.err
     # As rsl_rl's, it trains this number of further iterations.
-    assert SEEN["loaded"] == 0.5 and SEEN["learned"] == 2
+    assert SEEN["loaded"] == 0.5
+    assert SEEN["learned"] == 2
     assert folder != first
     argv = [OWN, "--log-root", str(tmp_path), "--device", "cpu"]
     for flags in (

@@ -1,8 +1,9 @@
 """ONNX policies: export, deployment metadata, and inference with onnxruntime.
 
-A file accepts any number of environments (dynamic batch dimension). Recurrent policies have one input
-and one output per hidden state, with rsl_rl's names: `h_in` and `h_out`, for LSTMs also `c_in` and
-`c_out`, (layers, N, hidden).
+Inputs and outputs of a file have batch size 1, because deployment programs multiply their dimensions.
+The graph itself computes any batch size; `OnnxPolicy` runs it for all environments at once. Recurrent
+policies have one input and one output per hidden state, with rsl_rl's names: `h_in` and `h_out`, for
+LSTMs also `c_in` and `c_out`, (layers, 1, hidden).
 
 Each key of the metadata is one string property of the file; lists are comma-separated. The keys of
 mjlab 1.6 come first, in its order and layout; numbers have full precision, and more keys follow:
@@ -16,6 +17,7 @@ mjlab 1.6 come first, in its order and layout; numbers have full precision, and 
 | observation_dims | size of each of its terms, history included |
 | observation_delay | minimum and maximum lag of each term, in steps |
 | initializers_sha256 | digest of the weights in the file, see `initializers_digest` |
+| graph_batch_size | "any": the graph computes more rows than its inputs declare |
 | step_dt, physics_dt, decimation | control timestep (s), physics timestep (s), their ratio |
 
 The target of an action term is `action * action_scale + action_offset`, clipped to `action_clip`.
@@ -59,6 +61,7 @@ logger = logging.getLogger(__name__)
 
 OPSET = 18
 DIGEST_KEY = "initializers_sha256"
+_BATCH_KEY, _ANY_BATCH = "graph_batch_size", "any"
 _ACTIONS = "actions"
 # Metadata that must agree between training and inference. Numbers are compared with a tolerance,
 # because mjlab 1.6 writes three decimals.
@@ -110,9 +113,10 @@ def export_with_metadata(
 
 
 def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
-    """Write `model`, the result of rsl_rl's `as_onnx`, to `path`, for any number of environments.
+    """Write `model`, the result of rsl_rl's `as_onnx`, to `path`, with batch size 1.
 
-    The tracing exporter (`dynamo=False`) writes a single file and needs neither the compiler nor
+    The graph computes any batch size, because the export with a dynamic batch dimension keeps reshapes
+    from fixing it; `OnnxPolicy` reads such a file for any number of environments. The tracing exporter (`dynamo=False`) writes a single file and needs neither the compiler nor
     onnxscript, whose imports alone take longer than the whole export.
     """
     if getattr(model, "obs_dim_1d", None) == 0:
@@ -146,7 +150,12 @@ def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
             )
         finally:
             exporter_log.setLevel(level)
-    write_atomically(path, buffer.getvalue())
+    import onnx
+
+    exported = onnx.load_from_string(buffer.getvalue())
+    _declare_batch_size(exported.graph, 1)
+    exported.metadata_props.add(key=_BATCH_KEY, value=_ANY_BATCH)
+    write_atomically(path, exported.SerializeToString())
 
 
 class _ImagesOnly(torch.nn.Module):
@@ -172,6 +181,17 @@ def _memories(inputs: Iterable[str], outputs: Iterable[str]) -> dict[str, str]:
     pairs = {name: f"{name.removesuffix('_in')}_out" for name in inputs if name.endswith("_in")}
     known = set(outputs)
     return {before: after for before, after in pairs.items() if after in known}
+
+
+def _declare_batch_size(graph: Any, size: int | None) -> None:
+    """Set the batch size of inputs and outputs of `graph`, in place. None: dynamic."""
+    memories = _memories([item.name for item in graph.input], [item.name for item in graph.output])
+    second = {*memories, *memories.values()}
+    for value in (*graph.input, *graph.output):
+        dim = value.type.tensor_type.shape.dim[1 if value.name in second else 0]
+        dim.Clear()
+        if size is not None:
+            dim.dim_value = size
 
 
 # Metadata.
@@ -411,8 +431,8 @@ class OnnxPolicy:
     """ONNX policy for any number of environments, run on the CPU.
 
     Calls with observations return actions (N, num_actions). Recurrent policies keep their hidden
-    state until `reset`. Files with a fixed batch size of 1, as written by earlier releases, are run
-    once per environment.
+    state until `reset`. Files of other programs with a fixed batch size of 1, also those of releases
+    1.x, are run once per environment.
 
     Further outputs of a file, and their inputs, are ignored: exported policies of motion tracking
     return the reference at an input `time_step`, for use on a robot; an environment has its own
@@ -445,6 +465,8 @@ class OnnxPolicy:
         self.device = device
         model = _read_model(self.path)
         self.metadata: dict[str, str] = {item.key: item.value for item in model.metadata_props}
+        if self.metadata.get(_BATCH_KEY) == _ANY_BATCH:
+            _declare_batch_size(model.graph, None)
         outputs = {item.name: _dims(item) for item in model.graph.output}
         if _ACTIONS not in outputs and len(outputs) != 1:
             raise OnnxPolicyError(

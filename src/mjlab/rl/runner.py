@@ -502,7 +502,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     ) -> None:
         """Write the policy (normalizer, network, deterministic head) to `path`/`filename`.
 
-        Opset 18, dynamic batch size; input `obs`, output `actions`. Image models have an additional
+        Opset 18, batch size 1; input `obs`, output `actions`. Image models have an additional
         input per image group, by name; recurrent models their hidden state.
         """
         model = self.alg.get_policy().as_onnx(verbose=verbose)

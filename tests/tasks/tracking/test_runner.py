@@ -42,12 +42,12 @@ def test_the_exported_policy_carries_the_reference(make_runner, tmp_path, task, 
     runner.save(str(folder / "model_7.pt"))
     session = onnxruntime.InferenceSession(folder / "2026-01-02_dance.onnx")
     assert [(i.name, i.shape) for i in session.get_inputs()] == [
-        ("obs", ["batch", size]), ("time_step", ["batch", 1]),
+        ("obs", [1, size]), ("time_step", [1, 1]),
     ]  # fmt: skip
     assert [(o.name, o.shape) for o in session.get_outputs()] == [
-        ("actions", ["batch", 29]), ("joint_pos", ["batch", 29]), ("joint_vel", ["batch", 29]),
-        ("body_pos_w", ["batch", 14, 3]), ("body_quat_w", ["batch", 14, 4]),
-        ("body_lin_vel_w", ["batch", 14, 3]), ("body_ang_vel_w", ["batch", 14, 3]),
+        ("actions", [1, 29]), ("joint_pos", [1, 29]), ("joint_vel", [1, 29]),
+        ("body_pos_w", [1, 14, 3]), ("body_quat_w", [1, 14, 4]),
+        ("body_lin_vel_w", [1, 14, 3]), ("body_ang_vel_w", [1, 14, 3]),
     ]  # fmt: skip
     motion = runner.motion_command.motion
     obs = torch.randn(1, size)
@@ -56,10 +56,6 @@ def test_the_exported_policy_carries_the_reference(make_runner, tmp_path, task, 
     with torch.inference_mode():
         expected = policy({"actor": obs}).numpy()
     last = motion.time_step_total - 1
-    frames = np.array([[0.0], [17.0], [1e6]], np.float32)
-    found = session.run(None, {"obs": obs.repeat(3, 1).numpy(), "time_step": frames})
-    np.testing.assert_allclose(found[0], expected.repeat(3, axis=0), atol=1e-5)
-    np.testing.assert_array_equal(found[1], motion.joint_pos[[0, 17, last]].numpy())
     for step, frame in ((0.0, 0), (17.9, 17), (300.0, 300), (1e6, last), (-3.0, 0)):
         found = session.run(None, {"obs": obs.numpy(), "time_step": np.array([[step]], np.float32)})
         np.testing.assert_allclose(found[0], expected, atol=1e-5)
