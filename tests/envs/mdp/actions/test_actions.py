@@ -70,14 +70,65 @@ def test_positions_start_from_the_default_and_are_those_of_the_encoders(world: A
     data.default_joint_pos[:] = torch.tensor([0.1, 0.2, 0.3])
     data.encoder_bias[:] = torch.tensor([0.01, 0.02, 0.03])
     term = act.JointPositionActionCfg(**JOINTS, scale=0.5, offset=9.0).build(world)
-    # The offset is a copy: what a reset event does to the defaults later has no effect.
-    data.default_joint_pos[:] = 7.0
     step(term, [1.0, 0.0, 0.0])
     expected = torch.tensor([0.59, 0.18, 0.27]).expand(4, 3)
     torch.testing.assert_close(data.joint_pos_target, expected)
     plain = act.JointPositionActionCfg(**JOINTS, offset=1.0, use_default_offset=False)
     step(plain.build(world), [0.0, 0.0, 0.0])
     torch.testing.assert_close(data.joint_pos_target, 1.0 - data.encoder_bias)
+
+
+@pytest.mark.parametrize("names", [(".*",), ("hip", "ankle")])
+@pytest.mark.parametrize("kind", ["pos", "vel"])
+def test_the_offset_follows_the_default(world: Any, names: tuple[str, ...], kind: str) -> None:
+    data = world.robot.data
+    cfg_class = act.JointPositionActionCfg if kind == "pos" else act.JointVelocityActionCfg
+    term = cfg_class(entity_name="robot", actuator_names=names).build(world)
+    columns = term.target_ids.tolist()
+    default = getattr(data, f"default_joint_{kind}")
+    for write in (
+        lambda: default[:, :].copy_(torch.tensor([0.4, 0.2, -0.1]).expand(4, 3)),
+        lambda: default[torch.tensor([1, 3]), 0].fill_(9.0),
+        lambda: default.__setitem__((torch.tensor([1, 3])[:, None], torch.tensor([0, 2])), 0.7),
+        lambda: setattr(data, f"default_joint_{kind}", default + 1.0),
+    ):
+        write()
+        expected = getattr(data, f"default_joint_{kind}")[:, columns]
+        torch.testing.assert_close(term.offset, expected)
+        step(term, [0.0] * len(columns))
+        target = getattr(data, f"joint_{kind}_target")[:, columns]
+        torch.testing.assert_close(target, expected)
+    # Writes by a package, alone and beside the default, are kept.
+    term.offset[2] = 5.0
+    assert getattr(data, f"default_joint_{kind}")[2, 0] != 5.0
+    getattr(data, f"default_joint_{kind}")[0, 0] = term.offset[0, 0] = 3.0
+    assert term.offset[0, 0] == 3.0
+    assert term.offset[2].tolist() == [5.0] * len(columns)
+
+
+def test_the_offset_follows_in_inference_mode(world: Any) -> None:
+    data = world.robot.data
+    term = act.JointPositionActionCfg(**JOINTS).build(world)
+    with torch.inference_mode():
+        data.default_joint_pos[:] = 0.3
+        step(term, [0.0, 0.0, 0.0])
+        data.default_joint_pos = torch.full((4, 3), 0.6)
+        data.default_joint_pos[0] = 0.5
+        step(term, [0.0, 0.0, 0.0])
+    expected = torch.tensor([0.5, 0.6, 0.6, 0.6])[:, None].expand(4, 3)
+    torch.testing.assert_close(data.joint_pos_target, expected)
+
+
+def test_a_subclass_sets_the_offset(world: Any) -> None:
+    class Own(act.JointPositionAction):
+        def __init__(self, cfg: Any, env: Any) -> None:
+            super().__init__(cfg, env)
+            self._offset = self._offset + 1.0
+
+    term = Own(act.JointPositionActionCfg(**JOINTS), world)
+    world.robot.data.default_joint_pos[:] = 0.3
+    step(term, [0.0, 0.0, 0.0])
+    assert world.robot.data.joint_pos_target[0].tolist() == [1.0, 1.0, 1.0]
 
 
 def test_relative_positions_follow_the_joint(world: Any) -> None:

@@ -547,6 +547,22 @@ def test_a_reach_of_ten_centimetres_ends_within_two_millimetres(
         assert error.max() < 0.02
 
 
+def test_the_posture_follows_the_default(arm: Any) -> None:
+    ik = term(
+        arm,
+        position_weight=0.0,
+        orientation_weight=1e-3,
+        posture_weight=9.0,
+        max_dq=9.0,
+        posture_target={"j2": 0.9},
+    )
+    arm.robot.data.default_joint_pos[:] = torch.tensor([0.1, 0.5, 0.6, 0.2, -0.1, 0.0])
+    ik.process_actions(torch.zeros(NUM_ENVS, 6))
+    q = arm.robot.data.joint_pos + ik.compute_dq()
+    expected = torch.tensor([0.1, 0.9, 0.6, 0.2, -0.1, 0.0]).expand(NUM_ENVS, 6)
+    torch.testing.assert_close(q, expected, atol=1e-3, rtol=0.0)
+
+
 def test_the_posture_decides_what_the_position_leaves_open(arm: Any) -> None:
     elbows = []
     for wrist in (-0.8, 0.8):

@@ -9,6 +9,7 @@ import torch
 
 from mjlab.actuator.actuator import TransmissionType, constant_within_step
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
+from mjlab.managers.lookup import version_of
 from mjlab.managers.manager_base import label_errors
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names, resolve_matching_names_values
@@ -54,9 +55,14 @@ class BaseAction(ActionTerm):
         "_target_names",
         "_columns",
         "_scale",
-        "_offset",
+        "_own_offset",
+        "_default_field",
+        "_default",
+        "_default_stamp",
         "_clip",
     }
+    # Field of the entity's default values that are the offset; None: a fixed offset.
+    _default_field: str | None = None
 
     def __init__(self, cfg: BaseActionCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
@@ -106,6 +112,16 @@ class BaseAction(ActionTerm):
         return self._offset
 
     @property
+    def _offset(self) -> torch.Tensor | float:
+        if self._default_field is not None:
+            self._follow_default(getattr(self._entity.data, self._default_field))
+        return self._own_offset
+
+    @_offset.setter
+    def _offset(self, value: torch.Tensor | float) -> None:
+        self._default_field, self._own_offset = None, value
+
+    @property
     def target_ids(self) -> torch.Tensor:
         """Ids of the targets within the entity, in the order of the action components."""
         return self._target_ids
@@ -127,6 +143,22 @@ class BaseAction(ActionTerm):
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Zero the raw action of `env_ids` (None: all)."""
         self._raw_actions[slice(None) if env_ids is None else env_ids] = 0.0
+
+    def _use_default_offset(self, field: str) -> None:
+        self._default = getattr(self._entity.data, field)[:, self._columns].clone()
+        self._offset = self._default.clone()
+        self._default_field, self._default_stamp = field, None
+
+    def _follow_default(self, default: torch.Tensor) -> None:
+        """Copy default values that an event changed; the version of the tensor says if one did."""
+        stamp = version_of(default)
+        if stamp == self._default_stamp:
+            return
+        self._default_stamp = stamp
+        current = default[:, self._columns]
+        changed = current != self._default
+        self._own_offset = torch.where(changed, current, self._own_offset)
+        self._default = current.clone()
 
     def _find_targets(self) -> tuple[list[int], list[str]]:
         names, ordered = self.cfg.actuator_names, self.cfg.preserve_order
@@ -159,7 +191,8 @@ class JointPositionActionCfg(BaseActionCfg):
     """Joint position target configuration."""
 
     use_default_offset: bool = True
-    """Use the default joint positions as offset; `offset` is then ignored."""
+    """Use the entity's default joint positions as offset, also after an event changed them; `offset`
+    is then ignored."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.JOINT
@@ -178,7 +211,7 @@ class JointPositionAction(BaseAction):
     def __init__(self, cfg: JointPositionActionCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         if cfg.use_default_offset:
-            self._offset = self._entity.data.default_joint_pos[:, self._columns].clone()
+            self._use_default_offset("default_joint_pos")
 
     @constant_within_step
     def apply_actions(self) -> None:
@@ -220,7 +253,8 @@ class JointVelocityActionCfg(BaseActionCfg):
     """Joint velocity target configuration."""
 
     use_default_offset: bool = True
-    """Use the default joint velocities as offset; `offset` is then ignored."""
+    """Use the entity's default joint velocities as offset, also after an event changed them; `offset`
+    is then ignored."""
 
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.JOINT
@@ -235,7 +269,7 @@ class JointVelocityAction(BaseAction):
     def __init__(self, cfg: JointVelocityActionCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         if cfg.use_default_offset:
-            self._offset = self._entity.data.default_joint_vel[:, self._columns].clone()
+            self._use_default_offset("default_joint_vel")
 
     @constant_within_step
     def apply_actions(self) -> None:

@@ -111,7 +111,7 @@ class DifferentialIKAction(ActionTerm):
         "_body_ids",
         "_frame_pos",
         "_frame_rotation",
-        "_posture",
+        "_posture_target",
         "_scale",
         "_entity",
     }
@@ -127,11 +127,13 @@ class DifferentialIKAction(ActionTerm):
         dofs = env.sim.mj_model.jnt_dofadr[joints].tolist()
         self._dofs = as_columns(dofs, self.device)
         self._find_frame()
-        self._posture = self._entity.data.default_joint_pos[:, self._columns].clone()
         positions = resolve_expr(cfg.posture_target or {}, tuple(self._joint_names), None)
-        for column, value in enumerate(positions):
-            if value is not None:
-                self._posture[:, column] = float(value)
+        # NaN: the default position.
+        self._posture_target = torch.tensor(
+            [math.nan if value is None else float(value) for value in positions],
+            dtype=torch.float32,
+            device=self.device,
+        )
         self._raw_actions = torch.zeros(
             self.num_envs, self.action_dim, dtype=torch.float32, device=self.device
         )
@@ -245,7 +247,15 @@ class DifferentialIKAction(ActionTerm):
         limit, posture = cfg.joint_limit_weight**2, cfg.posture_weight**2
         damping = max(cfg.damping, _MIN_DAMPING) ** 2
         stiffness = limit * (outside != 0.0) + (posture + damping)
+        if posture == 0.0:
+            return jacobian, error, stiffness, limit * outside
         return jacobian, error, stiffness, limit * outside + posture * (self._posture - q)
+
+    @property
+    def _posture(self) -> torch.Tensor:
+        """Posture, (N, number of joints); default positions may change."""
+        default = self._entity.data.default_joint_pos[:, self._columns]
+        return torch.where(self._posture_target.isnan(), default, self._posture_target)
 
     def _get_frame_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return position, (N, 3), and quaternion, (N, 4), of the frame in the world.
