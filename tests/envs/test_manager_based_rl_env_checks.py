@@ -10,11 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from mjlab.envs import ManagerBasedRlEnv
+from mjlab.envs import ManagerBasedRlEnv, mdp
 from mjlab.envs import manager_based_rl_env as env_checks
 from mjlab.envs import manager_based_rl_env as env_module
 from mjlab.envs.manager_based_rl_env import as_reset_ids, check_device
-from mjlab.managers import EventTermCfg, RewardTermCfg, SceneEntityCfg
+from mjlab.managers import (
+    CommandTerm,
+    CommandTermCfg,
+    EventTermCfg,
+    RewardTermCfg,
+    SceneEntityCfg,
+    TerminationTermCfg,
+)
 from mjlab.managers.action_manager import as_action
 from mjlab.tasks.registry import load_env_cfg
 
@@ -252,3 +259,101 @@ def test_environments_that_do_not_exist_are_refused_and_nothing_changes(env, env
         env.reset(env_ids=env_ids, seed=3)
     assert torch.equal(env.episode_length_buf, before)
     assert torch.equal(torch.get_rng_state(), state), "no generator may be reseeded"
+
+
+# Odd terms.
+
+
+def odd(match, *, reset=True, **fields):
+    """Return the warnings that match while a Go1 environment is built and reset."""
+    cfg = load_env_cfg("Mjlab-Velocity-Flat-Unitree-Go1")
+    cfg.scene.num_envs = 1
+    for name, value in fields.items():
+        setattr(cfg, name, value)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        if reset:
+            env.reset()
+            env.reset()
+        env.close()
+    return [str(w.message) for w in seen if match in str(w.message)]
+
+
+@pytest.mark.parametrize(
+    ("time_out", "finite", "count"), [(False, False, 1), (True, False, 0), (False, True, 0)]
+)
+def test_a_time_limit_that_counts_as_failure_warns(time_out, finite, count):
+    terms = {"limit": TerminationTermCfg(func=mdp.time_out, time_out=time_out)}
+    seen = odd("'limit'", reset=False, terminations=terms, is_finite_horizon=finite)
+    assert len(seen) == count
+
+
+@pytest.mark.parametrize(
+    ("shortest", "global_time", "limited", "count"),
+    [(1.5, False, True, 1), (1.0, False, True, 0), (1.5, True, True, 0), (1.5, False, False, 0)],
+)
+def test_an_interval_that_episodes_do_not_reach_warns(shortest, global_time, limited, count):
+    fired = []
+    event = EventTermCfg(
+        func=lambda env, env_ids: fired.append(env_ids),
+        mode="interval",
+        interval_range_s=(shortest, 2.0),
+        is_global_time=global_time,
+    )
+    limit = {"limit": TerminationTermCfg(func=mdp.time_out, time_out=True)}
+    seen = odd(
+        "['late'] interval_range_s",
+        events={"late": event},
+        episode_length_s=1.0,
+        terminations=limit if limited else {},
+    )
+    assert len(seen) == count
+
+
+def test_episodes_without_reset_events_warn_once():
+    assert len(odd("mode 'reset'", events={})) == 1
+    assert (
+        len(
+            odd(
+                "mode 'reset'",
+                events={},
+                commands={},
+                rewards={},
+                observations={},
+                curriculum={},
+                metrics={},
+                reset=False,
+            )
+        )
+        == 1
+    )
+    push = EventTermCfg(func=lambda env, env_ids: None, mode="step")
+    assert len(odd("mode 'reset'", events={"push": push})) == 1
+    start = EventTermCfg(func=mdp.reset_scene_to_default, mode="reset")
+    assert odd("mode 'reset'", events={"start": start}) == []
+
+
+class PlaceCfg(CommandTermCfg):
+    def build(self, env):
+        return Place(self, env)
+
+
+class Place(CommandTerm):
+    """Command that starts the robot at a frame of a motion."""
+
+    command = None
+
+    def _resample_command(self, env_ids):
+        robot = self._env.scene["robot"]
+        robot.write_joint_state_to_sim(
+            robot.data.default_joint_pos[env_ids],
+            robot.data.default_joint_vel[env_ids],
+            env_ids=env_ids,
+        )
+
+
+def test_a_command_may_start_episodes():
+    commands = {"motion": PlaceCfg(resampling_time_range=(9.0, 9.0))}
+    parts = {"rewards": {}, "observations": {}, "curriculum": {}, "metrics": {}}
+    assert odd("mode 'reset'", events={}, commands=commands, **parts) == []

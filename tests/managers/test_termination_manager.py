@@ -87,3 +87,24 @@ def test_values_that_are_numbers_count_as_true_unless_zero(env):
         True,
         False,
     ]
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")
+def test_buffers_of_earlier_releases(env):
+    cfg = {
+        "late": TerminationTermCfg(func=lambda env: env.value > 1.0, time_out=True),
+        "fallen": TerminationTermCfg(func=lambda env: env.value > 0.0),
+    }
+    manager = TerminationManager(cfg, env)
+    env.value = torch.tensor([0.0, 1.0, 2.0, 0.0])
+    manager.compute()
+    assert manager._terminated_buf is manager.terminated
+    assert manager._truncated_buf is manager.time_outs
+    assert {name: values.tolist() for name, values in manager._term_dones.items()} == {
+        "late": [False, False, True, False],
+        "fallen": [False, True, True, False],
+    }
+    manager._terminated_buf[0] = True
+    manager._term_dones["late"][3] = True
+    assert manager.terminated[0]
+    assert manager.get_term("late")[3]

@@ -212,7 +212,11 @@ _ATTRIBUTES: dict[str, dict[str, str]] = {
     "EntityData": {"generalized_force": "generalized_force"},
     "MetricsManager": {"_episode_sums": "episode_sums", "_step_count": "step_count"},
     "ObservationManager": {"_group_obs_term_cfgs": "group_obs_term_cfgs"},
-    "TerminationManager": {"_truncated_buf": "truncated_buf"},
+    "TerminationManager": {
+        "_term_dones": "term_dones",
+        "_terminated_buf": "terminated_buf",
+        "_truncated_buf": "truncated_buf",
+    },
 }
 
 # Legacy fields by class, with replacement and translation, applied in this order. A translation

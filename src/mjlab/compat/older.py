@@ -354,3 +354,13 @@ def group_obs_term_cfgs(manager: ObservationManager) -> dict[str, list[Any]]:
 def truncated_buf(manager: TerminationManager) -> torch.Tensor:
     """Return the buffer of time-outs, (N,) bool."""
     return manager.time_outs
+
+
+def terminated_buf(manager: TerminationManager) -> torch.Tensor:
+    """Return the buffer of failures, (N,) bool."""
+    return manager.terminated
+
+
+def term_dones(manager: TerminationManager) -> dict[str, torch.Tensor]:
+    """Return the last values of the terms, buffers (N,) bool by name."""
+    return {name: manager.get_term(name) for name in manager.active_terms}

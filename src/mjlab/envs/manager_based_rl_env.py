@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
+import warnings
 from collections.abc import Generator
 from dataclasses import dataclass, field
 from numbers import Real
@@ -200,6 +201,14 @@ class ManagerBasedRlEnv(Tabular):
         with selections_checked(self.scene):
             self.load_managers()
         self._placement.end_building()
+        report_odd_times(self)
+        moves = (e for e in self.scene.entities.values() if e is not self.scene.terrain)
+        # Commands of motions place robots, so tasks with commands are checked at the first reset.
+        self._may_not_start = "reset" not in self.event_manager.available_modes and any(
+            e.is_articulated or e.is_mocap or not e.is_fixed_base for e in moves
+        )
+        if not self.command_manager.active_terms:
+            self._report_start()
         # Expanding model fields invalidated the simulation's graphs.
         self.sim.create_graph()
         self.setup_manager_visualizers()
@@ -353,7 +362,8 @@ class ManagerBasedRlEnv(Tabular):
             self.scene.write_data_to_sim(env_ids)
             self._forward(env_ids, moved)
             self.command_manager.compute(dt=0.0, env_ids=env_ids)
-            self.scene.take_moved_envs()
+            self._may_not_start &= self.scene.take_moved_envs() is None
+            self._report_start()
             self.sim.sense()
             self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
             self.recorder_manager.record_post_reset(env_ids)
@@ -608,6 +618,18 @@ class ManagerBasedRlEnv(Tabular):
         else:
             self.sim.forward(stage="vel")
 
+    def _report_start(self) -> None:
+        """Warn, once, if nothing places the entities at the start of an episode."""
+        if self._may_not_start:
+            self._may_not_start = False
+            warnings.warn(
+                f"{type(self.cfg).__name__} events: expected a term of mode 'reset', got "
+                f"{list(self.cfg.events)}; episodes start at the model's qpos0 instead of init_state. "
+                "Add EventTermCfg(func=mdp.reset_scene_to_default, mode='reset').",
+                UserWarning,
+                stacklevel=3,
+            )
+
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         # The curriculum runs first, because it reads the final state of the episode.
         self.curriculum_manager.compute(env_ids=env_ids)
@@ -674,7 +696,11 @@ class ManagerBasedRlEnv(Tabular):
             part.debug_vis(visualizer)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all run-time state, for bitwise exact resume."""
+        """Return all run-time state, for bitwise exact resume, except random numbers.
+
+        Save these beside it: `mjlab.utils.random.rng_state` returns the states of the global
+        generators, and `set_rng_state` restores them. Checkpoints of the runner hold both.
+        """
         return env_state.state_dict(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -694,8 +720,7 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     """Check config values that would otherwise fail late.
 
     Raises:
-        ValueError: invalid value, or an attribute with a misspelled field name; the message names
-            the field, the value and the allowed values.
+        ValueError: invalid value; the message names the field, the value and the allowed values.
     """
     check_fields_exist(type(cfg).__name__, cfg)
     check_count("scene.num_envs", cfg.scene.num_envs)
@@ -712,6 +737,36 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     length = cfg.episode_length_s
     if not (isinstance(length, Real) and math.isfinite(length) and length >= 0):
         raise ValueError(f"episode_length_s: expected a finite number >= 0 (s), got {length!r}.")
+
+
+def report_odd_times(env: ManagerBasedRlEnv) -> None:
+    """Warn of time limits that count as failures, and of events that episodes are too short for."""
+    terms = {name: cfg for name, cfg in env.cfg.terminations.items() if cfg is not None}
+    limits = [n for n, cfg in terms.items() if getattr(cfg.func, "__name__", None) == "time_out"]
+    failures = [] if env.cfg.is_finite_horizon else [n for n in limits if not terms[n].time_out]
+    if failures:
+        warnings.warn(
+            f"TerminationManager terms {failures} time_out: expected True for a time limit, got False; "
+            "episodes that reach it count as failures without bootstrapping. Set time_out=True.",
+            UserWarning,
+            stacklevel=3,
+        )
+    longest = env.max_episode_length * env.step_dt
+    rare = {
+        name: cfg.interval_range_s
+        for name, cfg in env.cfg.events.items()
+        if cfg is not None and cfg.mode == "interval" and not cfg.is_global_time
+        # Resets resample the timers.
+        if limits and (cfg.interval_range_s or (0.0,))[0] > longest + 0.5 * env.step_dt
+    }
+    if rare:
+        warnings.warn(
+            f"EventManager terms {list(rare)} interval_range_s: expected intervals shorter than the "
+            f"episode ({longest:.4g} s), got {list(rare.values())}; timers restart with episodes, so "
+            "the events never happen. Use is_global_time=True, or mode='reset'.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def check_device(device: Any) -> None:

@@ -95,7 +95,7 @@ def training_runner(
     """Return the runner of `task`, with newly initialized networks.
 
     Raises:
-        ValueError: the agent config does not fit the environments, or has a misspelled field.
+        ValueError: the agent config does not fit the environments.
     """
     check_fields_exist(type(cfg.agent).__name__, cfg.agent)
     runner_cls: Any = load_runner_cls(task) or rl.MjlabOnPolicyRunner

@@ -117,7 +117,6 @@ def load_env_cfg(
         UnknownTaskError: unknown task.
         UnknownProfileError: unknown profile.
         TaskImportError: importing the config's function by name failed.
-        ValueError: an attribute set on the config has a misspelled field name.
     """
     if profile is not None:
         return _with_profile(task_name, profile, play)[0]
@@ -145,7 +144,7 @@ def load_rl_cfg(
     Raises:
         UnknownTaskError, UnknownProfileError, TaskImportError: see `load_env_cfg`.
         ValueError: the learner is unknown, or does not support the networks or observations of the
-            task; or an attribute set on the config has a misspelled field name.
+            task.
     """
     from mjlab.rl.learners import for_task_of, learner_of, with_learner
 
