@@ -177,13 +177,6 @@ def test_dc_motor_by_physical_constants_is_the_same_motor(make_world):
         ({"mode": DcMotorInputMode.VOLTAGE, "stiffness": 1.0}, "stiffness: .*VOLTAGE.*1.0"),
         ({"mode": DcMotorInputMode.POSITION, "voltage_limit": 24.0}, "stiffness in mode POSITION.*0.0"),
         ({"mode": DcMotorInputMode.VELOCITY, "stiffness": 1.0}, "voltage_limit in mode VELOCITY.*0.0"),
-        (
-            {
-                "mode": DcMotorInputMode.VELOCITY, "stiffness": 1.0, "voltage_limit": 24.0,
-                "integral_gain": 2.0,
-            },
-            "integral_gain: .*2.0.*POSITION",
-        ),
         ({"mode": 7, "stiffness": 1.0}, "mode: .*VELOCITY.*7"),
         ({"stiffness": 1.0, "voltage_limit": 24.0, "cogging": (1.0,)}, r"cogging: expected 3.*\(1.0,\)"),
     ],
@@ -191,6 +184,28 @@ def test_dc_motor_by_physical_constants_is_the_same_motor(make_world):
 def test_dc_motor_refuses_figures_that_its_mode_does_not_have(fields, named):
     with pytest.raises(ValueError, match=named):
         BuiltinDcMotorActuatorCfg(target_names_expr=("hip",), motor_params=MOTOR, **fields)
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0])
+def test_dc_motor_without_effort_limit(make_world, limit):
+    cfg = {"motor_params": MOTOR, "stiffness": 1.0, "voltage_limit": 24.0}
+    limits = [
+        make_world(
+            BuiltinDcMotorActuatorCfg(target_names_expr=("hip",), effort_limit=one, **cfg)
+        ).sim.mj_model.actuator_forcerange.tolist()
+        for one in (None, limit)
+    ]
+    assert limits[0] == limits[1]
+
+
+def test_integral_gain_without_effect_warns_once(make_world):
+    cfg = BuiltinDcMotorActuatorCfg(
+        target_names_expr=("hip",), motor_params=MOTOR, mode=DcMotorInputMode.VELOCITY,
+        stiffness=1.0, voltage_limit=24.0, integral_gain=2.0,
+    )  # fmt: skip
+    with pytest.warns(UserWarning, match="integral_gain: .*2.0.*POSITION") as caught:
+        make_world(cfg)
+    assert len(caught) == 1
 
 
 def test_dc_motor_that_mujoco_refuses_names_the_config(make_world):

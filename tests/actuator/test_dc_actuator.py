@@ -66,7 +66,24 @@ def test_effort_limit_below_the_stall_torque_does_not_warn(make_world):
         make_world(dc_cfg(effort_limit=10.0))
 
 
-@pytest.mark.parametrize("field", ["saturation_effort", "velocity_limit", "effort_limit"])
-def test_motor_figures_must_be_positive(field):
-    with pytest.raises(ValueError, match=f"{field}: .*> 0, got 0.0"):
-        dc_cfg(**{field: 0.0})
+def test_effort_limit_must_be_positive():
+    with pytest.raises(ValueError, match="effort_limit: .*> 0, got 0.0"):
+        dc_cfg(effort_limit=0.0)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+@pytest.mark.parametrize("field", ["saturation_effort", "velocity_limit"])
+def test_curve_below_zero_warns_once(make_world, field, value):
+    with pytest.warns(UserWarning, match=f"{field}: expected a number > 0, got {value}") as caught:
+        world = make_world(dc_cfg(**{field: value}))
+    assert len(caught) == 1
+    world.entity.write_data_to_sim()
+    if field == "saturation_effort" and value == 0.0:
+        assert not world.ctrl.any()
+
+
+def test_parameters_have_the_names_of_other_releases(make_world):
+    actuator = make_world(dc_cfg()).entity.actuators[0]
+    names = ("stiffness", "damping", "force_limit", "saturation_effort", "velocity_limit_motor")
+    assert actuator.param_names == names
+    assert (actuator.velocity_limit_motor == 20.0).all()

@@ -136,6 +136,19 @@ def test_network_of_another_input_size_is_refused_at_build(make_world, tmp_path)
         make_world(make_cfg(save(torch.nn.Linear(6, 1), tmp_path)))
 
 
+class Flat(torch.nn.Module):
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        return inputs.sum(dim=-1)
+
+
+def test_network_may_return_one_value_per_row(make_world, tmp_path):
+    world = make_world(make_cfg(save(Flat(), tmp_path)))
+    network = world.entity.actuators[0].network
+    assert isinstance(network, torch.jit.ScriptModule)
+    # Histories of two equal substeps: 2 (e + l') per joint.
+    torch.testing.assert_close(drive(world, 1.0, pos=0.25, vel=0.5), torch.full((3, 3), 2.5))
+
+
 def test_network_of_another_output_size_is_refused_at_build(make_world, tmp_path):
     with pytest.raises(ValueError, match=r"\(9, 1\), got outputs \(9, 2\)"):
         make_world(make_cfg(save(TwoOutputs(), tmp_path)))

@@ -165,17 +165,14 @@ def test_every_pattern_has_to_match_and_no_name_twice():
         ({"fields": ()}, r"fields.*\(\)"),
         ({"fields": ("found", "found")}, r"fields.*distinct.*\('found', 'found'\)"),
         ({"reduce": "sum"}, "reduce.*'none', 'mindist', 'maxforce', 'netforce'.*'sum'"),
-        ({"secondary_policy": "last"}, "secondary_policy.*'error'.*'last'"),
+        (
+            {"secondary": geom("box"), "secondary_policy": "last"},
+            "secondary_policy.*'error'.*'last'",
+        ),
         ({"num_slots": 0}, "num_slots.* 0"),
-        ({"history_length": -1}, "history_length.* -1"),
-        ({"fields": ("force",), "track_air_time": True}, "track_air_time=True.*'found'"),
         (
             {"global_frame": True, "fields": ("force", "normal")},
             r"global_frame=True.*\['tangent'\]",
-        ),
-        (
-            {"global_frame": True, "reduce": "netforce", "fields": ("force", "normal", "tangent")},
-            "cannot be combined with reduce='netforce'",
         ),
     ],
 )
@@ -201,6 +198,13 @@ def test_an_empty_pattern_may_be_filled_in_until_the_scene_is_built(pattern):
     cfg.secondary.pattern = "trunk_collision"
     feet = ["robot/left_foot", "robot/right_foot"]
     assert elements(compose(cfg, robot=LEGS)) == [(foot, "robot/trunk_collision") for foot in feet]
+
+
+def test_name_of_a_primary_may_be_a_sensor():
+    longer = sense(geom("box"))
+    longer.name = "touch_box"
+    scene = compose(sense(geom("box")), longer, box=BOX)
+    assert scene["touch"].primary_names == scene["touch_box"].primary_names == ["box"]
 
 
 def test_two_sensors_of_one_name_are_refused():

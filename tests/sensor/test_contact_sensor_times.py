@@ -16,7 +16,7 @@ from mjlab.sensor import ContactSensor, ContactSensorCfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.state import capture_state, restore_state
 
-from .contact_scenes import BOX, TERRAIN, build, compose, geom, sense
+from .contact_scenes import BOX, DT, GRAVITY, TERRAIN, build, compose, geom, sense, settle
 
 FEET = 2
 ENVS = 2
@@ -298,3 +298,73 @@ def test_a_subclass_that_overrides_update_is_called_at_every_substep(monkeypatch
     env.step(torch.zeros(4, env.action_manager.total_action_dim))
     sensor = next(s for s in env.scene.sensors.values() if isinstance(s, CountingSensor))
     assert sensor.updates == env.cfg.decimation
+
+
+# Fields.
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"fields": ("force",)},
+        {"fields": ("force",), "num_slots": 3},
+        {"fields": ("dist", "torque"), "reduce": "none"},
+        {"fields": ("force",), "reduce": "netforce", "history_length": 2},
+        {"fields": ("pos",), "reduce": "mindist", "history_length": -1},
+    ],
+)
+def test_air_time_does_not_depend_on_fields(fields, engine):
+    """A box that falls from 0.02 m and stays on the ground, in one of two environments."""
+    asked = sense(geom("box"), TERRAIN, track_air_time=True, **fields)
+    found = dataclasses.replace(asked, name="all", fields=("found", *asked.fields))
+    sim, scene = build(asked, found, box=BOX, engine=engine)
+    sim.data.qpos[:, 2] += torch.tensor([0.02, 10.0])
+    for _ in range(30):
+        sim.step()
+        scene.update(DT)
+    data, expected = scene["touch"].data, scene["all"].data
+    assert data.found is None
+    names = ("current_air_time", "current_contact_time", "last_air_time", "last_contact_time")
+    for name in names:
+        torch.testing.assert_close(getattr(data, name), getattr(expected, name))
+    # Free fall takes sqrt(2 * 0.02 / 9.81) = 0.064 s.
+    assert data.last_air_time[0, 0] == pytest.approx(0.064, abs=2 * DT)
+    assert data.current_air_time[1, 0] == pytest.approx(30 * DT)
+    assert data.current_contact_time[0, 0] > 0.0
+    assert torch.equal(scene["touch"].compute_first_air(31 * DT)[:, 0], torch.tensor([False, True]))
+
+
+def test_subclasses_choose_their_fields():
+    @dataclass
+    class FootSensorCfg(ContactSensorCfg):
+        fields: tuple[str, ...] = ("force",)
+        track_air_time: bool = True
+        threshold: float = 1.0
+
+        def build(self) -> ContactSensor:
+            return FootSensor(self)
+
+    class FootSensor(ContactSensor):
+        pass
+
+    sim, scene = build(FootSensorCfg("feet", geom("box"), TERRAIN), box=BOX)
+    assert type(scene["feet"]) is FootSensor
+    for _ in range(3):
+        sim.step()
+        scene.update(DT)
+    data = scene["feet"].data
+    torch.testing.assert_close(data.current_contact_time, torch.full((2, 1), 3 * DT))
+    assert data.force is not None
+    assert data.found is None
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_global_frame_keeps_a_net_force(engine):
+    cfg = sense(geom("box"), TERRAIN, fields=("force", "normal", "tangent"), reduce="netforce")
+    turned = dataclasses.replace(cfg, name="turned", global_frame=True)
+    sim, scene = build(cfg, turned, box=BOX, engine=engine)
+    settle(sim)
+    weight = torch.tensor([[[0.0, 0.0, -2.0 * GRAVITY]]]).repeat(2, 1, 1)
+    torch.testing.assert_close(scene["touch"].data.force, weight, rtol=1e-2, atol=1e-2)
+    torch.testing.assert_close(scene["turned"].data.force, scene["touch"].data.force)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from types import SimpleNamespace
 
 import mujoco
 import pytest
+import torch
 
 from mjlab.entity import EntityCfg
 from mjlab.envs.mdp import height_scan
@@ -15,7 +17,7 @@ from mjlab.sensor import GridPatternCfg, ObjRef, RayCastSensorCfg, TerrainHeight
 from mjlab.sim import SimulationCfg
 from mjlab.utils.spec_config import GeomCfg
 
-from .ray_scenes import BASE, ROBOT, floor, scene_with
+from .ray_scenes import BASE, ROBOT, floor, scene_with, sense
 from .simulated import simulation_of
 
 # Under the base: the foot, of group 2.
@@ -36,17 +38,30 @@ def floor_with(**fields):
     return edit
 
 
-def check(sensor, ground=floor, **kwargs) -> None:
-    sim, scene = scene_with(sensor, ground=ground, **kwargs)
-    scene.check_terrain_scans(sim.mj_model)
+def warnings_of(sim, scene) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        # The second call does nothing.
+        scene.check_terrain_scans(sim.mj_model)
+        scene.check_terrain_scans(sim.mj_model)
+    return [str(warning.message) for warning in caught]
 
 
+@pytest.mark.parametrize("engine", ["native", "warp"])
 @pytest.mark.parametrize("groups", [(0, 1, 2), None])
 @pytest.mark.parametrize("kind", [RayCastSensorCfg, TerrainHeightSensorCfg])
 @pytest.mark.parametrize("alignment", ["yaw", "world"])
-def test_a_scan_that_meets_its_own_robot_is_an_error(kind, groups, alignment):
-    with pytest.raises(ValueError, match=r"'scan'.* 9 of 9 rays .*'robot/foot'"):
-        check(scan(kind, include_geom_groups=groups, ray_alignment=alignment))
+def test_scan_of_its_own_robot_warns_once(kind, groups, alignment, engine):
+    sensor = scan(kind, include_geom_groups=groups, ray_alignment=alignment)
+    sim, scene = scene_with(sensor, engine=engine)
+    (message,) = warnings_of(sim, scene)
+    assert "9 of 9 rays" in message
+    assert "'robot/foot'" in message
+    assert "include_geom_groups=(0,)" in message
+    sense(sim)
+    # The foot's top is 0.35 m below the base.
+    distances = scene["scan"].data.distances
+    torch.testing.assert_close(distances, torch.full((1, 9), 0.35), atol=1e-4, rtol=0.0)
 
 
 @pytest.mark.parametrize("group", [0, 2])
@@ -58,15 +73,15 @@ def test_the_cure_of_the_message_works_and_leaves_the_robot_visible(group):
 
     def build(sensor):
         scene = Scene(SceneCfg(entities={"robot": robot}, sensors=(sensor,), spec_fn=floor), "cpu")
-        scene.check_terrain_scans(simulation_of(scene, SimulationCfg()).mj_model)
+        return warnings_of(simulation_of(scene, SimulationCfg()), scene)
 
-    with pytest.raises(ValueError, match=r"include_geom_groups=\(0,\)") as error:
-        build(scan())
-    # A robot in a group of the ground has to leave it, for one that viewers show.
-    assert ("group=1" in str(error.value)) == (group == 0)
+    (message,) = build(scan())
+    assert "include_geom_groups=(0,)" in message
+    # A robot in a group of the ground must leave it, for one that viewers show.
+    assert ("group=1" in message) == (group == 0)
     if group == 0:
         robot.geoms = (GeomCfg(geom_names_expr=(".*",), group=1),)
-    build(scan(include_geom_groups=(0,)))
+    assert build(scan(include_geom_groups=(0,))) == []
 
 
 @pytest.mark.parametrize(
@@ -83,28 +98,48 @@ def test_the_cure_of_the_message_works_and_leaves_the_robot_visible(group):
     ],
 )
 def test_other_scans_are_silent(sensor):
-    check(sensor)
+    assert warnings_of(*scene_with(sensor)) == []
 
 
 def test_another_entity_may_be_scanned():
     box = '<mujoco><worldbody><body><freejoint/><geom type="box" size=".3 .3 .1"/></body></worldbody></mujoco>'
-    check(scan(include_geom_groups=(0,)), entities={"robot": ROBOT, "box": box})
+    sensor = scan(include_geom_groups=(0,))
+    assert warnings_of(*scene_with(sensor, entities={"robot": ROBOT, "box": box})) == []
 
 
-@pytest.mark.parametrize("fields", [{"group": 4}, {"rgba": [1.0, 1.0, 1.0, 0.0]}])
-def test_ground_that_no_ray_can_meet_is_an_error(fields):
-    with pytest.raises(
-        ValueError, match=r"'scan' include_geom_groups: expected a group of the ground"
-    ):
-        check(scan(include_geom_groups=(0,)), ground=floor_with(**fields))
+@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize(
+    ("kind", "groups", "ground"),
+    [
+        (RayCastSensorCfg, (0,), {"group": 4}),
+        (RayCastSensorCfg, (0,), {"rgba": [1.0, 1.0, 1.0, 0.0]}),
+        (RayCastSensorCfg, (5,), {}),
+        (RayCastSensorCfg, (), {}),
+        (TerrainHeightSensorCfg, (), {}),
+        (TerrainHeightSensorCfg, (1, 2, 3), {}),
+    ],
+)
+def test_ground_that_no_ray_can_meet_warns_once(kind, groups, ground, engine):
+    sensor = scan(kind, include_geom_groups=groups, max_distance=0.3)
+    sim, scene = scene_with(sensor, ground=floor_with(**ground), engine=engine)
+    (message,) = warnings_of(sim, scene)
+    assert "expected a group of the ground" in message
+    assert f"include_geom_groups=({ground.get('group', 0)},)" in message
+    sense(sim)
+    assert (scene["scan"].data.distances == -1.0).all()
 
 
-def test_a_world_without_ground_is_no_error():
-    check(scan(include_geom_groups=(0,)), ground=lambda spec: None)
+def test_world_without_ground_is_silent():
+    sensor = scan(include_geom_groups=(0,))
+    assert warnings_of(*scene_with(sensor, ground=lambda spec: None)) == []
 
 
-def test_a_height_observation_needs_a_scan_whatever_its_alignment():
-    sim, scene = scene_with(scan(ray_alignment="base"))
+@pytest.mark.parametrize("alignment", ["base", "yaw"])
+def test_height_observations_warn_once_per_sensor(alignment):
+    sim, scene = scene_with(scan(ray_alignment=alignment))
     env = SimpleNamespace(scene=scene, sim=sim)
-    with pytest.raises(ValueError, match="'robot/foot'"):
-        check_term(height_scan, env, {"sensor_name": "scan"})  # ty: ignore
+    with pytest.warns(UserWarning, match="'robot/foot'") as caught:
+        scene.check_terrain_scans(sim.mj_model)
+        for _ in ("actor", "critic"):
+            check_term(height_scan, env, {"sensor_name": "scan"})  # ty: ignore
+    assert len(caught) == 1

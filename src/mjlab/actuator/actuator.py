@@ -12,6 +12,7 @@ substeps, the engine runs all of them in one dispatch. This makes CPU runs sever
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import mujoco
 import torch
 
+from mjlab.compat import offers_older_attributes
 from mjlab.utils.buffers import DelayBuffer
 from mjlab.utils.errors import (
     UnsupportedError,
@@ -49,7 +51,7 @@ class ActuatorCfg(ABC):
     """
 
     target_names_expr: tuple[str, ...]
-    """Regular expressions for target names; each must match a whole name."""
+    """Regular expressions for target names; each must match a whole name. May be a single string."""
     transmission_type: TransmissionType = TransmissionType.JOINT
     """Type of the targets: joints, tendons or sites."""
     armature: float | None = None
@@ -75,15 +77,12 @@ class ActuatorCfg(ABC):
     _positive: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        if isinstance(self.target_names_expr, str):
-            raise ValueError(
-                f"{type(self).__name__}.target_names_expr: expected a tuple of patterns, got the "
-                f"string {self.target_names_expr!r}; use ({self.target_names_expr!r},)."
-            )
         self.validate()
 
     def validate(self) -> None:
         """Check the field values; see the class. Subclasses extend this method."""
+        if isinstance(self.target_names_expr, str):
+            self.target_names_expr = (self.target_names_expr,)
         kinds = [kind.value for kind in TransmissionType]
         check_one_of(self._label("transmission_type"), self.transmission_type, kinds)
         # Configs may use the string "joint".
@@ -124,6 +123,7 @@ ActuatorCfgT = TypeVar("ActuatorCfgT", bound=ActuatorCfg)
 
 
 @stateful
+@offers_older_attributes
 class Actuator(ABC, Generic[ActuatorCfgT]):
     """Converts commands for its targets to controls of MuJoCo actuators.
 
@@ -137,6 +137,9 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         "cfg", "entity", "_mjs_actuators", "_target_ids_list", "_target_names", "_target_ids",
         "_ctrl_ids", "_global_ctrl_ids", "_global_element_ids", "_in_group", "_resets_delay",
     }  # fmt: skip
+
+    param_names: ClassVar[tuple[str, ...]] = ()
+    """Attributes that `control_law` reads."""
 
     def __init__(
         self,
@@ -229,15 +232,13 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
             model: Model fields of the simulation.
             data: Data fields of the simulation.
             device: Torch device.
-
-        Raises:
-            RuntimeError: `edit_spec` added no elements.
         """
         if not self._mjs_actuators:
-            raise WrongStateError(
-                f"{type(self).__name__} for {self._target_names} has no MuJoCo actuators; edit_spec "
-                "must append the elements it adds to self._mjs_actuators, and run before the model "
-                "is compiled."
+            warnings.warn(
+                f"{type(self).__name__} for {self._target_names}: edit_spec added no MuJoCo actuators "
+                "to self._mjs_actuators, so its controls are not used.",
+                UserWarning,
+                stacklevel=2,
             )
         # Unnamed actuators can only be identified by their position in the spec.
         own = [actuator.id for actuator in self.entity.spec.actuators]
@@ -320,7 +321,8 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
             ctrl = self.compute(self.apply_delay(self.get_command(data)))
         else:
             ctrl = self.compute_after_reset(self._delayed(self.get_command(data), env_ids), env_ids)
-        write_columns(data.data.ctrl, self.global_ctrl_ids, ctrl, env_ids)
+        if self._mjs_actuators:
+            write_columns(data.data.ctrl, self.global_ctrl_ids, ctrl, env_ids)
 
     def update(self, dt: float) -> None:
         """Hook called after every substep of `dt` seconds. An override sets `needs_substep`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -275,14 +276,6 @@ class DcMotorInputMode(IntEnum):
     VELOCITY = 2
 
 
-# Fields of `BuiltinDcMotorActuatorCfg` that a mode does not use.
-_UNUSED_GAINS = {
-    DcMotorInputMode.VOLTAGE: ("stiffness", "damping", "integral_gain"),
-    DcMotorInputMode.VELOCITY: ("integral_gain",),
-    DcMotorInputMode.POSITION: (),
-}
-
-
 @dataclass
 class DcMotorDatasheetParams:
     """Datasheet parameters of a DC motor."""
@@ -322,13 +315,14 @@ class BuiltinDcMotorActuatorCfg(ActuatorCfg):
     voltage_limit: float = 0.0
     """Maximum terminal voltage (V). 0 in mode VOLTAGE: no limit."""
     integral_gain: float = 0.0
-    """Gain ki of the controller (V/(rad s)). Mode POSITION only."""
+    """Gain ki of the controller (V/(rad s)). Mode POSITION only; no effect in mode
+    VELOCITY."""
     integral_limit: float = 0.0
     """Maximum time integral of the position error (rad s). 0: no limit."""
     slew_rate: float = 0.0
     """Maximum change of the command per second, starting at 0 after a reset. 0: no limit."""
     effort_limit: float | None = None
-    """Maximum electromagnetic torque (N m), before cogging and friction."""
+    """Maximum electromagnetic torque (N m), before cogging and friction. None, or <= 0: no limit."""
     gear: float = 1.0
     """Gear ratio from motor to target."""
     inductance: float = 0.0
@@ -343,7 +337,6 @@ class BuiltinDcMotorActuatorCfg(ActuatorCfg):
     """MuJoCo's five LuGre friction parameters. None: no LuGre friction."""
 
     _accepts_site: ClassVar[bool] = False
-    _positive: ClassVar[tuple[str, ...]] = ("effort_limit",)
 
     def validate(self) -> None:
         """See `ActuatorCfg`."""
@@ -357,7 +350,8 @@ class BuiltinDcMotorActuatorCfg(ActuatorCfg):
         has_controller = mode != DcMotorInputMode.VOLTAGE
         for name in ("stiffness", "voltage_limit") if has_controller else ():
             check_positive(f"{self._label(name)} in mode {mode.name}", getattr(self, name))
-        for name in _UNUSED_GAINS[mode]:
+        unused = ("stiffness", "damping", "integral_gain")
+        for name in unused if mode == DcMotorInputMode.VOLTAGE else ():
             if getattr(self, name) != 0.0:
                 raise ValueError(
                     f"{self._label(name)}: expected 0 in mode {mode.name}, got "
@@ -405,9 +399,16 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
         target_ids: list[int],
         target_names: list[str],
     ) -> None:
-        """See `Actuator`."""
+        """See `Actuator`. Warns of an integral gain in mode VELOCITY."""
         super().__init__(cfg, entity, target_ids, target_names)
         self._model: Any = None
+        if cfg.mode == DcMotorInputMode.VELOCITY and cfg.integral_gain != 0.0:
+            warnings.warn(
+                f"{type(cfg).__name__} for {cfg.target_names_expr} integral_gain: expected 0 in mode "
+                f"VELOCITY, got {cfg.integral_gain}, which has no effect; use mode POSITION.",
+                UserWarning,
+                stacklevel=2,
+            )
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
         """See `Actuator`."""

@@ -27,10 +27,6 @@ class DcMotorActuatorCfg(IdealPdActuatorCfg):
     velocity_limit: float
     """No-load speed w (rad/s or m/s)."""
 
-    _positive: ClassVar[tuple[str, ...]] = (
-        "effort_limit", "saturation_effort", "velocity_limit",
-    )  # fmt: skip
-
     def build(
         self, entity: Entity, target_ids: list[int], target_names: list[str]
     ) -> DcMotorActuator:
@@ -44,21 +40,31 @@ DcMotorCfgT = TypeVar("DcMotorCfgT", bound=DcMotorActuatorCfg)
 class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
     """Force of `IdealPdActuator`, clamped by `dc_motor_clip` instead of by the effort limit only.
 
-    `saturation_effort` and `velocity_limit` are also tensors, (N, n).
+    `saturation_effort` and `velocity_limit_motor` are also tensors, (N, n).
     """
 
     param_names: ClassVar[tuple[str, ...]] = (
-        *IdealPdActuator.param_names, "saturation_effort", "velocity_limit",
+        *IdealPdActuator.param_names, "saturation_effort", "velocity_limit_motor",
     )  # fmt: skip
 
     saturation_effort: torch.Tensor
-    velocity_limit: torch.Tensor
+    velocity_limit_motor: torch.Tensor
 
     def __init__(
         self, cfg: DcMotorCfgT, entity: Entity, target_ids: list[int], target_names: list[str]
     ) -> None:
-        """See `Actuator`. Warns if the effort limit exceeds the stall torque."""
+        """See `Actuator`. Warns of a curve below 0 or below the effort limit."""
         super().__init__(cfg, entity, target_ids, target_names)
+        for name in ("saturation_effort", "velocity_limit"):
+            value = getattr(cfg, name)
+            if not value > 0.0:
+                warnings.warn(
+                    f"{type(cfg).__name__} for {cfg.target_names_expr} {name}: expected a number > 0, "
+                    f"got {value}; the motor cannot follow its targets.",
+                    UserWarning,
+                    stacklevel=2,
+                )
+                return
         if math.isinf(cfg.effort_limit) or cfg.effort_limit > cfg.saturation_effort:
             warnings.warn(
                 f"{type(cfg).__name__} for {cfg.target_names_expr}: effort_limit="
@@ -73,7 +79,7 @@ class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
         """See `IdealPdActuator`; also allocates the per-environment parameters of the curve."""
         super().initialize(mj_model, model, data, device)
         self.saturation_effort = torch.full_like(self.stiffness, self.cfg.saturation_effort)
-        self.velocity_limit = torch.full_like(self.stiffness, self.cfg.velocity_limit)
+        self.velocity_limit_motor = torch.full_like(self.stiffness, self.cfg.velocity_limit)
 
     @staticmethod
     def control_law(params: dict[str, torch.Tensor], cmd: ActuatorCmd) -> torch.Tensor:
@@ -81,7 +87,7 @@ class DcMotorActuator(IdealPdActuator[DcMotorCfgT], Generic[DcMotorCfgT]):
         return dc_motor_clip(
             pd_torque(params["stiffness"], params["damping"], cmd),
             params["saturation_effort"],
-            params["velocity_limit"],
+            params["velocity_limit_motor"],
             params["force_limit"],
             cmd.vel,
         )

@@ -60,11 +60,11 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
 
     With e = p* - l, the inputs of a joint are [pos_scale (e_t, .., e_{t-H+1}), vel_scale (l'_t, ..,
     l'_{t-H+1})], newest first, with blocks swapped for `input_order="vel_pos"`. The network input has
-    one row per joint and environment, (N n, 2 H); its output is (N n, 1). The first values after a
+    one row per joint and environment, (N n, 2 H); its output is (N n, 1) or (N n,). The first values after a
     reset fill the whole history. Velocity and effort targets are not used.
     """
 
-    _transient = {"_network"}
+    _transient = {"network"}
 
     def __init__(
         self,
@@ -81,7 +81,8 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
                 f"{cfg.network_file!r} not found; save one with "
                 "torch.jit.script(network).save(path)."
             )
-        self._network: Any = None
+        self.network: Any = None
+        """TorchScript network. None before `initialize`."""
         self._history: CircularBuffer | None = None
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
@@ -96,7 +97,7 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
             with warnings.catch_warnings():
                 # Torch deprecates TorchScript, but existing network files use it.
                 warnings.simplefilter("ignore", DeprecationWarning)
-                self._network = torch.jit.load(self.cfg.network_file, map_location=device).eval()
+                self.network = torch.jit.load(self.cfg.network_file, map_location=device).eval()
         except RuntimeError as error:
             raise ValueError(
                 f"network_file: expected a TorchScript file, got {self.cfg.network_file!r}; save "
@@ -149,10 +150,10 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
         frames = self._buffer.buffer.flip(1).permute(0, 3, 2, 1)
         inputs = frames.reshape(-1, 2 * self.cfg.history_length)
         with torch.no_grad():
-            output = self._network(inputs)
+            output = self.network(inputs)
         force = self.cfg.torque_scale * output.reshape(cmd.pos.shape)
         return dc_motor_clip(
-            force, self.saturation_effort, self.velocity_limit, self.force_limit, cmd.vel
+            force, self.saturation_effort, self.velocity_limit_motor, self.force_limit, cmd.vel
         )
 
     def _check_network(self) -> None:
@@ -167,8 +168,8 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
         )
         try:
             with torch.no_grad():
-                output = self._network(inputs)
+                output = self.network(inputs)
         except RuntimeError as error:
             raise ValueError(f"{message} an error: {error}") from error
-        if output.shape != (num_rows, 1):
+        if output.numel() != num_rows:
             raise ValueError(f"{message} outputs {tuple(output.shape)}.")

@@ -56,7 +56,6 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
     _transient = {"default_stiffness", "default_damping", "default_force_limit", "_model", "_fused"}
 
     param_names: ClassVar[tuple[str, ...]] = ("stiffness", "damping", "force_limit")
-    """Attributes that `control_law` reads."""
 
     stiffness: torch.Tensor
     damping: torch.Tensor
@@ -188,11 +187,10 @@ def pd_torque(stiffness: torch.Tensor, damping: torch.Tensor, cmd: ActuatorCmd) 
 def _per_target(value: torch.Tensor, shape: tuple[int, int], name: str) -> torch.Tensor:
     """Broadcast `value` to `shape` (number of environments, number of targets)."""
     value = torch.as_tensor(value, dtype=torch.float32)
-    if value.shape == shape or value.ndim == 0:
-        return value.expand(shape)
-    if value.shape == shape[:1]:
-        return value.unsqueeze(-1).expand(shape)
-    raise ValueError(
-        f"{name}: expected shape ({shape[0]},) or {shape} for {counted(shape[0], 'environment')} and "
-        f"{counted(shape[1], 'target')}, got {tuple(value.shape)}."
-    )
+    try:
+        return (value.unsqueeze(-1) if value.ndim == 1 else value).expand(shape)
+    except RuntimeError:
+        raise ValueError(
+            f"{name}: expected shape ({shape[0]},) or {shape} for {counted(shape[0], 'environment')} "
+            f"and {counted(shape[1], 'target')}, got {tuple(value.shape)}."
+        ) from None

@@ -207,6 +207,7 @@ for _module, _passed in _PASSED_THROUGH.items():
 
 # Legacy attributes by class, with the function that computes their value.
 _ATTRIBUTES: dict[str, dict[str, str]] = {
+    "Actuator": {"base_actuator": "base_actuator", "command_field": "command_field"},
     "ContactSensor": {"_slots": "contact_slots"},
     "DifferentialIKAction": {"_joint_ids": "ik_joint_ids"},
     "EntityData": {"generalized_force": "generalized_force"},

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from mjlab.actuator import Actuator, ActuatorCfg
+from mjlab.actuator.actuator import DirectActuator
 from mjlab.envs.mdp import dr
 from mjlab.envs.mdp.dr._core import BODY, GEOM, ROBOT, SITE, FieldRow, randomize
 from mjlab.envs.mdp.dr.actuator import selected_actuators
@@ -287,6 +288,16 @@ def compute_flat_patches(
 
 
 # Legacy instance attributes.
+
+
+def base_actuator(actuator: Actuator) -> Actuator:
+    """Return the actuator: delays are part of each actuator, not of another around it."""
+    return actuator
+
+
+def command_field(actuator: Actuator) -> str:
+    """Return the first command of an actuator: "position", "velocity" or "effort"."""
+    return actuator.command_fields[0] if isinstance(actuator, DirectActuator) else "position"
 
 
 @dataclass(frozen=True)

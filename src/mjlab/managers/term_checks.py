@@ -106,9 +106,9 @@ def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any
 
 
 def check_height_scan(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Check that the rays of a term that measures heights meet the ground and not their robot.
+    """Warn if the rays of a term that measures heights miss the ground or meet their robot.
 
-    Sensors of other classes are not checked. Raises `ValueError`; see `check_terrain_scan`.
+    Sensors of other classes are not checked. See `check_terrain_scan`.
     """
     sensor = env.scene[sensor_name]
     if isinstance(sensor, RayCastSensor):

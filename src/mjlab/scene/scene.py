@@ -297,10 +297,9 @@ class Scene(Tabular):
         report_overruled(cfg, stated, self.entity_options)
 
     def check_terrain_scans(self, mj_model: mujoco.MjModel) -> None:
-        """Check that terrain scans see the ground, and not their robot. Call after `initialize`.
+        """Warn of terrain scans that miss the ground or meet their robot. Call after `initialize`.
 
-        Raises:
-            ValueError: the geom groups of a scan do not fit; see `check_terrain_scan`.
+        See `check_terrain_scan`.
         """
         for sensor in self._sensors.values():
             if isinstance(sensor, RayCastSensor) and sensor.scans_terrain:

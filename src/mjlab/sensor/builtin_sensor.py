@@ -93,7 +93,9 @@ class BuiltinSensorCfg(SensorCfg):
         allowed = next(v for start, v in _OBJECTS.items() if self.sensor_type.startswith(start))
         # Only frame sensors have a reference frame, and it is optional.
         frames = (*_FRAME, None) if self.sensor_type.startswith("frame") else (None,)
-        for field, ref, types in (("obj", self.obj, allowed or (None,)), ("ref", self.ref, frames)):
+        # The element of a clock or an energy only gives its prefix to the name.
+        checked = (("obj", self.obj, allowed), ("ref", self.ref, frames))
+        for field, ref, types in checked if allowed else checked[1:]:
             owner = f"Sensor {self.name!r} {field}.type for sensor_type {self.sensor_type!r}"
             check_one_of(owner, None if ref is None else ref.type, types)
 
@@ -154,7 +156,8 @@ class BuiltinSensor(Sensor[torch.Tensor]):
         sensor = scene_spec.add_sensor(
             name=name, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind.upper()}")
         )
-        for ref, kind in ((cfg.obj, "obj"), (cfg.ref, "ref")):
+        is_global = cfg.sensor_type in ("clock", "e_potential", "e_kinetic")
+        for ref, kind in () if is_global else ((cfg.obj, "obj"), (cfg.ref, "ref")):
             if ref is not None:
                 check_entity(f"Sensor {name!r}", ref, entities)
                 elements = "bodies" if ref.type in ("body", "xbody") else f"{ref.type}s"

@@ -80,36 +80,30 @@ class ContactSensorCfg(SensorCfg):
     secondary_policy: SecondaryPolicy = "first"
     """Handling of several secondary matches: take the `first`, accept `any` partner, or `error`."""
     track_air_time: bool = False
-    """Track air and contact times. Requires field `found`."""
+    """Track air and contact times, independent of `fields`."""
     global_frame: bool = False
-    """Rotate force and torque into the world frame. Requires `normal` and `tangent`."""
+    """Rotate force and torque into the world frame. Requires `normal` and `tangent`. The force of
+    `netforce` is in the world frame already."""
     history_length: int = 0
-    """Number of substeps of force, torque and dist to keep. 0: no history."""
+    """Number of substeps of force, torque and dist to keep, newest first. 0: no history."""
     debug: bool = False
     """Draw contact points and forces in viewers."""
 
     def __post_init__(self) -> None:
         owner = f"Contact sensor {self.name!r}"
         check_one_of(f"{owner} reduce", self.reduce, get_args(Reduction))
-        check_one_of(f"{owner} secondary_policy", self.secondary_policy, get_args(SecondaryPolicy))
+        if self.secondary is not None:
+            policies = get_args(SecondaryPolicy)
+            check_one_of(f"{owner} secondary_policy", self.secondary_policy, policies)
         if not self.fields or len(set(self.fields)) != len(self.fields):
             raise ValueError(f"{owner} fields: expected distinct names, got {self.fields!r}.")
         for name in self.fields:
             check_one_of(f"{owner} fields", name, FIELD_SIZES)
         check_count(f"{owner} num_slots", self.num_slots)
-        check_count(f"{owner} history_length", self.history_length, minimum=0)
-        required = ("found",) if self.track_air_time else ()
-        if self.global_frame:
-            if self.reduce == "netforce":
-                raise ValueError(
-                    f"{owner}: global_frame=True cannot be combined with reduce='netforce', whose "
-                    "sum is in the world frame already; leave out global_frame."
-                )
-            required += ("normal", "tangent")
-        if missing := [name for name in required if name not in self.fields]:
-            setting = "track_air_time" if "found" in missing else "global_frame"
+        missing = [name for name in ("normal", "tangent") if name not in self.fields]
+        if self.global_frame and missing:
             raise ValueError(
-                f"{owner}: {setting}=True requires fields {missing}, got {self.fields!r}."
+                f"{owner}: global_frame=True requires fields {missing}, got {self.fields!r}."
             )
 
     def build(self) -> ContactSensor:
@@ -197,6 +191,8 @@ class ContactSensor(Sensor[ContactData]):
         super().__init__()
         self.cfg = cfg
         measured = {*cfg.fields, *(_DEBUG_FIELDS if cfg.debug else ())}
+        if cfg.track_air_time:
+            measured.add("found")
         self._fields = [name for name in FIELD_SIZES if name in measured]
         sizes = [FIELD_SIZES[name] for name in self._fields]
         self._offsets = [sum(sizes[:i]) for i in range(len(sizes))]
@@ -239,9 +235,15 @@ class ContactSensor(Sensor[ContactData]):
         primaries = _resolve_match(f"{owner}: primary", cfg.primary, scene_spec, entities)
         secondary = self._resolve_secondary(owner, scene_spec, entities)
         self._primary_names = [primary.name for primary in primaries]
-        taken = {sensor.name for sensor in scene_spec.sensors}
         names = [f"{cfg.name}_{primary}" for primary in self._primary_names]
-        if clashes := sorted(taken.intersection((cfg.name, *names))):
+        # As a key of the scene, the name may hide only an element of another contact sensor.
+        hidden = mujoco.mjtSensor.mjSENS_CONTACT
+        clashes = sorted(
+            sensor.name
+            for sensor in scene_spec.sensors
+            if sensor.name in names or (sensor.name == cfg.name and sensor.type != hidden)
+        )
+        if clashes:
             raise ValueError(
                 f"{owner}: the scene already has MuJoCo sensors named {clashes}; rename this "
                 "sensor."

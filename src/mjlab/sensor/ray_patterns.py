@@ -6,6 +6,7 @@ A pattern returns offsets (m) and unit directions in the aligned frame of a ray 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import mujoco
@@ -37,7 +38,7 @@ class GridPatternCfg:
         """Return offsets and directions; ray `row * columns + column`, x along a row.
 
         Raises:
-            ValueError: resolution <= 0, negative size, or zero direction.
+            ValueError: resolution <= 0, or negative size.
         """
         check_fields_positive(self, "resolution")
         is_extent = all(side >= 0.0 and math.isfinite(side) for side in self.size)
@@ -88,11 +89,6 @@ class PinholeCameraPatternCfg:
             width: Image width (pixels).
             height: Image height (pixels).
         """
-        if len(intrinsic_matrix) != 9 or not intrinsic_matrix[4] > 0.0:
-            raise ValueError(
-                "from_intrinsic_matrix: expected nine numbers (fx, 0, cx, 0, fy, cy, 0, 0, 1) with "
-                f"fy > 0, got {intrinsic_matrix}."
-            )
         fovy = 2.0 * math.degrees(math.atan(height / (2.0 * intrinsic_matrix[4])))
         return cls(width=width, height=height, fovy=fovy)
 
@@ -100,14 +96,9 @@ class PinholeCameraPatternCfg:
         """Return zero offsets and directions; ray `row * width + column`.
 
         Raises:
-            ValueError: image without pixels, field of view outside (0, 180), unknown camera, or a
-                camera without `mj_model`.
+            ValueError: unknown camera, or a camera without `mj_model`.
         """
         width, height, half_x, half_y, center = self._image_plane(mj_model)
-        if width < 1 or height < 1:
-            raise ValueError(
-                f"PinholeCameraPatternCfg: expected at least 1 x 1 pixels, got {width} x {height}."
-            )
         u = (torch.arange(width, dtype=torch.float64) + 0.5) * 2.0 / width - 1.0
         v = 1.0 - (torch.arange(height, dtype=torch.float64) + 0.5) * 2.0 / height
         grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
@@ -138,7 +129,11 @@ class PinholeCameraPatternCfg:
                 center = (cx / fx, -cy / fy)
                 return width, height, sensor_x / (2 * fx), sensor_y / (2 * fy), center
         if not 0.0 < fovy < 180.0:
-            raise ValueError(f"Field of view: expected degrees in (0, 180), got {fovy}.")
+            warnings.warn(
+                f"PinholeCameraPatternCfg.fovy: expected degrees in (0, 180), got {fovy}.",
+                UserWarning,
+                stacklevel=2,
+            )
         half_y = math.tan(math.radians(fovy) / 2.0)
         return width, height, half_y * width / height, half_y, (0.0, 0.0)
 
@@ -178,22 +173,13 @@ class RingPatternCfg:
         return cls((Ring(radius, num_samples),), include_center, direction)
 
     def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
-        """Return offsets and directions: center, then ring by ring.
-
-        Raises:
-            ValueError: negative radius, ring without rays, or zero direction.
-        """
+        """Return offsets and directions: center, then ring by ring."""
         points = [(0.0, 0.0, 0.0)] if self.include_center else []
         for ring in self.rings:
-            if ring.num_samples < 1 or not (ring.radius >= 0.0 and math.isfinite(ring.radius)):
-                raise ValueError(
-                    "RingPatternCfg rings: expected num_samples >= 1 and a finite radius >= 0 m, "
-                    f"got num_samples {ring.num_samples} and radius {ring.radius}."
-                )
             for k in range(ring.num_samples):
                 angle = 2.0 * math.pi * k / ring.num_samples
                 points.append((ring.radius * math.cos(angle), ring.radius * math.sin(angle), 0.0))
-        offsets = torch.tensor(points, dtype=torch.float32, device=device)
+        offsets = torch.tensor(points, dtype=torch.float32, device=device).reshape(-1, 3)
         return offsets, _parallel(self.direction, len(points), "RingPatternCfg", device)
 
 
@@ -203,9 +189,12 @@ PatternCfg = GridPatternCfg | PinholeCameraPatternCfg | RingPatternCfg
 def _parallel(direction: tuple[float, ...], count: int, owner: str, device: str) -> torch.Tensor:
     vector = torch.tensor(direction, dtype=torch.float64)
     length = float(vector.norm())
-    if vector.shape != (3,) or not (math.isfinite(length) and length > 1e-9):
-        raise ValueError(
-            f"{owner}.direction: expected three finite numbers, not all 0, got {direction}."
+    if not 0.0 < length < math.inf:
+        warnings.warn(
+            f"{owner}.direction: expected three finite numbers, not all 0, got {direction}; every ray "
+            "misses.",
+            UserWarning,
+            stacklevel=2,
         )
     # One row per ray, the layout of patterns of diverging rays.
     return (vector / length).to(device, torch.float32).repeat(count, 1)

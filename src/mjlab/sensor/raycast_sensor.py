@@ -6,7 +6,7 @@ Data has N environments, F frames and n rays per frame; ray `f n + r` is ray r o
 from __future__ import annotations
 
 import copy
-import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -101,7 +101,7 @@ class RayCastSensorCfg(SensorCfg):
     exclude_parent_body: bool = True
     """Exclude the geoms of the frame's body (not those of its descendants)."""
     include_geom_groups: tuple[int, ...] | None = (0, 1, 2)
-    """Visible geom groups, of 0 to 5. None: all."""
+    """Visible geom groups, of 0 to 5. None: all. Empty: every ray misses."""
     debug_vis: bool = False
     """Draw the rays in viewers."""
     viz: VizCfg = field(default_factory=VizCfg)
@@ -160,32 +160,34 @@ class RayCastSensor(Sensor[RayCastData]):
     side. Rays ignore fully transparent geoms.
     """
 
-    _transient = {"_frames", "_offsets", "_local_directions", "_moving_directions"}
+    _transient = {
+        "_frames", "_offsets", "_local_directions", "_moving_directions", "is_checked_scan",
+    }  # fmt: skip
 
     def __init__(self, cfg: RayCastSensorCfg) -> None:
         """Check the config.
 
         Raises:
-            ValueError: unknown alignment, geom group outside 0..5, or max_distance <= 0.
+            ValueError: unknown alignment, or geom group outside 0..5.
         """
         super().__init__()
         self.cfg = cfg
         owner = f"Ray sensor {cfg.name!r}"
         check_one_of(f"{owner} ray_alignment", cfg.ray_alignment, get_args(RayAlignment))
-        if not 0.0 < cfg.max_distance < math.inf:
-            raise ValueError(
-                f"{owner} max_distance: expected a finite length > 0 (m), got {cfg.max_distance}."
+        if not cfg.max_distance > 0.0:
+            warnings.warn(
+                f"{owner} max_distance: expected a length > 0 (m), got {cfg.max_distance}; every ray "
+                "misses.",
+                UserWarning,
+                stacklevel=2,
             )
         for group in cfg.include_geom_groups or ():
             check_one_of(f"{owner} include_geom_groups", group, range(NUM_GEOM_GROUPS))
-        if cfg.include_geom_groups is not None and not cfg.include_geom_groups:
-            raise ValueError(
-                f"{owner} include_geom_groups: expected at least one group, got "
-                f"{cfg.include_geom_groups!r}; use None for all groups."
-            )
         frame = cfg.frame
         self._frame_refs = (frame,) if isinstance(frame, ObjRef) else tuple(frame)
         self._num_rays_per_frame = 0
+        self.is_checked_scan = False
+        """True after `check_terrain_scan`."""
 
     # Construction.
 
@@ -208,7 +210,7 @@ class RayCastSensor(Sensor[RayCastData]):
         """Generate the rays and look up the frames in the compiled model.
 
         Raises:
-            ValueError: invalid pattern, pattern without rays, or unknown frame (with close names).
+            ValueError: invalid pattern, or unknown frame (with close names).
         """
         try:
             offsets, directions = self.cfg.pattern.generate_rays(mj_model, device)
@@ -216,8 +218,10 @@ class RayCastSensor(Sensor[RayCastData]):
         except ValueError as error:
             raise ValueError(f"Ray sensor {self.cfg.name!r}: {error}") from error
         if len(offsets) == 0:
-            raise ValueError(
-                f"Ray sensor {self.cfg.name!r} pattern: expected at least one ray, got 0."
+            warnings.warn(
+                f"Ray sensor {self.cfg.name!r} pattern: expected at least one ray, got 0.",
+                UserWarning,
+                stacklevel=2,
             )
         self._offsets, self._local_directions = offsets, directions
         self._num_rays_per_frame = len(offsets)

@@ -6,6 +6,8 @@ robot must not.
 
 from __future__ import annotations
 
+import warnings
+
 import mujoco
 import numpy as np
 
@@ -15,14 +17,14 @@ from mjlab.utils.string import name_list
 
 
 def check_terrain_scan(sensor: RayCastSensor, mj_model: mujoco.MjModel) -> None:
-    """Check that rays can meet the ground and, in the initial pose, do not meet their own entity.
+    """Warn if rays cannot meet the ground or, in the initial pose, meet their own entity.
 
     Ground: geoms of entities without joints, and of the world. The initial pose is that of the last
-    keyframe. Call after `sensor.initialize`.
-
-    Raises:
-        ValueError: the ground is invisible to the rays, or rays meet the entity of their frame.
+    keyframe. Call after `sensor.initialize`. Later calls for the same sensor do nothing.
     """
+    if sensor.is_checked_scan:
+        return
+    sensor.is_checked_scan = True
     m = mj_model
     root = m.body_rootid[m.geom_bodyid]
     is_moving = np.bincount(m.body_rootid, m.body_dofnum, m.nbody)[root] > 0.0
@@ -31,10 +33,14 @@ def check_terrain_scan(sensor: RayCastSensor, mj_model: mujoco.MjModel) -> None:
     visible = _visible_geoms(m, sensor.include_geom_groups)
     owner = f"Ray sensor {sensor.cfg.name!r} include_geom_groups"
     if ground.any() and not (ground & visible).any() and m.nflex == 0:
-        raise ValueError(
-            f"{owner}: expected a group of the ground, {np.unique(m.geom_group[ground]).tolist()}, got "
-            f"{sensor.include_geom_groups}; no ray can meet the ground, in these groups or with alpha 0."
+        groups = tuple(np.unique(m.geom_group[ground]).tolist())
+        warnings.warn(
+            f"{owner}: expected a group of the ground, got {sensor.include_geom_groups}; no ray can meet "
+            f"the ground, in these groups or with alpha 0. Use include_geom_groups={groups}.",
+            UserWarning,
+            stacklevel=2,
         )
+        return
     seen = is_own & visible & is_moving
     if sensor.cfg.exclude_parent_body:
         seen &= m.geom_bodyid != np.array(sensor.frame_bodies)[:, None]
@@ -54,10 +60,12 @@ def check_terrain_scan(sensor: RayCastSensor, mj_model: mujoco.MjModel) -> None:
                 f", and move the geoms of the robot to another group: EntityCfg.geoms = "
                 f"(GeomCfg(geom_names_expr=('.*',), group={free}),)"
             )
-        raise ValueError(
+        warnings.warn(
             f"{owner}: expected groups without geoms of the robot below the sensor, got "
             f"{sensor.include_geom_groups}; {own_hits.sum()} of {own_hits.size} rays meet the robot in "
-            f"its initial pose, at {name_list(list(dict.fromkeys(names)), near=[])}. {cure}."
+            f"its initial pose, at {name_list(list(dict.fromkeys(names)), near=[])}. {cure}.",
+            UserWarning,
+            stacklevel=2,
         )
 
 
