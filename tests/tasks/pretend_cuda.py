@@ -331,9 +331,9 @@ def install(monkeypatch: pytest.MonkeyPatch, mode: PretendCuda) -> None:
             engine = create_engine(name, model, num_envs, cfg, "cpu")
         return PretendEngine(engine, mode) if _is_cuda(device) else engine
 
-    def make_marked(value: torch.Tensor, nworld: int, name: str) -> SharedField:
+    def make_marked(value: torch.Tensor, nworld: int | None, live: Any) -> SharedField:
         # Created by a function that torch function modes do not intercept.
-        field = make(value, nworld, name)
+        field = make(value, nworld, live)
         return mark(field) if is_marked(value) else field
 
     monkeypatch.setattr(simulation, "create_engine", create)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import mujoco
 import torch
 
-from mjlab.utils.errors import MjlabError, UnknownAttributeError, check_one_of
+from mjlab.utils.errors import MjlabError, check_one_of
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
@@ -75,29 +75,26 @@ _SENSORS_BY_FIELD = {
 }
 
 
-def check_sensor_fed(model: mujoco.MjModel, field: str) -> None:
-    """Check that MuJoCo computes a data field in `model`.
+def why_not_computed(model: mujoco.MjModel, field: str) -> str | None:
+    """Return the reason if steps do not compute a data field in `model`, None if steps do.
 
-    Some fields are computed for sensors only. Without such a sensor, these fields hold zeros on one
-    engine and intermediate results on the other.
-
-    Raises:
-        AttributeError: field is not computed; the message names the sensors to add, or the fields
-            to read instead.
+    Such fields hold zeros on one engine and intermediate results on the other.
     """
     if field == "qfrc_inverse":
-        # Steps do not run inverse dynamics, so the field would always be zero.
-        raise UnknownAttributeError(
-            "MjData.qfrc_inverse is computed by inverse dynamics only, and steps do not run it; for the "
-            "forces that drive the joints use qfrc_actuator + qfrc_applied."
+        return (
+            "is computed by inverse dynamics only, and steps do not run it; for the forces that "
+            "drive the joints use qfrc_actuator + qfrc_applied"
         )
+    if field == "energy" and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY:
+        return "is computed only with MujocoCfg.enableflags=('energy',)"
     sensors = _SENSORS_BY_FIELD.get(field, ())
     types = [getattr(mujoco.mjtSensor, f"mjSENS_{name.upper()}") for name in sensors]
     if sensors and not any((model.sensor_type == kind).any() for kind in types):
-        raise UnknownAttributeError(
-            f"MjData.{field} is computed only if the model has a sensor that needs it; add one of "
-            f"the sensors {', '.join(sensors)}."
+        return (
+            "is computed only if the model has a sensor that needs it; add one of the sensors "
+            f"{', '.join(sensors)}"
         )
+    return None
 
 
 # Rays.
@@ -257,6 +254,17 @@ class Engine(ABC):
 
         Raises:
             ValueError: unknown field, or one that the engine cannot expand.
+        """
+
+    @abstractmethod
+    def structure_field(self, name: str) -> torch.Tensor | None:
+        """Return the live tensor of an `MjModel` field without environment dimension.
+
+        Values that MuJoCo compiled from it, such as collision pairs, are unchanged. None: the engine
+        compiles the field, so that writing it has no effect.
+
+        Raises:
+            WrongStateError: engine copies the field when it is built.
         """
 
     @abstractmethod
@@ -435,3 +443,10 @@ def create_engine(
             f"--engine {'warp' if name == 'native' else 'native'}."
         ) from error
     return getattr(module, class_name)(model, num_envs, cfg, device)
+
+
+def mirror_on_warp(
+    engine: Engine, model: mujoco.MjModel, host: mujoco.MjData, cfg: SimulationCfg
+) -> Any:
+    """Return MuJoCo Warp structs on the tensors of a CPU engine, see `WarpMirror`."""
+    return importlib.import_module("mjlab.sim.warp.mirror").WarpMirror(engine, model, host, cfg)

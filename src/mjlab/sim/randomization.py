@@ -31,6 +31,12 @@ class RecomputeLevel(IntEnum):
     """Both."""
 
 
+BASES_OF_CONSTANTS = frozenset(
+    {"body_mass", "body_ipos", "body_inertia", "body_iquat", "body_gravcomp", "body_pos"}
+    | {"body_quat", "dof_armature", "qpos0", "geom_size"}
+)
+"""Model fields from which MuJoCo derives constants, see `RecomputeLevel`."""
+
 VARIANT_DEPENDENT_FIELDS = (
     *("geom_size", "geom_rbound", "geom_aabb", "geom_pos", "geom_quat"),
     *("body_mass", "body_subtreemass", "body_inertia", "body_invweight0", "body_ipos"),

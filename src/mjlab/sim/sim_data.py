@@ -7,13 +7,14 @@ load Warp.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Generic, TypeVar
 
 import torch
 
-from mjlab.utils.errors import UnknownAttributeError, WrongStateError
+from mjlab.utils.errors import UnknownAttributeError
 
 T = TypeVar("T")
 
@@ -21,13 +22,13 @@ T = TypeVar("T")
 class TorchArray(torch.Tensor):
     """Torch tensor that shares the memory of a Warp array. Operations return plain tensors.
 
-    An array with a single row shared by `nworld` worlds reads as `nworld` equal rows. Writing it by
-    `[...] = ...` raises `RuntimeError`, because one row cannot hold different values.
+    An array with a single row shared by `nworld` worlds reads as `nworld` equal rows. Writing one by
+    `[...] = ...` changes all, with a warning.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # ty: ignore[incompatible-method-override]
     _wp_array: Any
-    _is_shared: bool
+    _is_shared: bool  # Until the first write, which warns.
 
     def __new__(cls, wp_array: Any, nworld: int | None = None) -> TorchArray:
         """View `wp_array` of one or `nworld` rows."""
@@ -56,9 +57,12 @@ class TorchArray(torch.Tensor):
 
     def __setitem__(self, idx: Any, value: Any) -> None:
         if self._is_shared:
-            raise WrongStateError(
-                "Model field: expected one row per environment for writing, got one shared row; call "
-                "sim.expand_model_fields((name,)) first."
+            self._is_shared = False
+            warnings.warn(
+                "Model field: expected one row per world for writing, got one shared row, so the "
+                "write changes all worlds; use sim.expand_model_fields((name,)) before.",
+                UserWarning,
+                stacklevel=2,
             )
         super().__setitem__(idx, value)
 
@@ -82,7 +86,7 @@ class FieldView:
 
     def __setattr__(self, name: str, value: Any) -> None:
         # `data.qpos += 1` writes in place and then assigns the same tensor.
-        if value is self.__dict__.get(name):
+        if isinstance(value, torch.Tensor) and value is getattr(self, name, None):
             return
         raise UnknownAttributeError(
             f"{self._owner}.{name} cannot be replaced; write into it in place: "

@@ -24,13 +24,21 @@ from mjlab.sim.engine import (
     RayQuery,
     Stage,
     create_engine,
+    mirror_on_warp,
     resolve_engine_name,
+    why_not_computed,
 )
 from mjlab.sim.memory import LEAST_BYTES, bytes_per_environment, check_memory
-from mjlab.sim.randomization import RecomputeLevel, VariantInfo, VariantValues, is_structure
+from mjlab.sim.randomization import (
+    BASES_OF_CONSTANTS,
+    RecomputeLevel,
+    VariantInfo,
+    VariantValues,
+    is_structure,
+)
 from mjlab.sim.sim_data import FieldView
 from mjlab.sim.warning_log import collect_mujoco_warnings
-from mjlab.utils.errors import UnknownAttributeError, WrongStateError, check_positive
+from mjlab.utils.errors import UnknownAttributeError, check_positive
 from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.nan_guard import NanGuard
@@ -102,12 +110,14 @@ class Simulation:
         # randomization are read from a copy.
         self._default_model = copy.copy(self.mj_model)
         self._default_fields: dict[str, torch.Tensor] = {}
+        # Fields without environment dimension that were written.
+        self._structure: dict[str, torch.Tensor] = {}
         self._variants: VariantValues | None = None
-        self._engine = create_engine(engine_name, self.mj_model, num_envs, cfg, device)
-        self.data = FieldView(self._engine.data_field, num_envs, "data")
+        self._engine: Any = create_engine(engine_name, self.mj_model, num_envs, cfg, device)
+        self.data = FieldView(self._read_data_field, num_envs, "data")
         """Live `MjData` fields, (N, ...)."""
         self.model = FieldView(self._read_model_field, num_envs, "model")
-        """Live `MjModel` fields. Fields that are not expanded are shared and read-only."""
+        """Live `MjModel` fields. Fields that are not expanded are shared until their first write."""
         self._options = FieldView(self._read_option, num_envs, "model.opt")
         # Root of each body, (nbody,), and mask of degrees of freedom that move it, (nbody, nv).
         self._body_roots = torch.as_tensor(self.mj_model.body_rootid, device=device).long()
@@ -148,34 +158,36 @@ class Simulation:
 
     @property
     def wp_model(self) -> Any:
-        """MuJoCo Warp model. Raises `AttributeError` on other engines."""
-        return self._warp_engine("wp_model", "sim.model").wp_model
+        """MuJoCo Warp model. On the native engine a mirror: expanded fields share memory."""
+        return self._warp.wp_model
 
     @property
     def wp_data(self) -> Any:
-        """MuJoCo Warp data. Raises `AttributeError` on other engines."""
-        return self._warp_engine("wp_data", "sim.data").wp_data
+        """MuJoCo Warp data. On the native engine a mirror that shares the memory of `sim.data`."""
+        return self._warp.wp_data
 
     @property
     def wp_device(self) -> Any:
-        """Warp device. Raises `AttributeError` on other engines."""
-        return self._warp_engine("wp_device", "sim.device").wp_device
+        """Warp device."""
+        return self._warp.wp_device
+
+    @cached_property
+    def _warp(self) -> Any:
+        if self.engine_name == "warp":
+            return self._engine
+        return mirror_on_warp(self._engine, self.mj_model, self.mj_data, self.cfg)
 
     def render_context(self, views: tuple[CameraView, ...], view: CameraView) -> Any:
         """Return MuJoCo Warp's render context of `view`, one of `views` rendered together.
 
         Raises `AttributeError` on other engines, `RuntimeError` before the first rendering.
         """
-        engine = self._warp_engine("render_context", "the images of camera sensors")
-        return engine.renderer.context_of(views, view)
-
-    def _warp_engine(self, name: str, instead: str) -> Any:
         if self.engine_name != "warp":
             raise UnknownAttributeError(
-                f"Simulation.{name}: expected the warp engine, got {self.engine_name}; use {instead} "
-                "on both engines."
+                f"Simulation.render_context: expected the warp engine, got {self.engine_name}; use the "
+                "images of camera sensors on both engines."
             )
-        return self._engine
+        return self._engine.renderer.context_of(views, view)
 
     # Model fields.
 
@@ -242,6 +254,12 @@ class Simulation:
             )
         return value
 
+    def _read_data_field(self, name: str) -> Any:
+        value = self._engine.data_field(name)
+        if reason := why_not_computed(self.mj_model, name):
+            logger.warning("sim.data.%s %s.", name, reason)
+        return value
+
     def _read_model_field(self, name: str) -> Any:
         if name == "opt":
             return self._options
@@ -253,8 +271,47 @@ class Simulation:
             raise UnknownAttributeError(str(error)) from error
         if isinstance(value, int | bytes):
             return value
-        rows = None if is_structure(name, np.asarray(value)) else self.num_envs
-        return SharedField.make(self.get_default_field(name), rows, name)
+        default = self.get_default_field(name)
+        if is_structure(name, np.asarray(value)):
+            return SharedField.make(default, None, partial(self._live_structure, name))
+        return SharedField.make(default, self.num_envs, partial(self._live_field, name))
+
+    def _live_field(self, name: str, writes: bool) -> torch.Tensor | None:
+        """Return an expanded field, None if it is not expanded; expand it to write it."""
+        if name not in self._engine.model_fields:
+            if not writes:
+                return None
+            if self.num_envs > 1:
+                recompute = (
+                    ""
+                    if name not in BASES_OF_CONSTANTS
+                    else (
+                        " Constants derived from it keep their values until "
+                        "sim.recompute_constants(RecomputeLevel.set_const)."
+                    )
+                )
+                logger.warning(
+                    "Model field %r: expected one row per environment for writing, got one shared "
+                    "row, expanded now; use sim.expand_model_fields((%r,)) before, or declare the "
+                    "field with @requires_model_fields(%r).%s",
+                    name, name, name, recompute,
+                )  # fmt: skip
+            self.expand_model_fields((name,))
+        return getattr(self.model, name)
+
+    def _live_structure(self, name: str, writes: bool) -> torch.Tensor | None:
+        """Return the written value of a field without environment dimension; None before that."""
+        if writes and name not in self._structure:
+            value = self._engine.structure_field(name)
+            logger.warning(
+                "Model field %r is part of the model's structure. Writing it %s; change it in the "
+                "spec or model that the Simulation is built from.",
+                name,
+                "has no effect on the physics" if value is None
+                else "changes all environments, but not what was compiled from it",
+            )  # fmt: skip
+            self._structure[name] = self.get_default_field(name).clone() if value is None else value
+        return self._structure.get(name)
 
     def _read_option(self, name: str) -> Any:
         if not hasattr(self._default_model.opt, name):
@@ -287,7 +344,8 @@ class Simulation:
 
         Options are named `gravity` or `opt.gravity`.
 
-        Expand before storing references to `sim.model.<field>`: expansion replaces the tensor.
+        Expand before code outside torch stores references to `sim.model.<field>`: expansion
+        replaces the memory. The first write to a field expands it too, with a warning.
 
         Raises:
             ValueError: unknown field, or one that the engine cannot expand.
@@ -522,52 +580,79 @@ class Simulation:
 
 
 class SharedField(torch.Tensor):
-    """Model value shared by all environments. Writing raises `RuntimeError`.
+    """Model value shared by all environments. Writing makes it the engine's live tensor.
 
-    Writing one row would change every environment. Operations return plain tensors.
+    Operations return plain tensors, except views: these follow the field, so that references taken
+    before a write stay valid.
     """
 
-    error: str
+    live: Callable[[bool], torch.Tensor | None]
+    """Returns the live tensor, for reading or (True) writing; None: read the shared value."""
 
     @classmethod
-    def make(cls, value: torch.Tensor, nworld: int | None, name: str) -> SharedField:
+    def make(
+        cls,
+        value: torch.Tensor,
+        nworld: int | None,
+        live: Callable[[bool], torch.Tensor | None],
+    ) -> SharedField:
         """View `value` as a field of shape (nworld, ...); unchanged shape (structure) if None."""
         view = value if nworld is None else value.expand(nworld, *value.shape)
         field = torch.Tensor._make_subclass(cls, view)
-        field.error = f"Model field {name!r} is shared by all environments and cannot be written. "
-        field.error += (
-            "Change it in the spec or model that the Simulation is built from."
-            if nworld is None
-            else f"Call sim.expand_model_fields(({name!r},)) first, or declare it with "
-            f"@requires_model_fields({name!r})."
-        )
+        field.live = live
         return field
 
     @classmethod
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        target = args[0] if args else None
         name = getattr(func, "__name__", "")
         writes = name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
-        out = (kwargs or {}).get("out")
-        outputs = out if isinstance(out, tuple | list) else (out,)
-        for tensor in (target, *outputs) if writes else outputs:
-            if isinstance(tensor, SharedField):
-                raise WrongStateError(tensor.error)
-        with torch._C.DisableTorchFunctionSubclass():
-            result = func(*args, **(kwargs or {}))
-        # Views alias the shared value, so they stay protected. Empty tensors all have the same
-        # address.
-        if isinstance(target, SharedField):
+        target = args[0] if args else None
+        rest = [_follow(value, False) for value in args[1:]]
+        options = {key: _follow(value, key == "out") for key, value in (kwargs or {}).items()}
+        first = [_follow(value, writes) for value in args[:1]]
+
+        def call(on: Any) -> Any:
+            with torch._C.DisableTorchFunctionSubclass():
+                return func(*on, *rest, **options)
+
+        result = call(first)
+        if first and first[0] is target and isinstance(target, SharedField):
             if isinstance(result, np.ndarray):
                 result.flags.writeable = False
-            elif (
-                isinstance(result, torch.Tensor)
-                and result.numel()
-                and result.untyped_storage().data_ptr() == target.untyped_storage().data_ptr()
-            ):
-                result = result.as_subclass(cls)
-                result.error = target.error
+            elif isinstance(result, tuple | list):
+                return type(result)(
+                    _view(part, target, lambda on, k=k: call([on])[k])
+                    for k, part in enumerate(result)
+                )
+            return _view(result, target, lambda on: call([on]))
         return result
+
+
+def _follow(value: Any, writes: bool) -> Any:
+    """Replace shared fields in an argument of a torch function by their live tensors."""
+    if isinstance(value, SharedField):
+        live = value.live(writes)
+        return value if live is None else live
+    if type(value) in (tuple, list):
+        return type(value)(_follow(part, writes) for part in value)
+    return value
+
+
+def _view(result: Any, field: SharedField, view: Callable[[torch.Tensor], Any]) -> Any:
+    """Return `result`, if it is a view of a shared field, as a field that follows it."""
+    # Empty tensors all have the same address.
+    if not (
+        isinstance(result, torch.Tensor)
+        and result.numel()
+        and result.untyped_storage().data_ptr() == field.untyped_storage().data_ptr()
+    ):
+        return result
+
+    def live(writes: bool) -> torch.Tensor | None:
+        base = field.live(writes)
+        return None if base is None else view(base)
+
+    return SharedField.make(result, None, live)
 
 
 def _reshape_rows(field: str, tensor: torch.Tensor) -> torch.Tensor:

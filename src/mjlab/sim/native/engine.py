@@ -34,11 +34,10 @@ from mjlab.sim.engine import (
     Engine,
     EngineUnavailableError,
     Stage,
-    check_sensor_fed,
 )
 from mjlab.sim.native.rays import NativeRays
 from mjlab.sim.native.render import NativeRenderer, render_problem
-from mjlab.utils.errors import UnknownAttributeError, check_count
+from mjlab.utils.errors import UnknownAttributeError, WrongStateError, check_count
 from mjlab.utils.processes import cores_per_process
 
 if TYPE_CHECKING:
@@ -167,12 +166,11 @@ class NativeEngine(Engine):
 
     def data_field(self, name: str) -> torch.Tensor:
         if name not in self._tensors:
-            if name in ("contact", "nacon"):
+            if name in ("contact", "nacon", "efc"):
                 raise UnknownAttributeError(
                     f"The native engine does not provide sim.data.{name}; use a contact sensor "
-                    "(ContactSensorCfg)."
+                    '(ContactSensorCfg), or --engine warp (cfg.sim.engine = "warp").'
                 )
-            check_sensor_fed(self._model, name)
             try:
                 source = _as_tensor(self._batch.bind(name))
             except ValueError as error:
@@ -250,6 +248,21 @@ class NativeEngine(Engine):
                 f"simplified the inertia of bodies {', '.join(bodies)}; build the Simulation from a "
                 "spec (spec=...), or compile these bodies with simple='false'."
             )
+
+    def structure_field(self, name: str) -> torch.Tensor | None:
+        is_float = getattr(self._model, name).dtype.kind == "f"
+        if not is_float and name not in _FREE_INTEGERS:
+            return None
+        if name not in MODEL_FIELDS:
+            raise WrongStateError(
+                f"Model field {name!r} cannot be written on the native engine; change it in the spec "
+                "or model that the Simulation is built from, or use --engine warp "
+                '(cfg.sim.engine = "warp").'
+            )
+        rows = _as_tensor(self._batch.expand(name))
+        dtype = torch.float32 if is_float else rows.dtype
+        self._model_copies[name] = field = _Input(rows, dtype, is_shared=True)
+        return field.values
 
     def hide_geoms(self, absent: torch.Tensor) -> None:
         # Body masks, compiled from these, are at worst too permissive.
@@ -551,11 +564,15 @@ class _Copy:
 class _Input(_Copy):
     """Copy of a state or model field. Only modified elements are copied to the source.
 
-    So unmodified elements keep the double precision of the source.
+    So unmodified elements keep the double precision of the source. If shared, the copy has the
+    shape of one row of the source, and is copied to all rows.
     """
 
-    def __init__(self, source: torch.Tensor, dtype: torch.dtype) -> None:
-        super().__init__(source, dtype)
+    def __init__(
+        self, source: torch.Tensor, dtype: torch.dtype, *, is_shared: bool = False
+    ) -> None:
+        super().__init__(source[0] if is_shared else source, dtype)
+        self.source = source
         with torch.inference_mode(False):
             self._seen = self.values.clone()
         self._version = self.values._version

@@ -38,7 +38,6 @@ from mjlab.sim.engine import (
     Engine,
     EngineUnavailableError,
     Stage,
-    check_sensor_fed,
 )
 from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
@@ -112,12 +111,9 @@ class WarpEngine(Engine):
             EngineUnavailableError: device not found.
         """
         check_supported(model)
-        # Hide Warp's banner and compile messages by default.
-        if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() not in ("0", "false", "no"):
-            wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
         self.num_envs = num_envs
         self.device = torch.device(device)
-        self.wp_device = _find_device(self.device)
+        self.wp_device = find_device(self.device)
         self.mj_model = model
         self._host = mujoco.MjData(model)
         mujoco.mj_forward(model, self._host)
@@ -277,14 +273,14 @@ class WarpEngine(Engine):
 
     @torch.inference_mode(False)
     def data_field(self, name: str) -> Any:
-        if name == "nacon":
-            return as_torch(self.wp_data.nacon)
-        if name == "contact":
-            arrays = vars(self.wp_data.contact).items()
-            return SimpleNamespace(**{key: as_torch(array) for key, array in arrays})
+        if name in ("contact", "efc"):
+            values = vars(getattr(self.wp_data, name)).items()
+            return SimpleNamespace(**{key: _readable(value) for key, value in values})
         if name not in self._data_tensors:
             offered = offered_data_fields(self.wp_data)
-            if name == "ncon" or name.startswith("efc"):
+            if name not in offered and hasattr(self.wp_data, name):
+                return _readable(getattr(self.wp_data, name))
+            if name == "ncon" or name.startswith("efc_"):
                 raise UnknownAttributeError(
                     f"The warp engine does not provide MjData.{name}; use a contact sensor, or "
                     "sim.data.nacon and sim.data.contact for the contacts of all environments "
@@ -295,7 +291,6 @@ class WarpEngine(Engine):
                     f"Unknown per-environment MjData field {name!r} of the warp engine. Available: "
                     f"{name_list(sorted(offered), near=(name,))}."
                 )
-            check_sensor_fed(self.mj_model, name)
             self._data_tensors[name] = as_torch(getattr(self.wp_data, name))
         return self._data_tensors[name]
 
@@ -311,6 +306,12 @@ class WarpEngine(Engine):
         # Graphs hold the addresses of the arrays they were captured with.
         if new and self.num_envs > 1:
             self._graphs.clear()
+
+    def structure_field(self, name: str) -> torch.Tensor | None:
+        array = getattr(self.wp_model, name, None)
+        # MuJoCo Warp compiles collision pairs from the masks.
+        is_live = isinstance(array, wp.array) and name not in COLLISION_MASKS
+        return as_torch(array) if is_live else None
 
     @torch.inference_mode(False)
     def hide_geoms(self, absent: torch.Tensor) -> None:
@@ -620,6 +621,11 @@ def as_torch(array: Any) -> torch.Tensor:
     return wp.to_torch(array)
 
 
+def _readable(value: Any) -> Any:
+    """View a Warp array as a torch tensor; return other values unchanged."""
+    return as_torch(value) if isinstance(value, wp.array) else value
+
+
 def offered_data_fields(data: Any) -> set[str]:
     """Return the names of the per-environment `MjData` fields."""
     fields = _fields_over(type(data), "nworld") - _UNLIKE_MUJOCO
@@ -732,7 +738,11 @@ def hide_geoms(model: Any, absent: torch.Tensor) -> None:
     centers.copy_(torch.where(absent[..., None], places[:, None], centers))
 
 
-def _find_device(device: torch.device) -> Any:
+def find_device(device: torch.device) -> Any:
+    """Return Warp's device of a torch device. Raises `EngineUnavailableError` if not found."""
+    # Hide Warp's banner and compile messages by default.
+    if os.environ.get("MJLAB_WARP_QUIET", "1").strip().lower() not in ("0", "false", "no"):
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     wp.init()
     if device.type == "cpu":
         return wp.get_device("cpu")
