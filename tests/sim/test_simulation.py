@@ -391,13 +391,27 @@ def test_unknown_fields_name_close_ones():
 @pytest.mark.parametrize(
     "field",
     ["geom_type", "geom_contype", "geom_conaffinity", "body_contype", "dof_bodyid", "sensor_adr",
-     "body_geomnum", "actuator_trnid", "eq_active0", "geom_sameframe", "body_margin"],
+     "body_geomnum", "actuator_trnid", "eq_active0", "geom_sameframe"],
 )  # fmt: skip
-def test_a_field_the_engine_cannot_hold_per_environment_is_refused(field):
+def test_structure_stays_shared(field):
     sim = make_sim()
-    with pytest.raises(ValueError, match=f"'{field}'.* cannot differ between"):
-        sim.expand_model_fields((field,))
-    assert field not in sim.expanded_fields
+    with pytest.warns(UserWarning, match=f"'{field}'.* cannot differ between"):
+        sim.expand_model_fields((field, "body_mass"))
+    assert sim.expanded_fields == {"body_mass"}
+
+
+def test_bounding_volumes_are_not_expanded_by_name():
+    with pytest.raises(ValueError, match="'body_margin'"):
+        make_sim().expand_model_fields(("body_margin",))
+
+
+def test_a_spec_takes_precedence_over_a_model():
+    spec = mujoco.MjSpec.from_string(SLIDER_AND_BALL)
+    model = spec.compile()
+    spec.geom("ball").mass = 7.0
+    with pytest.warns(UserWarning, match="got both; `spec` is used"):
+        sim = Simulation(2, SimulationCfg(), model=model, spec=spec, device="cpu")
+    assert sim.model.body_mass[1, sim.mj_model.body("ball").id] == 7.0
 
 
 @pytest.mark.parametrize("field", ["geom_matid", "geom_condim", "jnt_limited"])
@@ -411,7 +425,7 @@ def test_bad_requests_are_refused_when_the_simulation_is_built():
     spec = mujoco.MjSpec.from_string(SLIDER_AND_BALL)
     with pytest.raises(ValueError, match="num_envs.*got 0"):
         Simulation(0, SimulationCfg(), spec=spec, device="cpu")
-    with pytest.raises(ValueError, match="exactly one"):
+    with pytest.raises(ValueError, match="got neither"):
         Simulation(1, SimulationCfg(), device="cpu")
     with pytest.raises(ValueError, match=r"engine.*native.*warp.*'bullet'"):
         Simulation(1, SimulationCfg(engine="bullet"), spec=spec, device="cpu")  # ty: ignore

@@ -35,6 +35,7 @@ def machine(monkeypatch):
         ("", "all", (None, 0)),
         ("-1", [0], (None, 0)),
         (None, [], (None, 0)),
+        ("3,5", [-1], ([5], 1)),
     ],
 )
 def test_ids_are_positions_among_the_visible(machine, visible, gpu_ids, expected):
@@ -49,7 +50,7 @@ def test_without_a_gpu_the_cpu_is_used(machine, gpu_ids):
     assert select_gpus(gpu_ids) == (None, 0)
 
 
-@pytest.mark.parametrize(("visible", "gpu_ids"), [(None, [0, 2]), ("6,7", [2]), ("6,7", [-1])])
+@pytest.mark.parametrize(("visible", "gpu_ids"), [(None, [0, 2]), ("6,7", [2]), ("6,7", [-3])])
 def test_positions_out_of_range_are_refused_with_the_valid_ones(machine, visible, gpu_ids):
     machine(2, visible)
     with pytest.raises(ValueError, match=rf"GPU \[{gpu_ids[-1]}\].*\[0, 1\]"):

@@ -255,6 +255,15 @@ def test_a_dump_without_states_is_refused(
 
 
 @pytest.mark.parametrize("field", ["buffer_size", "max_envs_to_dump"])
-def test_sizes_below_one_are_refused(model: mujoco.MjModel, tmp_path: Path, field: str) -> None:
-    with pytest.raises(ValueError, match=f"{field}.*0"):
-        make_guard(model, tmp_path, **{field: 0})
+def test_a_size_of_zero_keeps_no_states(
+    model: mujoco.MjModel, data: SimpleNamespace, tmp_path: Path, field: str
+) -> None:
+    with pytest.warns(UserWarning, match="no states"):
+        guard = make_guard(model, tmp_path, **{field: 0})
+    run_until_nan(guard, data, [2])
+    with np.load(guard.dump_path or "", allow_pickle=False) as file:
+        metadata = json.loads(str(file["_metadata"]))
+        states = [file[name] for name in file.files if name.startswith("states_step_")]
+    assert metadata["nan_env_ids"] == [2]
+    assert sum(rows.size for rows in states) == 0
+    assert metadata["buffer_size"] == len(states)

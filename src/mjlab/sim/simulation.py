@@ -6,6 +6,7 @@ import contextlib
 import copy
 import logging
 import math
+import warnings
 from collections.abc import Callable, Generator
 from functools import cached_property, partial
 from typing import Any
@@ -83,16 +84,19 @@ class Simulation:
         variants. The model must be compiled from the spec that contains the variants.
 
         Raises:
-            ValueError: `num_envs` below 1 or too large for the memory; neither or both of `model`
-                and `spec`; unknown options; XML that does not compile (with MuJoCo's message);
-                variants that differ in fields that the engine cannot expand.
+            ValueError: `num_envs` below 1 or too large for the memory; neither `model` nor `spec`;
+                unknown options; XML that does not compile (with MuJoCo's message); variants that
+                differ in fields that the engine cannot expand.
             EngineUnavailableError: engine cannot run on `device`.
         """
         check_positive("num_envs", num_envs)
-        if (model is None) == (spec is None):
-            raise ValueError(
-                "Simulation: expected exactly one of `model` and `spec`, got "
-                f"{'neither' if model is None else 'both'}."
+        if model is None and spec is None:
+            raise ValueError("Simulation: expected one of `model` and `spec`, got neither.")
+        if model is not None and spec is not None:
+            warnings.warn(
+                "Simulation: expected one of `model` and `spec`, got both; `spec` is used.",
+                UserWarning,
+                stacklevel=2,
             )
         engine_name = resolve_engine_name(cfg.engine, device)
         collect_mujoco_warnings()
@@ -342,7 +346,8 @@ class Simulation:
     def expand_model_fields(self, fields: tuple[str, ...] | list[str]) -> None:
         """Expand model fields to per-environment copies of the shared values.
 
-        Options are named `gravity` or `opt.gravity`.
+        Options are named `gravity` or `opt.gravity`. Structure that the engine cannot expand stays
+        shared, with a warning.
 
         Expand before code outside torch stores references to `sim.model.<field>`: expansion
         replaces the memory. The first write to a field expands it too, with a warning.
@@ -353,8 +358,13 @@ class Simulation:
         names = (name.removeprefix("opt.") for name in fields)
         new = tuple(name for name in names if name not in self._engine.model_fields)
         for name in new:
-            self.get_default_field(name)
-        self._engine.expand(new)
+            default = self.get_default_field(name)
+            try:
+                self._engine.expand((name,))
+            except ValueError as error:
+                if not is_structure(name, default.numpy(force=True)):
+                    raise
+                warnings.warn(f"{error} It stays shared.", UserWarning, stacklevel=2)
         self.model.forget(new)
         self._options.forget(new)
 

@@ -12,7 +12,8 @@ def select_gpus(
     """Return the devices for `CUDA_VISIBLE_DEVICES` and their number; (None, 0) for the CPU.
 
     Args:
-        gpu_ids: Indices into the visible GPUs, or "all", or None for the CPU. Visible GPUs are the
+        gpu_ids: Indices into the visible GPUs (negative: from the end), or "all", or None for the
+            CPU. Visible GPUs are the
             entries of `CUDA_VISIBLE_DEVICES` if set (numbers, or strings as for MIG devices), else
             all GPUs of the machine.
 
@@ -26,7 +27,7 @@ def select_gpus(
         return None, 0
     if gpu_ids == "all":
         return available, len(available)
-    invalid = [index for index in gpu_ids if not 0 <= index < len(available)]
+    invalid = [index for index in gpu_ids if not -len(available) <= index < len(available)]
     if invalid:
         raise ValueError(
             f"Unknown GPU {invalid}. Available: {list(range(len(available)))} "

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import tempfile
+import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.utils.errors import check_count, check_in_range, check_one_of
+from mjlab.utils.errors import check_in_range, check_one_of
 from mjlab.utils.os import own_folder, replacing, write_atomically
 
 if TYPE_CHECKING:
@@ -88,12 +89,14 @@ class NanGuard:
 
         `model_fields` returns the per-environment model fields, each (N, ...), at the time of a
         dump. None: dumps hold only the compiled model.
-
-        Raises:
-            ValueError: `buffer_size` or `max_envs_to_dump` is below 1.
         """
-        for name in ("buffer_size", "max_envs_to_dump"):
-            check_count(f"NanGuardCfg.{name}", getattr(cfg, name))
+        if cfg.enabled and (cfg.buffer_size == 0 or cfg.max_envs_to_dump == 0):
+            warnings.warn(
+                f"NanGuardCfg: expected buffer_size and max_envs_to_dump >= 1, got {cfg.buffer_size} "
+                f"and {cfg.max_envs_to_dump}; dumps will hold no states.",
+                UserWarning,
+                stacklevel=2,
+            )
         self.cfg = cfg
         self.enabled = cfg.enabled
         self.num_envs = num_envs
@@ -213,7 +216,7 @@ class NanGuard:
             "dumped_env_ids": ids,
             "state_spec": state_spec(self.mj_model),
             "state_size": mujoco.mj_stateSize(self.mj_model, state_spec(self.mj_model)),
-            "buffer_size": self.cfg.buffer_size,
+            "buffer_size": len(self.buffer),
             "detection_step": self._steps,
             "timestamp": stamp,
             "model_file": model_path.name,
