@@ -7,6 +7,7 @@ import re
 import zipfile
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 
@@ -163,20 +164,74 @@ def test_actuators_of_the_xml_and_others_may_share_a_pattern_but_no_joint(kit):
         assert by_config == {BuiltinMotorActuatorCfg: ["hip"], XmlActuatorCfg: ["knee"]}
 
 
-def test_a_free_joint_that_is_not_first_is_refused(kit):
-    """The reference takes it for an ordinary joint of an entity with a fixed base."""
+DOOR_AND_BALL = """<mujoco><worldbody>
+  <body name="door"><joint name="hinge" type="slide"/><geom size=".1"/></body>
+  <body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/>
+    <body name="fin"><joint name="flap" axis="0 1 0"/><geom size=".02" pos=".2 0 0"/></body>
+  </body></worldbody></mujoco>"""
+
+
+def test_root_is_the_body_of_the_free_joint(kit):
+    init = InitialState(pos=(1.0, 2.0, 3.0), joint_pos={"hinge": 0.5, "flap": -0.5})
+    sim, scene = kit.make(2, thing=kit.cfg(DOOR_AND_BALL, init_state=init))
+    thing, data = scene["thing"], scene["thing"].data
+    assert not thing.is_fixed_base
+    assert thing.root_body.name == "thing/ball"
+    assert thing.body_names == ("door", "ball", "fin")
+    assert thing.joint_names == ("hinge", "flap")
+    np.testing.assert_allclose(sim.mj_model.key("init_state").qpos[:4], [0.5, 1.0, 2.0, 3.0])
+    state = data.default_root_state.clone()
+    state[1, 7:] = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    thing.write_root_state_to_sim(state)
+    thing.write_joint_position_to_sim(data.default_joint_pos)
+    sim.forward()
+    torch.testing.assert_close(data.root_link_pos_w[1], torch.tensor([1.0, 2.0, 3.0]))
+    torch.testing.assert_close(data.root_link_vel_w[1], state[1, 7:])
+    torch.testing.assert_close(data.root_com_lin_vel_w, data.body_com_lin_vel_w[:, 1])
+    assert data.joint_pos[0].tolist() == [0.5, -0.5]
+
+
+def test_a_block_before_the_robot_is_not_its_root(kit):
     xml = """<mujoco><worldbody>
-      <body name="door"><joint name="hinge"/><geom size=".1"/></body>
-      <body name="ball"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
-    with pytest.raises(ValueError, match="'ball' comes after the joint 'hinge' of body 'door'"):
-        kit.cfg(xml).build()
+      <body name="block" pos="2 0 .5"><geom size=".1"/></body>
+      <body name="robot" pos="0 0 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    sim, scene = kit.make(1, robot=kit.cfg(xml))
+    sim.data.qvel[0, :3] = torch.tensor([0.0, 0.0, -3.0])
+    sim.forward()
+    data = scene["robot"].data
+    assert data.root_link_pos_w[0].tolist() == [0.0, 0.0, 1.0]
+    assert data.root_link_lin_vel_b[0].tolist() == [0.0, 0.0, -3.0]
+    assert data.heading_w.shape == (1,)
 
 
-def test_ball_joints_are_refused(kit):
-    xml = """<mujoco><worldbody><body><joint name="socket" type="ball"/><geom size=".1"/>
+def test_ball_joints_are_passive(kit):
+    xml = """<mujoco><worldbody><body name="arm"><joint name="socket" type="ball"/>
+      <geom size=".1" pos=".2 0 0"/>
+      <body><joint name="hinge" axis="0 1 0"/><geom size=".1" pos=".1 0 0"/></body>
       </body></worldbody></mujoco>"""
-    with pytest.raises(ValueError, match=r"ball joints.*\['socket'\].*three hinges"):
-        kit.cfg(xml).build()
+    cfg = kit.cfg(xml, init_state=InitialState(joint_pos={"hinge": 0.5}))
+    with pytest.warns(UserWarning, match=r"ball joints \['socket'\]"):
+        sim, scene = kit.make(2, arm=cfg)
+    arm = scene["arm"]
+    assert arm.joint_names == ("hinge",)
+    assert arm.all_joint_names == ("socket", "hinge")
+    np.testing.assert_allclose(sim.mj_model.key("init_state").qpos, [1, 0, 0, 0, 0.5])
+    arm.write_joint_position_to_sim(arm.data.default_joint_pos)
+    assert sim.data.qpos[1].tolist() == [1.0, 0.0, 0.0, 0.0, 0.5]
+    assert arm.data.joint_vel.shape == (2, 1)
+
+
+def test_dropped_elements_are_named(kit):
+    def spec_fn():
+        spec = mujoco.MjSpec.from_string(kit.ROBOT)
+        spec.add_actuator(name="motor", target="hip")
+        spec.add_exclude(name="pair", bodyname1="base", bodyname2="nobody")
+        return spec
+
+    motor = BuiltinMotorActuatorCfg(target_names_expr=("knee",), effort_limit=1.0)
+    with pytest.warns(UserWarning, match=r"actuators \['motor'\], excludes \['pair'\].*trntype"):
+        _, scene = kit.make(1, robot=EntityCfg(spec_fn=spec_fn, articulation=actuated(motor)))
+    assert scene["robot"].actuator_names == ("knee",)
 
 
 def test_joints_without_a_name_work(kit):

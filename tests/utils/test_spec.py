@@ -8,6 +8,7 @@ import pytest
 
 from mjlab.utils.spec import (
     auto_wrap_fixed_base_mocap,
+    compile_composed,
     copy_material_data,
     copy_mesh_data,
     copy_texture_data,
@@ -130,6 +131,39 @@ def test_the_wrap_keeps_options_keyframes_and_the_rest():
     np.testing.assert_array_equal(wrapped.jnt_range, direct.jnt_range)
     np.testing.assert_array_equal(wrapped.dof_damping, direct.dof_damping)
     assert wrapped.opt.timestep == 0.01
+
+
+ANCHORED = """<mujoco model="anchored"><worldbody>
+  <geom name="table" type="box" size=".1 .1 .1"/><site name="hook" pos=".3 0 1"/>
+  <camera name="eye" mode="targetbody" target="world" pos="1 0 0"/>
+  <body name="a" pos="0 0 1"><joint name="j" axis="0 1 0"/><geom size=".05"/>
+    <site name="tip" pos=".3 0 0"/></body></worldbody>
+  <equality><connect name="pin" body1="a" anchor=".3 0 0"/><weld name="glue" body1="world" body2="a"/>
+    <connect name="sites" site1="tip" site2="hook"/><joint name="lock" joint1="j"/></equality>
+  <contact><exclude name="no" body1="world" body2="a"/></contact>
+  <sensor><framepos name="from" objtype="body" objname="a" reftype="body" refname="world"/>
+    <subtreecom name="all" body="world"/></sensor></mujoco>"""
+
+
+def test_the_mocap_base_takes_the_place_of_the_world():
+    alone = mujoco.MjModel.from_xml_string(ANCHORED)
+    model = compile_composed(
+        auto_wrap_fixed_base_mocap(lambda: mujoco.MjSpec.from_string(ANCHORED))()
+    )
+    base = model.body("mocap_base").id
+    body_equalities = model.eq_objtype == mujoco.mjtObj.mjOBJ_BODY.value
+    ends = zip(
+        model.eq_obj1id[body_equalities][:2], model.eq_obj2id[body_equalities][:2], strict=True
+    )
+    assert [tuple(map(int, pair)) for pair in ends] == [(base + 1, base), (base, base + 1)]
+    assert model.exclude_signature[0] == (base << 16) + base + 1
+    data, data_alone = mujoco.MjData(model), mujoco.MjData(alone)
+    data.mocap_pos[0] = (3, -2, 1)
+    for m, d in ((model, data), (alone, data_alone)):
+        d.qpos[:] = 0.2
+        mujoco.mj_forward(m, d)
+    np.testing.assert_allclose(data.efc_pos, data_alone.efc_pos, atol=1e-12)
+    np.testing.assert_allclose(data.sensor("from").data, data_alone.sensor("from").data, atol=1e-12)
 
 
 def test_an_empty_spec_becomes_a_lone_mocap_body():

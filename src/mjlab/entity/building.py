@@ -18,7 +18,7 @@ from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
 from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS, XmlActuatorCfg
 from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.mujoco import control_inputs, qpos_width
-from mjlab.utils.spec import authored_position
+from mjlab.utils.spec import authored_position, compile_composed
 from mjlab.utils.string import compile_pattern, resolve_expr
 
 KEY_NAME = "init_state"
@@ -27,6 +27,9 @@ BIT_FIELDS = ("disableflags", "enableflags", "disableactuator")
 
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _BALL = mujoco.mjtJoint.mjJNT_BALL
+
+# Elements that refer to others by name.
+_REFERRING = ("tendons", "actuators", "sensors", "equalities", "pairs", "excludes")
 
 # Order of MuJoCo's MJOPTION_FIELDS (mjxmacro.h), and of the bits in `spec.authored.option`. A bit
 # tells an explicitly authored value from a default.
@@ -66,14 +69,31 @@ _AUTHORED_ORDER = (
 def copy_spec(spec: Any, function: str) -> mujoco.MjSpec:
     """Return a copy of a spec returned by the user's `function`; raise `ValueError` for other types.
 
-    A copy, because editors and scenes modify the spec, and the function may return the same one twice.
+    A copy, because editors and scenes modify the spec, and the function may return the same one
+    twice. Copies omit elements that refer to nothing, such as actuators without `trntype`: a warning
+    names them.
     """
     if not isinstance(spec, mujoco.MjSpec):
         raise ValueError(
             f"{function}: expected it to return mujoco.MjSpec, got {type(spec).__name__}; use e.g. "
             "mujoco.MjSpec.from_file(path)."
         )
-    return spec.copy()
+    copy = spec.copy()
+    lost = []
+    for kind in _REFERRING:
+        kept = [element.name for element in getattr(copy, kind)]
+        own = [element.name for element in getattr(spec, kind)]
+        if len(kept) < len(own):
+            lost.append(f"{kind} {[name for name in own if name not in kept] or '(unnamed)'}")
+    if lost:
+        warnings.warn(
+            f"Spec {spec.modelname!r}: dropped {', '.join(lost)}, because they refer to elements that "
+            "are not in the spec, or have no `trntype`; correct the names, and set e.g. "
+            "actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT.",
+            UserWarning,
+            stacklevel=2,
+        )
+    return copy
 
 
 # Simulation options. A scene has one `<option>`, and attaching a spec drops the `<option>` of that
@@ -131,16 +151,43 @@ def write_option(option: Any, name: str, value: Any) -> None:
         setattr(option, name, value)
 
 
+# Statements of the XML that attaching drops.
+
+
+def scale_to_total_mass(spec: mujoco.MjSpec) -> None:
+    """Apply `settotalmass` of `<compiler>`: scale all masses and inertias, and clear it.
+
+    The other compiler settings belong to the elements, which keep them when they are attached.
+    """
+    total = spec.compiler.settotalmass
+    if total <= 0:
+        return
+    spec.compiler.settotalmass = -1
+    scale = total / compile_composed(spec.copy()).body_mass.sum()
+    spec.compiler.boundmass *= scale
+    spec.compiler.boundinertia *= scale
+    for body in spec.bodies:
+        body.mass *= scale
+        body.inertia *= scale
+        body.fullinertia *= scale
+        for geom in body.geoms:
+            # A geom has a mass or a density; a mass that is not given is NaN.
+            geom.mass *= scale
+            geom.density *= scale
+
+
 # Joints, root body and names.
 
 
 def find_joints(
     spec: mujoco.MjSpec,
 ) -> tuple[mujoco.MjsJoint | None, tuple[mujoco.MjsJoint, ...]]:
-    """Return the free joint of `spec` (or None) and the other joints. Names an unnamed free joint.
+    """Return the free joint of `spec` (or None) and its hinges and slides. Names a free joint.
+
+    Ball joints are passive: they are left out, with a warning.
 
     Raises:
-        ValueError: several free joints, a free joint that is not the first joint, or ball joints.
+        ValueError: several free joints.
     """
     joints = tuple(spec.joints)
     free = [joint for joint in joints if joint.type == _FREE]
@@ -149,21 +196,20 @@ def find_joints(
             f"Spec {spec.modelname!r}: expected at most one free joint, got {len(free)}, of the bodies "
             f"{[joint.parent.name for joint in free]}; make each floating body a separate entity."
         )
-    if free and joints[0] is not free[0]:
-        raise ValueError(
-            f"The free joint of body {free[0].parent.name!r} comes after the joint "
-            f"{joints[0].name!r} of body {joints[0].parent.name!r}. The free joint must be the "
-            "first joint of an entity; put its body first, or make it a separate entity."
-        )
     balls = [joint.name or f"(unnamed, of {joint.parent.name!r})" for joint in joints
              if joint.type == _BALL]  # fmt: skip
     if balls:
-        raise ValueError(
-            f"Spec {spec.modelname!r}: ball joints are not supported, got {balls}; use three hinges."
+        warnings.warn(
+            f"Spec {spec.modelname!r}: ball joints {balls} are passive: joint names, positions, "
+            "targets and initial states leave them out, and resets return them to their reference; "
+            "use three hinges for a joint to observe or drive.",
+            UserWarning,
+            stacklevel=2,
         )
     if free and not free[0].name:
         free[0].name = "floating_base_joint"
-    return (free[0] if free else None), tuple(joint for joint in joints if joint.type != _FREE)
+    scalar = tuple(joint for joint in joints if joint.type not in (_FREE, _BALL))
+    return (free[0] if free else None), scalar
 
 
 def place_body(body: mujoco.MjsBody, pose: tuple[float, ...]) -> None:
@@ -365,6 +411,8 @@ class XmlKey:
     name: str
     qpos: tuple[float, ...]
     ctrl: tuple[float, ...]
+    root_pos: tuple[float, ...] | None
+    """Position of the free joint."""
 
 
 @dataclass(frozen=True)
@@ -376,7 +424,7 @@ class InitialState:
     joint_pos: tuple[float, ...]
     joint_vel: tuple[float, ...]
     qpos: dict[mujoco.MjsJoint, tuple[float, ...]]
-    """`qpos` of each joint, a free joint included, in spec order."""
+    """`qpos` of each joint but ball joints, a free joint included, in spec order."""
     ctrl: dict[mujoco.MjsActuator, tuple[float, ...]]
     """Controls of each actuator, in spec order."""
 
@@ -390,7 +438,12 @@ def pop_keyframes(spec: mujoco.MjSpec) -> XmlKey | None:
     keys = list(spec.keys)
     if not keys:
         return None
-    first = XmlKey(keys[0].name, tuple(keys[0].qpos), tuple(keys[0].ctrl))
+    qpos = tuple(keys[0].qpos)
+    widths = [qpos_width(joint.type) for joint in spec.joints]
+    free = [i for i, joint in enumerate(spec.joints) if joint.type == _FREE]
+    start = sum(widths[: free[0]]) if free else 0
+    root_pos = qpos[start : start + 3] if free and len(qpos) == sum(widths) else None
+    first = XmlKey(keys[0].name, qpos, tuple(keys[0].ctrl), root_pos)
     if len(keys) > 1:
         warnings.warn(
             f"Spec {spec.modelname!r} has {len(keys)} keyframes: "
@@ -435,7 +488,7 @@ def resolve_initial_state(
         root_state=pose if free_joint is None else (*pose, *velocity),
         joint_pos=positions,
         joint_vel=tuple(map(float, resolve_expr(init.joint_vel, names, 0.0))),
-        qpos={joint: values.get(joint, pose) for joint in spec.joints},
+        qpos={joint: values.get(joint, pose) for joint in spec.joints if joint.type != _BALL},
         ctrl=_initial_ctrl(spec, joints, positions, xml_key),
     )
 

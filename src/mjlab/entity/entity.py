@@ -25,6 +25,7 @@ from mjlab.entity.building import (
     pop_keyframes,
     pop_options,
     resolve_initial_state,
+    scale_to_total_mass,
     short_names,
 )
 from mjlab.entity.data import EntityData, as_values, assign
@@ -125,14 +126,16 @@ class Entity:
         """Build the entity's spec: user spec, editors, actuators, initial keyframe.
 
         Raises:
-            ValueError: the spec has several free joints, a free joint that is not its first joint,
-                or ball joints; patterns of actuators or editors do not resolve.
+            ValueError: the spec has several free joints; patterns of actuators or editors do not
+                resolve.
         """
         self.cfg = cfg
         spec = self._make_spec()
+        scale_to_total_mass(spec)
         self.options = pop_options(spec)
         """Simulation options stated in the entity's XML. The scene decides whether to apply them."""
-        xml_key = pop_keyframes(spec)
+        self.xml_key = pop_keyframes(spec)
+        """First keyframe of the entity's XML."""
         self._spec = self._placeable(spec)
         self._spec_to_write = self._spec
         self._free_joint, self._joints = find_joints(self._spec)
@@ -152,7 +155,7 @@ class Entity:
             cfg.sort_actuators,
         )
         self.initial_state = resolve_initial_state(
-            self._spec, self._free_joint, self._joints, xml_key, cfg.init_state
+            self._spec, self._free_joint, self._joints, self.xml_key, cfg.init_state
         )
         """Configured initial state, resolved for this entity's joints and actuators."""
         if self._free_joint is None:
@@ -199,13 +202,13 @@ class Entity:
 
     @property
     def joints(self) -> tuple[mujoco.MjsJoint, ...]:
-        """Joints in spec order, without a free joint."""
+        """Hinges and slides in spec order."""
         return self._joints
 
     @property
     def root_body(self) -> mujoco.MjsBody:
-        """Root body: the first body; for a fixed base, the mocap body."""
-        return self._spec.bodies[1]
+        """Root body: the body of the free joint; for a fixed base, the mocap body."""
+        return self._spec.bodies[1] if self._free_joint is None else self._free_joint.parent
 
     @property
     def is_fixed_base(self) -> bool:
@@ -312,12 +315,12 @@ class Entity:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, without a free joint."""
+        """Names of the hinges and slides."""
         return short_names(self._joints)
 
     @property
     def all_joint_names(self) -> tuple[str, ...]:
-        """Names of all joints, a free joint included."""
+        """Names of all joints, with a free joint and ball joints."""
         return short_names(self._spec.joints)
 
     @property
@@ -374,7 +377,7 @@ class Entity:
 
     @property
     def num_joints(self) -> int:
-        """Number of joints, without a free joint."""
+        """Number of hinges and slides."""
         return len(self._joints)
 
     @property

@@ -48,9 +48,9 @@ class EntityIndexing:
     """
 
     bodies: tuple[mujoco.MjsBody, ...]
-    """Bodies without the world; the first is the root."""
+    """Bodies without the world. The root is the body of the free joint, else the first."""
     joints: tuple[mujoco.MjsJoint, ...]
-    """Joints without a free joint."""
+    """Hinges and slides."""
     geoms: tuple[mujoco.MjsGeom, ...]
     sites: tuple[mujoco.MjsSite, ...]
     tendons: tuple[mujoco.MjsTendon, ...]
@@ -166,7 +166,8 @@ def build_indexing(
 
     elements: dict[str, Any] = {kind: tuple(getattr(spec, kind)) for kind in _ID_FIELDS}
     elements["bodies"] = elements["bodies"][1:]
-    elements["joints"] = tuple(joint for joint in spec.joints if joint is not free_joint)
+    scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    elements["joints"] = tuple(joint for joint in spec.joints if joint.type in scalar)
     elements["actuators"] = tuple(spec.actuators) if is_actuated else None
     ids = {kind: element_ids(model, kind, found or ()) for kind, found in elements.items()}
     actuator_ids = ids["actuators"]
@@ -176,7 +177,7 @@ def build_indexing(
     free = [] if free_joint is None else element_ids(model, "joints", (free_joint,))
     geom_bodies = [int(model.geom_bodyid[i]) for i in ids["geoms"]]
     site_bodies = [int(model.site_bodyid[i]) for i in ids["sites"]]
-    root = ids["bodies"][0]
+    root = ids["bodies"][0] if not free else int(model.jnt_bodyid[free[0]])
     mocap_id = int(model.body_mocapid[root])
     return EntityIndexing(
         **elements,

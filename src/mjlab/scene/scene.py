@@ -21,6 +21,7 @@ import torch
 
 from mjlab.entity import Entity, EntityCfg
 from mjlab.entity.building import BIT_FIELDS, EntityOptions, add_key, stated_options, write_option
+from mjlab.scene.oddities import report_settings, warn_oddities
 from mjlab.sensor import (
     BuiltinSensor,
     CameraSensor,
@@ -37,7 +38,14 @@ from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
 from mjlab.utils.errors import UnknownNameError, check_count
 from mjlab.utils.indexing import EnvIds
 from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
-from mjlab.utils.spec import attach, compile_composed, export_spec, make_asset_paths_absolute
+from mjlab.utils.spec import (
+    attach,
+    compile_composed,
+    drop_references_to_world,
+    export_spec,
+    make_asset_paths_absolute,
+    pop_settings,
+)
 from mjlab.utils.state import stateful
 from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, Tabular, settings_of
@@ -92,6 +100,7 @@ class Scene(Tabular):
         self._spec = make_base_spec(scene_cfg.extent)
         self._terrain: TerrainEntity | None = None
         self._entities: dict[str, Entity] = {}
+        self._settings: dict[str, dict[str, Any]] = {}
         self._sensors: dict[str, Sensor[Any]] = {}
         self._sensor_context: SensorContext | None = None
         self._add_entities()
@@ -121,6 +130,8 @@ class Scene(Tabular):
         if scene_cfg.spec_fn is not None:
             scene_cfg.spec_fn(self._spec)
             self.entity_options = drop_overridden(self._spec.option, self.entity_options)
+        for name, settings in self._settings.items():
+            report_settings(name, settings, self._spec)
         add_key(self._spec, [entity.initial_state for entity in self._entities.values()])
         self._env_origins = torch.zeros(scene_cfg.num_envs, 3, dtype=torch.float32, device=device)
 
@@ -154,6 +165,16 @@ class Scene(Tabular):
         for key in list(entity.spec.keys):
             entity.spec.delete(key)
         make_asset_paths_absolute(entity.spec)
+        self._settings[name] = pop_settings(entity.spec)
+        dropped = drop_references_to_world(entity.spec)
+        if dropped:
+            warnings.warn(
+                f"Entity {name!r}: dropped {', '.join(dropped)}, because MuJoCo cannot attach them; "
+                "state the world as the second body of an equality, and a body of the entity in "
+                "a sensor.",
+                UserWarning,
+                stacklevel=4,
+            )
         attach(self._spec, entity.spec, prefix, self._spec.worldbody.add_frame())
 
     # Access.
@@ -328,6 +349,7 @@ class Scene(Tabular):
         cameras = [sensor for sensor in self._sensors.values() if isinstance(sensor, CameraSensor)]
         if rays or cameras:
             self._sensor_context = SensorContext(mj_model, model, data, cameras, rays, self._device)
+        warn_oddities(self, mj_model)
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Reset targets, delays, histories and sensors of `env_ids` (None: all)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+import operator
 import warnings
 from collections.abc import Callable, Collection
 from enum import Enum
@@ -31,6 +32,12 @@ _TRANSMISSIONS = {
     mujoco.MjsTendon: mujoco.mjtTrn.mjTRN_TENDON,
     mujoco.MjsSite: mujoco.mjtTrn.mjTRN_SITE,
 }
+_VISUAL_BLOCKS = ("global_", "headlight", "map", "quality", "rgba", "scale")
+_SIZES = ("memory", "nconmax", "njmax", "nuserdata") + tuple(
+    f"nuser_{kind}"
+    for kind in ("actuator", "body", "cam", "geom", "jnt", "sensor", "site", "tendon")
+)
+_BODIES = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
 _ON = mujoco.mjtLimited.mjLIMITED_TRUE
 _OFF = mujoco.mjtLimited.mjLIMITED_FALSE
 
@@ -63,6 +70,46 @@ def attach(
             logger.warning(message)
 
 
+def pop_settings(spec: mujoco.MjSpec) -> dict[str, Any]:
+    """Return visual settings, statistics and sizes other than MuJoCo's defaults, and reset them.
+
+    Keys are paths below the spec, such as "visual.map.znear". Attaching drops these settings, and
+    reports some of them as conflicts, without name and remedy.
+    """
+    default, found = mujoco.MjSpec(), {}
+    for path in _setting_paths():
+        initial, value = read_setting(default, path), read_setting(spec, path)
+        if not np.array_equal(value, initial, equal_nan=True):
+            found[path] = np.copy(value) if isinstance(value, np.ndarray) else value
+    write_settings(spec, {path: read_setting(default, path) for path in found})
+    for block in _VISUAL_BLOCKS:
+        setattr(spec.authored, f"visual_{block.rstrip('_')}", 0)
+    return found
+
+
+def read_setting(spec: mujoco.MjSpec, path: str) -> Any:
+    """Return the value of a path of `pop_settings`."""
+    return operator.attrgetter(path)(spec)
+
+
+def write_settings(spec: mujoco.MjSpec, values: dict[str, Any]) -> None:
+    """Write values by path; see `pop_settings`."""
+    for path, value in values.items():
+        block, _, name = path.rpartition(".")
+        setattr(read_setting(spec, block) if block else spec, name, value)
+
+
+@functools.cache
+def _setting_paths() -> tuple[str, ...]:
+    spec = mujoco.MjSpec()
+    blocks = (*(f"visual.{block}" for block in _VISUAL_BLOCKS), "stat")
+    return (
+        *(f"{block}.{name}" for block in blocks for name in dir(read_setting(spec, block))
+          if not name.startswith("_")),
+        *_SIZES,
+    )  # fmt: skip
+
+
 def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Compile a spec, suppressing MuJoCo's warning about empty prefixes; see `attach`."""
     with warnings.catch_warnings():
@@ -92,8 +139,9 @@ def auto_wrap_fixed_base_mocap(
     """Wrap `spec_fn` such that fixed bases are attached to a mocap body.
 
     A spec without a free joint whose first body is not a mocap body is attached to a new mocap body
-    `mocap_base`, so that each environment can place it by its mocap pose. Options, model name and
-    keyframes of the spec are kept. Other specs are returned unchanged.
+    `mocap_base`, so that each environment can place it by its mocap pose. References to the world
+    body become references to `mocap_base`, which takes its place. Options, model name and keyframes
+    of the spec are kept. Other specs are returned unchanged.
 
     The returned function raises `ValueError` if a spec to be wrapped contains a mocap body, because
     mocap bodies must be children of the world.
@@ -126,14 +174,65 @@ def _under_mocap_base(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     # Attaching drops the options; copied, because the scene reads the options of entities.
     for name in option_field_names():
         setattr(parent.option, name, getattr(spec.option, name))
+    write_settings(parent, pop_settings(child))
     base = parent.worldbody.add_body(name=MOCAP_BASE_NAME, mocap=True)
     for key in list(child.keys):
         child.delete(key)
     attach(parent, child, "", base.add_frame())
+    _refer_to_base(parent)
     for key in spec.keys:
         fields = ("name", "time", "qpos", "qvel", "act", "ctrl")
         parent.add_key(**{field: getattr(key, field) for field in fields})
     return parent
+
+
+def _refer_to_base(spec: mujoco.MjSpec) -> None:
+    """Replace the world body by the mocap base in all elements that refer to it."""
+
+    def replace(element: Any, field: str, *worlds: str) -> None:
+        if getattr(element, field) in worlds:
+            setattr(element, field, MOCAP_BASE_NAME)
+
+    for equality in _body_equalities(spec):
+        replace(equality, "name1", "world")
+        # Without a second body, MuJoCo takes the world.
+        replace(equality, "name2", "world", "")
+    for exclude in spec.excludes:
+        replace(exclude, "bodyname1", "world")
+        replace(exclude, "bodyname2", "world")
+    for sensor in spec.sensors:
+        if sensor.objtype in _BODIES:
+            replace(sensor, "objname", "world")
+        if sensor.reftype in _BODIES:
+            replace(sensor, "refname", "world")
+    for element in (*spec.cameras, *spec.lights):
+        replace(element, "targetbody", "world")
+
+
+def drop_references_to_world(spec: mujoco.MjSpec) -> list[str]:
+    """Delete what MuJoCo cannot attach with a prefix, and return its descriptions.
+
+    These are equalities with the world as first body, and sensors of the world. As second body, the
+    world is kept.
+    """
+    dropped = []
+    for equality in _body_equalities(spec):
+        if equality.name2 == "world":
+            equality.name2 = ""
+        if equality.name1 == "world":
+            dropped.append(f"equality {equality.name!r} of 'world' and {equality.name2!r}")
+            spec.delete(equality)
+    for sensor in spec.sensors:
+        is_contact = sensor.type == mujoco.mjtSensor.mjSENS_CONTACT
+        if sensor.objtype in _BODIES and sensor.objname == "world" and not is_contact:
+            dropped.append(f"sensor {sensor.name!r} of 'world'")
+            spec.delete(sensor)
+    return dropped
+
+
+def _body_equalities(spec: mujoco.MjSpec) -> list[mujoco.MjsEquality]:
+    links = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+    return [one for one in spec.equalities if one.type in links and one.objtype in _BODIES]
 
 
 def get_free_joint(spec: mujoco.MjSpec) -> mujoco.MjsJoint | None:

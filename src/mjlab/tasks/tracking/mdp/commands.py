@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from mjlab.compat import older_names
+from mjlab.entity.building import short_name
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.lookup import Lookup
 from mjlab.managers.term_checks import check_range, require_entity
@@ -576,9 +577,10 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
             f"body_names: expected bodies of entity {cfg.entity_name!r}, got {missing}. Available: "
             f"{list(robot.body_names)}."
         )
-    if cfg.body_names[0] != robot.body_names[0]:
+    root = short_name(robot.root_body.name)
+    if cfg.body_names[0] != root:
         raise ValueError(
-            f"body_names: expected the floating base {robot.body_names[0]!r} first, got "
+            f"body_names: expected the floating base {root!r} first, got "
             f"{cfg.body_names[0]!r}. Episodes start from its pose."
         )
     return robot

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import accepts_older_params, older_names
+from mjlab.entity.building import short_name
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.managers import RewardTermCfg, SceneEntityCfg
 from mjlab.managers.term_checks import checked_when_built, require_command
@@ -196,7 +197,7 @@ def single_body(
         names = [entity.body_names[i] for i in chosen]
         raise ValueError(
             f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
-            f"body_names for the root {entity.body_names[0]!r}."
+            f"body_names for the root {short_name(entity.root_body.name)!r}."
         )
     return int(chosen[0])
 

@@ -1,0 +1,209 @@
+"""Warnings about files of entities that state what a composed scene does not follow."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from mjlab.entity.building import KEY_NAME, short_name
+from mjlab.entity.indexing import element_ids
+from mjlab.utils.spec import read_setting
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.scene.scene import Scene
+
+# Depth of an initial contact that is a mistake (m). The feet of Go1 start 0.016 m deep.
+_DEEP = 0.03
+
+_LINKS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+_BODY, _PLANE = int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtGeom.mjGEOM_PLANE)
+
+logger = logging.getLogger(__name__)
+
+
+def report_settings(name: str, stated: dict[str, Any], spec: mujoco.MjSpec) -> None:
+    """Warn of sizes and camera settings of an entity's XML that the scene does not follow.
+
+    Other visual settings are logged at level INFO: the scene has a look of its own.
+
+    Args:
+        name: Name of the entity.
+        stated: Settings of its XML; see `pop_settings`.
+        spec: Spec of the scene.
+    """
+    for path, value in stated.items():
+        kept = read_setting(spec, path)
+        if np.array_equal(kept, value, equal_nan=True) or path.startswith("nuser_"):
+            # MuJoCo computes the number of user values from the elements.
+            continue
+        place = f"sim.{path}" if path in ("njmax", "nconmax") else f"spec.{path}"
+        message = (
+            f"Entity {name!r}: {path} is {_show(kept)} in the scene, not {_show(value)} as in the XML; "
+            f"to follow it, set {place} = {_show(value)}"
+            + ("." if place.startswith("sim") else " in SceneCfg.spec_fn.")
+        )
+        if path.startswith(("visual.map", "n", "memory")):
+            warnings.warn(message, UserWarning, stacklevel=3)
+        else:
+            logger.info(message)
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"({', '.join(map(_show, value.tolist()))})"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def warn_oddities(scene: Scene, model: mujoco.MjModel) -> None:
+    """Warn once of each oddity. Call with bound entities and their compiled model."""
+    entities = {n: entity for n, entity in scene.entities.items() if entity is not scene.terrain}
+    data = _initial_data(scene, entities, model)
+    grounds = [] if scene.terrain is None else ["the terrain"]
+    for name, entity in entities.items():
+        if scene.env_origins.any():
+            _warn_world_elements(name, entity, model)
+        if entity.is_fixed_base:
+            _warn_passed_geoms(name, entity, model, data)
+        else:
+            _warn_buried(name, entity, model, data)
+        grounds += [
+            f"geom {short or '(unnamed)'!r} of entity {name!r}"
+            for short, geom in zip(entity.geom_names, entity.indexing.geom_ids, strict=True)
+            if _is_level_plane(model, geom) and model.geom_contype[geom]
+        ]
+    if len(grounds) > 1:
+        _warn(
+            f"The scene has {len(grounds)} grounds, {' and '.join(grounds)}, and robots touch all of "
+            "them; remove the planes from the XML, or set SceneCfg.terrain=None."
+        )
+
+
+def _initial_data(
+    scene: Scene, entities: dict[str, Entity], model: mujoco.MjModel
+) -> mujoco.MjData:
+    """Return the configured initial state at the origin of the first environment."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key(KEY_NAME).id)
+    origin = scene.env_origins[0].cpu().numpy()
+    data.mocap_pos += origin
+    for entity in entities.values():
+        if not entity.is_fixed_base:
+            data.qpos[entity.indexing.free_joint_q_adr[:3].cpu().numpy()] += origin
+    mujoco.mj_fwdPosition(model, data)
+    return data
+
+
+def _warn_world_elements(name: str, entity: Entity, model: mujoco.MjModel) -> None:
+    """Warn of elements in the world: all environments share them.
+
+    Level planes reach all environments; cameras and lights may show several.
+    """
+    ix, spec = entity.indexing, entity.spec
+    fixed = {
+        "bodies": [
+            body.name
+            for body, i in zip(spec.bodies[1:], ix.body_ids, strict=True)
+            if model.body_parentid[i] == 0 and i != ix.root_body_id
+        ],
+        "geoms": [
+            geom.name
+            for geom, i in zip(spec.geoms, ix.geom_ids, strict=True)
+            if model.geom_bodyid[i] == 0 and not _is_level_plane(model, i)
+        ],
+        "sites": [
+            site.name
+            for site, i in zip(spec.sites, ix.site_ids, strict=True)
+            if model.site_bodyid[i] == 0
+        ],
+        "equalities": [
+            equality.name or f"of body {short_name(equality.name1)!r}"
+            for equality, i in zip(
+                spec.equalities, element_ids(model, "equalities", spec.equalities), strict=True
+            )
+            if model.eq_type[i] in _LINKS and model.eq_objtype[i] == _BODY
+            and 0 in (model.eq_obj1id[i], model.eq_obj2id[i])
+        ],
+    }  # fmt: skip
+    listed = [f"{kind} {_names(own)}" for kind, own in fixed.items() if own]
+    if listed:
+        _warn(
+            f"Entity {name!r}: {', '.join(listed)} are fixed to the world, so all environments share "
+            "them at the world's origin; move them to a separate entity, because each environment "
+            "places its own fixed bases, or to the terrain."
+        )
+
+
+def _warn_passed_geoms(
+    name: str, entity: Entity, model: mujoco.MjModel, data: mujoco.MjData
+) -> None:
+    """Warn of geoms of the XML's world that the links attached to it pass through.
+
+    MuJoCo filters contacts of a body with its parent, but not with the world, whose place the mocap
+    base takes. Links that touch the geoms initially are meant to overlap.
+    """
+    root, ids = entity.indexing.root_body_id, entity.indexing.geom_ids.tolist()
+    weld, parent = model.body_weldid, model.body_parentid
+    body = {i: int(model.geom_bodyid[i]) for i in ids}
+    links = [i for i in ids if weld[body[i]] != root and weld[parent[weld[body[i]]]] == root]
+    pairs = [
+        (i, j)
+        for i in ids
+        for j in links
+        if body[i] == root
+        and (
+            model.geom_contype[i] & model.geom_conaffinity[j]
+            or model.geom_contype[j] & model.geom_conaffinity[i]
+        )
+        and mujoco.mj_geomDistance(model, data, i, j, _DEEP, None) > 0
+    ]
+    if pairs:
+        geoms = dict.fromkeys(model.geom(i).name for i, _ in pairs)
+        bodies = dict.fromkeys(model.body(body[j]).name for _, j in pairs)
+        _warn(
+            f"Entity {name!r}: bodies {_names(bodies)} pass through geoms {_names(geoms)} of the world "
+            "body, because a fixed base is one body with them, and a body does not touch its "
+            "parent; move these geoms to a separate entity, or to the terrain."
+        )
+
+
+def _warn_buried(name: str, entity: Entity, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Warn of a floating base whose initial state is deep in static geoms.
+
+    Objects without a configured position are placed by an event or a command.
+    """
+    pos, key = entity.cfg.init_state.pos, entity.xml_key
+    if not (any(pos) or entity.is_articulated or key):
+        return
+    depth = 0.0
+    for contact in data.contact[: data.ncon]:
+        bodies = [model.geom_bodyid[geom] for geom in contact.geom if geom >= 0]
+        is_own = entity.indexing.root_body_id in model.body_rootid[bodies]
+        if is_own and 0 in model.body_weldid[bodies]:
+            depth = max(depth, -float(contact.dist))
+    if depth > _DEEP:
+        known = key is not None and key.root_pos not in (None, tuple(pos))
+        hint = f" (keyframe {key.name!r} of the XML has {key.root_pos})" if known else ""
+        _warn(
+            f"Entity {name!r}: the initial state is {depth:.3f} m deep in the ground; set "
+            f"init_state.pos, now {tuple(pos)}{hint}."
+        )
+
+
+def _is_level_plane(model: mujoco.MjModel, geom: int) -> bool:
+    """Return True for a plane that is the same in all environments."""
+    x, y = model.geom_quat[geom][1:3]
+    return int(model.geom_type[geom]) == _PLANE and abs(x) + abs(y) < 1e-6
+
+
+def _names(names: Iterable[str]) -> str:
+    return str([short_name(name) or "(unnamed)" for name in names])
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=5)

@@ -1,0 +1,204 @@
+"""Statements of an entity's file that a scene cannot follow: each is one warning, or it is right."""
+
+from __future__ import annotations
+
+import logging
+import re
+import warnings
+
+import mujoco
+import pytest
+import torch
+
+from mjlab.entity import EntityCfg
+from mjlab.scene import Scene, SceneCfg
+from mjlab.sim import Simulation, SimulationCfg
+from mjlab.terrains import TerrainEntityCfg
+
+PLANE = TerrainEntityCfg(terrain_type="plane")
+FLOOR = '<geom name="floor" type="plane" size="0 0 1"/>'
+BALL = '<body name="ball" pos="0 0 1"><freejoint/><geom name="hull" size=".1"/></body>'
+LINK = (
+    '<body name="link" pos="0 0 1"><joint name="slide" type="slide" axis="0 0 1"/>'
+    '<geom name="bob" size=".1"/></body>'
+)
+HIGH = EntityCfg.InitialStateCfg(pos=(0.0, 0.0, 1.0))
+
+
+def thing(world: str, rest: str = "", **fields) -> EntityCfg:
+    xml = f'<mujoco model="thing">{rest}<worldbody>{world}</worldbody></mujoco>'
+    return EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(xml), **fields)
+
+
+def build(*entities: EntityCfg, num_envs: int = 3, terrain=PLANE, **fields):
+    """Return the simulation, the scene and the warnings of building them."""
+    named = {f"thing_{k}": cfg for k, cfg in enumerate(entities)}
+    cfg = SceneCfg(num_envs=num_envs, terrain=terrain, entities=named, env_spacing=3.0, **fields)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = Scene(cfg, device="cpu")
+        sim = Simulation(num_envs, SimulationCfg(), spec=scene.spec, device="cpu")
+        scene.initialize(sim.mj_model, sim.model, sim.data)
+    return sim, scene, [str(one.message) for one in caught if one.category is UserWarning]
+
+
+# The world of a file.
+
+TO_WORLD = {
+    "connect": '<equality><connect body1="{body}" anchor="0 0 0"/></equality>',
+    "weld": '<equality><weld body1="{body}"/></equality>',
+    "weld to a named world": '<equality><weld body1="{body}" body2="world"/></equality>',
+    "sites": '<equality><connect site1="tip" site2="hook"/></equality>',
+}
+
+
+def with_sites(body: str) -> str:
+    return body.replace("</body>", '<site name="tip"/></body>') + '<site name="hook" pos="0 0 1"/>'
+
+
+@pytest.mark.parametrize("kind", TO_WORLD)
+def test_fixed_bases_hold_equalities_everywhere(kind):
+    world = with_sites(LINK) if kind == "sites" else LINK
+    cfg = thing(world, TO_WORLD[kind].format(body="link"))
+    sim, scene, said = build(cfg)
+    assert not said
+    pose = scene["thing_0"].data.default_root_state.clone()
+    pose[:, :3] += scene.env_origins
+    scene["thing_0"].write_mocap_pose_to_sim(pose)
+    sim.step(100)
+    assert scene.env_origins[:, 0].tolist() == [3.0, 0.0, -3.0]
+    torch.testing.assert_close(
+        scene["thing_0"].data.joint_pos, torch.zeros(3, 1), atol=1e-2, rtol=0.0
+    )
+
+
+@pytest.mark.parametrize("kind", TO_WORLD)
+def test_floating_bases_tied_to_the_world_warn_once(kind):
+    world = with_sites(BALL) if kind == "sites" else BALL
+    cfg = thing(world, TO_WORLD[kind].format(body="ball"), init_state=HIGH)
+    _, _, said = build(cfg)
+    assert len(said) == 1
+    assert re.search("'thing_0'.*" + ("'hook'" if kind == "sites" else "of body 'ball'"), said[0])
+    assert not build(cfg, num_envs=1)[2]
+    assert not build(cfg, terrain=None)[2]
+
+
+def test_references_with_the_world_first_are_named():
+    sensor = '<sensor><subtreecom name="all" body="world"/></sensor>'
+    weld = '<equality><weld name="glue" body1="world" body2="{}"/></equality>'
+    _, scene, said = build(thing(BALL, weld.format("ball") + sensor, init_state=HIGH))
+    assert len(said) == 1
+    assert re.search("'thing_0'.*equality 'glue'.*sensor 'all'", said[0])
+    sim, _, said = build(thing(LINK, weld.format("link") + sensor))
+    assert not said
+    assert (sim.mj_model.neq, sim.mj_model.nsensor) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("world", "named"),
+    [
+        ('<geom name="step" size=".5"/>', "geoms ['step']"),
+        ('<body name="block"><geom size=".1"/></body>', "bodies ['block']"),
+        ('<body name="target" mocap="true"/>', "bodies ['target']"),
+        ('<site name="goal"/>', "sites ['goal']"),
+        ('<geom name="ramp" type="plane" size="1 1 1" euler="0 20 0"/>', "geoms ['ramp']"),
+    ],
+)
+def test_static_elements_of_floating_bases_warn_once(world, named):
+    for order in (world + BALL, BALL + world):
+        _, _, said = build(thing(order, init_state=HIGH))
+        assert len([text for text in said if named in text]) == len(said) == 1
+    if "mocap" not in world:
+        assert "fixed to the world" not in "".join(build(thing(world + LINK))[2])
+
+
+def test_links_that_pass_through_their_own_floor_warn():
+    _, _, said = build(thing(FLOOR + LINK), terrain=None)
+    assert len(said) == 1
+    assert "['link'] pass through geoms ['floor']" in said[0]
+    # What overlaps from the beginning is meant to.
+    assert not build(thing('<geom size=".5" pos="0 0 1"/>' + LINK), terrain=None)[2]
+
+
+def test_excludes_of_the_world_hold_in_the_scene():
+    leg = LINK.replace(
+        "</body>", '<body name="leg"><joint axis="0 1 0"/><geom size=".2"/></body></body>'
+    )
+    table = '<geom name="table" size=".3" pos="0 0 1"/>'
+    exclude = '<contact><exclude body1="world" body2="leg"/></contact>'
+    for rest, count in (("", 1), (exclude, 0)):
+        sim, _, _ = build(thing(table + leg, rest), num_envs=1, terrain=None)
+        data = mujoco.MjData(sim.mj_model)
+        mujoco.mj_forward(sim.mj_model, data)
+        assert data.ncon == count
+
+
+# Grounds and initial states.
+
+
+def test_a_second_ground_warns_once():
+    floor = thing(FLOOR + BALL, init_state=HIGH)
+    for cfgs, terrain in (((floor,), PLANE), ((floor, floor), None)):
+        _, _, said = build(*cfgs, terrain=terrain)
+        assert len(said) == 1
+        assert re.search("2 grounds.*'floor' of entity 'thing_0'", said[0])
+    assert not build(floor, terrain=None)[2]
+
+
+def test_a_robot_that_starts_in_the_ground_warns_with_the_depth():
+    leg = BALL.replace(
+        "</body>", '<body><joint name="hip"/><geom size=".05" pos="0 0 -.3"/></body></body>'
+    )
+    key = '<keyframe><key name="home" qpos="0 0 .35 1 0 0 0 0"/></keyframe>'
+    for joint_pos in ({}, None):
+        init = EntityCfg.InitialStateCfg(joint_pos=joint_pos)
+        _, _, said = build(thing(leg, key, init_state=init))
+        assert len(said) == 1
+        assert re.search("'thing_0'.*0.350 m.*'home'.*0.35", said[0])
+    init = EntityCfg.InitialStateCfg(pos=(0.0, 0.0, 0.35))
+    assert not build(thing(leg, key, init_state=init))[2]
+
+
+# Settings.
+
+
+@pytest.mark.parametrize("body", [BALL, LINK])
+@pytest.mark.parametrize(
+    ("block", "field", "assigned"),
+    [
+        (
+            '<visual><map znear="0.05"/></visual>',
+            "visual.map.znear",
+            "spec.visual.map.znear = 0.05",
+        ),
+        ('<size njmax="500"/>', "njmax", "sim.njmax = 500"),
+        ('<size nuserdata="5"/>', "nuserdata", "spec.nuserdata = 5"),
+        ('<size memory="1M"/>', "memory", "spec.memory = 1048576"),
+    ],
+)
+def test_a_conflict_names_field_value_and_remedy(body, block, field, assigned, caplog):
+    cfg = thing(body, block, init_state=HIGH)
+    _, _, said = build(cfg)
+    assert len(said) == 1
+    assert re.search(f"'thing_0'.*{field} is.*{re.escape(assigned)}", said[0])
+    assert not caplog.records
+
+
+def test_a_setting_of_the_scene_is_no_conflict():
+    def follow(spec: mujoco.MjSpec) -> None:
+        spec.visual.map.znear = 0.05
+
+    cfg = thing(BALL, '<visual><map znear="0.05"/></visual>', init_state=HIGH)
+    assert not build(cfg, spec_fn=follow)[2]
+    user = thing(BALL.replace("size", 'user="1 2" size'), '<size nuser_geom="2"/>', init_state=HIGH)
+    sim, _, said = build(user)
+    assert not said
+    assert sim.mj_model.geom("thing_0/hull").user.tolist() == [1.0, 2.0]
+
+
+def test_looks_of_an_entity_are_logged(caplog):
+    looks = '<statistic extent="2"/><visual><headlight ambient=".4 .4 .4"/></visual>'
+    with caplog.at_level(logging.INFO):
+        assert not build(thing(BALL, looks, init_state=HIGH))[2]
+    assert "visual.headlight.ambient = (0.4, 0.4, 0.4)" in caplog.text
+    assert "stat.extent = 2" in caplog.text
