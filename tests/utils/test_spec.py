@@ -141,8 +141,10 @@ ANCHORED = """<mujoco model="anchored"><worldbody>
   <equality><connect name="pin" body1="a" anchor=".3 0 0"/><weld name="glue" body1="world" body2="a"/>
     <connect name="sites" site1="tip" site2="hook"/><joint name="lock" joint1="j"/></equality>
   <contact><exclude name="no" body1="world" body2="a"/></contact>
-  <sensor><framepos name="from" objtype="body" objname="a" reftype="body" refname="world"/>
-    <subtreecom name="all" body="world"/></sensor></mujoco>"""
+  <sensor><subtreecom name="all" body="world"/><contact name="touch" body1="world" data="found"/>
+    <distance name="gap" body1="a" body2="world" cutoff="9"/>
+    <framezaxis name="up" objtype="body" objname="world" reftype="site" refname="tip"/>
+  </sensor></mujoco>"""
 
 
 def test_the_mocap_base_takes_the_place_of_the_world():
@@ -163,7 +165,16 @@ def test_the_mocap_base_takes_the_place_of_the_world():
         d.qpos[:] = 0.2
         mujoco.mj_forward(m, d)
     np.testing.assert_allclose(data.efc_pos, data_alone.efc_pos, atol=1e-12)
-    np.testing.assert_allclose(data.sensor("from").data, data_alone.sensor("from").data, atol=1e-12)
+    np.testing.assert_allclose(
+        data.sensor("all").data - (3, -2, 1), data_alone.sensor("all").data, atol=1e-12
+    )
+    for name in ("touch", "gap", "up"):
+        np.testing.assert_allclose(data.sensor(name).data, data_alone.sensor(name).data, atol=1e-12)
+    data.mocap_quat[0] = (0.8, 0.6, 0, 0)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(
+        data.sensor("up").data, data.site("tip").xmat.reshape(3, 3)[2], atol=1e-12
+    )
 
 
 def test_an_empty_spec_becomes_a_lone_mocap_body():

@@ -38,6 +38,12 @@ _SIZES = ("memory", "nconmax", "njmax", "nuserdata") + tuple(
     for kind in ("actuator", "body", "cam", "geom", "jnt", "sensor", "site", "tendon")
 )
 _BODIES = (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY)
+_GEOM_SENSORS = (
+    mujoco.mjtSensor.mjSENS_CONTACT,
+    mujoco.mjtSensor.mjSENS_GEOMDIST,
+    mujoco.mjtSensor.mjSENS_GEOMNORMAL,
+    mujoco.mjtSensor.mjSENS_GEOMFROMTO,
+)
 _ON = mujoco.mjtLimited.mjLIMITED_TRUE
 _OFF = mujoco.mjtLimited.mjLIMITED_FALSE
 
@@ -175,7 +181,10 @@ def _under_mocap_base(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     for name in option_field_names():
         setattr(parent.option, name, getattr(spec.option, name))
     write_settings(parent, pop_settings(child))
-    base = parent.worldbody.add_body(name=MOCAP_BASE_NAME, mocap=True)
+    # Without mass, as the world: geoms of the world have none.
+    base = parent.worldbody.add_body(
+        name=MOCAP_BASE_NAME, mocap=True, explicitinertial=True, mass=0.0
+    )
     for key in list(child.keys):
         child.delete(key)
     attach(parent, child, "", base.add_frame())
@@ -201,9 +210,11 @@ def _refer_to_base(spec: mujoco.MjSpec) -> None:
         replace(exclude, "bodyname1", "world")
         replace(exclude, "bodyname2", "world")
     for sensor in spec.sensors:
-        if sensor.objtype in _BODIES:
+        # Sensors of frames keep the world as their reference: it has the direction of gravity.
+        is_of_geoms = sensor.type in _GEOM_SENSORS
+        if is_of_geoms or _is_of_world(sensor):
             replace(sensor, "objname", "world")
-        if sensor.reftype in _BODIES:
+        if is_of_geoms:
             replace(sensor, "refname", "world")
     for element in (*spec.cameras, *spec.lights):
         replace(element, "targetbody", "world")
@@ -222,12 +233,14 @@ def drop_references_to_world(spec: mujoco.MjSpec) -> list[str]:
         if equality.name1 == "world":
             dropped.append(f"equality {equality.name!r} of 'world' and {equality.name2!r}")
             spec.delete(equality)
-    for sensor in spec.sensors:
-        is_contact = sensor.type == mujoco.mjtSensor.mjSENS_CONTACT
-        if sensor.objtype in _BODIES and sensor.objname == "world" and not is_contact:
-            dropped.append(f"sensor {sensor.name!r} of 'world'")
-            spec.delete(sensor)
+    for sensor in filter(_is_of_world, spec.sensors):
+        dropped.append(f"sensor {sensor.name!r} of 'world'")
+        spec.delete(sensor)
     return dropped
+
+
+def _is_of_world(sensor: mujoco.MjsSensor) -> bool:
+    return sensor.objname == "world" and sensor.refname in ("", "world")
 
 
 def _body_equalities(spec: mujoco.MjSpec) -> list[mujoco.MjsEquality]:
