@@ -14,6 +14,7 @@ import torch
 from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
 from mjlab.actuator.builtin_group import BuiltinActuatorGroup
 from mjlab.actuator.fused_group import FusedActuatorGroup
+from mjlab.actuator.position_hold import PositionHold
 from mjlab.entity.building import (
     Found,
     add_key,
@@ -46,7 +47,7 @@ class EntityArticulationInfoCfg:
 
     actuators: tuple[ActuatorCfg, ...] = ()
     """Actuators to add, or to take over from the XML. XML actuators that no config lists stay in
-    the model with zero control."""
+    the model with zero control; position actuators among them hold their length after a reset."""
     soft_joint_pos_limit_factor: float = 1.0
     """Range of the soft joint limits as a fraction of the joint range, about the same center."""
 
@@ -241,6 +242,11 @@ class Entity:
         return TransmissionType.SITE in {one.transmission_type for one in self._actuators}
 
     @property
+    def seeds_lengths(self) -> bool:
+        """True if `seed_position_targets` reads lengths of tendons or actuators."""
+        return self.has_tendon_actuators or bool(self._position_hold)
+
+    @property
     def variant_metadata(self) -> VariantInfo | None:
         """Variants and their assignment; None unless built from a `VariantEntityCfg`."""
         return None
@@ -273,6 +279,12 @@ class Entity:
         self._fused_group, self._own_actuators = FusedActuatorGroup.process(others)
         self._builtin_group.initialize(data.nworld, device)
         self._fused_group.initialize(data.nworld, device)
+        ids = [actuator.id for actuator in self._spec.actuators]
+        listed = {i for one in self._actuators for i in one.global_element_ids.tolist()}
+        self._position_hold = PositionHold(mj_model, data, ids, {*ids} - listed, device)
+        if self.has_tendon_actuators:
+            # Engines compute a field after its first access.
+            _ = self._data.tendon_len
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Set targets to zero and clear delays and histories. Reset events write the state."""
@@ -588,17 +600,23 @@ class Entity:
         _set_target(self.data.site_effort_target, effort, site_ids, env_ids, "site")
 
     def seed_position_targets(self, env_ids: EnvIds = None) -> None:
-        """Set joint position targets that are unset since the reset to the current positions.
+        """Set position targets that are unset since the reset to the current positions and lengths.
 
         A reset sets all targets to zero, so position actuators would pull toward zero until the
-        first action. Called after the reset events, this holds the joints where the events placed them.
+        first action. Called after the reset events, this holds joints and tendons where the events
+        placed them, and sets the controls of position actuators without a config. With
+        `seeds_lengths`, `sim.forward(env_ids, stage="pos")` must precede.
         """
-        target = self.data.joint_pos_target
-        if target.shape[1] == 0:
-            return
         rows = as_index(env_ids)
-        chosen = target[rows]
-        target[rows] = torch.where(chosen == 0.0, self.data.joint_pos[rows], chosen)
+        for target, current in (
+            (self.data.joint_pos_target, "joint_pos"),
+            (self.data.tendon_len_target, "tendon_len"),
+        ):
+            if target.shape[1] > 0:
+                chosen = target[rows]
+                target[rows] = torch.where(chosen == 0.0, getattr(self.data, current)[rows], chosen)
+        if self._position_hold:
+            self._position_hold.apply(env_ids)
 
     # State writers.
 

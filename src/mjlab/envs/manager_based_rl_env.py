@@ -641,6 +641,8 @@ class ManagerBasedRlEnv(Tabular):
                 env_ids=env_ids,
                 global_env_step_count=self._sim_step_counter // self.cfg.decimation,
             )
+        if any(entity.seeds_lengths for entity in self.scene.entities.values()):
+            self.sim.forward(env_ids, stage="pos")
         for entity in self.scene.entities.values():
             entity.seed_position_targets(env_ids)
         log = self.extras["log"]

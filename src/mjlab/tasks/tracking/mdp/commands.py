@@ -345,6 +345,8 @@ class MotionCommand(MotionReader, CommandTerm):
         robot.write_joint_state_to_sim(joint_pos, self.motion.joint_vel[at], env_ids=env_ids)
         robot.write_root_state_to_sim(root_state, env_ids=env_ids)
         robot.reset(env_ids)
+        if robot.seeds_lengths:
+            self._env.sim.forward(env_ids, stage="pos")
         robot.seed_position_targets(env_ids)
 
     def _count_failures(self, env_ids: torch.Tensor) -> None:
