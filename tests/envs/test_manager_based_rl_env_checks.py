@@ -91,72 +91,54 @@ def test_whole_numbers_of_numpy_are_whole_numbers():
 SLIDER = SceneEntityCfg("cartpole", joint_names="slider")
 
 
-def read_constant(env):
+def read_own(env):
     return env.scene["cartpole"].data.joint_pos[:, SLIDER.joint_ids].sum(dim=-1)
 
 
-def read_through_helper(env):
-    return read_constant(env)
+def read_constant(env):
+    return mdp.joint_vel_l2(env, SLIDER)
 
 
-class ReadsAttribute:
-    selection = SLIDER
-
-    def __init__(self, cfg, env):
-        pass
-
-    def __call__(self, env):
-        return env.scene["cartpole"].data.joint_pos[:, self.selection.joint_ids].sum(dim=-1)
+def read_new(env):
+    return mdp.joint_vel_l2(env, SceneEntityCfg("cartpole", joint_names=("slider",)))
 
 
-class ReadsAbsentParameter:
-    def __init__(self, cfg, env):
-        self.ids = cfg.params.get("asset_cfg", SLIDER).joint_ids
-
-    def __call__(self, env):
-        return torch.zeros(env.num_envs)
-
-
-def resolve_copy(env):
+def read_resolved(env):
     selection = copy.deepcopy(SLIDER)
     selection.resolve(env.scene)
-    return env.scene["cartpole"].data.joint_pos[:, selection.joint_ids].sum(dim=-1)
+    assert selection.joint_ids == [0]
+    return mdp.joint_vel_l2(env, selection)
 
 
-def assert_unresolved(cfg):
-    with pytest.raises(ValueError, match=r"'cartpole' joint_ids.*joint_names='slider'.*resolve"):
-        env = ManagerBasedRlEnv(cfg, device="cpu")
-        env.reset()
-        env.step(torch.zeros(NUM_ENVS, 1))
+def read_all(env):
+    return mdp.joint_vel_l2(env, SceneEntityCfg("cartpole", joint_names=".*"))
 
 
-@pytest.mark.parametrize(
-    "term", [read_constant, read_through_helper, ReadsAttribute, ReadsAbsentParameter]
-)
-def test_a_term_that_reads_unresolved_ids_is_an_error(term):
+def warnings_of(term):
     cfg = cartpole()
     cfg.rewards["new"] = RewardTermCfg(func=term, weight=1.0)
-    assert_unresolved(cfg)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        env.reset()
+        for _ in range(3):
+            env.step(torch.zeros(NUM_ENVS, 1))
+        env.close()
+    return [str(one.message) for one in caught if "SceneEntityCfg" in str(one.message)]
 
 
-@pytest.mark.parametrize("mode", ["startup", "reset", "interval"])
-def test_an_event_that_reads_unresolved_ids_is_an_error(mode):
-    cfg = cartpole()
-    interval = (0.0, 0.0) if mode == "interval" else None
-    cfg.events["new"] = EventTermCfg(
-        func=lambda env, env_ids: read_constant(env), mode=mode, interval_range_s=interval
-    )
-    assert_unresolved(cfg)
+@pytest.mark.parametrize("term", [read_constant, read_new])
+def test_unresolved_selection_warns_once(term):
+    SLIDER._read = frozenset()
+    (message,) = warnings_of(term)
+    assert "'cartpole' joint_ids" in message
+    assert "slider" in message
+    assert "every joint" in message
 
 
-def test_a_term_that_resolves_its_own_selection_runs():
-    cfg = cartpole()
-    cfg.rewards["new"] = RewardTermCfg(func=resolve_copy, weight=1.0)
-    env = ManagerBasedRlEnv(cfg, device="cpu")
-    env.reset()
-    env.step(torch.zeros(NUM_ENVS, 1))
-    env.close()
-    assert SLIDER.joint_ids == slice(None), "no term runs"
+@pytest.mark.parametrize("term", [read_own, read_resolved, read_all])
+def test_no_warning_where_ids_are_meant(term):
+    assert warnings_of(term) == []
 
 
 # The device.

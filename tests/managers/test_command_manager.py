@@ -312,8 +312,13 @@ class SelectingCfg(CountCfg):
 def test_selections_in_the_config_are_resolved_before_the_command_is_built(env):
     manager, term = make_selecting(env, "joint_b")
     assert term.cfg.asset_cfg.joint_ids == [1]
-    with pytest.raises(ValueError, match=r"term 'goal', field 'asset_cfg'.*knee"):
-        make_selecting(env, "knee")
+
+
+def test_selections_that_match_nothing_warn(env):
+    with pytest.warns(UserWarning, match=r"term 'goal', field 'asset_cfg'.*knee") as caught:
+        manager, term = make_selecting(env, "knee")
+    assert len(caught) == 1
+    assert term.cfg.asset_cfg.joint_ids == slice(None)
 
 
 def make_selecting(env, joint):

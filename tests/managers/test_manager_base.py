@@ -180,13 +180,27 @@ def test_selections_that_are_default_arguments_are_resolved(env, kind, term):
     assert DEFAULT.joint_ids == slice(None), "other environments use the default too"
 
 
-def test_a_default_argument_that_matches_nothing_is_an_error(env, kind):
+def test_default_argument_without_match_warns(env, kind):
     def knees(env, asset_cfg=SceneEntityCfg("robot", joint_names="knee")):  # noqa: B008
-        return env.value
+        return env.value if asset_cfg.joint_ids == slice(None) else None
 
     manager_class, make = kind
-    with pytest.raises(ValueError, match=r"term 'a', parameter 'asset_cfg'.*knee"):
-        manager_class({"a": make(knees)}, env)
+    with pytest.warns(UserWarning, match=r"term 'a'.*'asset_cfg'.*knee") as caught:
+        manager = manager_class({"a": make(knees)}, env)
+    assert len(caught) == 1
+    manager.compute(**({"dt": 0.1} if manager_class is RewardManager else {}))
+
+
+def test_nested_selection_without_match_warns(env, kind):
+    def knees(env, cfgs):
+        return env.value if cfgs["knee"].joint_ids == slice(None) else None
+
+    manager_class, make = kind
+    cfgs = {"knee": SceneEntityCfg("robot", joint_names="knee")}
+    with pytest.warns(UserWarning, match=r"term 'a'.*'cfgs'.*knee") as caught:
+        manager = manager_class({"a": make(knees, params={"cfgs": cfgs})}, env)
+    assert len(caught) == 1
+    manager.compute(**({"dt": 0.1} if manager_class is RewardManager else {}))
 
 
 def test_a_selection_that_fails_names_manager_term_and_parameter(env, kind):

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import pickle
+import warnings
 
+import mujoco
 import pytest
+import torch
 
+from mjlab.actuator import BuiltinPositionActuatorCfg, XmlActuatorCfg
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.managers import SceneEntityCfg
-from mjlab.managers.scene_entity_config import selections_checked
+from mjlab.managers.scene_entity_config import columns_of
 
 KINDS = (
     "joint",
@@ -135,53 +139,202 @@ def test_a_sensor_can_be_named_but_not_selected_from(env):
         SceneEntityCfg("camera", joint_names="a").resolve(env.scene)
 
 
-# Ids that were never resolved.
+def test_names_and_indices_in_another_order_agree(env):
+    cfg = SceneEntityCfg("robot", joint_names=("joint_c", "joint_a"), joint_ids=[2, 0])
+    cfg.resolve(env.scene)
+    assert cfg.joint_ids == [2, 0]
+
+
+@pytest.mark.parametrize("names", ["", ".*", ("",), ("leg", "")])
+def test_repeated_names_resolve_to_the_same_ids(env, names):
+    env.scene["robot"].geom_names = ("", "leg", "")
+    cfg = SceneEntityCfg("robot", geom_names=names)
+    cfg.resolve(env.scene)
+    once = copy.deepcopy(cfg)
+    for one in (cfg, copy.deepcopy(cfg), pickle.loads(pickle.dumps(cfg))):
+        one.resolve(env.scene)
+        assert one == once
+    assert once.geom_ids == ([0, 2] if set(names) <= {""} else slice(None))
+
+
+def test_a_failed_selection_is_unchanged(env):
+    cfg = SceneEntityCfg("robot", joint_names="joint_a", body_names="arm")
+    with pytest.raises(ValueError, match="arm"):
+        cfg.resolve(env.scene)
+    assert cfg == SceneEntityCfg("robot", joint_names="joint_a", body_names="arm")
+
+
+# Kinds that follow from others.
+
+LEGS = """
+<mujoco>
+  <worldbody>
+    <body name="trunk">
+      {joint}
+      <geom size=".1"/>
+      <site name="imu"/>
+      <body name="leg">
+        <joint name="hip"/>
+        <geom size=".1" name="thigh"/>
+        <geom size=".2"/>
+        <body name="shin">
+          <joint name="knee"/>
+          <joint name="ankle"/>
+          <geom size=".1"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="cable"><joint joint="hip" coef="1"/></fixed></tendon>
+  <actuator>
+    <motor name="pull" tendon="cable"/>
+    <motor name="bend" joint="knee"/>
+    <motor name="turn" joint="hip"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def legs(joint="<freejoint/>", actuators=None):
+    actuators = actuators or (
+        XmlActuatorCfg(target_names_expr=("knee", "hip")),
+        BuiltinPositionActuatorCfg(target_names_expr=("knee",), stiffness=1.0, damping=1.0),
+    )
+    cfg = EntityCfg(
+        spec_fn=lambda: mujoco.MjSpec.from_string(LEGS.format(joint=joint)),
+        articulation=EntityArticulationInfoCfg(actuators=actuators),
+    )
+    return {"robot": cfg.build()}
+
+
+def resolved(scene, **fields):
+    cfg = SceneEntityCfg("robot", **fields)
+    cfg.resolve(scene)
+    return cfg
+
+
+# Actuators: pull (a tendon), bend and the servo called knee (knee), turn (hip).
+@pytest.mark.parametrize("joint", ["<freejoint/>", ""])
+@pytest.mark.parametrize(
+    ("fields", "actuators"),
+    [
+        ({"joint_names": "hip"}, [2]),
+        ({"joint_names": ("hip", "knee")}, [1, 2, 3]),
+        ({"joint_names": ("knee", "hip"), "preserve_order": True}, [1, 3, 2]),
+        ({"joint_names": ".*"}, [1, 2, 3]),
+        ({"joint_names": "ankle"}, []),
+        ({"joint_names": ()}, []),
+        ({"joint_ids": [0]}, [2]),
+        ({"joint_ids": [-3]}, [2]),
+        ({"joint_ids": slice(0, 1)}, [2]),
+        ({"joint_ids": 0}, [2]),
+        ({"joint_ids": torch.tensor([0])}, [2]),
+        ({"joint_names": "hip", "actuator_names": ["pull"]}, [0]),
+        ({"joint_names": "hip", "actuator_ids": [0, 1]}, [0, 1]),
+        ({"body_names": "leg"}, slice(None)),
+        ({}, slice(None)),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*already have an actuator")
+def test_actuators_follow_from_joints(joint, fields, actuators):
+    scene = legs(joint)
+    cfg = resolved(scene, **fields)
+    assert cfg.actuator_ids == actuators
+    for again in (cfg, copy.deepcopy(cfg)):
+        again.resolve(scene)
+        assert again.actuator_ids == actuators
+
+
+@pytest.mark.parametrize("joint", ["<freejoint/>", ""])
+@pytest.mark.parametrize(
+    ("fields", "geoms"),
+    [
+        ({"body_names": "leg"}, [1, 2]),
+        ({"body_names": ("shin", "trunk"), "preserve_order": True}, [3, 0]),
+        ({"body_names": ("shin", "trunk")}, [0, 3]),
+        ({"body_names": ".*"}, slice(None)),
+        ({"body_ids": [-1]}, [3]),
+        ({"body_names": ()}, []),
+        ({"body_names": "leg", "geom_names": "thigh"}, [1]),
+        ({"body_names": "leg", "geom_ids": slice(0, 1)}, slice(0, 1)),
+        ({"joint_names": "hip"}, slice(None)),
+        ({"site_names": "imu"}, slice(None)),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*already have an actuator")
+def test_geoms_follow_from_bodies(joint, fields, geoms):
+    scene = legs(joint)
+    cfg = resolved(scene, **fields)
+    assert cfg.geom_ids == geoms
+    for again in (cfg, copy.deepcopy(cfg)):
+        again.resolve(scene)
+        assert again.geom_ids == geoms
+
+
+def test_all_joints_select_all_actuators():
+    servo = BuiltinPositionActuatorCfg(target_names_expr=("knee",), stiffness=1.0, damping=1.0)
+    scene = legs(actuators=(servo,))
+    scene["robot"].spec.delete(scene["robot"].spec.actuators[0])
+    assert resolved(scene, joint_names=".*").actuator_ids == slice(None)
+
+
+@pytest.mark.filterwarnings("ignore:.*already have an actuator")
+def test_derived_ids_follow_a_change():
+    scene = legs()
+    cfg = resolved(scene, joint_names="hip")
+    cfg.joint_names, cfg.joint_ids = "knee", slice(None)
+    cfg.resolve(scene)
+    assert cfg.actuator_ids == [1, 3]
+    cfg.joint_names, cfg.joint_ids = None, slice(None)
+    cfg.resolve(scene)
+    assert cfg.actuator_ids == slice(None)
+
+
+# Terms that read ids.
+
+
+def messages_of(env, cfg, kind):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(3):
+            columns_of(cfg, kind, env)
+            columns_of(copy.deepcopy(cfg), kind, env)
+    return [str(one.message) for one in caught]
+
+
+@pytest.mark.parametrize("other", KINDS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_use_of_a_kind_not_selected_warns_once(env, kind, other):
+    cfg = resolved(env.scene, **{f"{other}_names": f"{other}_a"})
+    messages = messages_of(env, cfg, kind)
+    if kind == other or (other, kind) in (("joint", "actuator"), ("body", "geom")):
+        assert messages == []
+        return
+    (message,) = messages
+    for words in (f"'robot' {kind}_ids", f"{other}_a", f"every {kind}", f"{kind}_names"):
+        assert words in message
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_unresolved_ids_are_an_error_while_terms_run(env, kind):
+def test_ids_never_resolved_warn_once(env, kind):
     cfg = SceneEntityCfg("robot", **{f"{kind}_names": f"{kind}_b"})
-    with (
-        selections_checked(env.scene),
-        pytest.raises(
-            ValueError, match=f"'robot' {kind}_ids: .*{kind}_names='{kind}_b'.*parameter"
-        ),
-    ):
-        getattr(cfg, f"{kind}_ids")
-    assert getattr(cfg, f"{kind}_ids") == slice(None), "no term runs"
+    (message,) = messages_of(env, cfg, kind)
+    for words in (f"'robot' {kind}_ids", f"{kind}_b", "never resolved", "resolve(env.scene)"):
+        assert words in message
 
 
-def test_ids_that_select_what_their_names_say_can_be_read(env):
-    everything = SceneEntityCfg("robot", joint_names="joint_.*")
-    resolved = SceneEntityCfg("robot", joint_names="joint_b")
-    resolved.resolve(env.scene)
-    # The fields of a kind do not concern another kind.
-    bodies = SceneEntityCfg("robot", joint_names="joint_b")
-    with selections_checked(env.scene):
-        assert everything.joint_ids == slice(None)
-        assert resolved.joint_ids == copy.deepcopy(resolved).joint_ids == [1]
-        assert bodies.body_ids == slice(None)
-        bodies.resolve(env.scene)
-        assert bodies.joint_ids == [1]
+@pytest.mark.parametrize(
+    "fields", [{}, {"joint_names": ".*"}, {"joint_ids": [1]}, {"joint_ids": slice(0, 1)}]
+)
+def test_ids_that_are_meant_do_not_warn(env, fields):
+    assert messages_of(env, SceneEntityCfg("robot", **fields), "joint") == []
 
 
-def test_unresolved_selections_can_be_copied_compared_and_printed_while_terms_run(env):
-    cfg = SceneEntityCfg("robot", joint_names="joint_b")
-    with selections_checked(env.scene):
-        for same in (
-            copy.deepcopy(cfg),
-            dataclasses.replace(cfg),
-            SceneEntityCfg(**dataclasses.asdict(cfg)),
-            pickle.loads(pickle.dumps(cfg)),
-        ):
-            assert same == cfg
-            assert repr(same) == repr(cfg)
-
-
-def test_checks_of_several_scenes_nest(env):
-    cfg = SceneEntityCfg("robot", joint_names="joint_b")
-    with selections_checked(env.scene):
-        with selections_checked(None):
-            assert cfg.joint_ids == slice(None)
-        with pytest.raises(ValueError, match="joint_ids"):
-            _ = cfg.joint_ids
+@pytest.mark.filterwarnings("ignore:.*already have an actuator")
+def test_joint_without_actuator_warns_once(env):
+    scene = legs()
+    env.scene.update(scene)
+    (message,) = messages_of(env, resolved(scene, joint_names="ankle"), "actuator")
+    for words in ("actuator_ids", "joint_names=['ankle']", "no actuator"):
+        assert words in message
+    assert messages_of(env, resolved(scene, joint_names=()), "actuator") == []

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp import rewards as feet_rewards
 from mjlab.tasks.velocity.mdp.observations import Source, check_same_feet, site_columns
 from mjlab.tasks.velocity.mdp.rewards import if_commanded
-from mjlab.utils.indexing import as_columns, as_ids
+from mjlab.utils.indexing import as_ids
 from mjlab.utils.state import changes_undone
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def _check_sites(
 @checked_when_built(_check_sites)
 def foot_height(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _ROBOT) -> torch.Tensor:
     """Height of selected sites above z = 0 (m), (N, sites)."""
-    sites = as_columns(asset_cfg.site_ids, env.device)
+    sites = columns_of(asset_cfg, "site", env)
     return env.scene[asset_cfg.name].data.site_pos_w[:, sites, 2]
 
 

@@ -15,6 +15,7 @@ from mjlab.actuator.actuator import Actuator, ActuatorCfg, TransmissionType
 from mjlab.actuator.builtin_group import BuiltinActuatorGroup
 from mjlab.actuator.fused_group import FusedActuatorGroup
 from mjlab.actuator.position_hold import PositionHold
+from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS
 from mjlab.entity.building import (
     Found,
     add_key,
@@ -379,6 +380,24 @@ class Entity:
     def pair_names(self) -> tuple[str, ...]:
         """Names of the contact pairs."""
         return short_names(self._spec.pairs)
+
+    # Owners of elements.
+
+    @property
+    def actuator_joints(self) -> list[int | None]:
+        """Index of the joint that each actuator acts on, or None. Empty without configured actuators."""
+        joints = {joint.name: index for index, joint in enumerate(self._joints)}
+        on_joint = XML_TRANSMISSIONS[TransmissionType.JOINT]
+        return [
+            joints.get(actuator.target) if actuator.trntype in on_joint else None
+            for actuator in (self._spec.actuators if self.is_actuated else ())
+        ]
+
+    @property
+    def geom_bodies(self) -> list[int | None]:
+        """Index of the body of each geom; None for the world."""
+        bodies = {body: index for index, body in enumerate(self._spec.bodies[1:])}
+        return [bodies.get(geom.parent) for geom in self._spec.geoms]
 
     # Element counts.
 

@@ -47,7 +47,6 @@ from mjlab.managers import (
     TerminationTermCfg,
     look_up,
 )
-from mjlab.managers.scene_entity_config import selections_checked
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
 from mjlab.utils.config_fields import check_fields_exist
@@ -198,8 +197,7 @@ class ManagerBasedRlEnv(Tabular):
             )
         self.metadata["render_fps"] = 1.0 / self.step_dt
         self._placement.begin()
-        with selections_checked(self.scene):
-            self.load_managers()
+        self.load_managers()
         self._placement.end_building()
         report_odd_times(self)
         moves = (e for e in self.scene.entities.values() if e is not self.scene.terrain)
@@ -554,10 +552,9 @@ class ManagerBasedRlEnv(Tabular):
 
     @contextlib.contextmanager
     def _checking_terms(self, resets: bool = False) -> Generator[None]:
-        """Check that terms within the block read no unresolved selections and no unused origins."""
+        """Check that terms within the block read no unused origins."""
         self._placement.begin(resets)
-        with selections_checked(self.scene):
-            yield
+        yield
         self._placement.end()
 
     def _clear_extras(self) -> None:

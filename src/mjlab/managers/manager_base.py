@@ -12,6 +12,7 @@ import copy
 import dataclasses
 import inspect
 import logging
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -214,10 +215,12 @@ class ManagerBase(Tabular, ABC):
     def _resolve_selections(self, label: str, value: Any, is_nested: bool = False) -> None:
         """Resolve every `SceneEntityCfg` in a dict, list, tuple or dataclass, in place."""
         if isinstance(value, SceneEntityCfg):
-            # A nested selection without names needs no ids, and its entity may be optional.
-            if value.selects_names or not is_nested:
+            # A nested selection of no elements needs no ids, and its entity may be optional.
+            if not is_nested:
                 with label_errors(label):
                     value.resolve(self._env.scene)
+            elif value.selected_kinds():
+                self._try_to_resolve(label, value)
             return
         if isinstance(value, (list, tuple)):
             inner = list(enumerate(value))
@@ -225,6 +228,20 @@ class ManagerBase(Tabular, ABC):
             inner = list(value.items()) if isinstance(value, dict) else _items(value) or ()
         for key, item in inner:
             self._resolve_selections(f"{label}[{key!r}]", item, is_nested=True)
+
+    def _try_to_resolve(self, label: str, selection: SceneEntityCfg) -> bool:
+        """Resolve a selection that releases 1.x leave unresolved: warn if that fails."""
+        try:
+            selection.resolve(self._env.scene)
+        except (KeyError, ValueError) as error:
+            warnings.warn(
+                f"{label}: the selection stays unresolved, so its ids are those of all elements. "
+                f"{error}",
+                UserWarning,
+                stacklevel=2,
+            )
+            return False
+        return True
 
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
         """Replace a class by its instance, and check that the term is callable.
@@ -239,9 +256,13 @@ class ManagerBase(Tabular, ABC):
             check_params(label, cfg.func, signature, leading, cfg.params)
             for key, parameter in signature.parameters.items():
                 default = parameter.default
-                if isinstance(default, SceneEntityCfg) and default.selects_names:
-                    cfg.params.setdefault(key, copy.deepcopy(default))
-            self._resolve_params(name, cfg)
+                if key in cfg.params or not isinstance(default, SceneEntityCfg):
+                    continue
+                selection = copy.deepcopy(default)
+                if selection.selected_kinds() and self._try_to_resolve(
+                    f"{label}, default of parameter {key!r}", selection
+                ):
+                    cfg.params[key] = selection
         with label_errors(label):
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):

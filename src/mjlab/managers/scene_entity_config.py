@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import re
-import sys
-from collections.abc import Generator
-from contextvars import ContextVar
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+import torch
+
+from mjlab.entity import Entity
+from mjlab.utils.indexing import Columns, as_columns
+
 if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
     from mjlab.scene import Scene
 
 # Kind of element to the entity's method that finds it by pattern. The entity's list of names and
@@ -29,6 +34,8 @@ _FINDERS = {
     "texture": "find_textures",
     "pair": "find_pairs",
 }
+# Kind that follows from another: its kind, and the entity's list of the owner of each element.
+_FOLLOWS = {"actuator": ("joint", "actuator_joints"), "geom": ("body", "geom_bodies")}
 
 
 @dataclass
@@ -38,6 +45,10 @@ class SceneEntityCfg:
     Managers resolve selections when they are built: names (regular expressions, matched in full)
     become the matching names, and ids become the indices of these elements within the entity, or
     `slice(None)` for all elements in natural order.
+
+    Selected joints select their actuators, and selected bodies their geoms, unless these are
+    selected too. Other kinds that are not selected stay `slice(None)`, all elements. Terms of this
+    package warn where they use all elements of a kind although only other kinds are selected.
     """
 
     name: str
@@ -91,7 +102,11 @@ class SceneEntityCfg:
     preserve_order: bool = False
     """Order the selection by pattern instead of the entity's natural order."""
 
+    # State, not fields. Ids that followed from another kind when the selection was resolved.
+    _derived = MappingProxyType({})
     _is_resolved = False
+    # Kinds whose ids a term has read.
+    _read = frozenset()
 
     def __str__(self) -> str:
         """Return the entity and its selected elements: `robot`, `robot joint hip`, `robot 12 joints`."""
@@ -108,10 +123,13 @@ class SceneEntityCfg:
         """Resolve names and ids in the scene. Resolving is idempotent.
 
         Raises `KeyError` for an unknown entity, and `ValueError` if a pattern matches nothing, two
-        patterns match one name, an index is out of range, or names and ids disagree.
+        patterns match one name, an index is out of range, or names and ids disagree. The selection
+        is then unchanged.
         """
-        entity = scene[self.name]
-        for kind in _FINDERS:
+        entity: Any = scene[self.name]
+        kinds = self.selected_kinds()
+        resolved: dict[str, Any] = {}
+        for kind in kinds:
             names, ids = getattr(self, f"{kind}_names"), getattr(self, f"{kind}_ids")
             if names is None and not isinstance(ids, list):
                 continue
@@ -121,14 +139,26 @@ class SceneEntityCfg:
                     f"{type(entity).__name__}."
                 )
             names, ids = self._resolve_kind(kind, names, ids, entity)
-            setattr(self, f"{kind}_names", names)
-            setattr(self, f"{kind}_ids", ids)
-        self._is_resolved = True
+            resolved |= {f"{kind}_names": names, f"{kind}_ids": ids}
+        derived: dict[str, Any] = dict.fromkeys(self._derived, slice(None))
+        for kind, (source, owners) in _FOLLOWS.items():
+            if source in kinds and kind not in kinds and isinstance(entity, Entity):
+                ids = resolved.get(f"{source}_ids", getattr(self, f"{source}_ids"))
+                count = len(getattr(entity, f"{source}_names"))
+                derived[kind] = _following(getattr(entity, owners), ids, count)
+        resolved |= {f"{kind}_ids": ids for kind, ids in derived.items()}
+        for name, value in resolved.items():
+            setattr(self, name, value)
+        self._derived, self._is_resolved = derived, True
 
-    @property
-    def selects_names(self) -> bool:
-        """True if the selection has patterns of names."""
-        return any(getattr(self, f"{kind}_names") is not None for kind in _FINDERS)
+    def selected_kinds(self) -> list[str]:
+        """Return the kinds of elements selected by names or ids, such as `joint`."""
+        return [
+            kind
+            for kind in _FINDERS
+            if getattr(self, f"{kind}_names") is not None
+            or not (_is_all(ids := getattr(self, f"{kind}_ids")) or ids is self._derived.get(kind))
+        ]
 
     def empty_selections(self) -> list[str]:
         """Return the fields of names, such as `geom_names`, that explicitly select nothing."""
@@ -143,30 +173,24 @@ class SceneEntityCfg:
         if names is None:
             return self._names_at(kind, ids, all_names), ids
         requested = [names] if isinstance(names, str) else list(names)
-        found_ids, found_names = [], []
-        if requested:
-            # Plain names may hold special characters of regular expressions; resolved names must
-            # match themselves.
-            patterns = [re.escape(name) if name in all_names else name for name in requested]
+        at_ids = self._names_at(kind, ids, all_names) if isinstance(ids, list) else all_names
+        # Names of a resolved selection are no patterns: unnamed geoms repeat a name.
+        if requested == at_ids:
+            return requested, ids if isinstance(ids, list) else slice(None)
+        # Plain names may hold special characters of regular expressions.
+        patterns = tuple(re.escape(name) if name in all_names else name for name in requested)
+        try:
             find = getattr(entity, _FINDERS[kind])
-            try:
-                found_ids, found_names = find(tuple(patterns), preserve_order=self.preserve_order)
-            except ValueError as error:
-                raise ValueError(
-                    f"entity {self.name!r}, {kind}_names={requested}: {error}"
-                ) from error
-        found_ids, found_names = list(found_ids), list(found_names)
-        if isinstance(ids, slice):
-            everything = found_ids == list(range(len(all_names)))
-            return found_names, slice(None) if everything else found_ids
-        requested_ids = [ids] if isinstance(ids, int) else list(ids)
-        at_ids = self._names_at(kind, requested_ids, all_names)
-        if found_ids != requested_ids or requested != at_ids:
+            found = find(patterns, preserve_order=self.preserve_order) if patterns else ([], [])
+        except ValueError as error:
+            raise ValueError(f"entity {self.name!r}, {kind}_names={requested}: {error}") from error
+        found_ids, found_names = map(list, found)
+        if isinstance(ids, list):
             raise ValueError(
                 f"entity {self.name!r}: {kind}_names={requested} (ids {found_ids}) and "
-                f"{kind}_ids={requested_ids} (names {at_ids}) disagree; set only one of them."
+                f"{kind}_ids={ids} (names {at_ids}) disagree; set only one of them."
             )
-        return requested, ids
+        return found_names, _slice_if_all(found_ids, len(all_names))
 
     def _names_at(self, kind: str, ids: list[int], all_names: list[str]) -> list[str]:
         outside = [i for i in ids if not -len(all_names) <= i < len(all_names)]
@@ -178,59 +202,72 @@ class SceneEntityCfg:
         return [all_names[i] for i in ids]
 
 
-# Scene whose terms are being built or run.
-_scene: ContextVar[Scene | None] = ContextVar("scene", default=None)
+def columns_of(asset_cfg: SceneEntityCfg, kind: str, env: ManagerBasedRlEnv) -> Columns:
+    """Return the column index of the selected elements of a kind, such as "joint", for a term.
 
-
-@contextlib.contextmanager
-def selections_checked(scene: Scene | None) -> Generator[None]:
-    """Within the block, reading ids of a selection with names that was never resolved is an error.
-
-    These ids would silently select all elements: managers resolve parameters, but neither constants
-    nor selections that a term creates. No error if the names do select all elements.
-
-    Raises:
-        ValueError: such ids were read; the message names the selection and the cure.
+    Warns once if these are probably not the elements that were meant: the names were never resolved,
+    or this kind follows from none of the selected kinds, so that all elements are used; or no
+    element follows from the selected ones.
     """
-    token = _scene.set(scene)
+    if kind not in asset_cfg._read:
+        asset_cfg._read |= {kind}
+        # Terms may create a selection at every step.
+        key, known = f"{kind} of {asset_cfg!r}", vars(env).setdefault("_read_selections", set())
+        if key not in known:
+            known.add(key)
+            _warn_of_ids(asset_cfg, kind, env)
+    return as_columns(getattr(asset_cfg, f"{kind}_ids"), env.device)
+
+
+def _warn_of_ids(cfg: SceneEntityCfg, kind: str, env: ManagerBasedRlEnv) -> None:
+    selected, ids = cfg.selected_kinds(), getattr(cfg, f"{kind}_ids")
+    source = _FOLLOWS[kind][0] if kind in _FOLLOWS else None
+    parts = {k: "ids" if getattr(cfg, f"{k}_names") is None else "names" for k in selected}
+    shown = ", ".join(f"{k}_{part}={getattr(cfg, f'{k}_{part}')}" for k, part in parts.items())
+    if not selected or not (_is_all(ids) or ids == []):
+        return
+    if kind not in selected and source not in selected:
+        names = f"{kind}_names" if source is None else f"{kind}_names or {source}_names"
+        problem = f"expected {names}, got {shown}"
+        remedy = f"the term uses every {kind}; set {kind}_names, to '.*' for all"
+    elif _is_all(ids) and not cfg._is_resolved and not _means_all(cfg, kind, env):
+        problem = f"expected a resolved selection, got {shown}, never resolved"
+        remedy = (
+            f"the term uses every {kind}; pass the selection as a parameter of the term, or call its "
+            "resolve(env.scene)"
+        )
+    elif kind not in selected and ids == [] and getattr(cfg, f"{source}_ids") != []:
+        problem = f"expected a {source} with at least one {kind}, got {shown}"
+        remedy = f"the term uses no {kind}; set {kind}_names"
+    else:
+        return
+    message = f"SceneEntityCfg of {cfg.name!r} {kind}_ids: {problem}; {remedy}."
+    warnings.warn(message, UserWarning, stacklevel=4)
+
+
+def _means_all(cfg: SceneEntityCfg, kind: str, env: ManagerBasedRlEnv) -> bool:
+    """Return True if resolving the selection gives all elements of a kind."""
+    resolved = copy.copy(cfg)
     try:
-        yield
-    finally:
-        _scene.reset(token)
+        resolved.resolve(env.scene)
+    except (KeyError, ValueError):
+        return False
+    return _is_all(getattr(resolved, f"{kind}_ids"))
 
 
-class _Ids:
-    """Field of ids of a kind of element. Reading it is checked within `selections_checked`."""
-
-    def __init__(self, kind: str) -> None:
-        self._ids, self._names = f"{kind}_ids", f"{kind}_names"
-
-    def __get__(self, cfg: Any, owner: type | None = None) -> Any:
-        state = getattr(cfg, "__dict__", {})
-        if cfg is None or self._ids not in state:
-            raise AttributeError(f"{owner} has no {self._ids}")
-        ids = state[self._ids]
-        if type(ids) is slice and not cfg._is_resolved and state[self._names] is not None:
-            # Copies and representations are made of unresolved selections, too.
-            reader = sys._getframe(1).f_globals.get("__name__")
-            if (scene := _scene.get()) is not None and reader not in (__name__, "dataclasses"):
-                self._check(cfg, ids, scene)
-        return ids
-
-    def __set__(self, cfg: Any, ids: Any) -> None:
-        cfg.__dict__[self._ids] = ids
-
-    def _check(self, cfg: SceneEntityCfg, ids: slice, scene: Scene) -> None:
-        resolved = copy.deepcopy(cfg)
-        resolved.resolve(scene)
-        if getattr(resolved, self._ids) != ids:
-            names = getattr(cfg, self._names)
-            raise ValueError(
-                f"SceneEntityCfg of {cfg.name!r} {self._ids}: expected a resolved selection, got one that "
-                f"selects all and not {self._names}={names!r}; pass it as a parameter of the term, or "
-                "call its resolve(env.scene) first."
-            )
+def _following(owners: Sequence[int | None], ids: Any, count: int) -> list[int] | slice:
+    """Return the elements owned by `ids` out of `count`: in natural order, or in that of the ids."""
+    ids = ids.cpu() if isinstance(ids, torch.Tensor) else as_columns(ids, "cpu")
+    chosen = torch.arange(count)[ids].flatten().tolist()
+    found = [element for element, owner in enumerate(owners) if owner in chosen]
+    if chosen != sorted(chosen):
+        found.sort(key=lambda element: chosen.index(owners[element]))
+    return _slice_if_all(found, len(owners))
 
 
-for _kind in _FINDERS:
-    setattr(SceneEntityCfg, f"{_kind}_ids", _Ids(_kind))
+def _slice_if_all(ids: list[int], count: int) -> list[int] | slice:
+    return slice(None) if ids == list(range(count)) and count > 0 else ids
+
+
+def _is_all(ids: Any) -> bool:
+    return isinstance(ids, slice) and ids == slice(None)

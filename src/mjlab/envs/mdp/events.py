@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.utils.indexing import as_columns, as_ids, num_selected
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
+from mjlab.utils.indexing import as_ids, num_selected
 from mjlab.utils.lab_api.math import (
     quat_apply,
     quat_apply_inverse,
@@ -28,7 +28,6 @@ from mjlab.utils.state import stateful
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.managers.scene_entity_config import SceneEntityCfg
     from mjlab.viewer.debug_visualizer import DebugVisualizer
 
 __all__ = [
@@ -151,7 +150,7 @@ def reset_joints_by_offset(
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
-    data, joints = asset.data, as_columns(asset_cfg.joint_ids, env.device)
+    data, joints = asset.data, columns_of(asset_cfg, "joint", env)
     position = data.default_joint_pos[ids][:, joints]
     position += sample_uniform(*position_range, position.shape, env.device)
     limits = data.soft_joint_pos_limits[ids][:, joints]
@@ -213,11 +212,15 @@ def apply_external_force_torque(
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
-    shape = (len(ids), num_selected(asset_cfg.body_ids, len(asset.data.indexing.body_ids)), 3)
+    shape = (
+        len(ids),
+        num_selected(columns_of(asset_cfg, "body", env), len(asset.data.indexing.body_ids)),
+        3,
+    )
     forces = sample_uniform(*force_range, shape, env.device)
     torques = sample_uniform(*torque_range, shape, env.device)
     asset.write_external_wrench_to_sim(
-        forces, torques, env_ids=ids, body_ids=as_columns(asset_cfg.body_ids, env.device)
+        forces, torques, env_ids=ids, body_ids=columns_of(asset_cfg, "body", env)
     )
 
 
@@ -259,8 +262,10 @@ class apply_body_impulse:
         self._env = env
         self._asset_cfg: SceneEntityCfg = params["asset_cfg"]
         self._asset: Entity = env.scene[self._asset_cfg.name]
-        self._bodies = as_columns(self._asset_cfg.body_ids, env.device)
-        self._num_bodies = num_selected(self._asset_cfg.body_ids, self._asset.num_bodies)
+        self._bodies = columns_of(self._asset_cfg, "body", env)
+        self._num_bodies = num_selected(
+            columns_of(self._asset_cfg, "body", env), self._asset.num_bodies
+        )
         self._cooldown_s = tuple(params["cooldown_s"])
         self._offset = params.get("body_point_offset")
         # A mapping or any object may define a subset of the fields.

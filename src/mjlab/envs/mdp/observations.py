@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.managers.term_checks import check_height_scan, checked_when_built
 from mjlab.sensor.builtin_sensor import BuiltinSensor
 from mjlab.utils.errors import WrongTypeError, check_exists
-from mjlab.utils.indexing import as_columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -72,7 +71,7 @@ def joint_pos_rel(
         biased: Add the encoder bias, as in readings of the robot's encoders.
     """
     asset: Entity = env.scene[asset_cfg.name]
-    data, joints = asset.data, as_columns(asset_cfg.joint_ids, env.device)
+    data, joints = asset.data, columns_of(asset_cfg, "joint", env)
     relative = data.joint_pos[:, joints] - data.default_joint_pos[:, joints]
     if biased:
         relative += data.encoder_bias[:, joints]
@@ -84,7 +83,7 @@ def joint_vel_rel(
 ) -> torch.Tensor:
     """Joint velocities minus default velocities (rad/s or m/s), (N, joints)."""
     asset: Entity = env.scene[asset_cfg.name]
-    joints = as_columns(asset_cfg.joint_ids, env.device)
+    joints = columns_of(asset_cfg, "joint", env)
     return asset.data.joint_vel[:, joints] - asset.data.default_joint_vel[:, joints]
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.managers.term_checks import check_contact_sensor, checked_when_built
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names_values
@@ -50,7 +50,7 @@ def joint_torques_l2(
 ) -> torch.Tensor:
     """Sum of squared actuator forces, before the gear, over the selected **actuators**."""
     asset: Entity = env.scene[asset_cfg.name]
-    chosen = asset.data.indexing.force_columns(asset_cfg.actuator_ids)
+    chosen = asset.data.indexing.force_columns(columns_of(asset_cfg, "actuator", env))
     forces = asset.data.actuator_force[:, as_columns(chosen, env.device)]
     return forces.square().sum(dim=1)
 
@@ -60,7 +60,7 @@ def joint_vel_l2(
 ) -> torch.Tensor:
     """Sum of squared joint velocities."""
     asset: Entity = env.scene[asset_cfg.name]
-    velocities = asset.data.joint_vel[:, as_columns(asset_cfg.joint_ids, env.device)]
+    velocities = asset.data.joint_vel[:, columns_of(asset_cfg, "joint", env)]
     return velocities.square().sum(dim=1)
 
 
@@ -69,7 +69,7 @@ def joint_acc_l2(
 ) -> torch.Tensor:
     """Sum of squared joint accelerations."""
     asset: Entity = env.scene[asset_cfg.name]
-    accelerations = asset.data.joint_acc[:, as_columns(asset_cfg.joint_ids, env.device)]
+    accelerations = asset.data.joint_acc[:, columns_of(asset_cfg, "joint", env)]
     return accelerations.square().sum(dim=1)
 
 
@@ -95,7 +95,7 @@ def joint_pos_limits(
 ) -> torch.Tensor:
     """Sum of soft joint limit violations (rad or m)."""
     asset: Entity = env.scene[asset_cfg.name]
-    joints = as_columns(asset_cfg.joint_ids, env.device)
+    joints = columns_of(asset_cfg, "joint", env)
     position = asset.data.joint_pos[:, joints]
     limits = asset.data.soft_joint_pos_limits[:, joints]
     below = (limits[..., 0] - position).clamp_(min=0.0)
@@ -161,7 +161,7 @@ class posture:
         self, env: ManagerBasedRlEnv, std: object, asset_cfg: SceneEntityCfg
     ) -> torch.Tensor:
         asset: Entity = env.scene[asset_cfg.name]
-        joints = as_columns(asset_cfg.joint_ids, env.device)
+        joints = columns_of(asset_cfg, "joint", env)
         error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
         return torch.exp(-(error / self.std).square().mean(dim=1))
 
@@ -174,7 +174,7 @@ class electrical_power_cost:
 
     def __call__(self, env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
         asset: Entity = env.scene[asset_cfg.name]
-        joints = as_columns(asset_cfg.joint_ids, env.device)
+        joints = columns_of(asset_cfg, "joint", env)
         power = asset.data.qfrc_actuator[:, joints] * asset.data.joint_vel[:, joints]
         return power.clamp_(min=0.0).sum(dim=1)
 

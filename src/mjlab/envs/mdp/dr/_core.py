@@ -24,8 +24,8 @@ from mjlab.envs.mdp.dr._types import (
     resolve_operation,
 )
 from mjlab.managers.event_manager import RecomputeLevel, requires_model_fields
-from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.utils.indexing import as_columns, as_ids
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
+from mjlab.utils.indexing import as_ids
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul
 from mjlab.utils.mujoco import dof_width, qpos_width
 
@@ -44,9 +44,7 @@ class ObjectKind:
     """MuJoCo object type: location of its ids in configs, entities and the model."""
 
     name: str
-    """Name in error messages."""
-    cfg_ids: str
-    """Attribute of `SceneEntityCfg` with the ids within the entity."""
+    """Kind in `SceneEntityCfg` and in error messages."""
     entity_names: str
     """Attribute of `Entity` with the names, in the order of those ids."""
     global_ids: str
@@ -56,18 +54,18 @@ class ObjectKind:
     number of addresses by joint type."""
 
 
-BODY = ObjectKind("body", "body_ids", "body_names", "body_ids")
-GEOM = ObjectKind("geom", "geom_ids", "geom_names", "geom_ids")
-SITE = ObjectKind("site", "site_ids", "site_names", "site_ids")
-JOINT = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids")
-DOF = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", ("jnt_dofadr", dof_width))
-QPOS = ObjectKind("joint", "joint_ids", "joint_names", "joint_ids", ("jnt_qposadr", qpos_width))
-TENDON = ObjectKind("tendon", "tendon_ids", "tendon_names", "tendon_ids")
-CAMERA = ObjectKind("camera", "camera_ids", "camera_names", "cam_ids")
-LIGHT = ObjectKind("light", "light_ids", "light_names", "light_ids")
-MATERIAL = ObjectKind("material", "material_ids", "material_names", "mat_ids")
-TEXTURE = ObjectKind("texture", "texture_ids", "texture_names", "tex_ids")
-PAIR = ObjectKind("pair", "pair_ids", "pair_names", "pair_ids")
+BODY = ObjectKind("body", "body_names", "body_ids")
+GEOM = ObjectKind("geom", "geom_names", "geom_ids")
+SITE = ObjectKind("site", "site_names", "site_ids")
+JOINT = ObjectKind("joint", "joint_names", "joint_ids")
+DOF = ObjectKind("joint", "joint_names", "joint_ids", ("jnt_dofadr", dof_width))
+QPOS = ObjectKind("joint", "joint_names", "joint_ids", ("jnt_qposadr", qpos_width))
+TENDON = ObjectKind("tendon", "tendon_names", "tendon_ids")
+CAMERA = ObjectKind("camera", "camera_names", "cam_ids")
+LIGHT = ObjectKind("light", "light_names", "light_ids")
+MATERIAL = ObjectKind("material", "material_names", "mat_ids")
+TEXTURE = ObjectKind("texture", "texture_names", "tex_ids")
+PAIR = ObjectKind("pair", "pair_names", "pair_ids")
 
 
 # Public functions.
@@ -373,7 +371,7 @@ def select(
     all_ids: torch.Tensor = getattr(entity.data.indexing, kind.global_ids)
     # Names are looked up only for patterns: randomization may run nearly every step.
     if pattern is None:
-        chosen = as_columns(getattr(asset_cfg, kind.cfg_ids), env.device)
+        chosen = columns_of(asset_cfg, kind.name, env)
         local_ids = torch.arange(len(all_ids), device=env.device)[chosen]
     else:
         names = getattr(entity, kind.entity_names)

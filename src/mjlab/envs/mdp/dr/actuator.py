@@ -38,8 +38,9 @@ from mjlab.envs.mdp.dr._types import (
     resolve_operation,
 )
 from mjlab.managers.event_manager import requires_model_fields
+from mjlab.managers.scene_entity_config import columns_of
 from mjlab.utils.errors import WrongTypeError, check_one_of
-from mjlab.utils.indexing import as_columns, as_ids
+from mjlab.utils.indexing import as_ids
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -185,7 +186,7 @@ def selected_actuators(
     `asset_cfg.actuator_ids` indexes individual actuators, in the order of `actuator_names`.
     """
     entity: Entity = env.scene[asset_cfg.name]
-    chosen = entity.data.indexing.actuator_ids[as_columns(asset_cfg.actuator_ids, env.device)]
+    chosen = entity.data.indexing.actuator_ids[columns_of(asset_cfg, "actuator", env)]
     for actuator in entity.actuators:
         ids, count = actuator.global_element_ids, len(actuator.target_names)
         # Custom actuators may have another layout; functions that need it reject them.

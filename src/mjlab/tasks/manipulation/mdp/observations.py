@@ -14,7 +14,7 @@ import mujoco
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.managers.term_checks import checked_when_built, require_sensor
 from mjlab.sensor import CameraSensor
 from mjlab.tasks.manipulation.mdp.commands import (
@@ -23,7 +23,6 @@ from mjlab.tasks.manipulation.mdp.commands import (
     check_reach,
 )
 from mjlab.utils.errors import WrongTypeError, check_exists, check_in_range, check_positive
-from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 
 if TYPE_CHECKING:
@@ -89,7 +88,7 @@ def check_task_term(
 
 def find_site(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> str:
     """Return the name of the selected site; raises `ValueError` unless exactly one is selected."""
-    names, ids = env.scene[asset_cfg.name].site_names, asset_cfg.site_ids
+    names, ids = env.scene[asset_cfg.name].site_names, columns_of(asset_cfg, "site", env)
     selected = list(names[ids]) if isinstance(ids, slice) else [names[index] for index in ids]
     if len(selected) != 1:
         raise ValueError(
@@ -147,7 +146,7 @@ def ee_velocity(
 ) -> torch.Tensor:
     """Linear velocity of the end effector in the end-effector frame (m/s), (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
-    sites = as_columns(asset_cfg.site_ids, env.device)
+    sites = columns_of(asset_cfg, "site", env)
     velocity = asset.data.site_lin_vel_w[:, sites].squeeze(1)
     return quat_apply_inverse(site_quat(env, asset_cfg), velocity)
 
@@ -236,13 +235,13 @@ def goal_command(env: ManagerBasedRlEnv, name: str, *kinds: type) -> Any:
 def site_pos(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the world position of the selected site, (N, 3)."""
     asset: Entity = env.scene[asset_cfg.name]
-    return asset.data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device)].squeeze(1)
+    return asset.data.site_pos_w[:, columns_of(asset_cfg, "site", env)].squeeze(1)
 
 
 def site_quat(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the world orientation of the selected site, (N, 4)."""
     asset: Entity = env.scene[asset_cfg.name]
-    return asset.data.site_quat_w[:, as_columns(asset_cfg.site_ids, env.device)].squeeze(1)
+    return asset.data.site_quat_w[:, columns_of(asset_cfg, "site", env)].squeeze(1)
 
 
 __getattr__ = older_names(__name__)

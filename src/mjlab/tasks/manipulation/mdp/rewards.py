@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.managers.term_checks import checked_when_built
 from mjlab.tasks.manipulation.mdp.commands import LiftingCommand, MultiCubeLiftingCommand
 from mjlab.tasks.manipulation.mdp.observations import (
@@ -21,7 +21,6 @@ from mjlab.tasks.manipulation.mdp.observations import (
     goal_command,
     site_pos,
 )
-from mjlab.utils.indexing import as_columns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -99,7 +98,7 @@ def joint_velocity_hinge_penalty(
     Velocities are in rad/s, in m/s for slide joints. The value is positive; use a negative weight.
     """
     asset: Entity = env.scene[asset_cfg.name]
-    speed = asset.data.joint_vel[:, as_columns(asset_cfg.joint_ids, env.device)].abs()
+    speed = asset.data.joint_vel[:, columns_of(asset_cfg, "joint", env)].abs()
     return speed.sub_(max_vel).clamp_(min=0.0).square_().sum(dim=1)
 
 

@@ -14,12 +14,11 @@ import mujoco
 import torch
 
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.observations import height_columns
 from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
 from mjlab.utils.errors import check_exists, check_field, check_fields_positive, check_positive
-from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.torch import constant_tensor
 
@@ -271,7 +270,7 @@ class weighted_joint_deviation:
     ) -> torch.Tensor:
         """Return the cost, (N,)."""
         asset: Entity = env.scene[asset_cfg.name]
-        joints = as_columns(asset_cfg.joint_ids, env.device)
+        joints = columns_of(asset_cfg, "joint", env)
         error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
         return (error.square_() * self._weights).sum(dim=1)
 
@@ -308,9 +307,11 @@ class feet_tilt:
         data.qpos[addresses] = asset.data.default_joint_pos[0].tolist()
         mujoco.mj_kinematics(model, data)
         if asset_cfg.site_names:
-            matrices = data.site_xmat[asset.indexing.site_ids[asset_cfg.site_ids].cpu()]
+            matrices = data.site_xmat[
+                asset.indexing.site_ids[columns_of(asset_cfg, "site", env)].cpu()
+            ]
         else:
-            matrices = data.xmat[asset.indexing.body_ids[asset_cfg.body_ids].cpu()]
+            matrices = data.xmat[asset.indexing.body_ids[columns_of(asset_cfg, "body", env)].cpu()]
         # The third row of a rotation matrix is world z in the rotated frame.
         self._rest = torch.tensor(matrices[:, 6:], dtype=torch.float32, device=env.device)
 
@@ -318,9 +319,9 @@ class feet_tilt:
         """Return the cost, (N,)."""
         data = env.scene[asset_cfg.name].data
         if asset_cfg.site_names:
-            quat = data.site_quat_w[:, as_columns(asset_cfg.site_ids, env.device)]
+            quat = data.site_quat_w[:, columns_of(asset_cfg, "site", env)]
         else:
-            quat = data.body_link_quat_w[:, as_columns(asset_cfg.body_ids, env.device)]
+            quat = data.body_link_quat_w[:, columns_of(asset_cfg, "body", env)]
         up = quat_apply_inverse(quat, self._up.expand(*quat.shape[:-1], 3))
         # Norm of the cross product, because 1 - cos^2 cancels at small angles.
         return torch.linalg.cross(up, self._rest.expand_as(up)).square_().sum(dim=(1, 2))
@@ -329,7 +330,7 @@ class feet_tilt:
 def height_over_feet(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the height of the root above the lowest foot (m), (N,). Feet are `site_names`."""
     data = env.scene[asset_cfg.name].data
-    feet = data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device), 2]
+    feet = data.site_pos_w[:, columns_of(asset_cfg, "site", env), 2]
     return data.root_link_pos_w[:, 2] - feet.amin(dim=1)
 
 
@@ -360,6 +361,6 @@ def feet_apart_l2(
     with `preserve_order`.
     """
     data = env.scene[asset_cfg.name].data
-    feet = data.site_pos_w[:, as_columns(asset_cfg.site_ids, env.device)]
+    feet = data.site_pos_w[:, columns_of(asset_cfg, "site", env)]
     apart = quat_apply_inverse(data.root_link_quat_w, feet[:, 0] - feet[:, 1])[:, 1]
     return (distance - apart).clamp_(min=0.0).square_()

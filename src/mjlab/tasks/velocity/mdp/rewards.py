@@ -17,6 +17,7 @@ from mjlab.compat import accepts_older_params, older_names
 from mjlab.entity.building import short_name
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.managers import RewardTermCfg, SceneEntityCfg
+from mjlab.managers.scene_entity_config import columns_of
 from mjlab.managers.term_checks import checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.observations import (
     Source,
@@ -34,7 +35,6 @@ from mjlab.tasks.velocity.mdp.terrain_utils import (
     terrain_normal_from_sensors,
 )
 from mjlab.utils.errors import check_positive
-from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
@@ -183,23 +183,26 @@ class upright:
 def single_body(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG, **_: Any
 ) -> int | None:
-    """Return the index of the selected body; None without selection, for the root.
+    """Return the index of the selected body; None for the root, without selection or with an empty one.
 
     Raises:
         ValueError: several bodies are selected; the message names them.
     """
     ids: Any = asset_cfg.body_ids
-    entity: Entity = env.scene[asset_cfg.name]
     if isinstance(ids, slice) and asset_cfg.body_names is None:
         return None
-    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else list(ids)
+    entity: Entity = env.scene[asset_cfg.name]
+    ids = columns_of(asset_cfg, "body", env)
+    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else ids.tolist()
+    if not chosen:
+        return None
     if len(chosen) != 1:
         names = [entity.body_names[i] for i in chosen]
         raise ValueError(
             f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
             f"body_names for the root {short_name(entity.root_body.name)!r}."
         )
-    return int(chosen[0])
+    return chosen[0]
 
 
 def body_quat(data: Any, body: int | None) -> torch.Tensor:
@@ -292,7 +295,7 @@ class variable_posture:
     ) -> torch.Tensor:
         """Return the reward."""
         asset: Entity = env.scene[asset_cfg.name]
-        joints = as_columns(asset_cfg.joint_ids, env.device)
+        joints = columns_of(asset_cfg, "joint", env)
         error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
         speed = command_speed(env, command_name)
         gait = (speed >= walking_threshold).long() + (speed >= running_threshold).long()
@@ -617,7 +620,7 @@ def values_of_joints(
 def _site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the horizontal speed of the selected sites (m/s), (N, sites)."""
     asset: Entity = env.scene[asset_cfg.name]
-    sites = as_columns(asset_cfg.site_ids, env.device)
+    sites = columns_of(asset_cfg, "site", env)
     velocity = asset.data.site_lin_vel_w[:, sites]
     # By component: faster on CPU than a norm over a dimension of size 2.
     return velocity[..., 0].square().addcmul_(velocity[..., 1], velocity[..., 1]).sqrt_()
