@@ -7,7 +7,6 @@ import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -103,7 +102,7 @@ class SceneEntityCfg:
     """Order the selection by pattern instead of the entity's natural order."""
 
     # State, not fields. Ids that followed from another kind when the selection was resolved.
-    _derived = MappingProxyType({})
+    _derived = dict[str, Any]()
     _is_resolved = False
     # Kinds whose ids a term has read.
     _read = frozenset()

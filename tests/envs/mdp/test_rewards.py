@@ -50,8 +50,25 @@ def test_sums_of_squares(moving: Any) -> None:
     torch.testing.assert_close(rewards.joint_acc_l2(moving, last), expected)
     force = data.actuator_force
     assert bool((force[:, 1] != 0.0).all())
-    knee = resolved(moving, actuator_names=["knee"])
-    torch.testing.assert_close(rewards.joint_torques_l2(moving, knee), force[:, 1] ** 2)
+    for knee in ({"actuator_names": ["knee"]}, {"joint_names": ("knee", "ankle")}):
+        chosen = resolved(moving, **knee)
+        torch.testing.assert_close(rewards.joint_torques_l2(moving, chosen), force[:, 1] ** 2)
+
+
+def test_torques_of_joints_without_actuator(moving: Any) -> None:
+    with pytest.warns(UserWarning, match=r"joint_names=\['ankle'\]; the term uses no") as caught:
+        for _ in range(2):
+            value = rewards.joint_torques_l2(moving, resolved(moving, joint_names=("ankle",)))
+    assert len(caught) == 1
+    assert value.tolist() == [0.0] * 4
+
+
+def test_torques_of_bodies_are_those_of_all(moving: Any) -> None:
+    with pytest.warns(UserWarning, match="body_names=.*every actuator") as caught:
+        for _ in range(2):
+            value = rewards.joint_torques_l2(moving, resolved(moving, body_names=("shin",)))
+    assert len(caught) == 1
+    torch.testing.assert_close(value, rewards.joint_torques_l2(moving))
 
 
 def test_limits_count_what_is_beyond_the_soft_ones(moving: Any) -> None:

@@ -251,6 +251,115 @@ def test_only_scale_and_abs_are_known(make_world: Any) -> None:
         world.apply(dr.pd_gains, kp_range=(1.0, 1.0), kd_range=(1.0, 1.0), operation="add")
 
 
+def custom(name: str, uses_defaults: bool = True, **functions: Any) -> dr.Operation:
+    functions = {"initialize": torch.ones_like, "combine": torch.mul} | functions
+    return dr.Operation(name, uses_defaults=uses_defaults, **functions)
+
+
+# Each starts from 20, 2 (position servo) or 10, 1 (ideal), and is applied twice with samples 4.
+OPERATIONS = {
+    "scale": ("scale", (80.0, 8.0), (40.0, 4.0)),
+    "abs": ("abs", (4.0, 4.0), (4.0, 4.0)),
+    "as ours": (custom("scale"), (80.0, 8.0), (40.0, 4.0)),
+    "divide": (custom("scale", combine=torch.div), (5.0, 0.5), (2.5, 0.25)),
+    "add": (
+        custom("add", initialize=torch.zeros_like, combine=torch.add),
+        (24.0, 6.0),
+        (14.0, 5.0),
+    ),
+    "current": (custom("mine", uses_defaults=False), (320.0, 32.0), (160.0, 16.0)),
+    "twice the sample": (
+        custom("abs", uses_defaults=False, combine=lambda base, rnd: 2.0 * rnd),
+        (8.0, 8.0),
+        (8.0, 8.0),
+    ),
+}
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_operations_decide_about_gains(make_world: Any, name: str, engine: str) -> None:
+    operation, servo, ideal = OPERATIONS[name]
+    world = make_world(actuators=(POSITION, IDEAL), engine=engine)
+    for _ in range(2):
+        ranges = {"kp_range": (4.0, 4.0), "kd_range": (4.0, 4.0)}
+        world.apply(dr.pd_gains, torch.tensor([1, 2]), operation=operation, **ranges)
+    model, second = world.sim.model, world.robot.actuators[1]
+    for row, (kp, kd), own in (
+        (0, (20.0, 2.0), (10.0, 1.0)),
+        (1, servo, ideal),
+        (2, servo, ideal),
+    ):
+        assert model.actuator_gainprm[row, 0, 0] == pytest.approx(kp)
+        assert model.actuator_biasprm[row, 0, 1:3].tolist() == pytest.approx([-kp, -kd])
+        assert second.stiffness[row].tolist() == pytest.approx([own[0]] * 2)
+        assert second.damping[row].tolist() == pytest.approx([own[1]] * 2)
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize(
+    ("operation", "limits"),
+    [
+        (custom("scale"), (10.0, 8.0)),
+        (custom("scale", combine=torch.div), (2.5, 2.0)),
+        (custom("add", initialize=torch.zeros_like, combine=torch.add), (7.0, 6.0)),
+        (custom("mine", uses_defaults=False), (20.0, 16.0)),
+    ],
+)
+def test_operations_decide_about_effort_limits(
+    make_world: Any, operation: Any, limits: tuple[float, float], engine: str
+) -> None:
+    world = make_world(actuators=(POSITION, IDEAL), engine=engine)
+    for _ in range(2):
+        world.apply(dr.effort_limits, effort_limit_range=(2.0, 2.0), operation=operation)
+    servo, ideal = limits
+    ranges = world.sim.model.actuator_forcerange[0].tolist()
+    assert ranges[0] == pytest.approx([-servo, servo])
+    assert ranges[1] == pytest.approx([-ideal, ideal])
+    assert world.robot.actuators[1].force_limit[0].tolist() == pytest.approx([ideal, ideal])
+
+
+@pytest.mark.parametrize("mode", [DcMotorInputMode.POSITION, DcMotorInputMode.VELOCITY])
+def test_custom_operations_act_in_volts(make_world: Any, mode: DcMotorInputMode) -> None:
+    gains = []
+    for operation in ("scale", custom("scale"), custom("mine", combine=lambda b, r: b * r)):
+        cfg = BuiltinDcMotorActuatorCfg(
+            target_names_expr=("hip",), motor_params=MOTOR_PARAMS, mode=mode,
+            stiffness=2.0, damping=0.5, voltage_limit=24.0,
+        )  # fmt: skip
+        world = make_world(actuators=(cfg,))
+        world.apply(dr.pd_gains, kp_range=(3.0, 3.0), kd_range=(2.0, 2.0), operation=operation)
+        gains.append(world.sim.model.actuator_gainprm[0, 0])
+    assert not torch.equal(gains[0], world.sim.get_default_field("actuator_gainprm")[0])
+    torch.testing.assert_close(gains[1], gains[0])
+    torch.testing.assert_close(gains[2], gains[0])
+
+
+# Selections by joint. "hip" is a servo, "knee" and "ankle" are ideal.
+@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize(
+    ("joints", "factors"),
+    [
+        (("knee",), (1.0, 3.0, 1.0)),
+        (("hip", "ankle"), (3.0, 1.0, 3.0)),
+        (".*", (3.0, 3.0, 3.0)),
+        ((), (1.0, 1.0, 1.0)),
+    ],
+)
+def test_joints_select_their_actuators(
+    make_world: Any, joints: Any, factors: tuple[float, ...], engine: str
+) -> None:
+    world = make_world(actuators=(POSITION, IDEAL), engine=engine)
+    chosen = SceneEntityCfg("robot", joint_names=joints)
+    world.apply(dr.pd_gains, kp_range=(3.0, 3.0), kd_range=(1.0, 1.0), asset_cfg=chosen)
+    world.apply(dr.effort_limits, effort_limit_range=(3.0, 3.0), asset_cfg=chosen)
+    ideal = world.robot.actuators[1]
+    gains = [world.sim.model.actuator_gainprm[1, 0, 0] / 20.0, *(ideal.stiffness[1] / 10.0)]
+    assert [float(gain) for gain in gains] == pytest.approx(factors)
+    limits = world.sim.model.actuator_forcerange[1, :, 1] / torch.tensor([5.0, 4.0, 4.0])
+    assert limits.tolist() == pytest.approx(factors)
+
+
 def with_actuator(element: str) -> str:
     return f"""<mujoco><worldbody><body name="cart"><joint name="slider" type="slide"/>
     <geom size=".1"/></body></worldbody><actuator>{element}</actuator></mujoco>"""

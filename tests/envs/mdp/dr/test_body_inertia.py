@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -15,7 +16,6 @@ from mjlab.envs.mdp.dr.body import (
     inertial_from_pseudo_inertia,
     pseudo_inertia_matrix,
 )
-from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.utils.lab_api.math import matrix_from_quat
 
 LAWS = settings(
@@ -168,17 +168,21 @@ def test_log_uniform_works_with_ranges_left_at_zero(make_world: Any) -> None:
     assert bool(((factor >= 1.22) & (factor <= 1.5)).all())
 
 
-def test_bodies_without_mass_are_refused_by_name(make_cart: Any) -> None:
+def test_bodies_without_mass_keep_it(make_cart: Any) -> None:
     # The mocap body above a fixed base has no mass.
     world = make_cart()
-    with pytest.raises(ValueError, match=r"\['mocap_base'\] have no mass"):
-        world.apply(dr.pseudo_inertia, alpha_range=(0.0, 0.1))
-    chosen = SceneEntityCfg("robot", body_names=("cart", "pole"))
-    world.apply(dr.pseudo_inertia, alpha_range=(0.0, 0.1), asset_cfg=chosen)
+    with pytest.warns(UserWarning, match=r"\['mocap_base'\] have no mass") as caught:
+        world.apply(dr.pseudo_inertia, alpha_range=(0.1, 0.1))
+    assert len(caught) == 1
+    factor = math.exp(0.2)
+    expected = torch.tensor([0.0, 0.0, 1.0 * factor, 0.1 * factor]).expand(4, 4)
+    torch.testing.assert_close(world.sim.model.body_mass, expected)
 
 
-def test_bodies_without_thickness_are_refused_by_name(make_world: Any) -> None:
+def test_bodies_without_thickness_keep_their_inertia(make_world: Any) -> None:
     xml = """<mujoco><worldbody><body name="plate"><freejoint/>
     <inertial pos="0 0 0" mass="1" diaginertia="1 1 2"/></body></worldbody></mujoco>"""
-    with pytest.raises(ValueError, match=r"\['plate'\].*not positive definite"):
-        make_world(xml).apply(dr.pseudo_inertia, alpha_range=(0.0, 0.1))
+    world = make_world(xml)
+    with pytest.warns(UserWarning, match=r"\['plate'\].*not positive definite"):
+        world.apply(dr.pseudo_inertia, alpha_range=(0.1, 0.1))
+    assert world.sim.model.body_mass[:, 1].tolist() == [1.0] * 4

@@ -29,13 +29,14 @@ CAMERAS_XML = """
     ],
     ids=["all", "selected", "by pattern"],
 )
-def test_cam_fovy_refuses_cameras_that_do_not_read_it_when_it_is_built(
-    make_world: Any, params: dict[str, Any]
-) -> None:
+def test_cam_fovy_warns_of_cameras_without_it(make_world: Any, params: dict[str, Any]) -> None:
     world = make_world(CAMERAS_XML)
-    term = EventTermCfg(func=dr.cam_fovy, mode="reset", params=params)
-    with pytest.raises(ValueError, match=r"'zoom'.*\['lens'\].*dr\.cam_intrinsic"):
-        world.events(zoom=term)
+    term = EventTermCfg(func=dr.cam_fovy, mode="startup", params=params)
+    with pytest.warns(UserWarning, match=r"\['lens'\].*dr\.cam_intrinsic") as caught:
+        manager = world.events(zoom=term)
+    assert len(caught) == 1
+    manager.apply("startup")
+    assert bool((world.sim.model.cam_fovy >= 40.0).any())
 
 
 def test_cam_fovy_is_for_cameras_that_read_it(make_world: Any) -> None:

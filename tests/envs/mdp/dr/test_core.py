@@ -204,8 +204,15 @@ def test_bad_axes_and_ranges_are_named(make_world: Any) -> None:
         world.apply(dr.geom_friction, ranges=0.5)
     with pytest.raises(ValueError, match="Unknown operation 'multiply'.*abs.*add.*scale"):
         world.apply(dr.geom_friction, ranges=(0.0, 1.0), operation="multiply")
-    with pytest.raises(ValueError, match=r"joint_damping axes.*\[1\]"):
-        world.apply(dr.joint_damping, ranges=(0.0, 1.0), axes=[1])
+
+
+@pytest.mark.parametrize(
+    "params", [{"ranges": (0.7, 0.7), "axes": [1]}, {"ranges": {7: (0.7, 0.7)}}]
+)
+def test_axes_of_one_number_per_object(make_world: Any, params: dict[str, Any]) -> None:
+    world = make_world()
+    world.apply(dr.joint_damping, **params)
+    assert world.sim.model.dof_damping[:, 6:].flatten().unique().tolist() == pytest.approx([0.7])
 
 
 def test_a_field_that_is_not_declared_is_expanded(make_world: Any, caplog: Any) -> None:

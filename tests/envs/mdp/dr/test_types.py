@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mjlab.envs.mdp.dr import Distribution, Operation
-from mjlab.envs.mdp.dr._types import draw, resolve_distribution, resolve_operation
+from mjlab.envs.mdp.dr._types import draw, read_bounds, resolve_distribution, resolve_operation
 
 
 @given(
@@ -35,9 +38,11 @@ def test_equal_log_uniform_bounds_are_a_constant(value: float) -> None:
 
 
 @pytest.mark.parametrize("bounds", [(0.0, 1.0), (-1.0, 1.0)])
-def test_log_uniform_refuses_bounds_at_or_below_zero(bounds: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="log_uniform bounds: expected bounds > 0"):
-        draw(resolve_distribution("log_uniform"), bounds, (3,), "cpu")
+def test_log_uniform_of_bounds_at_zero_warns(bounds: tuple[float, float]) -> None:
+    with pytest.warns(UserWarning, match="log_uniform bounds: expected bounds > 0") as caught:
+        sample = draw(resolve_distribution("log_uniform"), bounds, (3,), "cpu")
+    assert len(caught) == 1
+    assert sample.shape == (3,)
 
 
 def test_gaussian_refuses_a_negative_deviation() -> None:
@@ -56,7 +61,23 @@ def test_unknown_names_list_the_valid_ones_and_instances_pass() -> None:
     assert resolve_distribution(ours) is ours
 
 
-def test_a_distribution_of_the_wrong_shape_is_refused() -> None:
+def test_samples_broadcast_to_the_shape() -> None:
     scalar = Distribution("scalar", lambda lower, upper, shape, device: lower)
-    with pytest.raises(ValueError, match=r"'scalar': .*shape \(2, 2\), got \(\)"):
-        draw(scalar, (0.0, 1.0), (2, 2), "cpu")
+    assert torch.equal(draw(scalar, (3.0, 1.0), (2, 2), "cpu"), torch.full((2, 2), 3.0))
+
+
+def test_samples_of_another_shape_are_an_error() -> None:
+    three = Distribution("three", lambda lower, upper, shape, device: torch.zeros(3))
+    with pytest.raises(ValueError, match=r"'three': .*shape \(2, 2\), got \(3,\)"):
+        draw(three, (0.0, 1.0), (2, 2), "cpu")
+
+
+@pytest.mark.parametrize("kind", [int, np.float32, np.int64, torch.tensor])
+def test_bounds_of_every_kind_of_number(kind: Any) -> None:
+    assert read_bounds([kind(1), kind(2)], "ranges") == (1.0, 2.0)
+
+
+@pytest.mark.parametrize("value", [1.0, (1.0,), (1.0, 2.0, 3.0), ("1", "2"), None, "12"])
+def test_bounds_that_are_no_pair_are_an_error(value: Any) -> None:
+    with pytest.raises(ValueError, match="ranges: expected a pair of numbers"):
+        read_bounds(value, "ranges")

@@ -7,6 +7,7 @@ Each public function of `mjlab.envs.mdp.dr` is defined in the module of its obje
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -14,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import torch
 
 from mjlab.envs.mdp.dr._types import (
-    ABS,
     Distribution,
     Operation,
     Ranges,
@@ -470,7 +470,7 @@ def _bounds_by_axis(
 ) -> dict[int, tuple[float, float]]:
     """Return the bounds of each target axis, in sampling order.
 
-    A field with one number per object has the single axis 0.
+    A field with one number per object has the single axis 0, whatever its name.
     """
     if axes is not None:
         targets = list(axes)
@@ -478,7 +478,7 @@ def _bounds_by_axis(
         targets = list(ranges)
     else:
         targets = list(range(size) if row.default_axes is None else row.default_axes)
-    invalid = [axis for axis in targets if axis not in range(size)]
+    invalid = [axis for axis in targets if axis not in range(size) and size > 1]
     if invalid:
         raise ValueError(f"{row.name} axes: expected axes in {[*range(size)]}, got {invalid}.")
     if not isinstance(ranges, dict):
@@ -499,8 +499,7 @@ def _write(
 ) -> None:
     """Sample each axis and write `op.combine(base, samples)`."""
     field = model_field(selection.env, row.field)
-    from_default = op.uses_defaults or (row.unit and op is ABS)
-    base = default_values(selection, row.field) if from_default else field[selection.index]
+    base = default_values(selection, row.field) if op.uses_defaults else field[selection.index]
     rnd = op.initialize(base)
     # `rnd` is written below, but an operation may return the base itself as neutral element.
     rnd = rnd.clone() if rnd is base else rnd
@@ -515,13 +514,18 @@ def _write(
             rnd = sample
     new = preserve_absent_geoms(selection, op.combine(base, rnd), field)
     if row.unit:
+        others = [axis for axis in range(field.shape[-1]) if axis not in bounds]
+        new[..., others] = default_values(selection, row.field)[..., others]
         norms = new.norm(dim=-1, keepdim=True)
-        if bool((norms < 1e-6).any()):
-            raise ValueError(
+        is_zero = norms < 1e-6
+        if bool(is_zero.any()):
+            warnings.warn(
                 f"{row.name}: expected a nonzero direction, sampled a zero vector; choose ranges "
-                "that exclude the origin."
+                "that exclude the origin.",
+                UserWarning,
+                stacklevel=2,
             )
-        field[selection.index] = new / norms
+        field[selection.index] = new / torch.where(is_zero, 1.0, norms)
     elif has_axes:
         for axis in bounds:
             field[(*selection.index, axis)] = new[..., axis]

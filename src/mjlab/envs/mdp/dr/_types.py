@@ -5,6 +5,8 @@ Custom instances are accepted wherever a name is.
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -29,7 +31,7 @@ class Distribution:
     sample: Callable[[torch.Tensor, torch.Tensor, tuple[int, ...], str], torch.Tensor]
     """Sampler `sample(lower, upper, shape, device)`; bounds are 0-d tensors; returns `shape`."""
     check: Callable[[float, float], None] | None = None
-    """Check of the bounds before sampling; raises `ValueError` if they are invalid."""
+    """Check of the bounds before sampling; warns of invalid bounds, or raises `ValueError`."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +68,11 @@ def _gaussian(
 
 def _check_log_bounds(lower: float, upper: float) -> None:
     if lower != upper and min(lower, upper) <= 0.0:
-        raise ValueError(
+        warnings.warn(
             f"log_uniform bounds: expected bounds > 0, or equal bounds for a constant, got "
-            f"({lower}, {upper}); use 'uniform' for ranges that include 0."
+            f"({lower}, {upper}), and samples are NaN; use 'uniform' for ranges that include 0.",
+            UserWarning,
+            stacklevel=2,
         )
 
 
@@ -127,10 +131,11 @@ def read_bounds(value: Any, name: str) -> tuple[float, float]:
 
     Raises `ValueError` naming `name` for other values.
     """
-    if isinstance(value, (tuple, list)) and len(value) == 2:
-        lower, upper = value
-        if all(isinstance(bound, (int, float)) for bound in (lower, upper)):
-            return float(lower), float(upper)
+    is_pair = isinstance(value, (tuple, list)) and len(value) == 2
+    if is_pair and not any(isinstance(bound, str) for bound in value):
+        # Numbers of numpy and scalar tensors are numbers, too.
+        with contextlib.suppress(TypeError, ValueError):
+            return float(value[0]), float(value[1])
     raise ValueError(
         f"{name}: expected a pair of numbers, such as (0.8, 1.2), got {value!r} of type "
         f"{type(value).__name__}."
@@ -142,16 +147,18 @@ def draw(
 ) -> torch.Tensor:
     """Sample a tensor of `shape`.
 
-    Raises `ValueError` if the distribution rejects the bounds or returns the wrong shape.
+    Raises `ValueError` if the distribution rejects the bounds, or returns a shape that does not
+    broadcast to `shape`.
     """
     if distribution.check is not None:
         distribution.check(*bounds)
     # Filled on the device: copies from the host would synchronize.
     lower, upper = (torch.full((), b, dtype=torch.float32, device=device) for b in bounds)
     sample = distribution.sample(lower, upper, shape, device)
-    if sample.shape != torch.Size(shape):
+    try:
+        return sample.expand(shape)
+    except RuntimeError as error:
         raise ValueError(
             f"Distribution {distribution.name!r}: expected samples of shape {shape}, got "
             f"{tuple(sample.shape)}."
-        )
-    return sample
+        ) from error

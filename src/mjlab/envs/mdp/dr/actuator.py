@@ -28,8 +28,6 @@ from mjlab.actuator.actuator import TransmissionType
 from mjlab.compat import older_names
 from mjlab.envs.mdp.dr._core import ROBOT, model_field
 from mjlab.envs.mdp.dr._types import (
-    ABS,
-    SCALE,
     Distribution,
     Operation,
     draw,
@@ -78,15 +76,14 @@ def pd_gains(
         kd_range: Damping in the units of the actuator's config, or its factor with "scale".
         asset_cfg: Entity and actuators, selected individually by name or index.
         distribution: "uniform", "log_uniform", or a `Distribution`.
-        operation: "scale" multiplies the configured gains, "abs" replaces them.
+        operation: "scale" multiplies the configured gains, "abs" replaces them; or an `Operation`.
 
     Raises:
         ValueError: unsupported operation, DC motor in voltage mode, or DC motor in velocity mode
             with a slew rate.
         TypeError: a selected actuator has no gains, such as a motor or a muscle.
     """
-    dist, op = resolve_distribution(distribution), resolve_operation(operation)
-    check_one_of("pd_gains operation", op.name, ("scale", "abs"))
+    dist, op = resolve_distribution(distribution), _operation("pd_gains", operation)
     bounds = read_bounds(kp_range, "kp_range"), read_bounds(kd_range, "kd_range")
     chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     locations = [_locate_gains(env, selected) for selected in chosen]
@@ -128,15 +125,14 @@ def effort_limits(
         effort_limit_range: Effort limit (N m or N), or its factor with "scale".
         asset_cfg: Entity and actuators, selected individually by name or index.
         distribution: "uniform", "log_uniform", or a `Distribution`.
-        operation: "scale" multiplies the configured limits, "abs" replaces them.
+        operation: "scale" multiplies the configured limits, "abs" replaces them; or an `Operation`.
 
     Raises:
         ValueError: unsupported operation.
         TypeError: a selected actuator is of a custom type, or is an XML actuator with effort
             commands but without an effort limit.
     """
-    dist, op = resolve_distribution(distribution), resolve_operation(operation)
-    check_one_of("effort_limits operation", op.name, ("scale", "abs"))
+    dist, op = resolve_distribution(distribution), _operation("effort_limits", operation)
     bounds = read_bounds(effort_limit_range, "effort_limit_range")
     chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     locations = [_locate_limits(env, selected) for selected in chosen]
@@ -148,14 +144,19 @@ def effort_limits(
             merged = _merged(selected, actuator.force_limit, default, op, samples)
             actuator.set_effort_limit(selected.rows, merged)
         for parameter in targets:
-            values, at = samples, columns
+            at, unit = columns, None
             if parameter.field == "actuator_ctrlrange":
                 at = env.sim.get_default_field("actuator_ctrladr")[columns]
-                if op is ABS:
-                    # Effort = control * gain; only XML motors have a gain other than 1.
-                    gains = _default(env, selected.rows, columns, "actuator_gainprm", 0)
-                    values = samples / gains.abs()
-            _write(env, selected.rows, at, parameter, op, values)
+                # Effort = control * gain; only XML motors have a gain other than 1.
+                unit = _default(env, selected.rows, columns, "actuator_gainprm", 0).abs()
+            _write(env, selected.rows, at, parameter, op, samples, unit)
+
+
+def _operation(function: str, operation: Operation | str) -> Operation:
+    """Return the operation; raise `ValueError` for a name other than "scale" and "abs"."""
+    if not isinstance(operation, Operation):
+        check_one_of(f"{function} operation", operation, ("scale", "abs"))
+    return resolve_operation(operation)
 
 
 @dataclass(frozen=True)
@@ -399,13 +400,27 @@ def _write(
     parameter: Parameter,
     op: Operation,
     samples: torch.Tensor,
+    unit: torch.Tensor | None = None,
 ) -> None:
-    field, axis = parameter.field, parameter.axis
-    if op is SCALE:
-        samples = _default(env, rows, columns, field, axis) * samples
-    else:
-        samples = parameter.sign * samples
-    model_field(env, field)[rows[:, None], columns[None, :], axis] = samples
+    """Write a parameter in the samples' units: the field times `sign` and, if given, `unit`."""
+    field, index = parameter.field, (rows[:, None], columns[None, :], parameter.axis)
+    base = parameter.sign * _base(env, rows, columns, field, parameter.axis, op)
+    new = op.combine(base, samples) if unit is None else op.combine(base * unit, samples) / unit
+    model_field(env, field)[index] = parameter.sign * new
+
+
+def _base(
+    env: ManagerBasedRlEnv,
+    rows: torch.Tensor,
+    columns: torch.Tensor,
+    field: str,
+    axis: int,
+    op: Operation,
+) -> torch.Tensor:
+    """Return the values that the operation starts from, (R, C)."""
+    if op.uses_defaults:
+        return _default(env, rows, columns, field, axis).expand(len(rows), len(columns))
+    return model_field(env, field)[rows[:, None], columns[None, :], axis]
 
 
 def _set_dc_motor_gains(
@@ -431,10 +446,10 @@ def _set_dc_motor_gains(
     else:
         written = ((4, torch.zeros_like(back_emf), kp), (6, back_emf, kd))
     for axis, offset, samples in written:
-        unit = default(axis) - offset if op is SCALE else torque_per_volt
-        values = offset + unit * samples
+        stored = _base(env, selected.rows, columns, "actuator_gainprm", axis, op)
+        new = op.combine((stored - offset) / torque_per_volt, samples)
         model_field(env, "actuator_gainprm")[selected.rows[:, None], columns[None, :], axis] = (
-            values
+            offset + torque_per_volt * new
         )
 
 
@@ -449,6 +464,6 @@ def _merged(
     assert current is not None
     assert default is not None
     merged = current[selected.rows].clone()
-    base = default[selected.rows][:, selected.targets]
-    merged[:, selected.targets] = base * samples if op is SCALE else samples
+    base = (default if op.uses_defaults else current)[selected.rows][:, selected.targets]
+    merged[:, selected.targets] = op.combine(base, samples)
     return merged

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -140,15 +141,17 @@ def pseudo_inertia(
         distribution: "uniform", "log_uniform", "gaussian", or a `Distribution`.
         asset_cfg: Entity and bodies.
 
+    Selected bodies without mass or with an unphysical inertia keep their values, with a warning.
+
     Raises:
-        ValueError: a selected body (named) has no mass or an unphysical inertia, or invalid range.
+        ValueError: invalid range.
     """
     dist = resolve_distribution(distribution)
     d_ranges = (d1_range, d2_range, d3_range) if d_range is None else (d_range,) * 3
     t_ranges = (t1_range, t2_range, t3_range) if t_range is None else (t_range,) * 3
     ranges = (alpha_range, *d_ranges, s12_range, s13_range, s23_range, *t_ranges)
-    bodies = select(env, env_ids, asset_cfg, BODY)
-    default = _default_pseudo_inertia(bodies)
+    bodies = _physical(select(env, env_ids, asset_cfg, BODY))
+    default = pseudo_inertia_matrix(_defaults(bodies))
     parameters = []
     for name, value in zip(_PARAMETERS, ranges, strict=True):
         bounds = read_bounds(value, f"pseudo_inertia: {name}_range")
@@ -169,22 +172,31 @@ def pseudo_inertia(
         model_field(env, field)[bodies.index] = value.float()
 
 
-def _default_pseudo_inertia(bodies: Selection) -> torch.Tensor:
-    values = Inertial(*(default_values(bodies, field).double() for field in _FIELDS))
+def _defaults(bodies: Selection) -> Inertial:
+    return Inertial(*(default_values(bodies, field).double() for field in _FIELDS))
+
+
+def _physical(bodies: Selection) -> Selection:
+    """Return the bodies with a positive definite pseudo-inertia matrix; warn if others are selected."""
+    values = _defaults(bodies)
     # J is positive definite iff the mass and the second moments of mass along the principal axes
     # are positive. The margin covers float32 rounding: a flat body has a zero second moment.
     trace = values.inertia.sum(dim=-1, keepdim=True)
     second_moments = 0.5 * trace - values.inertia
     unphysical = (second_moments <= 2e-7 * trace).any(dim=-1) | (values.mass <= 0.0)
-    bad = unphysical.any(dim=0).tolist()
-    invalid = [name for name, is_bad in zip(bodies.names, bad, strict=True) if is_bad]
-    if invalid:
-        raise ValueError(
-            f"pseudo_inertia: bodies {invalid} have no mass or an unphysical inertia (pseudo-inertia "
-            "matrix not positive definite); exclude them from body_names, or set mass and inertia "
-            "in the model."
-        )
-    return pseudo_inertia_matrix(values)
+    bad = unphysical.any(dim=0)
+    if not bad.any():
+        return bodies
+    invalid = [name for name, is_bad in zip(bodies.names, bad.tolist(), strict=True) if is_bad]
+    warnings.warn(
+        f"pseudo_inertia: bodies {invalid} have no mass or an unphysical inertia (pseudo-inertia "
+        "matrix not positive definite) and keep it; exclude them from body_names, or set mass and "
+        "inertia in the model.",
+        UserWarning,
+        stacklevel=3,
+    )
+    kept = {"local_ids": bodies.local_ids[~bad], "columns": bodies.columns[~bad]}
+    return dataclasses.replace(bodies, **kept)
 
 
 def pseudo_inertia_matrix(body: Inertial) -> torch.Tensor:

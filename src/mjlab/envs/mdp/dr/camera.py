@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -36,7 +37,7 @@ cam_quat = rotation_term(
 def _check_cam_fovy(
     env: ManagerBasedRlEnv, ranges: Ranges, asset_cfg: SceneEntityCfg = ROBOT, **_: Any
 ) -> None:
-    """Raise `ValueError` if a selected camera has a sensor size: MuJoCo then ignores fovy."""
+    """Warn if a selected camera has a sensor size: MuJoCo then ignores fovy."""
     model = env.sim.mj_model
     for selection in targets_of(env, ranges, asset_cfg, CAMERA):
         # Orthographic cameras have no focal length: fovy is the height of the image.
@@ -47,10 +48,12 @@ def _check_cam_fovy(
             and model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
         ]
         if ignored:
-            raise ValueError(
+            warnings.warn(
                 f"cam_fovy: expected cameras without focal and sensorsize, got {ignored}, whose "
                 "fovy MuJoCo ignores; use dr.cam_intrinsic, or select other cameras (camera_names "
-                "of the SceneEntityCfg)."
+                "of the SceneEntityCfg).",
+                UserWarning,
+                stacklevel=2,
             )
 
 
@@ -59,7 +62,7 @@ cam_fovy = checked_when_built(_check_cam_fovy)(
         __name__,
         "cam_fovy",
         CAMERA,
-        "Randomize vertical fields of view (degrees). Raises when the term is built for cameras "
-        "with focal length and sensor size, because MuJoCo ignores their fovy; use `cam_intrinsic`.",
+        "Randomize vertical fields of view (degrees). Warns when the term is built for cameras with "
+        "focal length and sensor size, because MuJoCo ignores their fovy; use `cam_intrinsic`.",
     )
 )
