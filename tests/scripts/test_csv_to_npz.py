@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,6 +29,79 @@ from mjlab.tasks.tracking.motion_recording import (
 from mjlab.utils.errors import UserError
 
 JOINTS = get_g1_robot_cfg().build().joint_names
+
+
+def table(**changes) -> np.ndarray:
+    """Return a table of a robot that turns about z and squats, in the layout of the task."""
+    t = np.linspace(0.0, 1.0, 41)[:, None]
+    half = 1.2 * t
+    joints = np.tile(0.05 * np.arange(29) / 29, (41, 1))
+    for side in ("left", "right"):
+        for name, share in (("hip_pitch", -1.0), ("knee", 2.0), ("ankle_pitch", -0.8)):
+            joints[:, JOINTS.index(f"{side}_{name}_joint")] = share * t[:, 0]
+    quat = np.hstack((0.0 * t, 0.0 * t, np.sin(half), np.cos(half)))
+    values = {"pos": np.hstack((t, 0.0 * t, 0.7 + 0.0 * t)), "quat": quat, "joints": joints}
+    values |= changes
+    return np.hstack(list(values.values()))
+
+
+def breadth_first() -> list[int]:
+    """Return the joints of the G1 from the pelvis outwards."""
+    model = get_g1_robot_cfg().build().compile()
+
+    def depth(body: int) -> int:
+        return 0 if body == 0 else 1 + depth(model.body_parentid[body])
+
+    return sorted(range(29), key=lambda joint: depth(model.jnt_bodyid[1 + joint]))
+
+
+def motion_of(tmp_path, values: np.ndarray, header: str = ""):
+    """Return the motion made from a table."""
+    path = tmp_path / "table.csv"
+    np.savetxt(path, values, delimiter=",", header=header, comments="")
+    return converted(path, tmp_path)
+
+
+@pytest.mark.parametrize("mark", ["", "# "])
+def test_columns_are_found_by_the_names_of_a_header(tmp_path, mark):
+    root = [
+        f"root_{kind}_{axis}"
+        for kind, axis in zip(["pos"] * 3 + ["rot"] * 4, "xyzxyzw", strict=True)
+    ]
+    names = [*root, *(name.replace("_joint", "_dof") for name in JOINTS), "frame"]
+    values = np.hstack((table(), np.arange(41)[:, None]))
+    order = [36, *range(35, 6, -1), 6, 3, 4, 5, 0, 1, 2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        expected = motion_of(tmp_path, table())
+        motion = motion_of(tmp_path, values[:, order], mark + ",".join(names[i] for i in order))
+    np.testing.assert_allclose(motion.body_pos_w, expected.body_pos_w, atol=1e-6)
+    np.testing.assert_allclose(motion.joint_pos, expected.joint_pos, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v: v[:, [0, 1, 2, 6, 3, 4, 5, *range(7, 36)]], "w x y z"),
+        (lambda v: np.hstack((v[:, :7], np.rad2deg(v[:, 7:]))), "degrees"),
+        (lambda v: np.hstack((v[:, :7], v[:, 7:][:, breadth_first()])), "breadth-first"),
+        (lambda v: np.hstack((v[:, :3], 1.1 * v[:, 3:7], v[:, 7:])), "norm 1.1; normalized"),
+    ],
+    ids=["wxyz", "degrees", "breadth_first", "norm"],
+)
+def test_other_conventions_are_converted_with_a_warning(tmp_path, change, message):
+    expected = motion_of(tmp_path, table())
+    with pytest.warns(UserWarning, match=message) as warned:
+        motion = motion_of(tmp_path, change(table()))
+    assert len(warned) == 1
+    np.testing.assert_allclose(motion.body_pos_w, expected.body_pos_w, atol=1e-5)
+
+
+def test_joints_far_beyond_their_limits_are_named(tmp_path):
+    values = table()
+    values[:, 7 + JOINTS.index("left_knee_joint")] = -1.5
+    with pytest.warns(UserWarning, match="'left_knee_joint': 1.4"):
+        motion_of(tmp_path, values)
 
 
 def recording(frames=91, fps=30.0, speed=1.0) -> Recording:
@@ -239,12 +313,12 @@ def a_line(**changes) -> str:
     [
         ("", "at least 2 poses, got 0"),
         (a_line(), "at least 2 poses, got 1"),
-        ("x,y,z\n" + a_line(), "is not a table of numbers"),
         ("1,2,3\n4,5,6\n", "expected 36 columns, got 3"),
+        (a_line().replace(",", " "), "is not a table of numbers"),
         (f"{a_line()}\n{a_line(c8=float('nan'))}", "Line 2 of .* NaN"),
-        (f"{a_line(c8=1e39)}\n{a_line()}", "joint_pos: .*float32.* infinite"),
-        (f"{a_line(c8=3e38)}\n{a_line(c8=-3e38)}", "joint_vel: .*float32.* infinite"),
-        (f"{a_line()}\n{a_line(c6=0.5)}", "Line 2 of .* norm 0.5"),
+        (f"{a_line(c8=1e39)}\n{a_line()}", "joint_pos .*float32.* infinite"),
+        (f"{a_line(c8=3e38)}\n{a_line(c8=-3e38)}", "joint_vel .*float32.* infinite"),
+        (f"{a_line()}\n{a_line(c6=0.0)}", "Line 2 of .* norm 0"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path, text, message):
@@ -279,7 +353,7 @@ def test_flags_that_make_no_sense_are_refused(csv, tmp_path, flags, message):
 
 def test_lines_of_a_range_are_told_as_in_the_file(tmp_path):
     path = tmp_path / "bad.csv"
-    path.write_text("\n".join([a_line()] * 6 + [a_line(c9=float("nan"))] + [a_line(c6=0.5)]))
+    path.write_text("\n".join([a_line()] * 6 + [a_line(c9=float("nan"))] + [a_line(c6=0.0)]))
     cfg = CsvToNpzConfig(input_file=str(path), output_file=str(tmp_path / "o.npz"))
     cfg.line_range = (3, 7)
     with pytest.raises(MotionFileError, match="Line 7 of .* NaN"):
@@ -289,7 +363,7 @@ def test_lines_of_a_range_are_told_as_in_the_file(tmp_path):
         convert(cfg)
     path.write_text("\n".join([a_line()] * 6 + [a_line(c6=0.5)]))
     cfg.line_range = (3, 7)
-    with pytest.raises(MotionFileError, match="Line 7 of .* norm 0.5"):
+    with pytest.warns(UserWarning, match="Line 7 of .* norm 0.5; normalized"):
         convert(cfg)
 
 

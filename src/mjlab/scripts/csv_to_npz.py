@@ -15,6 +15,7 @@ from mjlab.scripts.cli import run_alias
 from mjlab.scripts.export_scene import robot_cfg
 from mjlab.scripts.flags import parse_flags
 from mjlab.tasks.tracking.motion_file import Motion, npz_path, read_motion, write_motion
+from mjlab.tasks.tracking.motion_order import Skeleton, arranged, plausible
 from mjlab.tasks.tracking.motion_recording import (
     Recording,
     make_motion,
@@ -99,8 +100,9 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     target = npz_path(cfg.output_file or f"{name}.npz")
     if target.resolve() == source.resolve():
         raise UserError(f"--output-file: expected a path other than the input, got {target}.")
-    recording = _read(cfg, source, robot)
-    model = robot.compile()
+    skeleton = Skeleton.of_entity(robot)
+    model = skeleton.model
+    recording = _read(cfg, source, skeleton)
     motion = make_motion(
         resampled(recording, cfg.output_fps), model, robot.joint_names, robot.body_names
     )
@@ -118,10 +120,11 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     return path
 
 
-def _read(cfg: CsvToNpzConfig, source: Path, robot: Entity) -> Recording:
+def _read(cfg: CsvToNpzConfig, source: Path, robot: Skeleton) -> Recording:
     if source.suffix != ".npz":
-        return read_csv(source, cfg.input_fps, robot.joint_names, cfg.line_range)
-    motion = read_motion(source)
+        recording = read_csv(source, cfg.input_fps, robot.joint_names, cfg.line_range)
+        return plausible(source, recording, robot)
+    motion = arranged(source, read_motion(source), robot, is_strict=True)
     recording = recording_of(motion, motion.fps or cfg.input_fps)
     if cfg.line_range is None:
         return recording

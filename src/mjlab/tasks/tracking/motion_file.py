@@ -16,11 +16,12 @@ The world frame of a file is relative to the environment's origin.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import math
+import warnings
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,9 @@ _ARRAYS: dict[str, tuple[str | int, ...]] = {
     "body_ang_vel_w": ("frames", "bodies", 3),
 }
 """Arrays of a motion with their shapes."""
-_MIN_FRAMES = 2
+_OPTIONAL = {"fps", "joint_names", "body_names"}
+PER_JOINT = ("joint_pos", "joint_vel")
+PER_BODY = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
 _QUAT_TOLERANCE = 1e-3
 _RATE_TOLERANCE = 1e-3
 
@@ -80,10 +83,12 @@ class Motion:
 def read_motion(path: str | Path) -> Motion:
     """Read a motion as float32. Nothing in the file is executed (no pickle).
 
+    Odd content that can be played is one warning: NaN or infinite values, quaternions without unit
+    norm (normalized), a single frame (repeated), arrays longer than `joint_pos` (cut), an unusable
+    frame rate or unusable names (ignored).
+
     Raises:
-        MotionFileError: file not found, not a motion, or invalid content: arrays with different
-            numbers of frames, fewer than two frames, NaN or infinite values, quaternions without
-            unit norm.
+        MotionFileError: file not found, not a motion, no frame, or arrays that do not fit together.
     """
     path = Path(path)
     content = _load(path)
@@ -94,63 +99,43 @@ def read_motion(path: str | Path) -> Motion:
             "make a motion from joint angles."
         )
     arrays = {key: content[key] for key in _ARRAYS}
-    _check_arrays(path, arrays)
-    if len(arrays["joint_pos"]) < _MIN_FRAMES:
-        raise MotionFileError(
-            f"Motion {path}: expected at least {_MIN_FRAMES} frames, got {len(arrays['joint_pos'])}."
-        )
-    arrays["body_quat_w"] = _unit_quaternions(path, arrays["body_quat_w"])
-    names = {
-        key: _names(path, key, content.get(key), like, arrays[like].shape[1])
-        for key, like in (("joint_names", "joint_pos"), ("body_names", "body_pos_w"))
-    }
-    values: dict[str, Any] = {
-        key: np.ascontiguousarray(value, dtype=np.float32) for key, value in arrays.items()
-    }
-    return Motion(fps=_fps(path, content.get("fps")), **values, **names)
+    odd = _cut(arrays)
+    _check_shapes(path, arrays)
+    if len(arrays["joint_pos"]) == 0:
+        raise MotionFileError(f"Motion {path}: expected at least 1 frame, got 0.")
+    if len(arrays["joint_pos"]) == 1:
+        odd.append("1 frame, repeated")
+        arrays = {key: np.repeat(value, 2, axis=0) for key, value in arrays.items()}
+    odd += _not_finite(arrays)
+    arrays["body_quat_w"], wrong = _normalized(arrays["body_quat_w"])
+    odd += wrong
+    fps, wrong = _fps(content.get("fps"))
+    odd += wrong
+    names: dict[str, tuple[str, ...]] = {}
+    for key, like in (("joint_names", "joint_pos"), ("body_names", "body_pos_w")):
+        names[key], wrong = _names(key, content.get(key), arrays[like].shape[1])
+        odd += wrong
+    if odd:
+        warnings.warn(f"Motion {path}: {'; '.join(odd)}.", UserWarning, stacklevel=2)
+    with np.errstate(over="ignore"):
+        values: dict[str, Any] = {
+            key: np.ascontiguousarray(value, dtype=np.float32) for key, value in arrays.items()
+        }
+    return Motion(fps=fps, **values, **names)
 
 
-def check_motion_fits(
-    path: str | Path,
-    motion: Motion,
-    joint_names: Sequence[str],
-    body_names: Sequence[str],
-    step_dt: float,
-) -> None:
-    """Check that a motion matches the robot and the control timestep.
+def check_rate(path: str | Path, motion: Motion, step_dt: float) -> None:
+    """Warn if the frame rate of a motion is not the control rate; `step_dt` (s) is a control step.
 
-    Args:
-        path: Path of the file, for messages.
-        motion: The motion.
-        joint_names: Joints of the robot, in order.
-        body_names: Bodies of the robot, in order.
-        step_dt: Control timestep (s).
-
-    Raises:
-        MotionFileError: the number, names or order of joints or bodies differs (names only if the
-            file has them), or the frame rate is not the control rate.
+    Frames are played one per step, whatever the rate of the file.
     """
-    for kind, expected, names, columns in (
-        ("joints", joint_names, motion.joint_names, motion.joint_pos),
-        ("bodies", body_names, motion.body_names, motion.body_pos_w),
-    ):
-        if columns.shape[1] != len(expected):
-            raise MotionFileError(
-                f"Motion {path}: expected {len(expected)} {kind}, got {columns.shape[1]}. The robot "
-                f"has {list(expected)}."
-            )
-        if names and tuple(names) != tuple(expected):
-            pairs = zip(names, expected, strict=True)
-            first = next(i for i, (name, other) in enumerate(pairs) if name != other)
-            raise MotionFileError(
-                f"Motion {path} {kind}: expected the names and order of the robot, "
-                f"{expected[first]!r} at index {first}, got {names[first]!r}."
-            )
     if motion.fps is not None and abs(motion.fps * step_dt - 1.0) > _RATE_TOLERANCE:
-        raise MotionFileError(
+        warnings.warn(
             f"Motion {path} fps: expected {1.0 / step_dt:g}, the control rate (timestep {step_dt:g} "
-            f"s), got {motion.fps:g}; resample it with `mjlab csv-to-npz --input-file {path} "
-            f"--output-fps {1.0 / step_dt:g} --output-file ...`."
+            f"s), got {motion.fps:g}; one frame is played per step. Resample it with `mjlab "
+            f"csv-to-npz --input-file {path} --output-fps {1.0 / step_dt:g} --output-file ...`.",
+            UserWarning,
+            stacklevel=2,
         )
 
 
@@ -168,7 +153,9 @@ def write_motion(path: str | Path, motion: Motion) -> Path:
     path = npz_path(path)
     entries = {"fps": np.array([motion.fps], dtype=np.float32)}
     arrays = {key: np.asarray(getattr(motion, key)) for key in _ARRAYS}
-    _check_arrays(path, arrays)
+    _check_shapes(path, arrays)
+    if problems := _not_finite(arrays):
+        raise MotionFileError(f"Motion {path}: {'; '.join(problems)}.")
     entries |= {key: array.astype(np.float32) for key, array in arrays.items()}
     for key in ("joint_names", "body_names"):
         if getattr(motion, key):
@@ -202,7 +189,13 @@ def _load(path: Path) -> dict[str, np.ndarray]:
                 raise MotionFileError(
                     f"Motion {path}: expected an .npz archive, got a single array."
                 )
-            return {key: archive[key] for key in archive.files}
+            keys = set(archive.files)
+            content = {key: archive[key] for key in _ARRAYS if key in keys}
+            for key in _OPTIONAL & keys:
+                # Objects cannot be read without executing the file.
+                with contextlib.suppress(ValueError):
+                    content[key] = archive[key]
+            return content
     except MotionFileError:
         raise
     except Exception as error:
@@ -211,22 +204,25 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         raise MotionFileError(f"{path} cannot be read as a motion (.npz): {reason}") from error
 
 
-def _names(
-    path: Path, key: str, value: np.ndarray | None, like: str, count: int
-) -> tuple[str, ...]:
-    """Return the names of the `count` columns of the array `like`, or () without names."""
-    if value is None:
-        return ()
-    if value.dtype.kind != "U" or value.shape not in ((0,), (count,)):
-        raise MotionFileError(
-            f"Motion {path} {key}: expected {count} strings, one per column of {like}, got "
-            f"{value.dtype} of shape {value.shape}."
-        )
-    return tuple(str(name) for name in value)
+def _names(key: str, value: np.ndarray | None, count: int) -> tuple[tuple[str, ...], list[str]]:
+    """Return the names of `count` columns, or () without usable names, and what is wrong."""
+    if value is None or value.size == 0:
+        return (), []
+    if value.dtype.kind not in "US" or value.shape != (count,):
+        return (), [f"{key} of {value.dtype} {value.shape} instead of {count} names, ignored"]
+    return tuple(n.decode() if isinstance(n, bytes) else str(n) for n in value.tolist()), []
 
 
-def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Raise `MotionFileError` unless the arrays are finite numbers of equal sizes."""
+def _cut(arrays: dict[str, np.ndarray]) -> list[str]:
+    """Cut arrays to the frames of `joint_pos`; return what is wrong."""
+    frames = len(arrays["joint_pos"]) if arrays["joint_pos"].ndim else 0
+    longer = [key for key, value in arrays.items() if value.ndim and len(value) > frames > 0]
+    arrays |= {key: arrays[key][:frames] for key in longer}
+    return [f"{longer} with more frames than joint_pos, cut"] if longer else []
+
+
+def _check_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Raise `MotionFileError` unless the arrays are numbers of equal sizes."""
     # Sizes of axes, from the first array that has them.
     sizes: dict[str | int, int] = {3: 3, 4: 4}
     for key, axes in _ARRAYS.items():
@@ -239,38 +235,46 @@ def _check_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
             raise MotionFileError(
                 f"Motion {path} {key}: expected numbers ({shape}), got {value.dtype} {value.shape}."
             )
+
+
+def _not_finite(arrays: dict[str, np.ndarray]) -> list[str]:
+    """Return the arrays with values that are not finite, one text each."""
+    found = []
+    for key, value in arrays.items():
         # Motions are stored as float32: values above 3.4e38 become infinite.
         with np.errstate(over="ignore"):
             is_finite = np.isfinite(value.astype(np.float32))
         if not is_finite.all():
-            raise MotionFileError(
-                f"Motion {path} {key}: expected finite float32 values (up to 3.4e38), got "
+            found.append(
+                f"{key} expected finite float32 values (up to 3.4e38), got "
                 f"{int((~is_finite).sum())} that are NaN or infinite, the first in frame "
-                f"{np.argwhere(~is_finite)[0][0]}."
+                f"{np.argwhere(~is_finite)[0][0]}"
             )
+    return found
 
 
-def _unit_quaternions(path: Path, quats: np.ndarray) -> np.ndarray:
+def _normalized(quats: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Return unit quaternions, zeros as they are, and what is wrong."""
     quats = quats.astype(np.float64)
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     wrong = np.abs(norms[..., 0] - 1.0) > _QUAT_TOLERANCE
-    if wrong.any():
-        frame, body = (int(i) for i in np.argwhere(wrong)[0])
-        raise MotionFileError(
-            f"Motion {path} body_quat_w: expected unit quaternions, got {int(wrong.sum())} without "
-            f"unit norm; in frame {frame}, body {body} the norm is {norms[frame, body, 0]:.4g}."
-        )
-    return quats / norms
+    quats = quats / np.where(norms > 0.0, norms, 1.0)
+    if not wrong.any():
+        return quats, []
+    frame, body = (int(i) for i in np.argwhere(wrong)[0])
+    return quats, [
+        f"body_quat_w expected unit quaternions, got {int(wrong.sum())} without unit norm, "
+        f"normalized; in frame {frame}, body {body} the norm is {norms[frame, body, 0]:.4g}"
+    ]
 
 
-def _fps(path: Path, value: Any) -> float | None:
+def _fps(value: Any) -> tuple[float | None, list[str]]:
+    """Return the frame rate, None without a usable one, and what is wrong."""
     if value is None:
-        return None
+        return None, []
     array = np.asarray(value)
     is_number = array.size == 1 and array.dtype.kind in "fiu"
     with np.errstate(over="ignore", under="ignore"):
-        if not (is_number and 0.0 < float(np.float32(array.item())) < math.inf):
-            raise MotionFileError(
-                f"Motion {path} fps: expected one finite number > 0, got {value!r}."
-            )
-    return float(array.item())
+        if is_number and 0.0 < float(np.float32(array.item())) < math.inf:
+            return float(array.item()), []
+    return None, [f"fps expected one finite number > 0, got {value!r}, ignored"]

@@ -1,13 +1,14 @@
 """Recordings of root and joint poses: resampling, conversion to motions, and CSV I/O.
 
-CSV files have the layout of the retargeted LAFAN1 data: no header, comma-separated, one pose per
-line:
-root position (m), root quaternion (x, y, z, w), and all joint angles (rad) in robot order.
+CSV files have the layout of the retargeted LAFAN1 data: comma-separated, one pose per line: root
+position (m), root quaternion (x, y, z, w), and all joint angles (rad) in robot order. A header line
+with names may give another order of the columns.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -211,18 +212,23 @@ def read_csv(
 ) -> Recording:
     """Read a recording from a CSV file.
 
+    With a header, joints are found by name, with or without the ending `_joint` or `_dof`; columns of
+    the root by their last letter (`qw`, `root_rot_x`); columns `frame` and `time` are not read. Without
+    these letters, the quaternion is taken as (w, x, y, z), with a warning, if only then the robot
+    stands upright.
+
     Args:
         path: CSV file.
         fps: Poses per second of the file.
         joint_names: Joints of the robot, in order.
-        line_range: First and last line to read, 1-based, inclusive. None: all lines.
+        line_range: First and last pose to read, 1-based, inclusive. None: all poses.
 
     Raises:
         MotionFileError: file not found, not a table of numbers, wrong number of columns, line range
-            outside of the file, fewer than two poses, or quaternions without unit norm.
+            outside of the file, fewer than two poses, or a quaternion of norm 0.
     """
     path = Path(path)
-    table = _table(path)
+    names, table = _table(path)
     first, last = (1, len(table)) if line_range is None else line_range
     if line_range is not None and not 1 <= first <= last <= len(table):
         raise MotionFileError(
@@ -231,40 +237,102 @@ def read_csv(
     table = table[first - 1 : last]
     if len(table) < 2:
         raise MotionFileError(f"{path}: expected at least 2 poses, got {len(table)}.")
+    joints, root, is_named = _columns(names, joint_names)
     expected = _ROOT_COLUMNS + len(joint_names)
-    if table.shape[1] != expected:
+    if table.shape[1] != (len(names) if is_named else expected):
         raise MotionFileError(
             f"{path}: expected {expected} columns, got {table.shape[1]}. The columns are position "
-            f"(3), orientation x y z w (4) and joints ({len(joint_names)}): {list(joint_names)}."
+            f"(3), orientation x y z w (4) and joints ({len(joint_names)}): {list(joint_names)}; "
+            "columns in another order need a header with these names."
         )
     if not np.isfinite(table).all():
         line = int(np.argwhere(~np.isfinite(table))[0][0]) + first
         raise MotionFileError(f"Line {line} of {path}: expected finite numbers, got NaN or inf.")
-    quat = table[:, [6, 3, 4, 5]]
+    quat = table[:, root[3:]]
     norms = np.linalg.norm(quat, axis=1, keepdims=True)
     wrong = np.flatnonzero(np.abs(norms[:, 0] - 1.0) > _QUAT_TOLERANCE)
     if len(wrong) > 0:
-        raise MotionFileError(
+        problem = (
             f"Line {wrong[0] + first} of {path}: expected a unit quaternion (x y z w) in columns 4 to "
-            f"7, got norm {norms[wrong[0], 0]:.4g}."
+            f"7, got norm {norms[wrong[0], 0]:.4g}"
         )
+        if not norms.all():
+            raise MotionFileError(f"{problem}.")
+        warnings.warn(f"{problem}; normalized.", UserWarning, stacklevel=2)
+    quat = quat / norms
+    if not is_named and np.median(_upright(quat)) < 0.5 <= np.min(_upright(quat[:, [1, 2, 3, 0]])):
+        warnings.warn(
+            f"{path}: expected quaternions x y z w in columns 4 to 7, got a robot that lies or stands "
+            "on its head; taken as w x y z, it is upright in all poses, which is used. Name the "
+            "columns in a header to select their order.",
+            UserWarning,
+            stacklevel=2,
+        )
+        quat = quat[:, [1, 2, 3, 0]]
     return Recording(
-        fps=fps, root_pos=table[:, :3], root_quat=quat / norms, joint_pos=table[:, _ROOT_COLUMNS:]
+        fps=fps, root_pos=table[:, root[:3]], root_quat=quat, joint_pos=table[:, joints]
     )
 
 
-def _table(path: Path) -> np.ndarray:
+def _upright(quat: np.ndarray) -> np.ndarray:
+    """Return the vertical component of the robot's z axis, of quaternions (w, x, y, z)."""
+    return 1.0 - 2.0 * (quat[:, 1] ** 2 + quat[:, 2] ** 2)
+
+
+def _columns(names: Sequence[str], joint_names: Sequence[str]) -> tuple[list[int], list[int], bool]:
+    """Return the columns of the joints, of the root (x y z, qw qx qy qz), and if they are named."""
+    joints = list(range(_ROOT_COLUMNS, _ROOT_COLUMNS + len(joint_names)))
+    plain = [_plain(name) for name in names]
+    if any(plain.count(_plain(name)) != 1 for name in joint_names):
+        return joints, [0, 1, 2, 6, 3, 4, 5], False
+    joints = [plain.index(_plain(name)) for name in joint_names]
+    skipped = {
+        i for i, name in enumerate(plain) if name in ("", "frame", "index", "time", "timestamp")
+    }
+    rest = [i for i in range(len(names)) if i not in {*joints, *skipped}]
+    letters = "".join(plain[i][-1] for i in rest)
+    # The quaternion is the block with w.
+    for start in (3, 0) if len(rest) == _ROOT_COLUMNS else ():
+        quat, pos = rest[start : start + 4], rest[:start] + rest[start + 4 :]
+        letter = {i: letters[rest.index(i)] for i in rest}
+        if sorted(letter[i] for i in quat) == list("wxyz"):
+            ordered = sorted(pos, key=letter.__getitem__) + sorted(quat, key=letter.__getitem__)
+            return joints, ordered, True
+    raise MotionFileError(
+        f"Header: expected the joints, and x y z and qx qy qz qw of the root, got {list(names)}."
+    )
+
+
+def _plain(name: str) -> str:
+    return re.sub("(_joint|_dof|_pos)+$", "", name.strip().strip('"').lower())
+
+
+def _table(path: Path) -> tuple[list[str], np.ndarray]:
+    """Return the names of the columns, empty without a header, and the numbers."""
     if not path.is_file():
         raise MotionFileError(f"File {path} not found.")
     try:
-        with warnings.catch_warnings():
-            # np.loadtxt warns about empty files; `read_csv` raises for them.
-            warnings.simplefilter("ignore", UserWarning)
-            return np.loadtxt(path, delimiter=",", ndmin=2)
+        with path.open(encoding="utf-8") as file:
+            cells = file.readline().lstrip("\ufeff# ").rstrip().split(",")
+            is_header = len(cells) > 1 and not any(map(_is_number, cells))
+            file.seek(0)
+            with warnings.catch_warnings():
+                # np.loadtxt warns about empty files; `read_csv` raises for them.
+                warnings.simplefilter("ignore", UserWarning)
+                table = np.loadtxt(file, delimiter=",", ndmin=2, skiprows=int(is_header))
+        return cells if is_header else [], table
     except ValueError as error:
         raise MotionFileError(
-            f"{path} is not a table of numbers (comma-separated, without a header): {error}"
+            f"{path} is not a table of numbers (comma-separated): {error}"
         ) from error
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def write_csv(path: str | Path, recording: Recording) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,7 +17,7 @@ from mjlab.compat import older_names
 from mjlab.entity.building import short_name
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.lookup import Lookup
-from mjlab.managers.term_checks import check_range, require_entity
+from mjlab.managers.term_checks import require_entity
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
     MotionReader,
@@ -32,6 +34,7 @@ from mjlab.tasks.tracking.mdp.motion_sampling import (
     draw_uniform,
     perturbed_start,
 )
+from mjlab.tasks.tracking.motion_order import Skeleton
 from mjlab.utils.errors import (
     WrongTypeError,
     check_count,
@@ -104,7 +107,7 @@ class MotionCommandCfg(CommandTermCfg):
     anchor_body_name: str
     """Body that aligns robot and reference; one of `body_names`."""
     body_names: tuple[str, ...]
-    """Bodies to track; the first is the floating base."""
+    """Bodies to track; the first is the floating base, which episodes start from."""
     entity_name: str
     """Name of the robot entity."""
     pose_range: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -180,7 +183,11 @@ class MotionCommand(MotionReader, CommandTerm):
         self.body_indexes = torch.tensor(indexes, device=self.device)
         self.anchor_body = indexes[self.anchor_index]
         self.motion_files, self.motion = read_library(
-            cfg.motion_file, self.robot, self.body_indexes, env.step_dt, self.device
+            cfg.motion_file,
+            Skeleton.of_entity(self.robot, env.sim.mj_model),
+            self.body_indexes,
+            env.step_dt,
+            self.device,
         )
         self.time_steps = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.motion_ids = torch.zeros_like(self.time_steps)
@@ -540,23 +547,36 @@ def _columns_of(body_names: tuple[str, ...], tracked: tuple[str, ...], device: s
 
 
 def check_command_cfg(cfg: MotionCommandCfg) -> None:
-    """Raise `ValueError` for invalid names, ranges or numbers in the config."""
+    """Raise `ValueError` for names or numbers that cannot be used; warn once of odd ones."""
     if len(set(cfg.body_names)) != len(cfg.body_names):
         raise ValueError(f"body_names: expected distinct bodies, got {list(cfg.body_names)}.")
     check_one_of("anchor_body_name", cfg.anchor_body_name, cfg.body_names)
     check_one_of("sampling_mode", cfg.sampling_mode, _MODES)
-    check_one_of("viz.mode", cfg.viz.mode, _DRAWINGS)
+    check_count("adaptive_kernel_size", cfg.adaptive_kernel_size)
+    if cfg.adaptive_uniform_ratio == 0:
+        # All start probabilities would be 0 before the first failure.
+        raise ValueError(
+            f"adaptive_uniform_ratio: expected a number > 0, got {cfg.adaptive_uniform_ratio}."
+        )
+    odd = []
+    if cfg.viz.mode not in _DRAWINGS:
+        odd.append(f"viz.mode expected one of {list(_DRAWINGS)}, got {cfg.viz.mode!r}")
+    ranges = {"joint_position_range": cfg.joint_position_range}
     for name in ("pose_range", "velocity_range"):
         for axis, bounds in getattr(cfg, name).items():
-            check_one_of(f"key of {name}", axis, AXES)
-            check_range(f"{name}[{axis!r}]", bounds)
-    check_range("joint_position_range", cfg.joint_position_range)
-    check_count("adaptive_kernel_size", cfg.adaptive_kernel_size)
-    # Zero would make all start probabilities 0 before the first failure.
-    check_positive("adaptive_uniform_ratio", cfg.adaptive_uniform_ratio)
+            ranges[f"{name}[{axis!r}]"] = bounds
+            if axis not in AXES:
+                odd.append(f"{name} expected keys {list(AXES)}, got {axis!r}, ignored")
+    for name, (low, high) in ranges.items():
+        if not -math.inf < low <= high < math.inf:
+            odd.append(f"{name} expected finite (low, high) with low <= high, got {(low, high)}")
+    if cfg.adaptive_uniform_ratio < 0:
+        odd.append(f"adaptive_uniform_ratio expected > 0, got {cfg.adaptive_uniform_ratio}")
     for name in ("adaptive_lambda", "adaptive_alpha"):
         if not 0.0 < getattr(cfg, name) <= 1.0:
-            raise ValueError(f"{name}: expected a number in (0, 1], got {getattr(cfg, name)}.")
+            odd.append(f"{name} expected in (0, 1], got {getattr(cfg, name)}")
+    if odd:
+        warnings.warn(f"MotionCommandCfg: {'; '.join(odd)}.", UserWarning, stacklevel=2)
 
 
 def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
@@ -564,8 +584,9 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
 
     Raises:
         KeyError: unknown entity.
-        ValueError: fixed base, a tracked body not found, or the first tracked body is not the
-            floating base.
+        ValueError: fixed base, or a tracked body not found.
+
+    Warns if the first tracked body is not the floating base.
     """
     robot = require_entity(env, cfg.entity_name)
     if robot.is_fixed_base:
@@ -581,9 +602,11 @@ def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
         )
     root = short_name(robot.root_body.name)
     if cfg.body_names[0] != root:
-        raise ValueError(
-            f"body_names: expected the floating base {root!r} first, got "
-            f"{cfg.body_names[0]!r}. Episodes start from its pose."
+        warnings.warn(
+            f"MotionCommandCfg body_names: expected the floating base {root!r} first, got "
+            f"{cfg.body_names[0]!r}; episodes start with the base in its pose.",
+            UserWarning,
+            stacklevel=2,
         )
     return robot
 

@@ -9,21 +9,20 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.tasks.tracking.motion_file import (
+    PER_BODY,
+    PER_JOINT,
     Motion,
     MotionFileError,
-    check_motion_fits,
+    check_rate,
     read_motion,
 )
+from mjlab.tasks.tracking.motion_order import Skeleton, arranged
 from mjlab.tasks.tracking.motion_sources import find_motions
 from mjlab.utils.lab_api.math import quat_inv, quat_mul, yaw_quat
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.scene import Scene
-
-
-_PER_BODY = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
-_PER_JOINT = ("joint_pos", "joint_vel")
 
 
 class MotionLoader:
@@ -58,12 +57,7 @@ class MotionLoader:
             MotionFileError: not a motion file, or fewer bodies.
         """
         motion = read_motion(motion_file)
-        bodies = motion.body_pos_w.shape[1]
-        unknown = [i for i in body_indexes.tolist() if not 0 <= i < bodies]
-        if unknown:
-            raise MotionFileError(
-                f"Motion {motion_file}: expected body indices in [0, {bodies - 1}], got {unknown}."
-            )
+        _check_bodies(motion_file, motion, body_indexes)
         self._take(motion, body_indexes, device)
 
     @classmethod
@@ -77,10 +71,10 @@ class MotionLoader:
 
     def _take(self, motion: Motion, body_indexes: torch.Tensor, device: str) -> None:
         self.fps = motion.fps
-        for name in _PER_JOINT:
+        for name in PER_JOINT:
             setattr(self, name, torch.from_numpy(getattr(motion, name)).to(device))
         columns = body_indexes.cpu().numpy()
-        for name in _PER_BODY:
+        for name in PER_BODY:
             values = getattr(motion, name)[:, columns]
             setattr(self, name, torch.from_numpy(values).to(device))
         self.time_step_total = motion.num_frames
@@ -107,7 +101,7 @@ class MotionLibrary:
 
     def __init__(self, motions: Sequence[MotionLoader], names: Sequence[str]) -> None:
         """Concatenate motions of the same robot."""
-        for name in (*_PER_JOINT, *_PER_BODY):
+        for name in (*PER_JOINT, *PER_BODY):
             setattr(self, name, torch.cat([getattr(motion, name) for motion in motions]))
         device = self.joint_pos.device
         self.names = tuple(names)
@@ -120,9 +114,13 @@ class MotionLibrary:
 
 
 def read_library(
-    motion_file: str, robot: Entity, body_indexes: torch.Tensor, step_dt: float, device: str
+    motion_file: str,
+    robot: Skeleton,
+    body_indexes: torch.Tensor,
+    step_dt: float,
+    device: str,
 ) -> tuple[tuple[Path, ...], MotionLibrary]:
-    """Return the files selected by `motion_file`, and their motions.
+    """Return the files selected by `motion_file`, and their motions in the order of the robot.
 
     Raises:
         MotionFileError: a file is not found, is not a motion, or does not match the robot.
@@ -130,10 +128,21 @@ def read_library(
     files = tuple(find_motions(motion_file))
     loaders = []
     for path in files:
-        motion = read_motion(path)
-        check_motion_fits(path, motion, robot.joint_names, robot.body_names, step_dt)
+        motion = arranged(path, read_motion(path), robot)
+        check_rate(path, motion, step_dt)
+        _check_bodies(path, motion, body_indexes)
         loaders.append(MotionLoader.from_motion(motion, body_indexes, device))
     return files, MotionLibrary(loaders, [path.stem for path in files])
+
+
+def _check_bodies(path: str | Path, motion: Motion, body_indexes: torch.Tensor) -> None:
+    bodies = motion.body_pos_w.shape[1]
+    unknown = [i for i in body_indexes.tolist() if not 0 <= i < bodies]
+    if unknown:
+        raise MotionFileError(
+            f"Motion {path}: expected body indices in [0, {bodies - 1}], got {unknown}; it has "
+            f"{bodies} bodies."
+        )
 
 
 class MotionReader:
