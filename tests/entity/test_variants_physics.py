@@ -314,15 +314,17 @@ def limited_things() -> dict[str, Any]:
     return {"free": thing("free", geom), "limited": thing("limited", geom, **limited)}
 
 
-def test_limits_of_joints_differ_where_the_engine_allows_it_and_are_refused_by_name_else() -> None:
+def test_limits_of_joints_differ_where_the_engine_allows() -> None:
     cfg = VariantEntityCfg(variants=limited_things())
     scene = make_scene(2, {"thing": cfg})
     simulate(scene, "native")
     limits = scene["thing"].data.joint_pos_limits[:, 0]
     torch.testing.assert_close(limits[1], torch.tensor([-20.0, 20.0]).deg2rad())
     assert limits[0].isinf().all()
-    with pytest.raises(ValueError, match="entity 'thing' differ in .*'jnt_limited'.*native"):
-        simulate(make_scene(2, {"thing": cfg}), "warp")
+    with pytest.warns(UserWarning, match="entity 'thing' differ in .*'jnt_limited'.*native"):
+        shared = simulate(make_scene(2, {"thing": cfg}), "warp")
+    assert not shared.model.jnt_limited.any()
+    assert shared.model.jnt_range[1, -1].tolist() == pytest.approx(limits[1].tolist())
 
 
 def test_a_search_for_contacts_that_ignores_planes_or_boxes_is_refused() -> None:

@@ -62,7 +62,6 @@ def on_the_floor(engine: WarpEngine) -> WarpEngine:
         ('<option solver="PGS"/>', "the solver 'pgs'"),
         ('<option><flag autoreset="disable"/></option>', "the disable flag 'autoreset'"),
         ('<option><flag midphase="disable"/></option>', "the disable flag 'midphase'"),
-        ('<option><flag sleep="enable"/></option>', "the enable flag 'sleep'"),
         ('<option><flag fwdinv="enable"/></option>', "the enable flag 'fwdinv'"),
     ],
 )
@@ -525,6 +524,30 @@ def test_rays_hit_only_the_groups_and_bodies_asked_for() -> None:
     assert (distances == -1).all()
     assert (geoms == -1).all()
     assert not normals.any()
+
+
+def test_a_reset_wakes_what_sleeps() -> None:
+    def make() -> WarpEngine:
+        xml = LANDING_BOX.replace(
+            "<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', 1
+        )
+        return make_engine(xml)
+
+    engine = make()
+    assert engine.mj_model.opt.enableflags
+    engine.step(1500)
+    assert (engine.data_field("tree_asleep") >= 0).all()
+    resumed = make()
+    resumed.load_state_dict(engine.state_dict())
+    height = engine.data_field("qpos")[:, 2].clone()
+    engine.reset(torch.tensor([0]))
+    engine.data_field("qpos")[0, 2] = 1.0
+    for each in (engine, resumed):
+        each.forward(None)
+        each.step(50)
+    assert torch.equal(resumed.data_field("qpos")[:, 2], height)
+    assert engine.data_field("qpos")[0, 2] == pytest.approx(0.95, abs=1e-3)
+    assert engine.data_field("qpos")[1, 2] == height[1]
 
 
 # Public names for packages that hold Warp arrays.

@@ -162,6 +162,10 @@ class VariantValues:
         """Names of the fields whose values differ between environments."""
         return tuple(self._values)
 
+    def drop(self, field: str) -> None:
+        """Remove one of `fields`, which has the compiled value in all environments."""
+        del self._values[field]
+
     def get(self, field: str) -> np.ndarray:
         """Return the values of one of `fields` in MuJoCo's dtype, (N, ...)."""
         return self._values[field][self._row]

@@ -328,17 +328,21 @@ class Simulation:
         variants = VariantValues(self._default_model, self.num_envs, info, derived)
         self._variants = variants
         for name in variants.fields:
-            try:
-                self.expand_model_fields((name,))
-            except ValueError as error:
+            if problem := self._expand(name):
                 names = ", ".join(repr(entity) for entity, _ in info)
-                raise ValueError(
-                    f"Variants of entity {names} differ in model field {name!r}: {error}"
-                ) from error
+                warnings.warn(
+                    f"Variants of entity {names} differ in model field {name!r}, and all "
+                    f"environments have the value of the first: {problem}",
+                    UserWarning,
+                    stacklevel=3,
+                )
+                variants.drop(name)
+                del self._default_fields[name]
         # Updates the mean inertia too: it is not a field, and scales the solver tolerance.
         self.recompute_constants(3)
         for name in dict.fromkeys((*variants.fields, *derived)):
-            getattr(self.model, name).copy_(self.get_default_field(name))
+            if name in self._engine.model_fields:
+                getattr(self.model, name).copy_(self.get_default_field(name))
         if self.absent_geoms is not None:
             self._engine.hide_geoms(self.absent_geoms)
         self._engine.forward(None)
@@ -355,18 +359,24 @@ class Simulation:
         Raises:
             ValueError: unknown field, or one that the engine cannot expand.
         """
-        names = (name.removeprefix("opt.") for name in fields)
-        new = tuple(name for name in names if name not in self._engine.model_fields)
-        for name in new:
-            default = self.get_default_field(name)
-            try:
-                self._engine.expand((name,))
-            except ValueError as error:
-                if not is_structure(name, default.numpy(force=True)):
-                    raise
-                warnings.warn(f"{error} It stays shared.", UserWarning, stacklevel=2)
-        self.model.forget(new)
-        self._options.forget(new)
+        for name in (name.removeprefix("opt.") for name in fields):
+            if problem := self._expand(name):
+                warnings.warn(f"{problem} It stays shared.", UserWarning, stacklevel=2)
+
+    def _expand(self, name: str) -> ValueError | None:
+        """Expand a field. Structure that cannot be expanded stays shared: return the reason."""
+        if name in self._engine.model_fields:
+            return None
+        default = self.get_default_field(name)
+        try:
+            self._engine.expand((name,))
+        except ValueError as error:
+            if not is_structure(name, default.numpy(force=True)):
+                raise
+            return error
+        self.model.forget((name,))
+        self._options.forget((name,))
+        return None
 
     def expand_constants(self, level: RecomputeLevel | int) -> None:
         """Expand the model fields that `recompute_constants(level)` writes."""

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 # Inputs of the next step: set by `reset`, saved in `state_dict`.
-_STATE_FIELDS = (*INPUTS, "history")
+_STATE_FIELDS = (*INPUTS, "history", "tree_asleep")
 # Fields with a different layout than in MuJoCo, or without environment dimension.
 _UNLIKE_MUJOCO = frozenset(
     {"qLD", "qLDiagInv", "qLU", "solver_niter", "contact", "efc", "flexedge_hessian"}
@@ -471,6 +471,9 @@ class WarpEngine(Engine):
         for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
             tensor = self.data_field(name)
             tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
+        rows = slice(None) if env_ids is None else env_ids
+        # Awake for as long as possible.
+        self.data_field("tree_asleep")[rows] = -(1 + mujoco.mjMINAWAKE)
         model = self.wp_model
         mocap = as_torch(model.mocap_bodyid).long()
         starts = {
@@ -479,7 +482,6 @@ class WarpEngine(Engine):
             "mocap_pos": as_torch(model.body_pos)[:, mocap],
             "mocap_quat": as_torch(model.body_quat)[:, mocap],
         }
-        rows = slice(None) if env_ids is None else env_ids
         for name, values in starts.items():
             tensor = self.data_field(name)
             tensor[rows] = values.expand(tensor.shape)[rows]
@@ -581,8 +583,7 @@ def check_supported(model: mujoco.MjModel) -> None:
             problems.append(f"the <{element}> actuators {names}; use {instead} instead")
     for kind, known in (("disable", mjwarp.DisableBit), ("enable", mjwarp.EnableBit)):
         option = f"{kind}flags"
-        # Sleep states are not part of the state that is reset and saved here.
-        supported = sum(int(bit) for bit in known if bit.name != "SLEEP")
+        supported = sum(int(bit) for bit in known)
         problems += [
             f"the {kind} flag {flag!r}; leave it out of MujocoCfg.{option} and of the XML"
             for flag in flag_names(option, getattr(model.opt, option) & ~supported)
