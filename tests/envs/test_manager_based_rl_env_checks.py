@@ -144,11 +144,33 @@ def test_no_warning_where_ids_are_meant(term):
 # The device.
 
 
-@pytest.mark.parametrize("device", ["gpu", "cuda:x", "", "meta", None, 0])
+@pytest.mark.parametrize("device", ["gpu", "cuda:x", "", "meta", 0])
 @pytest.mark.usefixtures("nothing_is_built")
 def test_what_is_no_device_is_refused(device):
     with pytest.raises(ValueError, match=r"device: expected 'cpu', 'cuda'"):
         ManagerBasedRlEnv(cartpole(), device=device)
+
+
+def test_without_a_device_there_is_a_default(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    env = ManagerBasedRlEnv(cartpole(), device=None)  # ty: ignore
+    assert env.device == env.reset()[0]["actor"].device.type == "cpu"
+    env.close()
+
+
+@pytest.mark.parametrize("limited", [False, True])
+def test_a_negative_episode_length_ends_every_step(limited):
+    cfg = cartpole()
+    cfg.episode_length_s = -1.0
+    cfg.terminations = (
+        {"t": TerminationTermCfg(func=mdp.time_out, time_out=True)} if limited else {}
+    )
+    with pytest.warns(UserWarning, match="episode_length_s"):
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    truncated = env.step(torch.zeros(NUM_ENVS, 1))[3]
+    assert truncated.tolist() == [limited] * NUM_ENVS
+    env.close()
 
 
 def test_cuda_is_refused_where_there_is_none(monkeypatch):
@@ -210,6 +232,7 @@ def test_an_array_of_another_shape_is_refused(env):
         (3, [3]),
         ([], []),
         ([5, 0], [5, 0]),
+        ([-1, -6], [5, 0]),
         (np.array([1, 2], dtype=np.int32), [1, 2]),
         (torch.tensor([1], dtype=torch.uint8), [1]),
         ([False, True, False, False, True, False], [1, 4]),
@@ -226,7 +249,7 @@ def test_environments_are_named_in_many_ways(env_ids, expected):
     ("env_ids", "words"),
     [
         ([0, 6], r"got \[6\]"),
-        (torch.tensor([-1]), r"got \[-1\]"),
+        (torch.tensor([-7]), r"got \[-7\]"),
         (torch.ones(5, dtype=torch.bool), "mask of length 5"),
         (torch.tensor([0.0, 1.0]), "float32"),
         ([1.5], "float32"),

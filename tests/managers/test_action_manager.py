@@ -122,10 +122,24 @@ def test_every_term_is_applied_and_reset(env):
         assert manager.get_term(name).resets == [ids]
 
 
-@pytest.mark.parametrize("shape", [(4, 3), (3, 2), (2,), (1, 2)])
+@pytest.mark.parametrize("shape", [(4, 3), (3, 2), (2,), (1, 3)])
 def test_another_shape_is_refused_with_both_shapes(env, shape):
     with pytest.raises(ValueError, match=rf"\(4, 2\).*got \({shape[0]},"):
         make(env, 2).process_action(torch.zeros(shape))
+
+
+def test_one_action_serves_all_environments(env):
+    manager = make(env, 2)
+    manager.process_action(torch.tensor([[1.0, 2.0]]))
+    assert manager.action.tolist() == [[1.0, 2.0]] * 4
+
+
+def test_an_action_with_gradients_is_detached(env):
+    manager = make(env, 2)
+    for _ in range(2):
+        manager.process_action(torch.ones(4, 2, requires_grad=True) * 2.0)
+    assert manager.action.tolist() == [[2.0, 2.0]] * 4
+    assert not manager.action.requires_grad
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])

@@ -43,10 +43,13 @@ def test_other_modes_do_not_fire(env):
     assert calls == []
 
 
-def test_an_unknown_mode_is_refused(env):
-    with pytest.raises(ValueError, match=r"'a'.*startup.*reset.*interval.*step.*'rest'"):
-        make(env, "rest")
-    manager, _ = make(env, "step")
+def test_an_unknown_mode_never_happens(env):
+    with pytest.warns(UserWarning, match=r"'a'.*startup.*reset.*interval.*step.*'rest'"):
+        manager, calls = make(env, "rest")
+    for mode in ("startup", "step", "interval"):
+        manager.apply(mode, dt=0.02)
+    manager.reset(None)
+    assert calls == []
     with pytest.raises(ValueError, match="'rest'"):
         manager.apply("rest")
 
@@ -141,13 +144,31 @@ def test_arguments_that_do_not_fit_are_refused(env, mode, arguments, message):
         manager.apply(mode, **arguments)
 
 
-@pytest.mark.parametrize(
-    "bounds",
-    [None, (2.0, 1.0), (-1.0, 1.0), (-2.0, -1.0), (1.0,), 1.0, (float("nan"), 1.0), ("0", "1")],
-)
+@pytest.mark.parametrize("bounds", [None, (1.0,), 1.0, ("0", "1"), (0.1, 0.2, 0.3)])
 def test_intervals_need_a_range(env, bounds):
-    with pytest.raises(ValueError, match="'a'.*interval_range_s"):
+    with pytest.raises((TypeError, ValueError), match="'a'.*interval_range_s"):
         make(env, "interval", interval_range_s=bounds)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "steps"),
+    [((0.2, 0.1), {5, 6, 7, 8, 9, 10}), ((-1.0, -0.5), {1}), ((float("nan"), 1.0), {None})],
+)
+def test_an_odd_interval_warns_and_acts_as_sampled(env, bounds, steps):
+    with pytest.warns(UserWarning, match="'a'.*interval_range_s"):
+        manager, calls = make(env, "interval", interval_range_s=bounds)
+    fired = dict.fromkeys(range(4))
+    for step in range(1, 12):
+        del calls[:]
+        manager.apply("interval", dt=0.02)
+        fired |= {i: step for ids in calls for i in ids if fired[i] is None}
+    assert set(fired.values()) <= steps
+
+
+def test_an_interval_of_another_mode_is_not_read(env):
+    manager, calls = make(env, "step", interval_range_s=(2.0, 1.0))
+    manager.apply("step", dt=0.02)
+    assert calls == [None]
 
 
 def changing(level, *fields):

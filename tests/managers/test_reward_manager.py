@@ -165,7 +165,21 @@ def test_terms_that_draw_can_be_switched_off(env):
         manager.set_debug_vis("plain", False)
 
 
-@pytest.mark.parametrize("weight", [None, "1", (1.0,), float("nan"), float("inf")])
-def test_a_weight_that_is_no_number_is_refused_by_name(env, weight):
-    with pytest.raises(ValueError, match="RewardManager term 'a' weight: .*number"):
+@pytest.mark.parametrize("weight", [None, "1", (1.0,)])
+def test_a_weight_that_is_no_number_is_named(env, weight):
+    with pytest.raises(TypeError, match="RewardManager term 'a' weight: .*number"):
         RewardManager({"a": term("a", weight)}, env)
+
+
+@pytest.mark.parametrize("weight", [float("nan"), float("inf")])
+def test_a_weight_that_is_not_finite_counts_as_zero(env, weight):
+    cfg = RewardTermCfg(func=lambda env: torch.ones(4), weight=weight)
+    with pytest.warns(UserWarning, match="RewardManager term 'a' weight"):
+        manager = RewardManager({"a": cfg}, env)
+    assert manager.compute(0.02).tolist() == [0.0] * 4
+
+
+def test_a_weight_may_be_a_tensor(env):
+    weight = torch.tensor(2.0)
+    cfg = RewardTermCfg(func=lambda env: torch.ones(4), weight=weight)  # ty: ignore
+    assert RewardManager({"a": cfg}, env).compute(0.5).tolist() == [1.0] * 4

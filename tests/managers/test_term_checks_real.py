@@ -52,14 +52,3 @@ def test_a_term_without_real_numbers_is_named(manager: str, kind: str, late: boo
         env.reset()
         for _ in range(3):
             env.step(torch.zeros(2, 1))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_action_without_real_numbers_is_refused(kind: str):
-    cfg = load_env_cfg("Mjlab-Cartpole-Swingup")
-    cfg.scene.num_envs = 2
-    env = ManagerBasedRlEnv(cfg, device="cpu")
-    env.reset()
-    with pytest.raises(TypeError, match=f"action.*{kind}"):
-        env.step(KINDS[kind](2, 1))
-    env.close()

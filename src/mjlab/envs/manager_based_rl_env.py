@@ -135,7 +135,7 @@ class ManagerBasedRlEnv(Tabular):
     ) -> None:
         """Build scene, simulation and managers of `cfg` on `device` (`cpu`, `cuda:0`, ...).
 
-        `render_mode` is None or `rgb_array`. Additional keyword arguments are ignored.
+        A `device` of None is the first GPU, or the CPU if there is none. `render_mode` is None or `rgb_array`. Additional keyword arguments are ignored.
 
         Raises:
             ValueError: invalid config, named by field, or unknown device.
@@ -143,6 +143,8 @@ class ManagerBasedRlEnv(Tabular):
                 machine.
         """
         check_env_cfg(cfg)
+        if device is None:
+            device = "cuda:0" if torch.cuda.is_available() else "cpu"
         check_device(device)
         # Checked before the scene creates tensors on a device that the engine does not support.
         Simulation.check(cfg.scene.num_envs, cfg.sim, device)
@@ -734,8 +736,14 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
                 f"terms; use del cfg.scene.entities[{name!r}] to remove the entity."
             )
     length = cfg.episode_length_s
-    if not (isinstance(length, Real) and math.isfinite(length) and length >= 0):
+    if not (isinstance(length, Real) and math.isfinite(length)):
         raise ValueError(f"episode_length_s: expected a finite number >= 0 (s), got {length!r}.")
+    if length < 0:
+        warnings.warn(
+            f"episode_length_s: expected a number >= 0 (s), got {length!r}; time limits end every step.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def report_odd_times(env: ManagerBasedRlEnv) -> None:
@@ -823,7 +831,8 @@ def as_reset_ids(env_ids: Any, num_envs: int, device: str) -> torch.Tensor:
     if ids.is_floating_point() or ids.is_complex():
         raise ValueError(f"{expected}, got numbers of type {ids.dtype}.")
     ids = ids.long()
-    wrong = ids[(ids < 0) | (ids >= num_envs)]
+    wrong = ids[(ids < -num_envs) | (ids >= num_envs)]
     if len(wrong) > 0:
         raise ValueError(f"{expected}, got {wrong[:10].tolist()}{' ...' * (len(wrong) > 10)}.")
-    return ids
+    # Negative ids count from the end.
+    return ids % num_envs

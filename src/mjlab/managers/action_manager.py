@@ -13,7 +13,6 @@ import torch
 
 from mjlab.actuator.actuator import is_constant_within_step
 from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase
-from mjlab.managers.term_checks import check_real
 from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import as_index
 from mjlab.utils.spaces import Box, Space, batch_space
@@ -171,6 +170,9 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         step, because checking immediately would synchronize with the GPU.
         """
         action = as_action(action, self.device)
+        # One action for all environments.
+        if action.shape == (1, self._action.shape[1]):
+            action = action.expand_as(self._action)
         if action.shape != self._action.shape:
             raise ValueError(
                 f"action: expected shape {tuple(self._action.shape)} (environments, components), "
@@ -207,11 +209,9 @@ def as_action(action: Any, device: str) -> torch.Tensor:
 
     Raises:
         ValueError: `action` is neither a tensor nor an array of numbers.
-        TypeError: `action` is a complex tensor, or a tensor without data.
     """
     if isinstance(action, torch.Tensor):
-        check_real(action, str, "action")
-        return action.to(device)
+        return action.detach().to(device)
     try:
         # Copied, because torch warns about read-only arrays.
         return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import operator
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
@@ -17,9 +18,9 @@ from mjlab.managers.manager_base import (
     ManagerTermBaseCfg,
     TermFunctionSwitches,
     TermListManager,
+    label_errors,
 )
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import is_interval
 from mjlab.sim.randomization import RecomputeLevel
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_ids, is_empty
@@ -62,8 +63,7 @@ class EventTermCfg(ManagerTermBaseCfg):
 class EventManager(TermFunctionSwitches, TermListManager):
     """Triggers events and recomputes the model constants that depend on their changes.
 
-    Raises `ValueError` for an unknown mode, and for mode "interval" without a valid
-    `interval_range_s`.
+    Raises `ValueError` for mode "interval" without `interval_range_s`.
     """
 
     _title = "events"
@@ -86,12 +86,20 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 never = torch.full((self.num_envs,), _NEVER, dtype=torch.long, device=self.device)
                 self._last_reset_step[name] = never
             bounds = term.interval_range_s
-            is_missing = bounds is None and term.mode == "interval"
-            if is_missing or (bounds is not None and not (is_interval(bounds) and bounds[0] >= 0)):
-                raise ValueError(
-                    f"{self._label(name)} interval_range_s: expected (shortest, longest) in "
-                    f"seconds, with 0 <= shortest <= longest, got {bounds!r}."
-                )
+            if term.mode == "interval":
+                with label_errors(f"{self._label(name)} interval_range_s"):
+                    if bounds is None:
+                        raise ValueError("expected (shortest, longest) in seconds, got None.")
+                    shortest, longest = bounds
+                    in_order = 0.0 <= shortest <= longest
+                if not in_order:
+                    warnings.warn(
+                        f"{self._label(name)} interval_range_s: expected (shortest, longest) in "
+                        f"seconds with 0 <= shortest <= longest, got {bounds!r}; times below 0 fire at "
+                        "every step, NaN never fires.",
+                        UserWarning,
+                        stacklevel=2,
+                    )
             if term.mode == "interval":
                 self._lookups[name] = Lookup()
                 if term.is_global_time:
@@ -211,8 +219,13 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
     def _prepare_terms(self) -> None:
         for name, cfg in self.cfg.items():
-            if isinstance(cfg, EventTermCfg):
-                check_one_of(f"{self._label(name)} mode", cfg.mode, get_args(EventMode))
+            if isinstance(cfg, EventTermCfg) and cfg.mode not in get_args(EventMode):
+                warnings.warn(
+                    f"{self._label(name)} mode: expected one of {get_args(EventMode)}, got "
+                    f"{cfg.mode!r}; the event never happens.",
+                    UserWarning,
+                    stacklevel=2,
+                )
         super()._prepare_terms()
         for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
             for key, value in cfg.params.items():

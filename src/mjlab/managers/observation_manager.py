@@ -7,8 +7,10 @@ import copy
 import dataclasses
 import functools
 import logging
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
@@ -18,10 +20,10 @@ from mjlab.entity import Entity
 from mjlab.managers.action_manager import ActionTerm
 from mjlab.managers.command_manager import CommandTerm
 from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
-from mjlab.managers.term_checks import check_real, is_interval
+from mjlab.managers.term_checks import check_real
 from mjlab.sensor import Sensor
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
-from mjlab.utils.errors import WrongTypeError, check_count, check_exists, check_one_of
+from mjlab.utils.errors import WrongTypeError, check_exists
 from mjlab.utils.indexing import as_ids, as_index, is_empty
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
@@ -329,9 +331,12 @@ class ObservationManager(ManagerBase):
     def _prepare_terms(self) -> None:
         for name, group_cfg in self._enabled(self.cfg, ObservationGroupCfg):
             label = f"Observation group {name!r}"
-            check_one_of(f"{label} nan_policy", group_cfg.nan_policy, get_args(NanPolicy))
-            if group_cfg.history_length is not None:
-                check_count(f"{label} history_length", group_cfg.history_length, minimum=0)
+            if group_cfg.nan_policy not in get_args(NanPolicy):
+                _warn(
+                    f"{label} nan_policy: expected one of {get_args(NanPolicy)}, got "
+                    f"{group_cfg.nan_policy!r}; using 'sanitize'."
+                )
+                self.cfg[name] = group_cfg = dataclasses.replace(group_cfg, nan_policy="sanitize")
             terms = {
                 term_name: self._build_term(f"{name}/{term_name}", term_cfg, group_cfg)
                 for term_name, term_cfg in self._enabled(group_cfg.terms, ObservationTermCfg)
@@ -345,10 +350,11 @@ class ObservationManager(ManagerBase):
     ) -> ObservationTerm:
         # Checked even without corruption: the mistake would surface only once it is enabled.
         if not (cfg.noise is None or isinstance(cfg.noise, NoiseCfg | NoiseModelCfg)):
-            raise ValueError(
+            _warn(
                 f"Observation term {label!r} noise: expected a NoiseCfg (e.g. UniformNoiseCfg("
-                f"n_min=-0.1, n_max=0.1)), a NoiseModelCfg, or None, got {cfg.noise!r}."
+                f"n_min=-0.1, n_max=0.1)), a NoiseModelCfg, or None, got {cfg.noise!r}; no noise applies."
             )
+            cfg.noise = None
         if not group_cfg.enable_corruption:
             cfg.noise = None
         if group_cfg.history_length is not None:
@@ -433,8 +439,8 @@ class ObservationTerm:
 
     The term's function is called once, to infer its shape.
 
-    Raises `ValueError`, naming the term, for an invalid clip, scale, delay or history, and prefixes
-    errors of the term's function with the term's name.
+    Raises `ValueError`, naming the term, for an invalid scale or delay, and prefixes errors of the
+    term's function with the term's name.
 
     Attributes:
         shape: Shape of the result without the environment dimension.
@@ -457,18 +463,15 @@ class ObservationTerm:
             value = cfg.func(env, **cfg.params)
         self._check_first(value)
         self._raw_shape = value.shape
-        if cfg.clip is not None and not is_interval(cfg.clip):
-            raise ValueError(
-                f"{self._name} clip: expected (low, high) with low <= high, or None, got "
-                f"{cfg.clip!r}."
-            )
+        if cfg.clip is not None:
+            self._check_clip(cfg.clip)
         if cfg.scale is not None:
             cfg.scale = scale_tensor(self._name, cfg.scale, self._raw_shape, env.device)
         with label_errors(self._name):
             self._noise_model = self._build_noise_model()
             self._delay = self._build_delay()
             self._history = None
-            if cfg.history_length != 0:
+            if cfg.history_length > 0:
                 self._history = CircularBuffer(cfg.history_length, env.num_envs, env.device)
         self.shape: tuple[int, ...] = tuple(self._raw_shape[1:])
         if self._history is not None:
@@ -560,10 +563,11 @@ class ObservationTerm:
         if not isinstance(value, torch.Tensor):
             self._check_first(value)
         elif value.shape != self._raw_shape:
-            raise ValueError(
-                f"{self._name}: expected shape {tuple(self._raw_shape)}, as when the environment was "
-                f"built, got {tuple(value.shape)}."
+            logger.warning(
+                "%s: expected shape %s, as before, got %s.",
+                *(self._name, tuple(self._raw_shape), tuple(value.shape)),
             )
+            self._raw_shape = value.shape
         check_real(value, str, self._name)
         # Policies are float32, whatever torch's default dtype.
         return value.float() if value.dtype == torch.float64 else value
@@ -575,12 +579,25 @@ class ObservationTerm:
                 f"{self._name}: expected a tensor of shape {expected}, got "
                 f"{type(value).__name__}: {value!r}."
             )
-        if value.ndim < 2 or value.shape[0] != self._env.num_envs:
+        if value.ndim < 2:
             hint = "; use `.unsqueeze(-1)` for one number" if value.ndim == 1 else ""
             raise ValueError(
                 f"{self._name}: expected shape {expected}, got {tuple(value.shape)}{hint}."
             )
+        if value.shape[0] != self._env.num_envs:
+            _warn(f"{self._name}: expected shape {expected}, got {tuple(value.shape)}.")
         check_real(value, str, self._name)
+
+    def _check_clip(self, clip: Any) -> None:
+        expected = (
+            f"{self._name} clip: expected (low, high) with low <= high, or None, got {clip!r}"
+        )
+        bounds = clip[:2] if isinstance(clip, (tuple, list)) else ()
+        numbers = [bound for bound in bounds if isinstance(bound, (Real, torch.Tensor))]
+        if len(bounds) < 2 or not numbers or len(numbers) + list(bounds).count(None) < 2:
+            raise ValueError(f"{expected}.")
+        if len(clip) > 2 or not numbers[0] <= numbers[-1]:
+            _warn(f"{expected}; torch.clamp gets the first two values.")
 
     def _build_noise_model(self) -> Any:
         noise = self.cfg.noise
@@ -590,7 +607,12 @@ class ObservationTerm:
 
     def _build_delay(self) -> DelayBuffer | None:
         cfg = self.cfg
-        if cfg.delay_max_lag == 0 and cfg.delay_min_lag == 0:
+        if cfg.delay_max_lag <= 0:
+            if cfg.delay_min_lag > 0:
+                _warn(
+                    f"{self._name} delay_max_lag: expected an integer >= delay_min_lag="
+                    f"{cfg.delay_min_lag}, got {cfg.delay_max_lag}; no delay applies."
+                )
             return None
         return DelayBuffer(
             min_lag=cfg.delay_min_lag,
@@ -602,6 +624,10 @@ class ObservationTerm:
             update_period=cfg.delay_update_period,
             per_env_phase=cfg.delay_per_env_phase,
         )
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=3)
 
 
 def scale_tensor(name: str, scale: Any, raw_shape: torch.Size, device: str) -> torch.Tensor:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,6 +15,7 @@ from mjlab.managers.manager_base import (
     ManagerTermBaseCfg,
     TermFunctionSwitches,
     TermListManager,
+    label_errors,
 )
 from mjlab.managers.nonfinite import NonFiniteWatch
 from mjlab.utils.indexing import as_index, is_empty
@@ -42,7 +43,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         env: The environment.
         scale_by_dt: Multiply rewards by the control timestep (s), so that weights are rates.
 
-    Raises `ValueError` if a weight is not a finite number.
+    Raises `TypeError` if a weight is not a number.
     """
 
     _cfg_type = RewardTermCfg
@@ -61,11 +62,14 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._scale_by_dt = scale_by_dt
         super().__init__(cfg, env)
         for name, term in zip(self._term_names, self._term_cfgs, strict=True):
-            # A NaN weight would silently disable the term: NaN rewards count as 0.
-            if not (isinstance(term.weight, Real) and math.isfinite(term.weight)):
-                raise ValueError(
-                    f"{self._label(name)} weight: expected a finite number, got {term.weight!r}; to "
-                    "disable the term, set its weight to 0 or the term to None."
+            with label_errors(f"{self._label(name)} weight"):
+                is_finite = math.isfinite(term.weight)
+            if not is_finite:
+                warnings.warn(
+                    f"{self._label(name)} weight: expected a finite number, got {term.weight!r}; NaN and "
+                    "infinite rewards count as 0. To disable the term, set it to None.",
+                    UserWarning,
+                    stacklevel=2,
                 )
         size = (len(self._term_names), self.num_envs)
         # Terms first: each term writes to contiguous memory.

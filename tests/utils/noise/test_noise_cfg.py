@@ -107,16 +107,30 @@ def test_cached_tensors_can_take_part_in_gradients():
     "make",
     [
         lambda: UniformNoiseCfg(n_min=1.0, n_max=1.0),
-        lambda: UniformNoiseCfg(n_min=2, n_max=1),
-        lambda: UniformNoiseCfg(n_min=(0.0, 2.0), n_max=(1.0, 1.0)),
+        lambda: UniformNoiseCfg(n_min=2.0, n_max=1.0),
         lambda: GaussianNoiseCfg(std=0.0),
-        lambda: GaussianNoiseCfg(std=(1.0, -1.0)),
+        lambda: GaussianNoiseCfg(std=-1.0),
         lambda: ConstantNoiseCfg(operation="mul"),  # ty: ignore[invalid-argument-type]
     ],
 )
 def test_values_out_of_range_are_refused(make):
     with pytest.raises(ValueError, match="must be|expected"):
         make()
+
+
+@pytest.mark.parametrize(
+    ("cfg", "low", "high"),
+    [
+        (UniformNoiseCfg(n_min=2, n_max=1), 1.0, 2.0),
+        (UniformNoiseCfg(n_min=1, n_max=1), 1.0, 1.0),
+        (UniformNoiseCfg(n_min=(2.0, 0.5, 1.0), n_max=(1.0, 0.5, 1)), 0.5, 2.0),
+        (GaussianNoiseCfg(std=0, mean=3.0), 3.0, 3.0),
+        (GaussianNoiseCfg(std=(0.0, -1.0, 0.0)), -9.0, 9.0),
+    ],
+)
+def test_integers_and_tuples_may_be_reversed_or_zero(cfg, low, high):
+    values = cfg.apply(torch.zeros(50, 3))
+    assert low <= values.min() <= values.max() <= high
 
 
 def test_an_operation_that_became_invalid_is_refused():

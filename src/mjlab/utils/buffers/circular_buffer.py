@@ -105,7 +105,7 @@ class CircularBuffer:
         return ring[(self._pointer - lags) % self._max_len, self._rows]
 
     def append(self, data: torch.Tensor) -> None:
-        """Append a frame, (batch_size, ...). Raises `ValueError` for a wrong shape."""
+        """Append a frame, (batch_size, ...). Raises `ValueError` for a wrong first shape."""
         if self._buffer is None:
             self._check_batch(data)
             # If the first frame is appended under `inference_mode`, later appends outside it must work.
@@ -113,16 +113,12 @@ class CircularBuffer:
                 self._buffer = torch.zeros(
                     (self._max_len, *data.shape), dtype=data.dtype, device=self._device
                 )
-        elif data.shape != self._buffer.shape[1:]:
-            raise ValueError(
-                f"CircularBuffer frame: expected shape {tuple(self._buffer.shape[1:])} of the first "
-                f"frame, got {tuple(data.shape)}."
-            )
         self._pointer = (self._pointer + 1) % self._max_len
         if self._may_have_empty_rows:
             # A mask, because indexing empty rows would synchronize the GPU.
-            empty = (self._num_pushes == 0).view(1, -1, *(1,) * (data.dim() - 1))
-            torch.where(empty, data.to(self._buffer).unsqueeze(0), self._buffer, out=self._buffer)
+            empty = (self._num_pushes == 0).view(1, -1, *(1,) * (self._buffer.dim() - 2))
+            frame = data.to(self._buffer).expand(self._buffer.shape[1:])
+            torch.where(empty, frame.unsqueeze(0), self._buffer, out=self._buffer)
             self._may_have_empty_rows = False
         self._buffer[self._pointer] = data
         self._num_pushes += 1

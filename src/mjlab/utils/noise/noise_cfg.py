@@ -81,9 +81,10 @@ class UniformNoiseCfg(NoiseCfg):
     """Upper bound of n (exclusive), a scalar or one value per component."""
 
     def __post_init__(self) -> None:
-        """Raise `ValueError` unless n_min < n_max (components of tuples may be equal)."""
+        """Raise `ValueError` unless n_min < n_max, if both are floats."""
         super().__post_init__()
-        if not _in_order(self.n_min, self.n_max):
+        both = isinstance(self.n_min, float) and isinstance(self.n_max, float)
+        if both and self.n_min >= self.n_max:
             raise ValueError(
                 f"UniformNoiseCfg: expected n_min < n_max, got n_min={self.n_min}, "
                 f"n_max={self.n_max}."
@@ -107,9 +108,10 @@ class GaussianNoiseCfg(NoiseCfg):
     """Standard deviation of n, a scalar or one value per component."""
 
     def __post_init__(self) -> None:
-        """Raise `ValueError` unless std is positive (components of tuples may be 0)."""
+        """Raise `ValueError` for a float std <= 0."""
         super().__post_init__()
-        check_field(self, "std", _in_order(0.0, self.std), "a number > 0")
+        is_wrong = isinstance(self.std, float) and self.std <= 0.0
+        check_field(self, "std", not is_wrong, "a number > 0")
 
     def apply(self, data: torch.Tensor) -> torch.Tensor:
         """Return the data with n = mean + std z, z standard normal."""
@@ -222,9 +224,3 @@ def _param(value: Any, data: torch.Tensor) -> Any:
     if isinstance(value, torch.Tensor):
         return value.to(data)
     return constant_tensor(tuple(value), data.device, data.dtype)
-
-
-def _in_order(low: Any, high: Any) -> bool:
-    if isinstance(low, (int, float)) and isinstance(high, (int, float)):
-        return low < high
-    return bool((torch.as_tensor(low) <= torch.as_tensor(high)).all())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -84,9 +85,12 @@ class BaseAction(ActionTerm):
             with label_errors(f"{type(cfg).__name__}.clip"):
                 found = resolve_matching_names_values(cfg.clip, self._target_names)
             for i, name, pair in zip(*found, strict=True):
-                if len(pair) != 2 or not pair[0] <= pair[1]:
-                    raise ValueError(
-                        f"clip of target {name!r}: expected (low, high) with low <= high, got {pair!r}."
+                if not (isinstance(pair, (tuple, list)) and pair[0] <= pair[-1]):
+                    warnings.warn(
+                        f"{type(cfg).__name__}.clip of target {name!r}: expected (low, high) with low "
+                        f"<= high, got {pair!r}; the target is constant.",
+                        UserWarning,
+                        stacklevel=2,
                     )
                 bounds[i] = torch.tensor(pair, dtype=torch.float32, device=self.device)
             self._clip = bounds.repeat(self.num_envs, 1, 1)

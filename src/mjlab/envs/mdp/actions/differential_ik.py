@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -11,7 +12,7 @@ import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
-from mjlab.utils.errors import check_one_of, check_positive
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.math import compute_pose_error, normalize, quat_box_plus, quat_from_matrix
 from mjlab.utils.string import resolve_expr
@@ -98,8 +99,7 @@ class DifferentialIKAction(ActionTerm):
     unreachable. Poses are in the world frame: tasks with separate environment origins add them to
     absolute positions.
 
-    Raises `ValueError` if a joint pattern matches nothing, if the frame pattern does not match
-    exactly one element, or for an invalid number in the config.
+    Raises `ValueError` if a joint pattern or the frame pattern matches nothing.
     """
 
     cfg: DifferentialIKActionCfg
@@ -240,7 +240,7 @@ class DifferentialIKAction(ActionTerm):
         errors = compute_pose_error(position, quat, self._desired_pos, self._desired_quat)
         jacobians = self._env.sim.jacobian(position, self._body_ids)
         weights = (cfg.position_weight, cfg.orientation_weight)
-        used = [k for k in (0, 1) if weights[k] != 0.0]
+        used = [k for k in (0, 1) if weights[k] != 0.0] or [0]
         jacobian = torch.cat([weights[k] * jacobians[k][:, :, self._dofs] for k in used], dim=1)
         error = torch.cat([weights[k] * errors[k] for k in used], dim=1)
         outside = high.clamp(max=0.0) + low.clamp(min=0.0)
@@ -271,10 +271,13 @@ class DifferentialIKAction(ActionTerm):
         find = {"body": entity.find_bodies, "site": entity.find_sites, "geom": entity.find_geoms}
         ids, names = find[cfg.frame_type](cfg.frame_name)
         if len(ids) != 1:
-            raise ValueError(
+            text = (
                 f"frame_name {cfg.frame_name!r}: expected to match exactly one {cfg.frame_type} of "
-                f"entity {cfg.entity_name!r}, got {len(ids)}: {names}."
+                f"entity {cfg.entity_name!r}, got {len(ids)}: {names}"
             )
+            if not ids:
+                raise ValueError(f"{text}.")
+            warnings.warn(f"{text}; using {names[0]!r}.", UserWarning, stacklevel=2)
         kinds = {"body": "body_ids", "site": "site_ids", "geom": "geom_ids"}
         frame = int(getattr(entity.indexing, kinds[cfg.frame_type])[ids[0]])
         body = frame
@@ -319,15 +322,17 @@ def damped_least_squares(
 
 def _check_cfg(cfg: DifferentialIKActionCfg) -> None:
     check_one_of("frame_type", cfg.frame_type, get_args(FrameType))
-    for name in (*_WEIGHTS, "damping"):
-        value = getattr(cfg, name)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(f"{name}: expected a finite number >= 0, got {value!r}.")
-    check_positive("max_dq", cfg.max_dq)
+    odd = [f"{n}={getattr(cfg, n)!r}" for n in (*_WEIGHTS, "damping") if not getattr(cfg, n) >= 0.0]
+    if not cfg.max_dq > 0.0:
+        odd.append(f"max_dq={cfg.max_dq!r}")
     if cfg.position_weight == 0.0 and cfg.orientation_weight == 0.0:
-        raise ValueError(
-            "position_weight, orientation_weight: expected at least one weight > 0, got 0 for both; "
-            "the frame would be unconstrained."
+        odd.append("position_weight=0, orientation_weight=0")
+    if odd:
+        warnings.warn(
+            f"DifferentialIKActionCfg: expected weights and damping >= 0, one of position_weight and "
+            f"orientation_weight > 0, and max_dq > 0, got {', '.join(odd)}.",
+            UserWarning,
+            stacklevel=2,
         )
 
 
