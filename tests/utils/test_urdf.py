@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import mujoco
@@ -85,7 +86,45 @@ def test_a_mujoco_element_takes_precedence(urdf: Path) -> None:
     assert read_urdf(urdf).compile().nmesh == 0
 
 
-def test_a_mesh_that_is_not_found_is_named(urdf: Path) -> None:
-    urdf.write_text(_ROBOT.replace("part.obj", "other.obj"), encoding="utf-8")
-    with pytest.raises(ValueError, match=r"two.urdf: mesh 'package://.*other.obj' not found"):
+def test_a_missing_mesh_of_a_colliding_geom_is_named(urdf: Path) -> None:
+    collision = _MESH.replace("visual>", "collision>")
+    text = _ROBOT.replace(_MESH, collision).replace("part.obj", "other.obj")
+    urdf.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=r"two.urdf: mesh 'package://.*other.obj'.*not found"):
         read_urdf(urdf)
+
+
+@pytest.mark.parametrize("options", ["", '<mujoco><compiler discardvisual="false"/></mujoco>'])
+@pytest.mark.parametrize("name", ["part.dae", "part.glb", "other.obj", "OTHER.STL"])
+def test_visual_meshes_that_cannot_be_read_are_dropped(urdf: Path, name: str, options: str) -> None:
+    (urdf.parents[1] / "meshes" / "part.dae").write_text("<COLLADA/>", encoding="utf-8")
+    part = "package://two_description/meshes/part.obj"
+    other = f"package://two_description/meshes/{name}"
+    both = _MESH.replace(part, other) + _MESH.replace(part, other)
+    text = _ROBOT.replace(_MESH, both).replace("</robot>", f"{options}</robot>")
+    urdf.write_text(text, encoding="utf-8")
+    with pytest.warns(UserWarning, match=f"dropped 2 visual geoms.*{name}") as caught:
+        model = read_urdf(urdf).compile()
+    assert len(caught) == 1
+    assert (model.nmesh, model.ngeom, model.nv) == (0, 2, 1)
+    assert model.body("arm").mass[0] == pytest.approx(1.0)
+
+
+def test_meshes_with_the_same_stem_stay_apart(urdf: Path) -> None:
+    folder = urdf.parents[1] / "meshes"
+    (folder / "collision").mkdir()
+    text = (folder / "part.obj").read_text(encoding="utf-8")
+    (folder / "collision" / "part.obj").write_text(text.replace("v 1 0 0", "v 5 0 0"))
+    collision = _MESH.replace("visual>", "collision>").replace("part.obj", "collision/part.obj")
+    for visual in (_MESH, _MESH.replace("part.obj", "part.dae")):
+        urdf.write_text(_ROBOT.replace(_MESH, visual + collision), encoding="utf-8")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = read_urdf(urdf).compile()
+        sizes = {
+            bool(model.geom_contype[i]): model.geom_aabb[i, 3:].max()
+            for i in range(model.ngeom)
+            if model.geom_dataid[i] >= 0
+        }
+        assert sizes[True] > 2.0
+        assert sizes.get(False, 0.0) < 1.0
