@@ -166,6 +166,9 @@ class ManagerBasedRlEnv(Tabular):
         )
         self.scene.initialize(self.sim.mj_model, self.sim.model, self.sim.data)
         self.scene.check_terrain_scans(self.sim.mj_model)
+        if self.scene.world_cameras:
+            self.sim.expand_model_fields(("cam_pos",))
+            self.scene.place_cameras(self.sim.model)
         self.sim.add_forward_callback(self.scene.invalidate_sensor_caches)
         if self.scene.sensor_context is not None:
             self.sim.set_sensor_context(self.scene.sensor_context)
@@ -640,6 +643,7 @@ class ManagerBasedRlEnv(Tabular):
                 env_ids=env_ids,
                 global_env_step_count=self._sim_step_counter // self.cfg.decimation,
             )
+        self.scene.place_cameras(self.sim.model, env_ids)
         if any(entity.seeds_lengths for entity in self.scene.entities.values()):
             self.sim.forward(env_ids, stage="pos")
         for entity in self.scene.entities.values():

@@ -36,7 +36,7 @@ from mjlab.sim.config import MujocoCfg
 from mjlab.sim.engine import Stage
 from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
 from mjlab.utils.errors import UnknownNameError, check_count
-from mjlab.utils.indexing import EnvIds
+from mjlab.utils.indexing import EnvIds, as_index
 from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
 from mjlab.utils.spec import (
     attach,
@@ -86,7 +86,7 @@ class SceneCfg:
 class Scene(Tabular):
     """Terrain, entities and sensors composed into one `MjSpec`. `initialize` binds a simulation."""
 
-    _transient = {"_env_origins", "_device", "_updated_sensors"}
+    _transient = {"_env_origins", "_device", "_updated_sensors", "world_cameras"}
 
     def __init__(self, scene_cfg: SceneCfg, device: str) -> None:
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
@@ -134,6 +134,9 @@ class Scene(Tabular):
             report_settings(name, settings, self._spec)
         add_key(self._spec, [entity.initial_state for entity in self._entities.values()])
         self._env_origins = torch.zeros(scene_cfg.num_envs, 3, dtype=torch.float32, device=device)
+        self._camera_origins = torch.zeros_like(self._env_origins)
+        self.world_cameras: list[int] = []
+        """Ids of the cameras of camera sensors whose body is the world."""
 
     # Composition.
 
@@ -347,9 +350,27 @@ class Scene(Tabular):
             part.initialize(mj_model, model, data, self._device)
         rays = [sensor for sensor in self._sensors.values() if isinstance(sensor, RayCastSensor)]
         cameras = [sensor for sensor in self._sensors.values() if isinstance(sensor, CameraSensor)]
+        ids = {camera.camera_idx for camera in cameras}
+        self.world_cameras = sorted(i for i in ids if mj_model.cam_bodyid[i] == 0)
+        self._camera_origins.zero_()
         if rays or cameras:
             self._sensor_context = SensorContext(mj_model, model, data, cameras, rays, self._device)
         warn_oddities(self, mj_model)
+
+    def place_cameras(self, model: Any, env_ids: EnvIds = None) -> None:
+        """Move the world cameras of sensors along with the origins of environments.
+
+        `model`: model fields of the simulation, with per-environment `cam_pos`.
+        """
+        if not self.world_cameras:
+            return
+        # Not a read by a user.
+        origins = self._env_origins if self._terrain is None else vars(self._terrain)["env_origins"]
+        rows = as_index(env_ids)
+        moved = origins[rows] - self._camera_origins[rows]
+        self._camera_origins[rows] = origins[rows]
+        for camera in self.world_cameras:
+            model.cam_pos[rows, camera] += moved
 
     def reset(self, env_ids: EnvIds = None) -> None:
         """Reset targets, delays, histories and sensors of `env_ids` (None: all)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import warnings
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -41,9 +42,10 @@ class CameraSensorCfg(SensorCfg):
     camera_name: str | None = None
     """Existing camera to use, with entity prefix. None: add a camera named after the sensor."""
     parent_body: str | None = None
-    """Parent body of the added camera, with entity prefix. None: world."""
+    """Parent body of the added camera, with entity prefix. None: the environment. A camera of the
+    world, added or existing, stands relative to the origin of each environment."""
     pos: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Position of the added camera in its body's frame (m)."""
+    """Position of the added camera in its body's frame, or from the environment's origin (m)."""
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation (w, x, y, z) of the added camera, which looks along -z with +y up."""
     fovy: float | None = None
@@ -104,26 +106,38 @@ class CameraSensor(Sensor[CameraSensorData]):
         """Check the config.
 
         Raises:
-            ValueError: invalid image size, data types, geom groups or field of view.
+            ValueError: invalid image size or data types, no geom groups, or field of view >= 180.
         """
         super().__init__()
         self.cfg = cfg
         owner = f"Camera sensor {cfg.name!r}"
         check_count(f"{owner} width", cfg.width)
         check_count(f"{owner} height", cfg.height)
+        odd = []
         for field, allowed in (
             ("data_types", CAMERA_DATA_TYPES), ("enabled_geom_groups", range(NUM_GEOM_GROUPS)),
         ):  # fmt: skip
             values = getattr(cfg, field)
             is_set = isinstance(values, Collection) and len(values) > 0
-            if not is_set or any(value not in allowed for value in values):
-                raise ValueError(
-                    f"{owner} {field}: expected at least one of {list(allowed)}, got {values!r}."
-                )
+            message = f"{field}: expected at least one of {list(allowed)}, got {values!r}"
+            if not is_set or (field == "data_types" and any(v not in allowed for v in values)):
+                raise ValueError(f"{owner} {message}.")
+            if any(value not in allowed for value in values):
+                odd.append(message)
         is_perspective = not cfg.orthographic and cfg.camera_name is None
         limit = _MAX_FOVY if is_perspective else math.inf
         if cfg.fovy is not None and not 0.0 < cfg.fovy < limit:
-            raise ValueError(f"{owner} fovy: expected a number in (0, {limit:g}), got {cfg.fovy}.")
+            message = f"fovy: expected a number in (0, {limit:g}), got {cfg.fovy}"
+            if cfg.fovy >= limit:
+                raise ValueError(f"{owner} {message}.")
+            odd.append(message)
+        if cfg.camera_name is not None and cfg.parent_body is not None:
+            odd.append(
+                f"parent_body: expected None for the existing camera {cfg.camera_name!r}, got "
+                f"{cfg.parent_body!r}, which is ignored"
+            )
+        if odd:
+            warnings.warn(f"{owner} {'; '.join(odd)}.", UserWarning, stacklevel=2)
         self._camera_idx = -1
         self._view: CameraView | None = None
         self._rgb: torch.Tensor | None = None
@@ -136,8 +150,8 @@ class CameraSensor(Sensor[CameraSensorData]):
         """Add the camera, or apply `fovy` and `orthographic` to the existing one.
 
         Raises:
-            ValueError: unknown body (with the available names), duplicate name of an added camera,
-                or a body for an existing camera.
+            ValueError: unknown body (with the available names), or duplicate name of an added
+                camera.
         """
         cfg = self.cfg
         camera = scene_spec.camera(self.camera_name)
@@ -148,12 +162,6 @@ class CameraSensor(Sensor[CameraSensorData]):
                     f"the sensor, or use the existing camera with camera_name={cfg.name!r}."
                 )
             camera = self._add_camera(scene_spec)
-        elif cfg.parent_body is not None:
-            raise ValueError(
-                f"Camera sensor {cfg.name!r}: parent_body={cfg.parent_body!r} applies to added cameras "
-                f"only, but camera_name={cfg.camera_name!r} selects an existing one; leave out one of "
-                "them."
-            )
         if camera is None:
             # Another sensor may add it; `initialize` raises otherwise.
             return
