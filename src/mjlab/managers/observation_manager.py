@@ -79,8 +79,8 @@ class ObservationTermCfg(ManagerTermBaseCfg):
     """Stagger resampling across environments over `delay_update_period`."""
 
     history_length: int = 0
-    """Number of past values to return, oldest first. 0: the current value only. Replaced by the
-    group's `history_length`."""
+    """Number of past values to return, oldest first (histories of contact sensors are newest first).
+    0: the current value only. Replaced by the group's `history_length`."""
 
     flatten_history_dim: bool = True
     """Return a history of H values as (num_envs, H * size) instead of (num_envs, H, ...)."""

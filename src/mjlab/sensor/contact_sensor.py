@@ -2,9 +2,10 @@
 
 One MuJoCo `contact` sensor is added per primary. Data has N environments, P primaries and S slots;
 column `p * S + s` is slot s of primary p. Contacts fill the slots in order, and empty slots are
-zero. Forces and torques are exerted by the primary on the secondary. Values are those of the last
-substep simulated; after a reset, those of a full forward. Histories and timers are updated every
-substep.
+zero. Forces and torques are exerted by the primary on its partner: those of a robot at rest sum to
+minus its weight, the opposite of Isaac Lab's `net_forces_w`. Values are those of the last substep
+simulated; after a reset, those of a full forward. Histories and timers are updated every substep.
+Contact histories are newest first, observation histories oldest first.
 """
 
 from __future__ import annotations
@@ -71,7 +72,8 @@ class ContactSensorCfg(SensorCfg):
     secondary: ContactMatch | None = None
     """Contact partner. None: any geom."""
     fields: tuple[str, ...] = ("found", "force")
-    """Measured fields, of `found`, `force`, `torque`, `dist`, `pos`, `normal`, `tangent`."""
+    """Measured fields, of `found`, `force`, `torque`, `dist`, `pos`, `normal`, `tangent`. Forces and
+    torques are exerted by the primary on its partner."""
     reduce: Reduction = "maxforce"
     """Contact selection per primary: `none` (arbitrary order), `mindist`, `maxforce`, or `netforce`
     (sum of all contacts, world frame)."""
@@ -144,10 +146,11 @@ class ContactData:
     found: torch.Tensor | None = None
     """Number of matching contacts, (N, P*S). 0 in empty slots."""
     force: torch.Tensor | None = None
-    """Contact force (N), (N, P*S, 3), in the contact frame (normal, tangent, normal x tangent); in
-    the world frame for `netforce` and `global_frame`."""
+    """Contact force of the primary on its partner (N), (N, P*S, 3), in the contact frame (normal,
+    tangent, normal x tangent); in the world frame for `netforce` and `global_frame`. A robot at rest
+    has minus its weight; the sign is opposite to Isaac Lab's `net_forces_w`."""
     torque: torch.Tensor | None = None
-    """Contact torque (N m), (N, P*S, 3), in the frame of `force`."""
+    """Contact torque of the primary on its partner (N m), (N, P*S, 3), in the frame of `force`."""
     dist: torch.Tensor | None = None
     """Signed distance (m), (N, P*S). Negative: penetration."""
     pos: torch.Tensor | None = None
@@ -165,7 +168,8 @@ class ContactData:
     last_contact_time: torch.Tensor | None = None
     """Duration of the last completed contact phase (s), (N, P)."""
     force_history: torch.Tensor | None = None
-    """Force of the last H substeps, newest first, (N, P*S, H, 3)."""
+    """Force of the last H substeps, newest first, (N, P*S, H, 3). Observation histories are oldest
+    first."""
     torque_history: torch.Tensor | None = None
     """Torque of the last H substeps, newest first, (N, P*S, H, 3)."""
     dist_history: torch.Tensor | None = None
