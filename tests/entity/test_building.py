@@ -294,12 +294,6 @@ def test_default_root_state_is_that_of_the_config(kit):
     assert scene["arm"].data.default_root_state.tolist() == [pose] * 2
 
 
-def test_a_pattern_of_the_initial_state_that_matches_nothing_is_reported(kit, caplog):
-    with caplog.at_level(logging.WARNING):
-        kit.cfg(kit.ARM, init_state=InitialState(joint_pos={"elbo": 1.0, "hip": 2.0})).build()
-    assert "['hip'] match none of the names ['shoulder', 'elbow']" in caplog.text
-
-
 def test_the_default_initial_state_of_an_entity_without_joints_is_not_reported(caplog):
     with caplog.at_level(logging.WARNING):
         EntityCfg().build()

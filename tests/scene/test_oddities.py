@@ -202,3 +202,77 @@ def test_looks_of_an_entity_are_logged(caplog):
         assert not build(thing(BALL, looks, init_state=HIGH))[2]
     assert "visual.headlight.ambient = (0.4, 0.4, 0.4)" in caplog.text
     assert "stat.extent = 2" in caplog.text
+
+
+# Initial joint positions.
+
+ARM = (
+    '<body name="arm" pos="0 0 1"><joint name="slider" type="slide" range="-1 1"/><geom size=".1"/>'
+    '<body name="pole"><joint name="hinge_1" range="{range}"/><geom size=".1"/>'
+    '<body name="tip"><joint name="hinge_2"/><geom size=".1"/></body></body></body>'
+)
+RADIAN = '<compiler angle="radian"/>'
+
+
+def arm(joint_pos=None, joint_vel=None, limits="-1 1", rest=RADIAN, **fields):
+    fields |= {} if joint_pos is None else {"joint_pos": joint_pos}
+    fields |= {} if joint_vel is None else {"joint_vel": joint_vel}
+    state = EntityCfg.InitialStateCfg(pos=(0.0, 0.0, 1.0), **fields)
+    return thing(ARM.format(range=limits), rest, init_state=state)
+
+
+@pytest.mark.parametrize("field", ["joint_pos", "joint_vel"])
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({"hinge": 0.5}, (0.0, 0.5, 0.5)),
+        ({"hinge": 0.5, ".*": 0.2}, (0.2, 0.5, 0.5)),
+        ({".*": 0.2, "hinge": 0.5}, (0.2, 0.2, 0.2)),
+        ({"hinge_1": 0.5}, (0.0, 0.5, 0.0)),
+        ({}, (0.0, 0.0, 0.0)),
+    ],
+)
+def test_patterns_match_from_the_start(field, values, expected):
+    _, scene, messages = build(arm(**{field: values}))
+    assert getattr(scene["thing_0"].data, f"default_{field}")[1].tolist() == pytest.approx(expected)
+    assert messages == []
+
+
+@pytest.mark.parametrize("field", ["joint_pos", "joint_vel"])
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_patterns_without_a_joint_warn_once(field, num_envs):
+    typos = {"hing_1": 0.5, "_2": 0.1, "slider": 0.2}
+    _, scene, messages = build(arm(**{field: typos}), num_envs=num_envs)
+    (message,) = messages
+    for words in ("'thing_0'", f"init_state.{field}", "['hing_1', '_2']", "did you mean 'hinge_1'"):
+        assert words in message
+    values = getattr(scene["thing_0"].data, f"default_{field}")[0].tolist()
+    assert values == pytest.approx((0.2, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("cfg", "words"),
+    [
+        (arm({"slider": 3.0}), ("'slider' at 3 (limits -1 to 1)",)),
+        (arm({"slider": -1.5, "hinge": 2.0}), ("'slider' at -1.5", "'hinge_1' at 2")),
+        (arm({"hinge_1": 0.5}, rest=""), ("'hinge_1' at 0.5", 'angle="radian"')),
+        (arm({"hinge_1": 45.0}), ("'hinge_1' at 45", "in rad, not in degrees")),
+    ],
+)
+def test_initial_positions_beyond_limits_warn_once(cfg, words):
+    (message,) = build(cfg)[2]
+    for word in ("'thing_0'", "init_state.joint_pos", *words):
+        assert word in message
+    assert ("radian" in message) == any("radian" in word for word in words)
+
+
+@pytest.mark.parametrize(
+    "cfg",
+    [
+        arm({"slider": 1.0, "hinge_1": -1.0, "hinge_2": 100.0}),
+        arm({"hinge_1": 1.5708}, limits="-1.5707 1.5707"),
+        arm({"hinge_1": 0.5}, limits="-45 45", rest=""),
+    ],
+)
+def test_initial_positions_at_limits_do_not_warn(cfg):
+    assert build(cfg)[2] == []

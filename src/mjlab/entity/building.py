@@ -19,7 +19,7 @@ from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS, XmlActuatorCfg
 from mjlab.utils.lab_api.string import resolve_matching_names
 from mjlab.utils.mujoco import control_inputs, qpos_width
 from mjlab.utils.spec import authored_position, compile_composed
-from mjlab.utils.string import compile_pattern, resolve_expr
+from mjlab.utils.string import compile_pattern, first_matches
 
 KEY_NAME = "init_state"
 BIT_FIELDS = ("disableflags", "enableflags", "disableactuator")
@@ -482,12 +482,12 @@ def resolve_initial_state(
         positions = _joint_pos_of_key(xml_key, spec, joints)
     else:
         xml_key = None
-        positions = tuple(map(float, resolve_expr(init.joint_pos, names, 0.0)))
+        positions = tuple(map(float, first_matches(init.joint_pos, names, 0.0)))
     values = {joint: (value,) for joint, value in zip(joints, positions, strict=True)}
     return InitialState(
         root_state=pose if free_joint is None else (*pose, *velocity),
         joint_pos=positions,
-        joint_vel=tuple(map(float, resolve_expr(init.joint_vel, names, 0.0))),
+        joint_vel=tuple(map(float, first_matches(init.joint_vel, names, 0.0))),
         qpos={joint: values.get(joint, pose) for joint in spec.joints if joint.type != _BALL},
         ctrl=_initial_ctrl(spec, joints, positions, xml_key),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 from mjlab.entity.building import KEY_NAME, short_name
 from mjlab.entity.indexing import element_ids
 from mjlab.utils.spec import read_setting
+from mjlab.utils.string import suggest, unmatched_patterns
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
 
 # Depth of an initial contact that is a mistake (m). The feet of Go1 start 0.016 m deep.
 _DEEP = 0.03
+
+# Distance of an initial position from a joint limit that is not a mistake (rad or m).
+_NEAR_LIMIT = 1e-3
 
 _LINKS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 _BODY, _PLANE = int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -66,6 +71,7 @@ def warn_oddities(scene: Scene, model: mujoco.MjModel) -> None:
     data = _initial_data(scene, entities, model)
     grounds = [] if scene.terrain is None else ["the terrain"]
     for name, entity in entities.items():
+        _warn_initial_joints(name, entity, model)
         if scene.env_origins.any():
             _warn_world_elements(name, entity, model)
         if entity.is_fixed_base:
@@ -97,6 +103,40 @@ def _initial_data(
             data.qpos[entity.indexing.free_joint_q_adr[:3].cpu().numpy()] += origin
     mujoco.mj_fwdPosition(model, data)
     return data
+
+
+def _warn_initial_joints(name: str, entity: Entity, model: mujoco.MjModel) -> None:
+    """Warn of patterns of the initial state without a joint, and of positions beyond the limits."""
+    init, names = entity.cfg.init_state, entity.joint_names
+    for field in ("joint_pos", "joint_vel"):
+        unmatched = unmatched_patterns(getattr(init, field) or {}, names) if names else []
+        if unmatched:
+            _warn(
+                f"Entity {name!r} init_state.{field}: expected patterns of joints, got {unmatched} "
+                f"without a joint, so these values are not used; {suggest(unmatched[0], names)}"
+            )
+    ids = entity.indexing.joint_ids.tolist()
+    positions = np.array(entity.initial_state.joint_pos)
+    low, high = model.jnt_range[ids].reshape(-1, 2).T
+    limited = model.jnt_limited[ids].astype(bool)
+    beyond = limited & ((positions < low - _NEAR_LIMIT) | (positions > high + _NEAR_LIMIT))
+    if not beyond.any():
+        return
+    hinges = limited & (model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_HINGE)
+    listed = [
+        f"{names[i]!r} at {positions[i]:.4g} (limits {low[i]:.4g} to {high[i]:.4g})"
+        for i in beyond.nonzero()[0]
+    ]
+    remedy = "change the positions or the limits"
+    # Limits in rad that were read as degrees are below 2 pi degrees.
+    if (beyond & hinges).any() and np.abs(model.jnt_range[ids][hinges]).max() < math.radians(6.3):
+        remedy = 'if the limits are in rad in the MJCF, add <compiler angle="radian"/>'
+    elif (np.abs(positions[beyond & hinges]) > 2.0 * math.pi).any():
+        remedy = "positions of hinges are in rad, not in degrees"
+    _warn(
+        f"Entity {name!r} init_state.joint_pos: expected positions within the joint limits, got "
+        f"{', '.join(listed)}. The limits push the joints back at every step; {remedy}."
+    )
 
 
 def _warn_world_elements(name: str, entity: Entity, model: mujoco.MjModel) -> None:

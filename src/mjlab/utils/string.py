@@ -32,8 +32,15 @@ def resolve_expr(
     Logs a warning for patterns that match no name, because these are usually misspelled. Raises
     `ValueError` for a pattern that is not a valid regular expression.
     """
+    _report_unmatched(pattern_map, names)
+    return first_matches(pattern_map, names, default_val)
+
+
+def first_matches(
+    pattern_map: dict[str, Any], names: tuple[str, ...], default_val: Any = None
+) -> tuple[Any, ...]:
+    """Return the values of `resolve_expr`, without warnings."""
     compiled = [(compile_pattern(pattern), value) for pattern, value in pattern_map.items()]
-    _report_unmatched((pattern for pattern, _ in compiled), names)
     return tuple(
         next((value for pattern, value in compiled if pattern.match(name)), default_val)
         for name in names
@@ -46,8 +53,8 @@ def filter_exp(exprs: list[str] | tuple[str, ...], names: tuple[str, ...]) -> tu
     Logs a warning for patterns that match no name. Raises `ValueError` for a pattern that is not a
     valid regular expression.
     """
+    _report_unmatched(exprs, names)
     compiled = [compile_pattern(expr) for expr in exprs]
-    _report_unmatched(compiled, names)
     return tuple(name for name in names if any(pattern.match(name) for pattern in compiled))
 
 
@@ -56,6 +63,11 @@ def resolve_field(field: Any, names: tuple[str, ...], default_val: Any = None) -
     if isinstance(field, dict):
         return resolve_expr(field, names, default_val)
     return tuple(field for _ in names)
+
+
+def unmatched_patterns(patterns: Iterable[str], names: Sequence[str]) -> list[str]:
+    """Return the patterns that match the start of no name. Raises `ValueError` as `resolve_expr`."""
+    return [p for p in patterns if not any(compile_pattern(p).match(name) for name in names)]
 
 
 def compile_pattern(pattern: str) -> re.Pattern[str]:
@@ -109,12 +121,10 @@ def suggest(name: str, available: Iterable[str]) -> str:
     return f"did you mean {' or '.join(map(repr, close))}? Available: {listed}."
 
 
-def _report_unmatched(patterns: Iterable[re.Pattern[str]], names: Sequence[str]) -> None:
+def _report_unmatched(patterns: Iterable[str], names: Sequence[str]) -> None:
+    unmatched = unmatched_patterns(patterns, names)
     # Without names, patterns cannot match: the default ".*" for an entity without joints is valid.
-    if not names:
-        return
-    unmatched = [p.pattern for p in patterns if not any(p.match(name) for name in names)]
-    if unmatched:
+    if names and unmatched:
         logger.warning(
             "Patterns %s match none of the names %s.", unmatched, name_list(names, near=unmatched)
         )
