@@ -158,15 +158,16 @@ def test_without_a_device_there_is_a_default(monkeypatch):
     env.close()
 
 
+@pytest.mark.parametrize("length", [0.0, -1.0])
 @pytest.mark.parametrize("limited", [False, True])
-def test_a_negative_episode_length_ends_every_step(limited):
+def test_a_time_limit_needs_an_episode_length(length, limited):
+    limit = {"t": TerminationTermCfg(func=mdp.time_out, time_out=True)} if limited else {}
     cfg = cartpole()
-    cfg.episode_length_s = -1.0
-    cfg.terminations = (
-        {"t": TerminationTermCfg(func=mdp.time_out, time_out=True)} if limited else {}
-    )
-    with pytest.warns(UserWarning, match="episode_length_s"):
+    cfg.episode_length_s, cfg.terminations = length, limit
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
         env = ManagerBasedRlEnv(cfg, device="cpu")
+    assert sum("episode_length_s" in str(w.message) for w in seen) == limited
     env.reset()
     truncated = env.step(torch.zeros(NUM_ENVS, 1))[3]
     assert truncated.tolist() == [limited] * NUM_ENVS

@@ -409,6 +409,7 @@ class Counting(ManagerTermBase):
         self.helper = Tally(n)
         self.pair = [Tally(n), Tally(n)]
         self.numbers = [0.0] * n
+        self.by_env = {k: [0.0] for k in range(n)}
         self.frames = deque([torch.zeros(n, 1)] * 3, maxlen=3)
         self.items = {"a": (torch.zeros(n, 1), SimpleNamespace(count=torch.zeros(n, 1)))}
         self.rings = CircularBuffer(n, n, "cpu")
@@ -422,6 +423,7 @@ class Counting(ManagerTermBase):
             values[env_ids] = 0.0
         for k in range(self.num_envs)[env_ids] if isinstance(env_ids, slice) else env_ids.tolist():
             self.numbers[k] = 0.0
+            self.by_env[k].clear()
         self.rings.reset(env_ids)
         self.columns[:, env_ids] = 0.0
 
@@ -441,6 +443,10 @@ class Counting(ManagerTermBase):
         if kind == "numbers":
             self.numbers = [number + 1.0 for number in self.numbers]
             return torch.tensor(self.numbers)[:, None]
+        if kind == "by_env":
+            for frames in self.by_env.values():
+                frames.append(len(frames) + 1.0)
+            return torch.tensor([frames[-1] for frames in self.by_env.values()])[:, None]
         if kind == "frames":
             self.frames.append(self.frames[-1] + 1.0)
             return self.frames[-1]
@@ -456,7 +462,10 @@ class Counting(ManagerTermBase):
         return self.columns[-1]
 
 
-KINDS = ("tensor", "array", "helper", "pair", "numbers", "frames", "items", "rings", "columns")
+KINDS = (
+    *("tensor", "array", "helper", "pair", "numbers", "by_env", "frames", "items"),
+    *("rings", "columns"),
+)
 
 
 class Drift(NoiseModel):

@@ -183,6 +183,15 @@ def test_metadata_of_position_actions_have_full_precision_and_the_actuators_gain
     env.close()
 
 
+def test_metadata_follow_the_default_pose():
+    env = leg_env()
+    entity = next(iter(env.scene.entities.values()))
+    entity.data.default_joint_pos[:] = torch.tensor([0.5, 0.25, -0.75])
+    metadata = get_base_metadata(env, "some_run")
+    assert metadata["default_joint_pos"] == [0.5, 0.25, -0.75]
+    assert metadata["action_offset"] == [0.25, -0.75]
+
+
 def test_attached_metadata_replaces_what_was_there(make_runner, tmp_path: Path):
     make_runner().export_policy_to_onnx(str(tmp_path), "policy.onnx")
     path = tmp_path / "policy.onnx"

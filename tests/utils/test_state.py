@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import io
 from collections import defaultdict, deque
@@ -9,7 +10,13 @@ from collections import defaultdict, deque
 import numpy as np
 import torch
 
-from mjlab.utils.state import capture_state, restore_state, shape_differences, stateful
+from mjlab.utils.state import (
+    capture_state,
+    changes_undone,
+    restore_state,
+    shape_differences,
+    stateful,
+)
 
 
 @stateful
@@ -153,3 +160,91 @@ def test_shapes_that_differ_are_named():
     saved["buffers"]["a"]["values"] = torch.zeros(7)
     assert shape_differences(saved, current) == ["buffers.a.values: expected shape (4,), got (7,)"]
     assert shape_differences(current, current) == []
+
+
+# Changes undone.
+
+
+class Plain:
+    """Object of a package, without a mark."""
+
+    def __init__(self) -> None:
+        self.values = torch.zeros(3, 2)
+        self.count = 0
+        self.parts: list = [torch.zeros(3), {"a": {1, 2}}]
+        self.unset: torch.Tensor | None = None
+        self.shared = Buffer()
+
+
+def test_changes_of_a_block_are_undone():
+    plain = Plain()
+    values, first, inner, shared = plain.values, plain.parts[0], plain.parts[1], plain.shared
+    with changes_undone([plain]) as changed:
+        plain.values += 1.0
+        plain.values = plain.values + 1.0
+        plain.count += 1
+        first.fill_(4.0)
+        inner["a"].add(3)
+        inner["b"] = 1
+        plain.parts = []
+        plain.unset = torch.ones(3)
+        plain.added = True
+        plain.shared.count = 8
+        del plain.shared
+    assert plain.values is values
+    assert values.tolist() == [[0.0, 0.0]] * 3
+    assert plain.parts[0] is first
+    assert plain.parts == [first, {"a": {1, 2}}]
+    assert first.tolist() == [0.0] * 3
+    assert (plain.count, plain.unset, shared.count) == (0, None, 3)
+    assert plain.shared is shared
+    assert not hasattr(plain, "added")
+    assert changed == []
+
+
+def test_rows_keep_their_changes():
+    plain, still = Plain(), Plain()
+    with changes_undone([still, plain], torch.tensor([1]), 3) as changed:
+        plain.values = plain.values + 1.0
+        plain.parts[0] += 1.0
+        plain.unset = torch.ones(3)
+        still.values[1] = 5.0
+        plain.count += 1
+    assert plain.values.tolist() == [[0.0, 0.0], [1.0, 1.0], [0.0, 0.0]]
+    assert plain.parts[0].tolist() == [0.0, 1.0, 0.0]
+    assert still.values[1].tolist() == [5.0, 5.0]
+    assert plain.count == 0
+    assert plain.unset is not None
+    assert changed == [1]
+
+
+def test_changes_are_undone_after_an_error():
+    plain = Plain()
+    with contextlib.suppress(ZeroDivisionError), changes_undone([plain]):
+        plain.count = 1 // (plain.values.fill_(1.0).sum() * 0).int().item()
+    assert plain.values.sum() == 0.0
+
+
+def test_shared_objects_and_inference_tensors():
+    plain = Plain()
+    with torch.inference_mode():
+        plain.values = torch.zeros(3, 2)
+    old = plain.values
+    with changes_undone([plain], torch.tensor([0]), 3, shared=(Buffer,)):
+        plain.values = plain.values + 2.0
+        plain.shared.count = 8
+    assert plain.values.tolist() == [[2.0, 2.0], [0.0, 0.0], [0.0, 0.0]]
+    assert old.sum() == 0.0
+    assert plain.shared.count == 8
+
+
+def test_generators_continue_on_request():
+    plain = Plain()
+    plain.torch = torch.Generator().manual_seed(1)  # ty: ignore
+    plain.numpy = np.random.default_rng(1)  # ty: ignore
+
+    def draw(generators: bool) -> tuple[float, float]:
+        with changes_undone([plain], generators=generators):
+            return torch.rand(1, generator=plain.torch).item(), plain.numpy.random()  # ty: ignore
+
+    assert draw(True) == draw(True) == draw(False) != draw(True)

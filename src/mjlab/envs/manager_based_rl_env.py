@@ -741,13 +741,7 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
             )
     length = cfg.episode_length_s
     if not (isinstance(length, Real) and math.isfinite(length)):
-        raise ValueError(f"episode_length_s: expected a finite number >= 0 (s), got {length!r}.")
-    if length < 0:
-        warnings.warn(
-            f"episode_length_s: expected a number >= 0 (s), got {length!r}; time limits end every step.",
-            UserWarning,
-            stacklevel=3,
-        )
+        raise ValueError(f"episode_length_s: expected a finite number (s), got {length!r}.")
 
 
 def report_odd_times(env: ManagerBasedRlEnv) -> None:
@@ -759,6 +753,13 @@ def report_odd_times(env: ManagerBasedRlEnv) -> None:
         warnings.warn(
             f"TerminationManager terms {failures} time_out: expected True for a time limit, got False; "
             "episodes that reach it count as failures without bootstrapping. Set time_out=True.",
+            UserWarning,
+            stacklevel=3,
+        )
+    if limits and env.max_episode_length <= 0:
+        warnings.warn(
+            f"episode_length_s: expected a number > 0 (s), got {env.cfg.episode_length_s!r}; terms "
+            f"{limits} end episodes at every step. Set episode_length_s, or remove the terms.",
             UserWarning,
             stacklevel=3,
         )

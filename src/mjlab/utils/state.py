@@ -104,7 +104,7 @@ def changes_undone(
 
     Attributes, items and values of objects, containers, tensors and arrays are restored, and
     references to these stay valid. Rows are those of tensors and arrays with `num_envs` as first or
-    second dimension, and items of sequences with one item per environment. Other state, such as
+    second dimension, and items of sequences and dicts with one item per environment. Other state, such as
     counters and running means, is restored completely.
 
     Args:
@@ -385,7 +385,7 @@ class _Rows:
         if current is None:
             return isinstance(kept, dict)
         differs = current.keys() != kept.keys()
-        if isinstance(old, (list, tuple, deque)) and self._is_per_env(kept, current):
+        if isinstance(old, (list, tuple, deque, dict)) and self._is_per_env(kept, current):
             for k in self._ids.tolist():
                 _forget(table, kept[k])
                 kept[k] = current[k]
@@ -423,7 +423,7 @@ class _Rows:
         return len(self._ids) > 0 and self._dim(value) is not None
 
     def _is_per_env(self, kept: dict[Any, Any], current: dict[Any, Any]) -> bool:
-        if not len(kept) == len(current) == self._num_envs:
+        if not kept.keys() == current.keys() == set(range(self._num_envs)):
             return False
         noted = [_noted(part, {}, self._shared) for part in kept.values()]
         return all(self._dim(value) is None for table in noted for value, _ in table.values())

@@ -24,15 +24,6 @@ __all__ = [
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 
 
-def _check_episode_length(env: ManagerBasedRlEnv) -> None:
-    if env.max_episode_length == 0:
-        raise ValueError(
-            "episode_length_s: expected a number > 0 (s), got 0; the term would fire at every step. Set "
-            "episode_length_s, or remove the term."
-        )
-
-
-@checked_when_built(_check_episode_length)
 def time_out(env: ManagerBasedRlEnv) -> torch.Tensor:
     """True where the episode has reached its maximum length."""
     return env.episode_length_buf >= env.max_episode_length
