@@ -11,6 +11,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers import EventTermCfg
 from mjlab.sim import Simulation, SimulationCfg
+from mjlab.sim.engine import CameraView
 from mjlab.tasks.registry import load_env_cfg
 
 FALLING = """
@@ -260,3 +261,47 @@ def test_an_event_of_any_mode_writes_an_option(engine, mode, num_envs, caplog):
     bias = env.sim.data.qfrc_bias[:, 1]
     torch.testing.assert_close(bias / bias[0], -expected)
     env.close()
+
+
+# What rays and cameras see.
+
+BLOCK = """
+<mujoco>
+  <worldbody>
+    <light pos="0 0 5"/>
+    <camera name="down" pos="0 0 4"/>
+    <geom name="floor" type="plane" size="5 5 .1"/>
+    <geom name="block" type="box" size=".3 .3 .1" pos="0 0 .1"/>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_writes_after_the_first_image_are_seen(engine, num_envs):
+    spec = mujoco.MjSpec.from_string(BLOCK)
+    sim = Simulation(num_envs, SimulationCfg(engine=engine), spec=spec, device="cpu")
+    origins = torch.tensor([0.0, 0.0, 3.0]).repeat(num_envs, 1, 1)
+    down = torch.tensor([0.0, 0.0, -1.0]).repeat(num_envs, 1, 1)
+    views = (CameraView(0, 5, 5, ("rgb", "depth"), (0, 1, 2)),)
+
+    def look() -> tuple[list[float], list[float]]:
+        sim.forward()
+        (image,) = sim.render(views)
+        assert image.depth is not None
+        distances, *_ = sim.raycast(origins, down)
+        return distances.flatten().tolist(), image.depth[:, 2, 2].flatten().tolist()
+
+    assert look()[1] == pytest.approx([3.8] * num_envs, abs=1e-5)
+    sim.model.geom_pos[-1, 1, 2] += 1.0
+    sim.model.geom_rgba[-1, 1] = torch.tensor([1.0, 0.0, 0.0, 1.0])
+    distances, depths = look()
+    others = [2.8] * (num_envs - 1), [3.8] * (num_envs - 1)
+    assert distances == pytest.approx([*others[0], 1.8], abs=1e-5)
+    assert depths == pytest.approx([*others[1], 2.8], abs=1e-5)
+    (image,) = sim.render(views)
+    assert image.rgb is not None
+    red, green, _ = image.rgb[-1, 2, 2].tolist()
+    assert red > 2 * green
+    sim.model.cam_pos[-1, 0, 2] = 6.0
+    assert look()[1] == pytest.approx([*others[1], 4.8], abs=1e-5)
