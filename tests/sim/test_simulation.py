@@ -155,6 +155,18 @@ def test_fields_stay_the_same_tensor():
     assert sim.data.xpos is xpos
 
 
+@pytest.mark.parametrize(
+    "ids", [3, -1, [3], torch.tensor(3), torch.tensor([-1, 3]), slice(3, 4), torch.arange(4) == 3]
+)
+def test_environment_ids_in_any_form(ids):
+    sim = make_sim()
+    sim.data.qpos[:, 0] = 0.5
+    sim.reset(ids)
+    assert sim.data.qpos[:, 0].tolist() == [0.5, 0.5, 0.5, 0.0]
+    with pytest.raises(ValueError, match=r"\[0, 4\)"):
+        sim.reset([4])
+
+
 def test_forward_of_some_environments_leaves_the_others():
     sim = make_sim()
     positions = sim.data.xpos

@@ -596,7 +596,7 @@ class Simulation:
             return None
         ids = as_ids(env_ids, self.num_envs, self.device)
         # Not sorted on a GPU: the host would wait for the device.
-        return ids if ids.is_cuda or len(ids) < 2 else ids.unique()
+        return ids if ids.is_cuda else torch.where(ids < 0, ids + self.num_envs, ids).unique()
 
 
 class SharedField(torch.Tensor):

@@ -23,7 +23,7 @@ def as_ids(
     if not isinstance(env_ids, slice):
         env_ids = torch.as_tensor(env_ids, device=device)
         if env_ids.dtype != torch.bool:
-            return env_ids.long()
+            return env_ids.long().flatten()
     return torch.arange(num_envs, device=device)[env_ids]
 
 
