@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 from mjlab.tasks.registry import list_tasks, load_env_cfg
+from mjlab.utils.errors import UnsupportedError
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -38,10 +39,21 @@ def register_tasks() -> None:
             continue
         try:
             gymnasium.register(
-                name, vector_entry_point="mjlab.gymnasium:make_vec_env", kwargs={"task": task}
+                name,
+                "mjlab.gymnasium:make_env",
+                vector_entry_point="mjlab.gymnasium:make_vec_env",
+                kwargs={"task": task},
             )
         except gymnasium.error.Error as error:
             logger.warning("Task %r not added to Gymnasium's registry: %s", task, error)
+
+
+def make_env(task: str, **kwargs: Any) -> gymnasium.Env:
+    """Raise UnsupportedError: tasks are vector environments. Entry point of `gymnasium.make`."""
+    raise UnsupportedError(
+        f"gymnasium.make: expected a single environment, got {NAMESPACE}/{task}, a vector environment; "
+        f'use gymnasium.make_vec("{NAMESPACE}/{task}", num_envs=1).'
+    )
 
 
 def make_vec_env(

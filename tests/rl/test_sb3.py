@@ -10,11 +10,16 @@ import pytest
 
 pytest.importorskip("stable_baselines3")
 
-from rl_ending_env import ending_env
+from rl_ending_env import TASK, ending_env
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
 
+from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl.sb3 import Sb3VecEnv
+from mjlab.tasks.registry import load_env_cfg
+from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 NUM_ENVS = 3
 
@@ -72,7 +77,41 @@ def test_attributes_and_methods_are_those_of_the_one_environment(make):
     env.set_attr("note", 7)
     assert env.env.note == 7
     assert env.env_method("get_observations", indices=0)[0]["actor"].shape == (NUM_ENVS, 5)
-    assert env.env_is_wrapped(object) == [False] * NUM_ENVS
+    assert env.env_is_wrapped(VecNormalize) == [False] * NUM_ENVS
+    # Infos have the returns that SB3 reads from a `Monitor`.
+    assert env.env_is_wrapped(Monitor, [0]) == [True]
+
+
+def test_evaluations_read_the_returns_of_episodes(make, recwarn):
+    env = VecNormalize(make(), norm_reward=True)
+    model = PPO("MlpPolicy", env, device="cpu", seed=1, n_steps=8, batch_size=24)
+    recwarn.clear()
+    returns, lengths = evaluate_policy(model, env, n_eval_episodes=6, return_episode_rewards=True)
+    assert not [warning for warning in recwarn if "Monitor" in str(warning.message)]
+    assert sorted(set(lengths)) == [3, 4, 5]
+    # Not the normalized rewards.
+    assert all(value > 0.0 for value in returns)
+
+
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
+def test_images_are_one_for_each_environment(render_mode):
+    cfg = load_env_cfg(TASK)
+    cfg.scene.num_envs, cfg.viewer.width, cfg.viewer.height = NUM_ENVS, 32, 24
+    try:
+        env = Sb3VecEnv(ManagerBasedRlEnv(cfg, "cpu", render_mode))
+        env.reset()
+        images = env.get_images()
+        assert len(images) == NUM_ENVS
+        if render_mode is None:
+            assert images == [None] * NUM_ENVS
+        else:
+            assert [image.shape for image in images] == [(24, 32, 3)] * NUM_ENVS
+            # Tiled, 2 x 2.
+            assert env.render().shape == (48, 64, 3)
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+    finally:
+        env.close()
 
 
 @pytest.mark.parametrize(

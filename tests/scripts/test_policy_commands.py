@@ -202,6 +202,22 @@ def test_episodes_are_played_in_as_many_environments_as_asked_for(run, flags, nu
     assert (figures["num_envs"], figures["num_episodes"]) == (num_envs, 4)
 
 
+@pytest.mark.parametrize(
+    ("flags", "at_once"),
+    [
+        ((), 4),
+        (("--num-envs", "2"), 2),
+        (("--env.scene.num-envs", "3"), 3),
+        (("--num_envs", "1"), 1),
+    ],
+)
+def test_num_envs_are_episodes_at_once(run, flags, at_once):
+    outcome = run("evaluate", TASK, "--agent", "zero", *SHORT, "--json", *flags)
+    assert outcome.status == 0, outcome.err
+    metrics = json.loads(outcome.out)
+    assert (metrics["num_episodes"], metrics["num_envs"]) == (4, at_once)
+
+
 def test_evaluation_prints_a_table_for_people(run, trained):
     outcome = run("evaluate", TASK, *SHORT, "--log-root", str(trained.parents[1]))
     assert outcome.status == 0, outcome.err

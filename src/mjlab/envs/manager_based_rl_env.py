@@ -413,7 +413,7 @@ class ManagerBasedRlEnv(Tabular):
         Returns:
             Observations (of the new episode in environments that were reset); reward (N,);
             terminated (N,) and truncated (N,) bool; extras, with `extras["log"]`. The next step
-            overwrites all but the observations.
+            overwrites only the extras.
 
         Raises:
             ValueError: action of the wrong shape, not numeric, or not finite.
@@ -472,11 +472,12 @@ class ManagerBasedRlEnv(Tabular):
             else:
                 self._pending_reset |= self.reset_buf
             self.recorder_manager.record_post_step()
+        # Copies, because libraries stack the results of a rollout at its end.
         return (
             self.obs_buf,
-            self.reward_buf,
-            self.reset_terminated,
-            self.reset_time_outs,
+            self.reward_buf.clone(),
+            self.reset_terminated.clone(),
+            self.reset_time_outs.clone(),
             self.extras,
         )
 
@@ -673,10 +674,14 @@ class ManagerBasedRlEnv(Tabular):
         seed_rng(seed)
         return seed
 
-    def render(self, camera: str | int | None = None) -> np.ndarray | None:
+    def render(
+        self, camera: str | int | None = None, env_idx: int | None = None
+    ) -> np.ndarray | None:
         """Return an RGB image, (height, width, 3) uint8, in mode `rgb_array`, else None.
 
-        `camera` is a camera of the model. None: the view of the config.
+        Args:
+            camera: Camera of the model. None: the view of the config.
+            env_idx: Environment to show without neighbors. None: those of the config.
 
         Raises:
             RenderingUnavailableError: this machine cannot render; the message names the packages
@@ -692,7 +697,7 @@ class ManagerBasedRlEnv(Tabular):
         if not self._renderer_is_open:
             self._renderer.initialize()
             self._renderer_is_open = True
-        self._renderer.update(self.sim, debug_vis_callback=self.update_visualizers, camera=camera)
+        self._renderer.update(self.sim, self.update_visualizers, camera, env_idx)
         return self._renderer.render()
 
     def update_visualizers(self, visualizer: DebugVisualizer) -> None:

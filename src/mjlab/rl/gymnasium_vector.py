@@ -158,9 +158,11 @@ class GymnasiumVectorEnv(VectorEnv):
         return self._shown(self._observations), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return one image of all environments, in a tuple; None without a render mode."""
-        image = self.env.render()
-        return None if image is None else (image,)
+        """Return one image of each environment; None without a render mode."""
+        if self.render_mode != "rgb_array":
+            return None
+        render: Any = self.env.unwrapped.render
+        return tuple(render(env_idx=index) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environment."""
@@ -224,21 +226,15 @@ def step_env(
         limit: Bound c: actions are clamped to [-c, c]. None: unbounded.
 
     Returns:
-        Results of `env.step`; later steps do not write to them. With `is_finite_horizon`, time-outs
-        are terminations instead of truncations.
+        Results of `env.step`. With `is_finite_horizon`, time-outs are terminations instead of
+        truncations.
     """
     if limit is not None:
         actions = actions.clamp(-limit, limit)
     observations, rewards, terminated, truncated, extras = env.step(actions)
     if env.unwrapped.cfg.is_finite_horizon:
-        return (
-            observations,
-            rewards.clone(),
-            terminated | truncated,
-            torch.zeros_like(truncated),
-            extras,
-        )
-    return observations, rewards.clone(), terminated.clone(), truncated.clone(), extras
+        terminated, truncated = terminated | truncated, torch.zeros_like(truncated)
+    return observations, rewards, terminated, truncated, extras
 
 
 # Spaces.

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from mjlab.rl.gymnasium_vector import gymnasium_env
@@ -108,12 +109,18 @@ class Sb3VecEnv(VecEnv):
         return [result for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for each of `indices`."""
-        return [False for _ in self._get_indices(indices)]
+        """Return for each of `indices` if `wrapper_class` is among the wrappers of the environment.
 
-    def get_images(self) -> list[np.ndarray | None]:
-        """Return one image of all environments, in a list."""
-        return [self.env.render()]
+        True for Stable-Baselines3's `Monitor`: infos already have its `episode`.
+        """
+        env, found = self.env, wrapper_class is Monitor
+        while env is not env.unwrapped and not found:
+            found, env = isinstance(env, wrapper_class), env.env
+        return [found for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """Return one image of each environment; None for each without a render mode."""
+        return self._envs.render() or [None] * self.num_envs
 
     def close(self) -> None:
         """Close the environment."""

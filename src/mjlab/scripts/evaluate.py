@@ -38,7 +38,10 @@ class EvaluateConfig(PolicyFlags):
     """Flags of `evaluate`."""
 
     num_episodes: int = 256
-    """Number of episodes, one per environment; in rounds if --env.scene.num-envs is lower."""
+    """Number of episodes; in rounds if --num-envs is lower."""
+    num_envs: int | None = None
+    """Number of environments: episodes at once; short for --env.scene.num-envs. None: one environment
+    per episode."""
     max_steps: int | None = None
     """Maximum episode length in steps; longer episodes are truncated and not a success. None: episode
     length of evaluations."""
@@ -60,17 +63,20 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
 
     Environments are those of evaluations in training (`EvaluationCfg.prepare_env`), or those of the
     training config if the task defines none, because the time limit is part of the task. Their
-    number is `num_episodes`; that of `cfg.env` if it differs from the task, or if `keep_num_envs`.
+    number is `cfg.num_envs`. If None, it is that of `cfg.env` if it differs from the task or if
+    `keep_num_envs`, else `num_episodes`.
     """
     from mjlab.rl.evaluation import evaluate_policy, required_return, success_definition
 
     check_count("--num-episodes", cfg.num_episodes)
+    if cfg.num_envs is not None:
+        check_count("--num-envs", cfg.num_envs)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
     default = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
     is_chosen = keep_num_envs or env_cfg.scene.num_envs != default
-    num_envs = None if is_chosen else cfg.num_episodes
+    num_envs = cfg.num_envs or (None if is_chosen else cfg.num_episodes)
     solved = load_rl_cfg(task, profile=cfg.profile).evaluation
     env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, profile=cfg.profile)
     try:

@@ -170,14 +170,15 @@ SCREENS: Mapping[str, Screen] = {
     "demo": _PLAY,
     "evaluate": {
         "run": (
-            Row("num_episodes", "N", "one per environment"),
+            Row("num_episodes", "N", "episodes"),
+            Row("num_envs", "N", "episodes at once", "all"),
             Row("max_steps", "N", "episode", "the task's"),
             Row("seed", "N"),
             Row("json", "", "print only JSON"),
             *_MACHINE,
         ),
         "policy": _POLICY,
-        "task": (Row("env.scene.num_envs", "N", "in rounds", "the episodes"), *_TASK),
+        "task": _TASK,
     },
     "profile-env": {
         "run": (

@@ -7,9 +7,11 @@ a painted sky, and directional lights merge into one sun that follows the camera
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import sys
+import weakref
 from collections.abc import Callable
 from contextlib import closing, suppress
 from typing import TYPE_CHECKING, Any
@@ -150,12 +152,15 @@ class OffscreenRenderer:
         flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._cfg.enable_shadows
         flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = self._cfg.enable_reflections
         self._visualizer = MujocoNativeDebugVisualizer(self._renderer.scene, self._model)
+        # Before the graphics library ends: MuJoCo's destructors print errors after it.
+        atexit.register(_close_open, weakref.ref(self))
 
     def update(
         self,
         data: Any,
         debug_vis_callback: Callable[[MujocoNativeDebugVisualizer], None] | None = None,
         camera: str | int | None = None,
+        env_idx: int | None = None,
     ) -> None:
         """Update the scene to the current state.
 
@@ -163,6 +168,7 @@ class OffscreenRenderer:
             data: A `Simulation`, its `data`, or a plain `MjData`.
             debug_vis_callback: Called with a visualizer for the primary environment.
             camera: Name or ID of a model camera to use instead of the configured view.
+            env_idx: Environment to show without neighbors. None: those of the config.
 
         Raises:
             RuntimeError: `initialize` has not been called.
@@ -170,7 +176,9 @@ class OffscreenRenderer:
         """
         scene = self.renderer.scene
         origins = self._scene.env_origins
-        env_idx = min(max(self._cfg.env_idx, 0), len(origins) - 1)
+        is_alone = env_idx is not None
+        if env_idx is None:
+            env_idx = min(max(self._cfg.env_idx, 0), len(origins) - 1)
         self._load(data, env_idx)
         move_sun(self._model, self._data, self._view.target(self._data.xpos))
         self._view.apply(self._camera, self._data.xpos)
@@ -182,7 +190,7 @@ class OffscreenRenderer:
         if self._extra_envs is None:
             # Choose neighbors once: terrain curricula move origins, and neighbors would flicker.
             self._extra_envs = nearest_envs(to_numpy(origins), env_idx, self._cfg.max_extra_envs)
-        for extra in self._extra_envs:
+        for extra in () if is_alone else self._extra_envs:
             self._load(data, extra)
             add_moving_geoms(scene, self._model, self._data, self._option)
 
@@ -219,6 +227,11 @@ class OffscreenRenderer:
             sync_model_fields(self._model, model, fields, env_idx)
         copy_state(data, env_idx, self._data)
         compute_poses(self._model, self._data)
+
+
+def _close_open(reference: weakref.ref[OffscreenRenderer]) -> None:
+    if (renderer := reference()) is not None:
+        renderer.close()
 
 
 def open_renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:

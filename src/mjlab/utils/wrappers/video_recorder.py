@@ -134,9 +134,12 @@ class VideoRecorder(ManagerBasedRlEnv):
             self._count_step(episode_over=True, stepped=False)
         return self.env.reset(**kwargs)
 
-    def render(self, camera: str | int | None = None) -> np.ndarray | None:
+    def render(
+        self, camera: str | int | None = None, env_idx: int | None = None
+    ) -> np.ndarray | None:
         """Return the environment's rendering."""
-        return self.env.render(camera) if camera is not None else self.env.render()
+        given = {"camera": camera, "env_idx": env_idx}
+        return self.env.render(**{name: one for name, one in given.items() if one is not None})
 
     def close(self) -> None:
         """Finish the clip being recorded, then close the environment."""
