@@ -18,7 +18,6 @@ from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, play_motions_once
 from mjlab.tasks.tracking.motion_file import read_motion
 from mjlab.tasks.tracking.motion_sources import shipped_motions
 from mjlab.tasks.tracking.options import MotionOptions
-from mjlab.utils.errors import UserError
 
 
 @pytest.fixture
@@ -179,8 +178,11 @@ def test_the_script_of_the_interface_writes_its_figures(short, tmp_path, capsys)
     assert list(written)[:6] == keys
     assert len(written["mpkpe_interval"]) == 2
     assert f"mpkpe            {means['mpkpe']:.4f}" in capsys.readouterr().out
-    cfg.num_episodes = 20
-    with pytest.raises(UserError, match="got 20; use --num-envs 20"):
-        run_evaluate_tracking(G1, cfg)
+    # As in `evaluate`, the number of environments is that of episodes at once.
+    cfg.num_episodes, cfg.json = 5, True
+    capsys.readouterr()
+    run_evaluate_tracking(G1, cfg)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["num_episodes"], printed["num_envs"]) == (5, 3)
     with pytest.raises(ValueError, match="expected a motion tracking task"):
         run_evaluate_tracking("Mjlab-Cartpole-Balance", cfg)

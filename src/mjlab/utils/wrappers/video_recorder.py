@@ -138,7 +138,7 @@ class VideoRecorder(ManagerBasedRlEnv):
         self, camera: str | int | None = None, env_idx: int | None = None
     ) -> np.ndarray | None:
         """Return the environment's rendering."""
-        given = {"camera": camera, "env_idx": env_idx}
+        given: dict[str, Any] = {"camera": camera, "env_idx": env_idx}
         return self.env.render(**{name: one for name, one in given.items() if one is not None})
 
     def close(self) -> None:

@@ -15,7 +15,6 @@ from mjlab.scripts.cli import Command, run_command, run_subcommand
 from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
 from mjlab.scripts.policy import parse_policy_flags
 from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS
-from mjlab.utils.errors import UserError
 
 _NAME = "python -m mjlab.tasks.tracking.scripts.evaluate"
 _COMMAND = Command(
@@ -37,8 +36,8 @@ _COMMAND = Command(
 class EvaluateTrackingConfig(EvaluateConfig):
     """Flags of `evaluate` for tracking tasks."""
 
-    num_envs: int = 1024
-    """Number of environments. Each plays one episode."""
+    num_envs: int | None = 1024
+    """Number of environments: episodes at once. Each plays one episode unless --num-episodes is set."""
     output_file: str | None = None
     """JSON file for the metrics. None: do not write."""
 
@@ -51,19 +50,14 @@ def run_evaluate_tracking(task: str, cfg: EvaluateTrackingConfig) -> dict[str, f
 
     Raises:
         ValueError: not a tracking task.
-        UserError: `num_episodes` is set; the number of episodes is always `num_envs`.
     """
     if "Tracking" not in task:
         raise ValueError(
             f"TASK: expected a motion tracking task, got {task!r}; use `evaluate {task}`."
         )
-    if cfg.num_episodes != EvaluateConfig.num_episodes:
-        raise UserError(
-            f"--num-episodes: expected no value, because each environment plays one episode, got "
-            f"{cfg.num_episodes}; use --num-envs {cfg.num_episodes}."
-        )
     cfg = copy.copy(cfg)
-    cfg.num_episodes = cfg.num_envs
+    if cfg.num_envs is not None and cfg.num_episodes == EvaluateConfig.num_episodes:
+        cfg.num_episodes = cfg.num_envs
     metrics = run_evaluate(task, cfg)
     means: dict[str, float] = {"success_rate": metrics["success_rate"]}
     intervals: dict[str, Any] = {"success_rate_interval": list(metrics["success_interval"])}
