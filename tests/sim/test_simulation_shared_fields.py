@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 
 import mujoco
@@ -163,6 +165,18 @@ def test_reading_expands_nothing(engine):
     assert not sim.expanded_fields
     assert type(field + 1) is torch.Tensor
     torch.testing.assert_close(target[0], sim.get_default_field("geom_friction"))
+
+
+def test_shared_values_print_copy_and_pickle(engine):
+    field = make_sim(engine, 2).model.body_mass
+    assert f"{field[0, BALL]:.2f}" == "1.00"
+    assert "SharedField" not in repr(field)
+    for copied in (copy.deepcopy(field), pickle.loads(pickle.dumps(field[0])).expand(2, -1)):
+        assert type(copied) is torch.Tensor
+        assert torch.equal(copied, field)
+    with pytest.raises(ValueError, match="read-only"):
+        field.numpy()[0] = 1.0
+    assert field.max(dim=1).values.tolist() == [2.0, 2.0]
 
 
 def test_results_without_elements_are_plain_tensors(engine):

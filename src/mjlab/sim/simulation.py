@@ -626,40 +626,44 @@ class SharedField(torch.Tensor):
     def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         name = getattr(func, "__name__", "")
         writes = name == "__setitem__" or (name.endswith("_") and not name.endswith("__"))
-        target = args[0] if args else None
-        rest = [_follow(value, False) for value in args[1:]]
-        options = {key: _follow(value, key == "out") for key, value in (kwargs or {}).items()}
-        first = [_follow(value, writes) for value in args[:1]]
-
-        def call(on: Any) -> Any:
-            with torch._C.DisableTorchFunctionSubclass():
-                return func(*on, *rest, **options)
-
-        result = call(first)
-        if first and first[0] is target and isinstance(target, SharedField):
+        with torch._C.DisableTorchFunctionSubclass():
+            first = [_follow(value, writes) for value in args[:1]]
+            rest = [_follow(value, False) for value in args[1:]]
+            options = {key: _follow(value, key == "out") for key, value in (kwargs or {}).items()}
+            result = func(*first, *rest, **options)
+            field = args[0] if args else None
+            if not isinstance(field, SharedField) or field.live(False) is not None:
+                return result
+            # A view of the shared value follows the field too.
             if isinstance(result, np.ndarray):
                 result.flags.writeable = False
-            elif isinstance(result, tuple | list):
-                return type(result)(
-                    _view(part, target, lambda on, k=k: call([on])[k])
-                    for k, part in enumerate(result)
-                )
-            return _view(result, target, lambda on: call([on]))
-        return result
+                return result
+
+            def view(base: torch.Tensor) -> Any:
+                with torch._C.DisableTorchFunctionSubclass():
+                    return func(base, *rest, **options)
+
+            if type(result) not in (tuple, list):
+                return _follower(result, field, view)
+            parts = (
+                _follower(part, field, lambda base, k=k: view(base)[k])
+                for k, part in enumerate(result)
+            )
+            return type(result)(parts)
 
 
 def _follow(value: Any, writes: bool) -> Any:
-    """Replace shared fields in an argument of a torch function by their live tensors."""
+    """Replace shared fields in an argument of a torch function by plain tensors: live or shared."""
     if isinstance(value, SharedField):
         live = value.live(writes)
-        return value if live is None else live
+        return value.as_subclass(torch.Tensor) if live is None else live
     if type(value) in (tuple, list):
         return type(value)(_follow(part, writes) for part in value)
     return value
 
 
-def _view(result: Any, field: SharedField, view: Callable[[torch.Tensor], Any]) -> Any:
-    """Return `result`, if it is a view of a shared field, as a field that follows it."""
+def _follower(result: Any, field: SharedField, view: Callable[[torch.Tensor], Any]) -> Any:
+    """Return `result` as a shared field if it is a view of `field`; other results unchanged."""
     # Empty tensors all have the same address.
     if not (
         isinstance(result, torch.Tensor)
