@@ -23,7 +23,7 @@ from mjlab.entity.variants import (
 )
 from mjlab.utils.spec_config import CollisionCfg
 
-from .variant_objects import BALL, BEADS, BOX, MESH, THINGS, make_scene, thing
+from .variant_objects import BALL, BEADS, BOX, MESH, THINGS, make_scene, simulate, thing
 
 
 def metadata_of(entity: Entity) -> VariantMetadata:
@@ -127,7 +127,6 @@ BAD_SIBLINGS = {
     "joints": ({HINGE: '<joint name="door"'}, "the same joints.*'door'.*'hinge'"),
     "types of joints": ({HINGE: '<joint type="slide" name="hinge"'}, "the same joints.*mjJNT_SLIDE"),
     "bodies": ({'<body name="lid"': '<body name="cap"'}, "the same bodies.*/thing/cap.*/thing/lid"),
-    "sites": ({'name="grip"': 'name="handle"'}, "the same sites"),
     "inertials": (
         {'<site name="grip"': '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><site name="grip"'},
         "the same kinds of inertial.*diaginertia.*derived from geoms",
@@ -148,6 +147,30 @@ def test_a_variant_with_another_structure_than_its_siblings_is_refused_by_name(w
     with pytest.raises(ValueError, match=f"(?s).*{message}") as caught:
         VariantEntityCfg(variants={"box": BOX, "odd": odd}).build()
     assert "odd" in str(caught.value)
+
+
+def test_sites_of_the_first_variant_count() -> None:
+    odd = thing("odd", '<geom size=".1"/>', **{'name="grip"': 'name="handle"'})
+    with pytest.warns(UserWarning, match="'box' and 'odd' have different sites.*'handle'"):
+        entity = VariantEntityCfg(variants={"box": BOX, "odd": odd}).build()
+    assert "grip" in entity.site_names
+    assert "handle" not in entity.site_names
+
+
+def test_references_to_a_geom_of_every_variant_follow_it() -> None:
+    xml = (
+        '<mujoco><asset><mesh name="m" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/></asset><worldbody>'
+        '<body name="b"><freejoint/><geom name="g" type="mesh" mesh="m" mass="1" pos="0 0 {}"/>'
+        '</body></worldbody><sensor><framepos name="q" objtype="geom" objname="g"/></sensor></mujoco>'
+    )
+    variants = {
+        name: lambda height=height: mujoco.MjSpec.from_string(xml.format(height))
+        for name, height in (("low", 0.2), ("high", 0.7))
+    }
+    sim = simulate(make_scene(2, {"r": VariantEntityCfg(variants=variants)}))
+    sim.forward()
+    heights = sim.data.sensordata[:, 2]
+    assert (heights[1] - heights[0]).item() == pytest.approx(0.5)
 
 
 def test_reserved_names_and_references_to_geoms_that_differ_are_refused() -> None:

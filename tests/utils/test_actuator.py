@@ -50,11 +50,6 @@ def test_a_rack_keeps_power_and_energy(inertia, speed, torque, radius):
     assert tuple(linear) == (linear.armature, linear.velocity_limit, linear.effort_limit)
 
 
-def test_a_rack_needs_a_positive_ratio():
-    with pytest.raises(ValueError, match="transmission_ratio"):
-        reflect_rotary_to_linear(1.0, 1.0, 1.0, 0.0)
-
-
 def test_units_and_fields():
     assert rpm_to_rad(60) == pytest.approx(2 * math.pi)
     motor = ElectricActuator(reflected_inertia=0.1, velocity_limit=30.0, effort_limit=20.0)

@@ -190,16 +190,19 @@ def test_an_unknown_transmission_is_refused(spec):
         create_motor_actuator(spec, "slide", effort_limit=1.0, transmission_type="body")
 
 
-def test_only_motors_act_on_sites(spec):
+def test_actuators_on_sites(spec):
     site = TransmissionType.SITE
-    for create in (
-        lambda: create_position_actuator(
-            spec, "site", stiffness=1.0, damping=0.0, transmission_type=site
-        ),
-        lambda: create_velocity_actuator(spec, "site", damping=1.0, transmission_type=site),
-        lambda: create_muscle_actuator(spec, "site", transmission_type=site),
-    ):
-        with pytest.raises(ValueError, match="'site': expected a motor"):
-            create()
-    with pytest.raises(ValueError, match=r"Site 'site'.*armature 0.5"):
+    servo = create_position_actuator(
+        spec, "site", stiffness=2.0, damping=0.0, effort_limit=3.0, transmission_type=site,
+        actuator_name="servo",
+    )  # fmt: skip
+    assert servo.ctrlrange.tolist() == [-1.5, 1.5]
+    create_velocity_actuator(
+        spec, "site", damping=1.0, transmission_type=site, actuator_name="speed"
+    )
+    with pytest.raises(ValueError, match="Site 'site'.*muscles"):
+        create_muscle_actuator(spec, "site", transmission_type=site)
+    with pytest.warns(UserWarning, match=r"Site 'site'.*armature 0.5"):
         create_motor_actuator(spec, "site", effort_limit=1.0, armature=0.5, transmission_type=site)
+    model = spec.compile()
+    assert set(model.actuator_trntype.tolist()) == {int(mujoco.mjtTrn.mjTRN_SITE)}

@@ -279,7 +279,8 @@ def build_actuators(
     Raises:
         ValueError: the patterns of a config do not resolve (with reason and candidates); or a
             target already has an actuator, of another config, or of the XML with the name of the
-            new one. Other XML actuators on a target stay active, with a warning.
+            new one. Other XML actuators on a target stay active, and two `XmlActuatorCfg` may take
+            over the same one, with a warning.
     """
     elements = {
         TransmissionType.JOINT: joints,
@@ -353,7 +354,8 @@ def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, lis
     """Warn if a config adds an actuator to a target with an XML actuator: their forces add up.
 
     Raises:
-        ValueError: two configs act on the same target, or two actuators get the same name.
+        ValueError: two configs add an actuator to the same target, or two actuators get the same
+            name.
     """
     in_xml: dict[tuple[TransmissionType, str], list[str]] = {}
     for element in spec.actuators:
@@ -368,14 +370,16 @@ def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, lis
         label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
         # XmlActuator skips targets without an actuator.
         names = [name for name in targets if (kind, name) in in_xml or not wraps]
-        taken, beside = [], []
+        taken, beside, twice = [], [], []
         for name in names:
             others = [] if wraps else in_xml.get((kind, name), [])
             by_xml = " and ".join(f"the XML actuator {other or '(unnamed)'!r}" for other in others)
             if name in others:
                 taken.append(f"{short_name(name)!r} has {by_xml}")
             elif (wraps, kind, name) in claimed:
-                taken.append(f"{short_name(name)!r} has one by {claimed[wraps, kind, name]}")
+                (twice if wraps else taken).append(
+                    f"{short_name(name)!r} has one by {claimed[wraps, kind, name]}"
+                )
             elif others:
                 beside.append(f"{short_name(name)!r} has {by_xml}")
         message = f"{label} acts on {kind.value}s that already have an actuator: "
@@ -395,6 +399,12 @@ def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, lis
             warnings.warn(
                 f"{message}{', '.join(beside)}. Both are active and their forces add up; if this is "
                 "not intended, remove the actuator from the XML.",
+                UserWarning,
+                stacklevel=2,
+            )
+        if twice:
+            warnings.warn(
+                f"{message}{', '.join(twice)}. The last config sets the control; narrow the patterns.",
                 UserWarning,
                 stacklevel=2,
             )

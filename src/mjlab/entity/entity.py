@@ -738,7 +738,7 @@ def _set_target(
     target: torch.Tensor, value: torch.Tensor, ids: Ids, env_ids: EnvIds, kind: str
 ) -> None:
     width = target.shape[1]
-    if width == 0:
+    if width == 0 and torch.as_tensor(value).numel() > 0:
         raise ValueError(
             f"Entity has no {kind} targets: it has no {kind}s"
             + ("." if kind == "joint" else f", or no configured actuator acts on a {kind}.")

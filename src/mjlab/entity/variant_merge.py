@@ -7,6 +7,7 @@ the slot, so geoms share a slot only if they agree in these.
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
@@ -30,6 +31,8 @@ from mjlab.utils.spec import (
 GeomRole = Literal["visual", "collision"]
 RESERVED_NAME_PREFIXES = ("mjlab/pad/",)
 """Prefixes of geom names in merged specs. Users' specs must not use them."""
+OPTIONAL_KINDS = ("sites", "cameras", "lights")
+"""Kinds of elements that variants should share by name, but need not."""
 MESH = mujoco.mjtGeom.mjGEOM_MESH
 _UNSUPPORTED = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
@@ -101,7 +104,8 @@ def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None
     Raises:
         ValueError: a spec does not have exactly one top-level body with a free joint first; uses a
             reserved name; or differs from the first spec in bodies, joints, kinds of inertial,
-            sites, cameras, lights, actuators, sensors, tendons or equalities.
+            actuators, sensors, tendons or equalities. Differing sites, cameras and lights are a
+            warning: the scene has those of the first spec.
     """
     for name, spec in zip(names, specs, strict=True):
         _check_variant(name, spec)
@@ -109,7 +113,15 @@ def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None
     for name, spec in zip(names[1:], specs[1:], strict=True):
         own = _structure(spec)
         for kind, expected in first.items():
-            if own[kind] != expected:
+            if own[kind] != expected and kind in OPTIONAL_KINDS:
+                warnings.warn(
+                    f"Variants {names[0]!r} and {name!r} have different {kind}: {name!r} has "
+                    f"{_differing(own[kind], expected)}; all environments have the {kind} of "
+                    f"{names[0]!r}.",
+                    UserWarning,
+                    stacklevel=2,
+                )
+            elif own[kind] != expected:
                 raise ValueError(
                     f"Variants {names[0]!r} and {name!r}: expected the same {kind}, by name and order, "
                     f"got a difference: {name!r} has {_differing(own[kind], expected)}, {names[0]!r} has "
@@ -163,7 +175,7 @@ def _structure(spec: mujoco.MjSpec) -> dict[str, list[Any]]:
         "kinds of inertial": of_bodies(_inertial_kind),
         **{
             kind: of_bodies(lambda b, kind=kind: [element.name for element in getattr(b, kind)])
-            for kind in ("sites", "cameras", "lights")
+            for kind in OPTIONAL_KINDS
         },
         "actuators": [
             (a.name, a.trntype.name, a.target, len(control_inputs(a))) for a in spec.actuators
@@ -287,6 +299,12 @@ class Slot:
     geoms: list[mujoco.MjsGeom | None]
     """Geom of each variant."""
 
+    @property
+    def common_name(self) -> str | None:
+        """Name of its geoms, if all variants have one by this name."""
+        names = {None if geom is None else geom.name for geom in self.geoms}
+        return names.pop() if len(names) == 1 else None
+
 
 Shared = tuple[mujoco.MjsGeom, ...]
 """Geom shared by all variants, one element per variant."""
@@ -377,12 +395,14 @@ def walk_bodies(spec: mujoco.MjSpec) -> Iterator[tuple[str, mujoco.MjsBody]]:
 def check_references(
     name: str, spec: mujoco.MjSpec, slots: list[Slot], shared: list[Shared], k: int
 ) -> None:
-    """Check that no element of variant `k` refers to a geom that becomes part of a slot.
+    """Check that elements of variant `k` refer to geoms that the merged spec has by one name.
 
     Raises:
-        ValueError: a sensor, contact pair or tendon refers to such a geom.
+        ValueError: a sensor or contact pair refers to a geom of a slot with other names in other
+            variants, or a tendon to a geom of any slot.
     """
-    own = [geom.name for slot in slots if (geom := slot.geoms[k]) is not None and geom.name]
+    geoms = {geom.name: slot for slot in slots if (geom := slot.geoms[k]) is not None and geom.name}
+    own = [name for name, slot in geoms.items() if slot.common_name != name]
     geom_type = mujoco.mjtObj.mjOBJ_GEOM
     used = [
         (f"sensor {s.name!r}", target)
@@ -393,6 +413,7 @@ def check_references(
     used += [
         (f"contact pair {p.name!r}", g) for p in spec.pairs for g in (p.geomname1, p.geomname2)
     ]
+    used = [(user, target) for user, target in used if target in own]
     used += [
         (f"tendon {tendon.name!r}", wrap.target.name)
         for tendon in spec.tendons
@@ -400,7 +421,7 @@ def check_references(
         if wrap.type in (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER)
     ]
     for user, target in used:
-        if target in own:
+        if target in geoms:
             raise ValueError(
                 f"Variant {name!r}: {user} refers to geom {target!r}, but only geoms shared by all "
                 "variants keep their names when variants are merged; refer to its body or a site, "
@@ -439,12 +460,26 @@ def merge_specs(
         if any_in_memory:
             put_files_in_memory(spec, f"{name}_")
     assets = _merge_assets(names, specs)
+    _refer_to_slots(merged, {one.common_name: one.key.name for own in slots for one in own})
     geoms = [
         [_slot_geom(names, group[0], slot) for slot in own]
         for group, own in zip(bodies, slots, strict=True)
     ]
     _make_hulls(merged, assets, slots, specs)
     return assets, geoms
+
+
+def _refer_to_slots(spec: mujoco.MjSpec, slot_names: dict[str | None, str]) -> None:
+    """Replace names of geoms by those of their slots in the sensors and contact pairs of `spec`."""
+    geom = mujoco.mjtObj.mjOBJ_GEOM
+    for sensor in spec.sensors:
+        if sensor.objtype == geom:
+            sensor.objname = slot_names.get(sensor.objname, sensor.objname)
+        if sensor.reftype == geom:
+            sensor.refname = slot_names.get(sensor.refname, sensor.refname)
+    for pair in spec.pairs:
+        pair.geomname1 = slot_names.get(pair.geomname1, pair.geomname1)
+        pair.geomname2 = slot_names.get(pair.geomname2, pair.geomname2)
 
 
 def _merge_assets(names: list[str], specs: list[mujoco.MjSpec]) -> Assets:

@@ -18,12 +18,8 @@ import numpy as np
 from mjlab.entity.building import copy_spec
 from mjlab.entity.entity import Entity, EntityCfg
 from mjlab.entity.indexing import element_ids
-from mjlab.entity.variant_merge import RESERVED_NAME_PREFIXES as RESERVED_NAME_PREFIXES
-from mjlab.entity.variant_merge import BodySignature as BodySignature
-from mjlab.entity.variant_merge import GeomRole as GeomRole
-from mjlab.entity.variant_merge import GeomSignature as GeomSignature
-from mjlab.entity.variant_merge import JointSignature as JointSignature
 from mjlab.entity.variant_merge import (
+    OPTIONAL_KINDS,
     Shared,
     Slot,
     VariantGeomSpec,
@@ -32,6 +28,11 @@ from mjlab.entity.variant_merge import (
     split_geoms,
     walk_bodies,
 )
+from mjlab.entity.variant_merge import RESERVED_NAME_PREFIXES as RESERVED_NAME_PREFIXES
+from mjlab.entity.variant_merge import BodySignature as BodySignature
+from mjlab.entity.variant_merge import GeomRole as GeomRole
+from mjlab.entity.variant_merge import GeomSignature as GeomSignature
+from mjlab.entity.variant_merge import JointSignature as JointSignature
 from mjlab.entity.variant_merge import SlotKey as SlotKey
 from mjlab.entity.variant_merge import VariantSlot as VariantSlot
 from mjlab.entity.variant_merge import validate_variant_specs as validate_variant_specs
@@ -306,7 +307,7 @@ def assign_worlds(
     if not callable(assignment):
         return np.array(allocate_worlds(assignment, nworld), dtype=np.int64)
     found = np.asarray(assignment(nworld))
-    if found.shape != (nworld,) or found.dtype.kind not in "iu":
+    if found.shape != (nworld,) or not np.array_equal(found, found.astype(np.int64)):
         raise ValueError(
             f"VariantEntityCfg.assignment({nworld}): expected {nworld} integers, the variant index of "
             f"each environment, got an array of shape {found.shape} and type {found.dtype}."
@@ -354,7 +355,7 @@ def _merge(
     elements = {}
     for kind in _FIELD_PREFIXES:
         if kind not in groups:
-            groups[kind] = list(zip(*(getattr(spec, kind) for spec in specs), strict=True))
+            groups[kind] = _matching(kind, specs)
         elements[kind] = [
             (group[0], [int(element.id) for element in group]) for group in groups[kind]
         ]
@@ -370,6 +371,16 @@ def _merge(
         source_specs,
         VariantTable(models, elements, assets),
     )
+
+
+def _matching(kind: str, specs: list[mujoco.MjSpec]) -> list[Any]:
+    """Return the elements of `kind` that all variants have, one per variant, in the first's order."""
+    own = [getattr(spec, kind) for spec in specs]
+    if kind not in OPTIONAL_KINDS or len({tuple(e.name for e in found) for found in own}) == 1:
+        return list(zip(*own, strict=True))
+    by_name = [{element.name: element for element in found if element.name} for found in own]
+    shared = [name for name in by_name[0] if all(name in found for found in by_name)]
+    return [tuple(found[name] for found in by_name) for name in shared]
 
 
 def _describe(slots: list[Slot], count: int) -> tuple[Any, Any]:

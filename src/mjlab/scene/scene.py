@@ -92,7 +92,7 @@ class Scene(Tabular):
         """Compose the spec: terrain, entities, sensors, then the config's own edits.
 
         Raises:
-            ValueError: invalid config, entity or sensor, or duplicate sensor name.
+            ValueError: invalid config, entity or sensor.
         """
         check_count("SceneCfg.num_envs", scene_cfg.num_envs)
         self._cfg = scene_cfg
@@ -112,9 +112,11 @@ class Scene(Tabular):
         for cfg in scene_cfg.sensors:
             name = cfg.prefixed_name
             if name in self._sensors:
-                raise ValueError(
-                    f"SceneCfg.sensors: expected unique names, got {name!r} twice; rename one of "
-                    "the sensors."
+                warnings.warn(
+                    f"SceneCfg.sensors: expected unique names, got {name!r} twice; the last one "
+                    "replaces the others.",
+                    UserWarning,
+                    stacklevel=2,
                 )
             sensor = cfg.build()
             sensor.edit_spec(self._spec, self._entities)
@@ -150,9 +152,11 @@ class Scene(Tabular):
             self._attach(TERRAIN, self._terrain, prefix="")
         for name, cfg in self._cfg.entities.items():
             if not name or "/" in name or name in self._entities:
-                raise ValueError(
+                warnings.warn(
                     f"Entity name {name!r}: expected a nonempty name without '/', other than "
-                    "'terrain' in a scene with a terrain."
+                    "'terrain' in a scene with a terrain; `scene[name]` is this entity.",
+                    UserWarning,
+                    stacklevel=3,
                 )
             try:
                 entity = cfg.build()

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mjlab.utils.errors import check_positive
-
 
 @dataclass
 class ElectricActuator:
@@ -74,9 +72,8 @@ def reflect_rotary_to_linear(
         effort_limit_rotary: tau (N m).
         transmission_ratio: r (m/rad), travel per angle.
 
-    Returns mass I / r^2, speed r omega and force tau / r. Raises `ValueError` unless r > 0.
+    Returns mass I / r^2, speed r omega and force tau / r.
     """
-    check_positive("transmission_ratio (m/rad)", transmission_ratio)
     return LinearJointProperties(
         armature=armature_rotary / transmission_ratio**2,
         velocity_limit=velocity_limit_rotary * transmission_ratio,

@@ -347,14 +347,15 @@ def create_position_actuator(
         actuator_name: Actuator name. None: name of the target.
 
     With an effort limit, the control range is the range of controls that changes the force; it is
-    not enforced. Raises `ValueError` for a site or an unknown target.
+    not enforced. A site has the position 0. Raises `ValueError` for an unknown target.
     """
-    target = _target(spec, joint_name, transmission_type, allow_site=False)
+    target = _target(spec, joint_name, transmission_type)
     _override(target, armature, frictionloss, viscous_damping)
     actuator = _add(spec, actuator_name or joint_name, target)
     _set_affine(actuator, stiffness, (0.0, -stiffness, -damping), effort_limit)
     if effort_limit is not None:
-        lower, upper = (authored_position(target, value) for value in target.range)
+        limits = (0.0, 0.0) if isinstance(target, mujoco.MjsSite) else target.range
+        lower, upper = (authored_position(target, value) for value in limits)
         # Without stiffness, the control has no effect.
         reach = effort_limit / stiffness if stiffness > 0 else 0.0
         actuator.ctrlrange[:] = (lower - reach, upper + reach)
@@ -377,7 +378,7 @@ def create_velocity_actuator(
 
     Arguments and errors as in `create_position_actuator`.
     """
-    target = _target(spec, joint_name, transmission_type, allow_site=False)
+    target = _target(spec, joint_name, transmission_type)
     _override(target, armature, frictionloss, viscous_damping)
     actuator = _add(spec, actuator_name or joint_name, target)
     _set_affine(actuator, damping, (0.0, 0.0, -damping), effort_limit)
@@ -397,9 +398,9 @@ def create_motor_actuator(
 ) -> mujoco.MjsActuator:
     """Add a motor: force on the target = gear clamp(u, -E, E), with E = `effort_limit` (or inf).
 
-    Raises `ValueError` for an unknown target, and for a site with armature, frictionloss or damping.
+    Raises `ValueError` for an unknown target. A site ignores armature, frictionloss and damping.
     """
-    target = _target(spec, joint_name, transmission_type, allow_site=True)
+    target = _target(spec, joint_name, transmission_type)
     _override(target, armature, frictionloss, viscous_damping)
     actuator = _add(spec, joint_name, target)
     actuator.dyntype = mujoco.mjtDyn.mjDYN_NONE
@@ -461,20 +462,19 @@ def apply_target_overrides(
 ) -> None:
     """Write passive properties that are not None to the joint or tendon.
 
-    Raises `ValueError` for an unknown target, and for a site if a property is positive.
+    Raises `ValueError` for an unknown target. A site ignores the properties, with a warning.
     """
-    target = _target(spec, target_name, transmission_type, allow_site=True)
+    target = _target(spec, target_name, transmission_type)
     _override(target, armature, frictionloss, viscous_damping)
 
 
-def _target(spec: mujoco.MjSpec, name: str, transmission_type: Any, allow_site: bool) -> Any:
+def _target(spec: mujoco.MjSpec, name: str, transmission_type: Any, allow_site: bool = True) -> Any:
     """Return the target joint, tendon or site."""
     kind = getattr(transmission_type, "value", transmission_type)
     check_one_of("transmission_type", kind, [member.value for member in TransmissionType])
     if kind == "site" and not allow_site:
         raise ValueError(
-            f"Site {name!r}: expected a motor, because other actuators cannot act on sites; use a "
-            "joint or a tendon."
+            f"Site {name!r}: expected a joint or a tendon, because muscles have a length."
         )
     check_exists(kind, name, [element.name for element in getattr(spec, f"{kind}s")])
     return getattr(spec, kind)(name)
@@ -486,12 +486,14 @@ def _override(
     frictionloss: float | None,
     viscous_damping: float | None,
 ) -> None:
-    """Write passive properties that are not None. Sites have no passive properties."""
+    """Write passive properties that are not None. Sites have none: warn."""
     if isinstance(target, mujoco.MjsSite):
         if armature or frictionloss or viscous_damping:
-            raise ValueError(
+            warnings.warn(
                 f"Site {target.name!r}: expected no passive properties, got armature {armature}, "
-                f"frictionloss {frictionloss} and viscous_damping {viscous_damping}."
+                f"frictionloss {frictionloss} and viscous_damping {viscous_damping}; they are not used.",
+                UserWarning,
+                stacklevel=4,
             )
         return
     if armature is not None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import mujoco
+import numpy as np
 
 from mjlab.compat import accepts_older_fields, older_defaults, set_array_field
 from mjlab.utils.errors import check_exists, check_field, check_one_of
@@ -264,13 +265,13 @@ class TextureCfg(SpecCfg):
             mark=mujoco_enum(self, "mark", _MARK),
         )
         _set_given(texture, self, _TEXTURE_FIELDS)
-        for face, path in enumerate(self.cubefiles or ()):
+        for face, path in enumerate((self.cubefiles or ())[:_CUBE_FACES]):
             texture.cubefiles[face] = path
         for cell, letter in enumerate(self.gridlayout or ""):
             texture.gridlayout[cell] = letter
 
     def validate(self) -> None:
-        """Raise `ValueError` if the source, the size or a required face is missing."""
+        """Raise `ValueError` if the source or the size is missing; warn of missing faces."""
         for field, enum in (("type", _TEXTURE), ("builtin", _BUILTIN), ("mark", _MARK)):
             mujoco_enum(self, field, enum)
         for field in ("width", "height"):
@@ -287,9 +288,11 @@ class TextureCfg(SpecCfg):
                 "`cubefiles`."
             )
         if self.cubefiles and len(self.cubefiles) != _CUBE_FACES:
-            raise ValueError(
+            warnings.warn(
                 f"TextureCfg {self.name!r} cubefiles: expected {_CUBE_FACES} files, got "
-                f"{len(self.cubefiles)}; use an empty string to omit a face."
+                f"{len(self.cubefiles)}; missing faces are blank, and others are not used.",
+                UserWarning,
+                stacklevel=2,
             )
         one_image = self.file is not None and self.gridsize in (None, (1, 1), [1, 1])
         if self.type == "skybox" and one_image and not drawn:
@@ -375,7 +378,7 @@ class LightCfg(SpecCfg):
         _set_given(light, self, _LIGHT_FIELDS)
 
     def validate(self) -> None:
-        """Raise `ValueError` for an unknown mode or type, or a target mode without `target`."""
+        """Raise `ValueError` for an unknown mode or type; warn of a target mode without `target`."""
         check_one_of("LightCfg.type", self.type, ("spot", "directional"))
         _validate_mode(self)
 
@@ -413,7 +416,7 @@ class CameraCfg(SpecCfg):
             camera.targetbody = find_body(self, spec, self.target).name
 
     def validate(self) -> None:
-        """Raise `ValueError` for an unknown mode, or a target mode without `target`."""
+        """Raise `ValueError` for an unknown mode; warn of a target mode without `target`."""
         _validate_mode(self)
 
 
@@ -498,17 +501,19 @@ def _validate_collision(cfg: GeomCfg | CollisionCfg) -> None:
         check_values(
             cfg,
             field,
-            lambda value, size=size: isinstance(value, (tuple, list)) and 1 <= len(value) <= size,
-            f"a tuple of 1 to {size} numbers",
+            lambda value, size=size: np.ndim(value) == 1 and len(value) <= size,
+            f"a tuple of up to {size} numbers",
         )
 
 
 def _validate_mode(cfg: LightCfg | CameraCfg) -> None:
     mujoco_enum(cfg, "mode", _CAM_LIGHT)
     if cfg.mode.startswith("target") and cfg.target is None:
-        raise ValueError(
-            f"{type(cfg).__name__} {cfg.name!r}: mode {cfg.mode!r} requires `target`, the name of "
-            "the target body."
+        warnings.warn(
+            f"{type(cfg).__name__} {cfg.name!r}: mode {cfg.mode!r} has no effect without `target`, the "
+            "name of the target body.",
+            UserWarning,
+            stacklevel=2,
         )
 
 
