@@ -6,7 +6,8 @@ import dataclasses
 import functools
 import logging
 import typing
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -456,3 +457,33 @@ def test_the_base_of_terms_gives_name_size_and_device(env):
     assert (term.name, term.num_envs, term.device) == ("Term", 4, "cpu")
     with pytest.raises(NotImplementedError, match="Term"):
         term()
+
+
+@dataclass
+class OwnRewardCfg:
+    """Config class of a package, with the fields of ours."""
+
+    func: Any
+    weight: float = 2.0
+    params: dict = field(default_factory=dict)
+
+
+@dataclass
+class OwnGroupCfg:
+    terms: dict
+    concatenate_terms: bool = True
+    concatenate_dim: int = -1
+    enable_corruption: bool = False
+    history_length: int | None = None
+    flatten_history_dim: bool = True
+    nan_policy: str = "disabled"
+    nan_check_per_term: bool = True
+
+
+def test_configs_with_the_same_fields_serve(env):
+    rewards: Any = {"a": OwnRewardCfg(func=lambda env: torch.ones(4))}
+    assert RewardManager(rewards, env).compute(0.5).tolist() == [1.0] * 4
+    term = ObservationTermCfg(func=lambda env: torch.ones(4, 2))
+    groups: Any = {"g": OwnGroupCfg({"t": term})}
+    assert ObservationManager(groups, env).compute()["g"].shape == (4, 2)
+    assert groups["g"].terms["t"] is term

@@ -219,7 +219,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
     def _prepare_terms(self) -> None:
         for name, cfg in self.cfg.items():
-            if isinstance(cfg, EventTermCfg) and cfg.mode not in get_args(EventMode):
+            if getattr(cfg, "mode", "step") not in get_args(EventMode):
                 warnings.warn(
                     f"{self._label(name)} mode: expected one of {get_args(EventMode)}, got "
                     f"{cfg.mode!r}; the event never happens.",

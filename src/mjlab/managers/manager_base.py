@@ -179,13 +179,14 @@ class ManagerBase(Tabular, ABC):
     def _enabled(
         self, cfg: Mapping[str, T | None], kind: type[T], quiet: bool = False
     ) -> Iterator[tuple[str, T]]:
-        """Yield the terms that are not None. Raises `TypeError` if a term is not of type `kind`."""
+        """Yield the terms that are not None. Raises `TypeError` if a term lacks fields of `kind`."""
         for name, term_cfg in cfg.items():
             if term_cfg is None:
                 if not quiet:
                     logger.info("%s: term %r is None (disabled).", type(self).__name__, name)
                 continue
-            if not isinstance(term_cfg, kind):
+            # Packages may use config classes with the same fields.
+            if not all(hasattr(term_cfg, field.name) for field in dataclasses.fields(kind)):  # ty: ignore
                 raise WrongTypeError(
                     f"{self._label(name)}: expected {kind.__name__}, or None to disable the term, "
                     f"got {type(term_cfg).__name__}: {term_cfg!r}."

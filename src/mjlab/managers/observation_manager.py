@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import dataclasses
 import functools
 import logging
 import warnings
@@ -136,10 +135,10 @@ class ObservationManager(ManagerBase):
     ) -> None:
         self.cfg = dict(cfg)
         for name, group in cfg.items():
-            if isinstance(group, ObservationGroupCfg):
+            if hasattr(group, "terms"):
                 # One copy per term: groups that share a term config must not share state.
-                terms = {key: copy.deepcopy(term) for key, term in group.terms.items()}
-                self.cfg[name] = dataclasses.replace(group, terms=terms)
+                self.cfg[name] = group = copy.copy(group)
+                group.terms = {key: copy.deepcopy(term) for key, term in group.terms.items()}
         self._groups: dict[str, ObservationGroup] = {}
         self._obs_buffer: dict[str, Observation] | None = None
         # Environments reset since the last step.
@@ -336,7 +335,7 @@ class ObservationManager(ManagerBase):
                     f"{label} nan_policy: expected one of {get_args(NanPolicy)}, got "
                     f"{group_cfg.nan_policy!r}; using 'sanitize'."
                 )
-                self.cfg[name] = group_cfg = dataclasses.replace(group_cfg, nan_policy="sanitize")
+                group_cfg.nan_policy = "sanitize"
             terms = {
                 term_name: self._build_term(f"{name}/{term_name}", term_cfg, group_cfg)
                 for term_name, term_cfg in self._enabled(group_cfg.terms, ObservationTermCfg)
