@@ -341,8 +341,6 @@ def test_an_environment_alone_moves_as_among_others(make):
         (lambda cfg: setattr(cfg, "decimation", 0), "decimation.*0"),
         (lambda cfg: setattr(cfg.sim.mujoco, "timestep", 0.0), "timestep.*0.0"),
         (lambda cfg: setattr(cfg.sim.mujoco, "timestep", math.nan), "timestep.*nan"),
-        (lambda cfg: setattr(cfg, "episode_length_s", -1.0), "episode_length_s.*-1.0"),
-        (lambda cfg: setattr(cfg, "episode_length_s", 0.0), "'time_out': episode_length_s"),
         (lambda cfg: setattr(cfg.sim, "engine", "magic"), "engine.*'magic'"),
         (lambda cfg: setattr(cfg.sim, "num_threads", -1), "num_threads"),
     ],
