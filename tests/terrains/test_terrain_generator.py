@@ -271,9 +271,11 @@ def test_flat_patches_are_moved_to_their_cells_and_gaps_hold_the_spawn_point():
         assert (patches[row, 1] == generator.terrain_origins[row, 1]).all()
 
 
-def test_unrequested_flat_patches_are_refused():
-    with pytest.raises(ValueError, match=r"Sub-terrain 'a' .* flat patches 'spawn'"):
-        build(sub_terrains={"a": Recorder(patches=2)})
+def test_unrequested_flat_patches_are_dropped():
+    with pytest.warns(UserWarning, match=r"flat patches \['spawn'\] are dropped") as caught:
+        generator, _ = build(sub_terrains={"a": Recorder(patches=2)}, num_rows=2, num_cols=3)
+    assert len(caught) == 1
+    assert not generator.flat_patches
 
 
 # Invalid configs.
@@ -287,22 +289,18 @@ def test_unrequested_flat_patches_are_refused():
         ({"size": (-8.0, 8.0)}, r"size: .*got \(-8.0, 8.0\)"),
         ({"num_rows": 0}, r"num_rows: expected .*got 0"),
         ({"num_cols": -1}, r"num_cols: expected .*got -1"),
-        ({"difficulty_range": (0.8, 0.2)}, r"difficulty_range: expected .*got \(0.8, 0.2\)"),
-        ({"difficulty_range": (0.0, 1.5)}, r"difficulty_range: .*got \(0.0, 1.5\)"),
-        ({"difficulty_range": (-0.1, 1.0)}, r"difficulty_range: .*got \(-0.1, 1.0\)"),
-        ({"color_scheme": "rainbow"}, "color_scheme: .*'height', 'random', 'none'.*got 'rainbow'"),
         ({"sub_terrains": {"a": BoxFlatTerrainCfg(proportion=-1.0), "b": BoxFlatTerrainCfg()}},
-         "'a' .*proportion: .*got -1.0"),
+         "sub_terrains: .*proportion > 0"),
+        ({"sub_terrains": {"a": BoxFlatTerrainCfg(proportion=-1.0),
+                           "b": BoxFlatTerrainCfg(proportion=3.0)}},
+         "sub_terrains: .*proportion > 0"),
         ({"sub_terrains": {"a": BoxFlatTerrainCfg(proportion=0.0)}},
          r"sub_terrains: .*proportion > 0.*\{'a': "),
         ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
-            step_height_range=(0, 0.1), step_width=0.3, platform_width=5.0)}},
-         r"'a' \(BoxPyramidStairsTerrainCfg\) platform_width: .*4.0\], got 5.0"),
-        ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
             step_height_range=(0, 0.1), step_width=0.3, border_width=2.0)}},
          r"border_width: .* 2.0\).*got 2.0"),
-        ({"sub_terrains": {"a": BoxFlatTerrainCfg(flat_patch_sampling=sampling(0, 0.5))}},
-         r"'a' \(BoxFlatTerrainCfg\) flat_patch_sampling\['spawn'\] num_patches: .*>= 1, got 0"),
+        ({"sub_terrains": {"a": BoxFlatTerrainCfg(flat_patch_sampling=sampling(-1, 0.5))}},
+         r"'a' \(BoxFlatTerrainCfg\) flat_patch_sampling\['spawn'\] num_patches: .*>= 0, got -1"),
         ({"sub_terrains": {"a": HfRandomUniformTerrainCfg(
             noise_range=(0.0, 0.1), flat_patch_sampling=sampling(2.5, 0.5))}},
          r"num_patches: .*got 2.5"),
@@ -315,20 +313,74 @@ def test_what_cannot_be_built_is_refused_before_anything_is(fields, message):
         TerrainGenerator(generator_cfg(**fields))
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"difficulty_range": (0.8, 0.2)}, r"difficulty_range: expected .*got \(0.8, 0.2\)"),
+        ({"difficulty_range": (0.0, 1.5)}, r"difficulty_range: .*got \(0.0, 1.5\)"),
+        ({"difficulty_range": (-0.1, 1.0)}, r"difficulty_range: .*got \(-0.1, 1.0\)"),
+        ({"color_scheme": "rainbow"}, "color_scheme: .*'height', 'random', 'none'.*got 'rainbow'"),
+        ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
+            step_height_range=(0, 0.1), step_width=0.3, platform_width=5.0)}},
+         r"'a' \(BoxPyramidStairsTerrainCfg\) platform_width: .* 4.0 m, got 5.0"),
+        ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
+            step_height_range=(0, 0.1), step_width=0.3, border_width=-1.0)}},
+         "border_width: .*>= 0 m, got -1.0"),
+    ],
+)  # fmt: skip
+def test_odd_values_warn_once(fields, message):
+    with pytest.warns(UserWarning, match=message) as caught:
+        generator, _ = build(curriculum=True, num_rows=3, **fields)
+    assert len(caught) == 1
+    assert np.isfinite(generator.terrain_origins).all()
+
+
+@pytest.mark.parametrize("ends", [(0.8, 0.2), (0.0, 1.5), (-0.2, 0.5)])
+def test_difficulties_are_those_of_the_range(ends):
+    stairs = BoxPyramidStairsTerrainCfg(
+        step_height_range=(0.0, 0.2), step_width=0.3, platform_width=1.0, border_width=0.25
+    )
+    with pytest.warns(UserWarning, match="difficulty_range"):
+        generator, _ = build(
+            size=(4.0, 4.0), curriculum=True, num_rows=2, sub_terrains={"s": stairs},
+            difficulty_range=ends,
+        )  # fmt: skip
+    # Four steps and the platform, of 0.2 m each at difficulty 1.
+    assert generator.terrain_origins[:, 0, 2] == pytest.approx(np.array(ends))
+
+
+@pytest.mark.parametrize("num_cols", [0, -1])
+def test_curriculum_ignores_the_number_of_columns(num_cols):
+    generator, _ = build(curriculum=True, num_rows=2, num_cols=num_cols)
+    assert generator.num_cols == len(generator.cfg.sub_terrains)
+
+
+def test_proportion_of_a_single_type_is_one():
+    kinds = {"a": BoxFlatTerrainCfg(proportion=-1.0)}
+    generator, _ = build(sub_terrains=kinds)
+    assert generator.proportions.tolist() == [1.0]
+
+
 def test_an_error_of_a_sub_terrain_says_which_one_it_is():
     kinds = {"rough": ALL_TERRAIN_PRESETS["box_random_grid"]()}
     with pytest.raises(ValueError, match="Sub-terrain 'rough' at difficulty .*square"):
         build(sub_terrains=kinds)
 
 
-def test_an_origin_that_is_no_point_is_refused():
+def test_origin_must_be_a_point():
+    @dataclasses.dataclass
     class Wrong(Recorder):
+        place: tuple[float, ...] = (0.0, 0.0)
+
         def function(self, difficulty, spec, rng):
             output = super().function(difficulty, spec, rng)
-            return dataclasses.replace(output, origin=np.array([0.0, np.nan, 0.0]))
+            return dataclasses.replace(output, origin=np.array(self.place))
 
-    with pytest.raises(ValueError, match="'a' at difficulty .*three finite numbers"):
+    with pytest.raises(ValueError, match="'a' at difficulty .*three numbers"):
         build(sub_terrains={"a": Wrong()})
+    with pytest.warns(UserWarning, match="got NaN") as caught:
+        build(sub_terrains={"a": Wrong(place=(0.0, np.nan, 0.0))}, num_rows=2)
+    assert len(caught) == 1
 
 
 def test_fields_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):

@@ -26,7 +26,6 @@ from mjlab.utils.color import brand_ramp
 from mjlab.utils.errors import (
     WrongStateError,
     check_field,
-    check_field_range,
     check_fields_positive,
 )
 
@@ -91,7 +90,7 @@ class BoxPyramidStairsTerrainCfg(SubTerrainCfg):
         direction: int,
     ) -> TerrainOutput:
         """Add stairs that rise (direction 1) or descend (-1) towards the center."""
-        check_fields_positive(self, "step_width")
+        check_field(self, "step_width", self.step_width != 0.0, "a number > 0")
         boxes = Boxes(spec, self.size)
         height = lerp(self.step_height_range, difficulty)
         inner = inset(self.size, self.border_width)
@@ -152,10 +151,10 @@ class BoxOpenStairsTerrainCfg(SubTerrainCfg):
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
         check_fields_positive(self, "step_thickness")
-        check_field(self, "step_width_range", min(self.step_width_range) > 0.0, "widths > 0")
         boxes = Boxes(spec, self.size)
         height = lerp(self.step_height_range, difficulty)
         width = lerp(self.step_width_range[::-1], difficulty)
+        check_field(self, "step_width_range", width != 0.0, "widths > 0")
         inner = inset(self.size, self.border_width)
         count = _count_steps(inner, self.platform_width, width)
         boxes.add_border(self.border_width, 0.0, border_color(BLUE), bottom=-height)
@@ -189,7 +188,7 @@ class BoxRandomStairsTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
-        check_fields_positive(self, "step_width")
+        check_field(self, "step_width", self.step_width != 0.0, "a number > 0")
         boxes = Boxes(spec, self.size)
         inner = inset(self.size, self.border_width)
         count = _count_steps(inner, self.platform_width, self.step_width)
@@ -252,7 +251,6 @@ class BoxRandomGridTerrainCfg(SubTerrainCfg):
         """
         check_field(self, "size", self.size[0] == self.size[1], "a square")
         check_field(self, "grid_height_range", min(self.grid_height_range) >= 0.0, "heights >= 0")
-        check_fields_positive(self, "height_merge_threshold", "max_merge_distance")
         boxes = Boxes(spec, self.size)
         grid = _lay_out(self, boxes.center)
         if min(grid.border) <= _TOLERANCE:
@@ -267,6 +265,7 @@ class BoxRandomGridTerrainCfg(SubTerrainCfg):
         merge = self.merge_similar_heights and not self.holes
         if merge:
             threshold = self.height_merge_threshold
+            check_field(self, "height_merge_threshold", threshold != 0.0, "a number > 0")
             # Rounding must not lift partly covered columns above the platform.
             rounded = np.round(heights / threshold) * threshold
             heights = np.clip(rounded, -highest, highest)
@@ -276,7 +275,7 @@ class BoxRandomGridTerrainCfg(SubTerrainCfg):
         ]
         kept = np.array(kept).reshape(grid.counts)
         for i, j, num_x, num_y in merge_equal_cells(
-            heights, kept, self.max_merge_distance if merge else 1
+            heights, kept, max(self.max_merge_distance, 1) if merge else 1
         ):
             x, y = grid.place(i, j)
             shift_x, shift_y = (num_x - 1) * grid.width / 2, (num_y - 1) * grid.width / 2
@@ -315,7 +314,7 @@ class BoxTiltedGridTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
-        check_fields_positive(self, "floor_depth")
+        check_field(self, "floor_depth", self.floor_depth >= 0.0, "a depth >= 0 m")
         boxes = Boxes(spec, self.size)
         grid = _lay_out(self, boxes.center)
         dark, bottom = border_color(GREEN), -self.floor_depth
@@ -405,13 +404,6 @@ def _lay_out(
     )
 
 
-def _check_lengths(cfg: SubTerrainCfg, *fields: str) -> None:
-    """Raise `ValueError` unless each of the fields is (low, high) with 0 < low <= high, finite."""
-    for field in fields:
-        check_field_range(cfg, field, lowest=0.0)
-        check_field(cfg, field, getattr(cfg, field)[0] > 0.0, "lengths > 0")
-
-
 # Boxes on flat ground.
 
 
@@ -443,9 +435,6 @@ class BoxRandomSpreadTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
-        _check_lengths(self, "box_width_range", "box_length_range", "box_height_range")
-        check_field_range(self, "box_yaw_range")
-        check_field(self, "num_boxes", self.num_boxes >= 0, "a number >= 0")
         boxes = Boxes(spec, self.size)
         boxes.add_border(self.border_width, 0.0, border_color(BLUE), bottom=-1.0)
         inner = inset(self.size, self.border_width)
@@ -530,9 +519,7 @@ class BoxSteppingStonesTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
-        check_fields_positive(self, "floor_depth")
-        check_field_range(self, "stone_size_range", lowest=0.0)
-        check_field(self, "stone_size_range", self.stone_size_range[1] > 0.0, "lengths > 0")
+        check_field(self, "floor_depth", self.floor_depth >= 0.0, "a depth >= 0 m")
         boxes = Boxes(spec, self.size)
         side = lerp(self.stone_size_range[::-1], difficulty)
         inner = np.array(inset(self.size, self.border_width))
@@ -613,8 +600,7 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
-        check_fields_positive(self, "floor_depth")
-        _check_lengths(self, "beam_width_range")
+        check_field(self, "floor_depth", self.floor_depth >= 0.0, "a depth >= 0 m")
         boxes = Boxes(spec, self.size)
         width = lerp(self.beam_width_range[::-1], difficulty)
         radius = self.platform_width / 2
@@ -624,7 +610,7 @@ class BoxNarrowBeamsTerrainCfg(SubTerrainCfg):
         dark, bottom, top = border_color(BLUE), -self.floor_depth, self.beam_height
         boxes.add_pit(self.border_width, top, dark, self.floor_depth)
         boxes.add_platform((2.0 * radius, 2.0 * radius), top, dark, bottom=bottom)
-        for index in range(self.num_beams):
+        for index in range(int(self.num_beams)):
             angle = 2.0 * math.pi * index / self.num_beams
             length = self._reach(angle, width) - radius
             if length < _MIN_BEAM:
@@ -680,9 +666,7 @@ class BoxNestedRingsTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain; see `SubTerrainCfg.function`."""
-        check_fields_positive(self, "floor_depth")
-        _check_lengths(self, "ring_width_range")
-        check_field_range(self, "gap_range", lowest=0.0)
+        check_field(self, "floor_depth", self.floor_depth >= 0.0, "a depth >= 0 m")
         boxes = Boxes(spec, self.size)
         width = lerp(self.ring_width_range[::-1], difficulty)
         gap = lerp(self.gap_range, difficulty)

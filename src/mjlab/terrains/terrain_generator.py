@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -15,13 +16,11 @@ import mujoco
 import numpy as np
 
 from mjlab.sim.memory import available_memory
-from mjlab.terrains.utils import FlatPatchSamplingCfg, make_border
+from mjlab.terrains.utils import FlatPatchSamplingCfg, check_flat_patch, make_border
 from mjlab.utils.errors import (
     WrongStateError,
     check_count,
     check_field,
-    check_in_range,
-    check_one_of,
 )
 
 _COLOR_SCHEMES = ("height", "random", "none")
@@ -171,6 +170,7 @@ class TerrainGenerator:
         """Add the terrain to `spec` as one static body `terrain`."""
         body = spec.worldbody.add_body(name="terrain")
         self._num_pixels, self._memory = 0, available_memory("cpu")
+        self._dropped_patches: set[str] = set()
         low, high = self.cfg.difficulty_range
         names, shares = list(self._sub_terrains), self.proportions
         if self.cfg.curriculum:
@@ -197,6 +197,16 @@ class TerrainGenerator:
                 pos=(0.0, 0.0, 0.6 * max(extent)),
                 dir=(0.0, 0.0, -1.0),
             )
+        odd = []
+        if self._dropped_patches:
+            odd.append(
+                f"unknown flat patches {sorted(self._dropped_patches)} are dropped; names in "
+                f"SubTerrainCfg.flat_patch_sampling: {sorted(self.flat_patches)}"
+            )
+        if not np.isfinite(self.terrain_origins).all():
+            odd.append("expected finite numbers in TerrainOutput.origin, got NaN or inf")
+        if odd:
+            warnings.warn(f"Terrain: {'; '.join(odd)}.", UserWarning, stacklevel=2)
         for index, geom in enumerate(body.geoms):
             # The ground would dominate the model's mean mass, which scales drawings in viewers.
             geom.mass = 0.0
@@ -230,6 +240,7 @@ class TerrainGenerator:
             if color is not None:
                 geometry.geom.rgba = np.array(color)
         self.terrain_origins[row, col] = output.origin + corner
+        self._dropped_patches |= (output.flat_patches or {}).keys() - self.flat_patches.keys()
         for patch, kept in self.flat_patches.items():
             # Unused entries hold the spawn point.
             kept[row, col] = self.terrain_origins[row, col]
@@ -276,49 +287,51 @@ def asset_name(spec: mujoco.MjSpec, kind: str) -> str:
 
 
 def check_generator(cfg: TerrainGeneratorCfg) -> None:
-    """Raise `ValueError` for an invalid config."""
+    """Raise `ValueError` for an invalid config. Warn of values outside their range."""
     expected = "at least one sub-terrain with proportion > 0, e.g. {'flat': BoxFlatTerrainCfg()}"
-    has_share = any(sub.proportion for sub in cfg.sub_terrains.values())
+    shares = np.array([sub.proportion for sub in cfg.sub_terrains.values()], dtype=float)
+    total = shares.sum()
+    has_share = total != 0.0 and bool((shares / total >= 0.0).all()) and math.isfinite(total)
     check_field(cfg, "sub_terrains", has_share, expected)
     is_size = len(cfg.size) == 2 and all(0.0 < side < math.inf for side in cfg.size)
     check_field(cfg, "size", is_size, "two finite lengths > 0 m")
     check_count("TerrainGeneratorCfg.num_rows", cfg.num_rows)
-    check_count("TerrainGeneratorCfg.num_cols", cfg.num_cols)
-    check_one_of("TerrainGeneratorCfg.color_scheme", cfg.color_scheme, _COLOR_SCHEMES)
+    if not cfg.curriculum:
+        check_count("TerrainGeneratorCfg.num_cols", cfg.num_cols)
+    odd = []
+    if cfg.color_scheme not in _COLOR_SCHEMES:
+        odd.append(f"color_scheme: expected one of {_COLOR_SCHEMES}, got {cfg.color_scheme!r}")
     low, high = cfg.difficulty_range
-    expected = "(low, high) with 0 <= low <= high <= 1"
-    check_field(cfg, "difficulty_range", 0.0 <= low <= high <= 1.0, expected)
+    if not 0.0 <= low <= high <= 1.0:
+        expected = "(low, high) with 0 <= low <= high <= 1"
+        odd.append(f"difficulty_range: expected {expected}, got {cfg.difficulty_range}")
     side = min(cfg.size)
     for name, sub in cfg.sub_terrains.items():
-        owner = f"Sub-terrain {name!r} ({type(sub).__name__})"
-        if not 0.0 <= sub.proportion < math.inf:
-            raise ValueError(f"{owner} proportion: expected a number >= 0, got {sub.proportion}.")
+        owner = f"sub-terrain {name!r} ({type(sub).__name__})"
         platform: Any = getattr(sub, "platform_width", 0.0)
-        check_in_range(f"{owner} platform_width", platform, 0.0, side)
+        if not 0.0 <= platform <= side:
+            odd.append(f"{owner} platform_width: expected 0 to {side} m, got {platform}")
         border: Any = getattr(sub, "border_width", 0.0)
-        if not 0.0 <= border < side / 2:
+        if border >= side / 2:
             raise ValueError(
-                f"{owner} border_width: expected a length in [0, {side / 2}) m (less than half the "
-                f"sub-terrain), got {border}."
+                f"TerrainGeneratorCfg {owner} border_width: expected a length in [0, {side / 2}) m "
+                f"(less than half the sub-terrain), got {border}."
             )
+        if border < 0.0:
+            odd.append(f"{owner} border_width: expected a length >= 0 m, got {border}")
         for key, patch in (sub.flat_patch_sampling or {}).items():
-            field = f"{owner} flat_patch_sampling[{key!r}]"
-            check_count(f"{field} num_patches", patch.num_patches)
-            check_in_range(f"{field} patch_radius", patch.patch_radius, 0.0, math.inf)
+            check_flat_patch(f"TerrainGeneratorCfg {owner}", key, patch)
+    if odd:
+        warnings.warn(f"TerrainGeneratorCfg {'; '.join(odd)}.", UserWarning, stacklevel=3)
 
 
 def check_output(output: TerrainOutput, patches: dict[str, np.ndarray]) -> None:
     """Raise `ValueError` for an invalid result of `SubTerrainCfg.function`."""
     origin = np.asarray(output.origin)
-    if origin.shape != (3,) or not np.isfinite(origin).all():
-        raise ValueError(f"origin: expected three finite numbers, got {output.origin}.")
+    if origin.shape != (3,):
+        raise ValueError(f"origin: expected three numbers, got {output.origin}.")
     for name, found in (output.flat_patches or {}).items():
-        if name not in patches:
-            raise ValueError(
-                f"Unknown flat patches {name!r}; names in SubTerrainCfg.flat_patch_sampling: "
-                f"{sorted(patches)}."
-            )
-        room = patches[name].shape[2]
+        room = patches[name].shape[2] if name in patches else len(found)
         if np.ndim(found) != 2 or np.shape(found)[1] != 3 or len(found) > room:
             raise ValueError(
                 f"flat patches {name!r}: expected shape (n, 3) with n <= {room} (num_patches), got "

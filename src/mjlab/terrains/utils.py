@@ -154,32 +154,13 @@ def find_flat_patches_from_heightfield(
     return np.stack((x[col], y[row], z[row, col]), axis=-1)
 
 
-def check_flat_patch(name: str, cfg: FlatPatchSamplingCfg, size: tuple[float, float]) -> None:
-    """Raise `ValueError` if a height field of this size cannot contain the patch.
-
-    Args:
-        name: Name of the patch, for the message.
-        cfg: Configuration of the patch.
-        size: Extent of the field along x and y (m).
-    """
-    owner = f"flat_patch_sampling[{name!r}]"
-    check_count(f"{owner} num_patches", cfg.num_patches)
-    check_in_range(f"{owner} patch_radius", cfg.patch_radius, 0.0, min(size) / 2)
-    check_in_range(f"{owner} max_height_diff", cfg.max_height_diff, 0.0, math.inf)
+def check_flat_patch(owner: str, name: str, cfg: FlatPatchSamplingCfg) -> None:
+    """Raise `ValueError` for invalid settings of the patch. `owner` opens the message."""
+    field = f"{owner} flat_patch_sampling[{name!r}]"
+    check_count(f"{field} num_patches", cfg.num_patches, minimum=0)
+    check_in_range(f"{field} patch_radius", cfg.patch_radius, 0.0, math.inf)
     if cfg.grid_resolution is not None:
-        check_positive(f"{owner} grid_resolution", cfg.grid_resolution)
-    for field, extent in (("x_range", size[0]), ("y_range", size[1]), ("z_range", math.inf)):
-        low, high = getattr(cfg, field)
-        if not low <= high:
-            raise ValueError(
-                f"{owner} {field}: expected (low, high) with low <= high, got {low, high}."
-            )
-        first, last = cfg.patch_radius, extent - cfg.patch_radius
-        if field != "z_range" and (high < first or low > last):
-            raise ValueError(
-                f"{owner} {field}: expected a range that overlaps [{first:g}, {last:g}] (centers "
-                f"of patches that fit, from the low corner of the sub-terrain), got {low, high}."
-            )
+        check_positive(f"{field} grid_resolution", cfg.grid_resolution)
 
 
 def interpolate_cubic(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
