@@ -592,7 +592,15 @@ def test_a_bridge_wraps_arrays_and_warns_of_a_shared_row() -> None:
     model.clear_cache()
     model.body_mass[0] = 1.0
     assert engine.wp_model.body_mass.numpy()[:, 0].tolist() == [1.0, 2.0]
-    assert WarpBridge(engine.wp_data).qpos.shape == (2, 2)
+    data = WarpBridge(engine.wp_data)
+    assert data.qpos.shape == (2, 2)
+    assert torch.equal(data.efc.force + 0, engine.data_field("efc").force)
+    assert model.opt.iterations == engine.wp_model.opt.iterations
+    with pytest.warns(UserWarning, match="changes all worlds"):
+        model.opt.gravity[0] = torch.tensor([0.0, 0.0, -1.0])
+    assert engine.wp_model.opt.gravity.numpy().tolist() == [[0.0, 0.0, -1.0]]
+    with pytest.raises(AttributeError, match="in place"):
+        model.opt.gravity = 1.0
 
 
 def test_importing_the_compatibility_names_loads_no_warp() -> None:

@@ -7,6 +7,7 @@ load Warp.
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -100,7 +101,7 @@ class FieldView:
 
 
 class WarpBridge(FieldView, Generic[T]):
-    """Warp struct with array attributes wrapped as `TorchArray`; others are returned unchanged.
+    """Warp struct with arrays wrapped as `TorchArray`, and structs in it as `WarpBridge`.
 
     Attributes cannot be replaced; write to them in place.
     """
@@ -117,11 +118,14 @@ class WarpBridge(FieldView, Generic[T]):
 
     def clear_cache(self) -> None:
         """Drop wrapped arrays. Required after an array of the struct was replaced."""
-        held = [name for name, value in self.__dict__.items() if isinstance(value, TorchArray)]
-        self.forget(held)
+        kinds = (TorchArray, WarpBridge)
+        self.forget([name for name, value in self.__dict__.items() if isinstance(value, kinds)])
 
     def __getattr__(self, name: str) -> Any:
         value = super().__getattr__(name)
+        if dataclasses.is_dataclass(value):
+            self.__dict__[name] = WarpBridge(value, self.nworld)
+            return self.__dict__[name]
         if not (hasattr(value, "ptr") and hasattr(value, "dtype")):
             # Not stored: the struct's value may change.
             self.forget([name])
