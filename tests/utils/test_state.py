@@ -248,3 +248,13 @@ def test_generators_continue_on_request():
             return torch.rand(1, generator=plain.torch).item(), plain.numpy.random()  # ty: ignore
 
     assert draw(True) == draw(True) == draw(False) != draw(True)
+
+
+def test_large_tensors_without_rows_are_data():
+    plain = Plain()
+    plain.motion, plain.images = torch.zeros(2, 2**20), torch.zeros(3, 2**20)  # ty: ignore
+    with changes_undone([plain], torch.tensor([0]), 3):
+        plain.motion += 1.0  # ty: ignore
+        plain.images += 1.0  # ty: ignore
+    assert plain.motion[:, 0].tolist() == [1.0, 1.0]  # ty: ignore
+    assert plain.images[:, 0].tolist() == [1.0, 0.0, 0.0]  # ty: ignore

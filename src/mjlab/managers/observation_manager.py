@@ -240,7 +240,7 @@ class ObservationManager(ManagerBase):
         """Return the result of `compute(update_history=True)` without side effects."""
         terms = self._terms(self._groups)
         roots = [*terms, *(term.state for term in terms)]
-        with preserved_rng(), changes_undone(roots, shared=_SHARED):
+        with preserved_rng(), changes_undone(roots, num_envs=self.num_envs, shared=_SHARED):
             return {name: group.compute(True, None) for name, group in self._groups.items()}
 
     def compute_group(

@@ -13,6 +13,7 @@ import contextlib
 import enum
 import inspect
 import logging
+import math
 import sys
 from collections import deque
 from collections.abc import Generator, Sequence
@@ -104,8 +105,9 @@ def changes_undone(
 
     Attributes, items and values of objects, containers, tensors and arrays are restored, and
     references to these stay valid. Rows are those of tensors and arrays with `num_envs` as first or
-    second dimension, and items of sequences and dicts with one item per environment. Other state, such as
-    counters and running means, is restored completely.
+    second dimension, and items of sequences and dicts with one item per environment. Other state,
+    such as counters and running means, is restored completely. Tensors of more than 2**20 values
+    without rows are data and are not restored.
 
     Args:
         roots: Objects whose state is kept, with all that they own.
@@ -117,7 +119,7 @@ def changes_undone(
     Yields a list. After the block it holds the indices of the roots whose state outside `env_ids`
     changed; it stays empty without `env_ids`.
     """
-    tables = [_noted(root, {}, shared) for root in roots]
+    tables = [_noted(root, {}, shared, num_envs) for root in roots]
     changed: list[int] = []
     try:
         yield changed
@@ -268,20 +270,24 @@ def _transient_names(cls: type) -> set[str]:
     return names
 
 
+# Larger tensors without rows are data, such as motions, and not copied at every reset.
+_LARGEST = 2**20
+
 # State of objects in the same process: original objects with copies of their contents, by `id`.
 _Table = dict[int, tuple[Any, Any]]
 
 
-def _noted(value: Any, table: _Table, shared: tuple[type, ...]) -> _Table:
+def _noted(value: Any, table: _Table, shared: tuple[type, ...], num_envs: int) -> _Table:
     """Add `value` and all that it owns to `table`."""
     if id(value) in table:
         return table
-    if isinstance(value, torch.Tensor):
-        if _owns_its_values(value) and not isinstance(value, torch.nn.Parameter):
+    if isinstance(value, (torch.Tensor, np.ndarray)):
+        is_table = math.prod(value.shape) > _LARGEST and num_envs not in value.shape[:2]
+        if isinstance(value, np.ndarray):
+            if value.dtype.kind in "biuf" and not is_table:
+                table[id(value)] = value, value.copy()
+        elif not (is_table or isinstance(value, torch.nn.Parameter)) and _owns_its_values(value):
             table[id(value)] = value, value.detach().clone()
-    elif isinstance(value, np.ndarray):
-        if value.dtype.kind in "biuf":
-            table[id(value)] = value, value.copy()
     elif isinstance(value, torch.Generator):
         table[id(value)] = value, value.get_state()
     elif isinstance(value, np.random.Generator):
@@ -289,7 +295,7 @@ def _noted(value: Any, table: _Table, shared: tuple[type, ...]) -> _Table:
     elif (parts := _parts(value, shared)) is not None:
         table[id(value)] = value, parts
         for part in parts.values():
-            _noted(part, table, shared)
+            _noted(part, table, shared, num_envs)
     return table
 
 
@@ -366,7 +372,6 @@ class _Rows:
 
     def __init__(self, env_ids: torch.Tensor, num_envs: int, shared: tuple[type, ...]) -> None:
         self._ids, self._num_envs, self._shared = env_ids.cpu(), num_envs, shared
-        self._others = torch.ones(num_envs, dtype=torch.bool).index_fill(0, self._ids, False)
 
     def take(
         self, table: _Table, old: Any, now: Any, seen: set[int], dim: int | None = None
@@ -406,10 +411,9 @@ class _Rows:
         if dim is None:
             return not torch.equal(*both)
         old, new = (values.movedim(dim, 0) for values in both)
-        ids, others = self._ids.to(old.device), self._others.to(old.device)
-        differs = not torch.equal(old[others], new[others])
+        ids = self._ids.to(old.device)
         old[ids] = new[ids]
-        return differs
+        return not torch.equal(old, new)
 
     def _dim(self, value: Any) -> int | None:
         """Return the dimension of rows of a tensor or array; None if it has none."""
@@ -425,7 +429,7 @@ class _Rows:
     def _is_per_env(self, kept: dict[Any, Any], current: dict[Any, Any]) -> bool:
         if not kept.keys() == current.keys() == set(range(self._num_envs)):
             return False
-        noted = [_noted(part, {}, self._shared) for part in kept.values()]
+        noted = [_noted(part, {}, self._shared, self._num_envs) for part in kept.values()]
         return all(self._dim(value) is None for table in noted for value, _ in table.values())
 
 
