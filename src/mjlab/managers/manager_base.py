@@ -264,7 +264,7 @@ class ManagerBase(Tabular, ABC):
                     f"{label}, default of parameter {key!r}", selection
                 ):
                     cfg.params[key] = selection
-        with label_errors(label):
+        with label_errors(label), label_warnings(label):
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):
             # Plain classes have run-time state too. Types not created by a class statement, such as
@@ -277,7 +277,7 @@ class ManagerBase(Tabular, ABC):
         """Return the instance of a class-based term."""
         cls = cfg.func
         try:
-            with label_errors(label):
+            with label_errors(label), label_warnings(label):
                 term = cls(cfg=cfg, env=self._env)
         except (KeyError, TypeError):
             # Constructors read `cfg.params` too; name the wrong parameter, if that is the cause.
@@ -429,6 +429,19 @@ def label_errors(label: str) -> Generator[None]:
             kind = next(k for k in (KeyError, TypeError, ValueError) if isinstance(error, k))
             labeled = kind(message)
         raise labeled from error
+
+
+@contextlib.contextmanager
+def label_warnings(label: str) -> Generator[None]:
+    """Prefix warnings of the block with `label`."""
+    caught: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            yield
+    finally:
+        for one in caught:
+            message = f"{label}: {one.message}"
+            warnings.warn_explicit(message, one.category, one.filename, one.lineno)
 
 
 def check_params(

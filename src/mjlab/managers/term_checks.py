@@ -12,7 +12,13 @@ import torch
 
 from mjlab.sensor import ContactSensor, RayCastSensor, Sensor
 from mjlab.sensor.terrain_scan import check_terrain_scan
-from mjlab.utils.errors import UnknownNameError, WrongTypeError, check_exists
+from mjlab.utils.errors import (
+    UnknownNameError,
+    WrongTypeError,
+    check_exists,
+    check_in_range,
+    warned,
+)
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -100,9 +106,10 @@ def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any
     has_history = sensor.cfg.history_length > 0 and "force" in sensor.cfg.fields
     if not has_history:
         require_fields(sensor, "found")
-    threshold = params.get("force_threshold", 0.0)
-    if not threshold >= 0.0:
-        raise ValueError(f"force_threshold: expected a force >= 0 (N), got {threshold!r}.")
+    threshold = params.get("force_threshold")
+    if has_history and threshold is not None:
+        with warned():
+            check_in_range("force_threshold (N)", threshold, 0.0, math.inf)
 
 
 def check_height_scan(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:

@@ -15,8 +15,10 @@ Messages read "<owner> <field>: expected X, got Y; use Z."
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Iterable
+import warnings
+from collections.abc import Generator, Iterable
 from numbers import Integral
 from typing import Any
 
@@ -62,6 +64,16 @@ class WrongStateError(MjlabError, RuntimeError):
 
 class UnsupportedError(MjlabError, NotImplementedError):
     """Request that the engine, the model or a setting does not support."""
+
+
+@contextlib.contextmanager
+def warned() -> Generator[None]:
+    """Turn a `ValueError` of the block into a `UserWarning`: of values that releases 1.x accept."""
+    try:
+        yield
+    except ValueError as error:
+        # The frames of this function and of `contextlib` are not of interest.
+        warnings.warn(str(error), UserWarning, stacklevel=3)
 
 
 def check_positive(name: str, value: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from mjlab.entity import EntityCfg
 from mjlab.envs.mdp import events
+from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.utils.lab_api.math import quat_apply, quat_from_euler_xyz, quat_mul
 
@@ -133,9 +135,18 @@ def test_uniform_root_state_turns_about_the_bodys_axes(world: Any) -> None:
     assert bool((world.sim.data.qvel[:3] == 0.0).all())
 
 
-def test_unknown_range_keys_are_refused(world: Any) -> None:
-    with pytest.raises(ValueError, match=r"\['rol'\].*'roll'"):
-        events.reset_root_state_uniform(world, None, {"rol": (0.0, 1.0)})
+@pytest.mark.parametrize(
+    "func", [events.reset_root_state_uniform, events.reset_root_state_from_flat_patches]
+)
+def test_unknown_range_keys_warn(world: Any, func: Any) -> None:
+    params = {"pose_range": {"rol": (0.0, 1.0), "x": (2.0, 2.0)}}
+    with pytest.warns(UserWarning, match="'place': .*pose_range 'rol'.*'roll'") as caught:
+        manager = world.events(place=EventTermCfg(func=func, mode="startup", params=params))
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        manager.apply("startup")
+    assert bool((world.sim.data.qpos[:, 0] - world.scene.env_origins[:, 0] == 3.0).all())
 
 
 def test_all_six_numbers_are_drawn_whatever_is_given(world: Any) -> None:

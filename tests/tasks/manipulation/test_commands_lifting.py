@@ -251,6 +251,17 @@ def test_a_sphere_marks_the_goal_of_the_environment_in_view():
     ("fields", "message"),
     [
         ({"difficulty": "hard"}, "difficulty.*'fixed', 'dynamic'.*'hard'"),
+        ({"resampling_time_range": (3.0, 2.0)}, "resampling_time_range"),
+    ],
+)
+def test_a_mistake_in_the_config_is_one_clear_message(fields, message):
+    with pytest.raises(ValueError, match=message):
+        lifting_command(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
         ({"success_threshold": 0.0}, "success_threshold.* 0.0"),
         ({"success_threshold": math.nan}, "success_threshold.* nan"),
         (
@@ -258,12 +269,12 @@ def test_a_sphere_marks_the_goal_of_the_environment_in_view():
             r"target_position_range.x.*\(0.5, 0.3\)",
         ),
         ({"object_pose_range": PoseRange(yaw=(0.0, math.inf))}, "object_pose_range.yaw"),
-        ({"resampling_time_range": (3.0, 2.0)}, "resampling_time_range"),
     ],
 )
-def test_a_mistake_in_the_config_is_one_clear_message(fields, message):
-    with pytest.raises(ValueError, match=message):
+def test_odd_numbers_warn_once(fields, message):
+    with pytest.warns(UserWarning, match=message) as caught:
         lifting_command(**fields)
+    assert len(caught) == 1
 
 
 def test_an_object_that_cannot_move_is_refused_unless_it_stays():

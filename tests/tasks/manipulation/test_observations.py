@@ -199,11 +199,6 @@ def test_the_mask_is_of_the_wanted_cubes_geoms_and_of_nothing_else():
     [
         ({"sensor_name": "camera"}, ValueError, "sensor 'camera'.*did you mean 'camera_d405'"),
         ({"sensor_name": "ee_ground_collision"}, TypeError, "CameraSensor"),
-        (
-            {"cutoff_distance": 0.01},
-            ValueError,
-            "min_depth and cutoff_distance: .*got 0.01 and 0.01",
-        ),
     ],
 )
 def test_a_wrong_camera_is_refused_when_the_environment_is_built(make_env, params, error, message):
@@ -211,6 +206,14 @@ def test_a_wrong_camera_is_refused_when_the_environment_is_built(make_env, param
         cfg.observations["camera"].terms["camera_d405_depth"].params.update(params)
 
     with pytest.raises(error, match=f"camera_d405_depth.*{message}"):
+        make_env(DEPTH, edit=edit)
+
+
+def test_depths_without_a_range_warn(make_env):
+    def edit(cfg):
+        cfg.observations["camera"].terms["camera_d405_depth"].params["cutoff_distance"] = 0.01
+
+    with pytest.warns(UserWarning, match="camera_d405_depth.*min_depth.*got 0.01 and 0.01"):
         make_env(DEPTH, edit=edit)
 
 

@@ -221,8 +221,6 @@ def test_stages_change_no_config_that_others_hold(make_env):
     ("stage", "message"),
     [
         ({"lin_vel_x": (0.0, 1.0)}, "with 'step'"),
-        ({"step": 7, "lin_vel": (0.0, 1.0)}, r"\(step 7\) 'lin_vel'; did you mean 'lin_vel"),
-        ({"step": 7, "lin_vel_X": None}, r"\(step 7\) 'lin_vel_X'; did you mean"),
         ({"step": 7, "ang_vel_z": (1.0, -1.0)}, "ang_vel_z of the stage of step 7"),
     ],
 )
@@ -232,6 +230,19 @@ def test_stages_that_make_no_sense_are_refused_when_the_term_is_built(make_env, 
 
     with pytest.raises(ValueError, match=f"'command_vel': .*velocity_stages.*{message}"):
         make_env(edit=edit)
+
+
+@pytest.mark.parametrize("key", ["lin_vel", "lin_vel_X", "heading"])
+def test_unknown_ranges_of_stages_are_ignored(make_env, key):
+    def edit(cfg):
+        stages = [{"step": 0, key: (0.0, 1.0), "ang_vel_z": (0.0, 0.7)}]
+        cfg.curriculum["command_vel"].params["velocity_stages"] = stages
+
+    with pytest.warns(UserWarning, match=rf"'command_vel': .*\(step 0\) '{key}'") as caught:
+        env = make_env(edit=edit)
+    assert len([one for one in caught if "command_vel" in str(one.message)]) == 1
+    env.reset()
+    assert env.command_manager.get_term("twist").cfg.ranges.ang_vel_z == (0.0, 0.7)
 
 
 def test_older_stages_of_reward_weights_are_still_offered():

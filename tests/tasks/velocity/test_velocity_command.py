@@ -323,15 +323,26 @@ def test_ranges_change_in_the_term_and_not_in_the_config():
             {"heading_command": True, "ranges": {"heading": (2.0, 1.0)}},
             "ranges.heading",
         ),
-        ({"rel_standing_envs": 1.2}, "rel_standing_envs.*1.2"),
-        ({"init_velocity_prob": -0.1}, "init_velocity_prob.*-0.1"),
-        ({"resampling_time_range": (-1.0, 2.0)}, "resampling_time_range"),
         ({"resampling_time_range": (3.0, 2.0)}, "resampling_time_range"),
     ],
 )
 def test_what_makes_no_sense_is_refused_when_the_command_is_built(fields, message):
     with pytest.raises(ValueError, match=message):
         velocity_command(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"rel_standing_envs": 1.2}, "rel_standing_envs.*1.2"),
+        ({"init_velocity_prob": -0.1}, "init_velocity_prob.*-0.1"),
+        ({"resampling_time_range": (-1.0, 2.0)}, "resampling_time_range"),
+    ],
+)
+def test_odd_numbers_of_the_command_warn(fields, message):
+    with pytest.warns(UserWarning, match=message) as caught:
+        velocity_command(**fields)
+    assert len(caught) == 1
 
 
 @pytest.mark.parametrize("name", ["robto", "feet_ground_contact"])

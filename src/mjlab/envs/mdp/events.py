@@ -14,6 +14,8 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
+from mjlab.managers.term_checks import checked_when_built
+from mjlab.utils.errors import check_exists, warned
 from mjlab.utils.indexing import as_ids, num_selected
 from mjlab.utils.lab_api.math import (
     quat_apply,
@@ -76,6 +78,15 @@ def reset_scene_to_default(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None)
             )
 
 
+def _check_ranges(env: ManagerBasedRlEnv, **params: Any) -> None:
+    """Warn of keys that are not used."""
+    for name in ("pose_range", "velocity_range"):
+        for key in params.get(name) or {}:
+            with warned():
+                check_exists(f"key of {name}", key, _SE3_KEYS)
+
+
+@checked_when_built(_check_ranges)
 def reset_root_state_uniform(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -89,7 +100,7 @@ def reset_root_state_uniform(
     velocity (linear at the link origin, angular) is in world axes. A mocap base takes only the pose.
 
     Raises:
-        ValueError: the base is fixed and not a mocap body, or a range has an unknown key.
+        ValueError: the base is fixed and not a mocap body.
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
@@ -100,6 +111,7 @@ def reset_root_state_uniform(
     _write_root(asset, asset_cfg.name, ids, pose, velocity_range)
 
 
+@checked_when_built(_check_ranges)
 def reset_root_state_from_flat_patches(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -115,7 +127,7 @@ def reset_root_state_from_flat_patches(
     `patch_name`.
 
     Raises:
-        ValueError: the base is fixed and not a mocap body, or a range has an unknown key.
+        ValueError: the base is fixed and not a mocap body.
     """
     pose_range = pose_range or {}
     terrain = env.scene.terrain
@@ -170,6 +182,7 @@ def randomize_terrain(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None) -> N
         env.scene.terrain.randomize_env_origins(resolve_env_ids(env, env_ids))
 
 
+@checked_when_built(_check_ranges)
 def push_by_setting_velocity(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -182,7 +195,7 @@ def push_by_setting_velocity(
     changes the velocity by exactly the sample.
 
     Raises:
-        ValueError: the base is fixed, or the range has an unknown key.
+        ValueError: the base is fixed.
     """
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
@@ -367,9 +380,6 @@ def _sample_se3_range(
 ) -> torch.Tensor:
     """Sample (..., 6) in the order of the keys. Missing keys are sampled too, from (0, 0)."""
     ranges = range_dict or {}
-    unknown = [key for key in ranges if key not in _SE3_KEYS]
-    if unknown:
-        raise ValueError(f"Unknown range keys {unknown}. Available: {list(_SE3_KEYS)}.")
     bounds = [ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS]
     return sample_ranges(bounds, shape[:-1], device)
 

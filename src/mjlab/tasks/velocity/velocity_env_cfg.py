@@ -48,9 +48,10 @@ def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
       `body_ang_vel`, `foot_clearance` and `foot_slip`; and the standard deviations of `pose`;
     - `viewer.body_name`.
 
-    Empty names of sensors and rewards raise `ValueError` when the environment is built. Empty names of
-    events, and of rewards of weight 0 (here `body_ang_vel` and `angular_momentum`), only log a
-    warning. Such events have no effect; such rewards raise once they get a nonzero weight.
+    Empty names of sensors and sites raise `ValueError` when the environment is built, and empty bodies of
+    `upright` and `body_ang_vel` are the root link. Empty names of events, and of rewards of weight 0
+    (here `angular_momentum`), only log a warning. Such events have no effect; such rewards raise once
+    they get a nonzero weight.
     """
     cfg = ManagerBasedRlEnvCfg(
         decimation=4,

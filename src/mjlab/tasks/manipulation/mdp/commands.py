@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +18,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range, require_entity
 from mjlab.tasks.manipulation.mdp.goal_panel import GoalPanel
-from mjlab.utils.errors import check_one_of, check_positive
+from mjlab.utils.errors import check_one_of, check_positive, warned
 from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
@@ -104,9 +105,12 @@ class GoalCommand(CommandTerm):
     def __init__(self, cfg: GoalCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         check_one_of("difficulty", cfg.difficulty, _DIFFICULTIES)
-        check_positive("success_threshold", cfg.success_threshold)
+        with warned():
+            check_positive("success_threshold", cfg.success_threshold)
         for axis in ("x", "y", "z"):
-            check_range(f"target_position_range.{axis}", getattr(cfg.target_position_range, axis))
+            with warned():
+                name = f"target_position_range.{axis}"
+                check_range(name, getattr(cfg.target_position_range, axis))
         self.target_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.goal_age = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.last_goal_met = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -389,9 +393,10 @@ class MultiCubeLiftingCommand(GoalCommand):
 
 
 def check_pose_range(within: Any) -> None:
-    """Raise `ValueError` for an invalid range in `within`."""
+    """Warn of an invalid range in `within`."""
     for name in ("x", "y", "z", "yaw"):
-        check_range(f"object_pose_range.{name}", getattr(within, name))
+        with warned():
+            check_range(f"object_pose_range.{name}", getattr(within, name))
 
 
 def require_object(env: ManagerBasedRlEnv, name: str, is_moved: bool) -> Entity:
@@ -478,7 +483,7 @@ def distance_apart(
 def check_reach(
     env: ManagerBasedRlEnv, command_name: str, cfg: GoalCommandCfg, entity_name: str, site: str
 ) -> None:
-    """Raise `ValueError` if goals or objects of a command are certainly out of an arm's reach.
+    """Warn if goals or objects of a command are certainly out of an arm's reach.
 
     `success_threshold` is added to the reach, because objects count as at their goal within it.
     """
@@ -499,10 +504,12 @@ def check_reach(
         farthest = max(corners, key=lambda point: math.dist(point, center))
         distance = math.dist(farthest, center)
         if distance > longest + cfg.success_threshold:
-            raise ValueError(
+            warnings.warn(
                 f"Command {command_name!r} {kind}: expected at most {longest:.2f} m from the first "
                 f"joint of entity {entity_name!r}, the reach of site {site!r}, got {distance:.2f} m "
-                f"at {farthest} (m, relative to the environment's origin); {remedy}."
+                f"at {farthest} (m, relative to the environment's origin); {remedy}.",
+                UserWarning,
+                stacklevel=2,
             )
 
 

@@ -7,6 +7,7 @@ positions are positions of their root links. Images have channels first: (N, C, 
 from __future__ import annotations
 
 import math
+import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from mjlab.tasks.manipulation.mdp.commands import (
     MultiCubeLiftingCommand,
     check_reach,
 )
-from mjlab.utils.errors import WrongTypeError, check_exists, check_in_range, check_positive
+from mjlab.utils.errors import WrongTypeError, check_exists, check_in_range, check_positive, warned
 from mjlab.utils.lab_api.math import quat_apply_inverse
 
 if TYPE_CHECKING:
@@ -71,18 +72,25 @@ def check_task_term(
     Raises:
         KeyError: unknown command.
         TypeError: the command is not of `kinds`.
-        ValueError: unknown object, invalid number, not exactly one site, or goals out of reach.
+        ValueError: unknown object, or not exactly one site.
+
+    Warns of numbers outside their ranges, and of goals out of reach.
     """
     for name, value in params.items():
         if name.endswith("std"):
-            check_positive(name, value)
-    check_in_range("max_vel", max_vel, 0.0, math.inf)
+            with warned():
+                check_positive(name, value)
+    with warned():
+        check_in_range("max_vel", max_vel, 0.0, math.inf)
     if object_name is not None:
         check_exists("entity in object_name", object_name, env.scene.entities)
     command = None if command_name is None else goal_command(env, command_name, *kinds)
     if has_hand:
         site = find_site(env, asset_cfg)
-        if command is not None:
+        # One warning for all terms that read the same goal and hand.
+        place, known = (command_name, asset_cfg.name, site), vars(env).setdefault("_reached", set())
+        if command is not None and place not in known:
+            known.add(place)
             check_reach(env, str(command_name), command.cfg, asset_cfg.name, site)
 
 
@@ -169,9 +177,11 @@ def _check_camera(
             f"{tuple(cfg.data_types)}; add it."
         )
     if not 0.0 <= min_depth < cutoff_distance:
-        raise ValueError(
+        warnings.warn(
             "min_depth and cutoff_distance: expected 0 <= min_depth < cutoff_distance, got "
-            f"{min_depth} and {cutoff_distance}."
+            f"{min_depth} and {cutoff_distance}.",
+            UserWarning,
+            stacklevel=2,
         )
 
 

@@ -40,6 +40,7 @@ from mjlab.utils.errors import (
     check_count,
     check_one_of,
     check_positive,
+    warned,
 )
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import (
@@ -498,9 +499,10 @@ def check_motion_term(
 
     Raises:
         KeyError: unknown command.
-        ValueError: a body that the command does not track, empty `body_names`, or `std` or
-            `threshold` not positive.
         TypeError: the command lacks attributes of `MotionCommand`.
+
+    Warns of bodies that the command does not track, of empty `body_names`, and of `std` or
+    `threshold` not positive.
     """
     command: Any = motion_command(env, command_name)
     missing: list[str] = []
@@ -513,34 +515,37 @@ def check_motion_term(
             f"Command {command_name!r}: expected a MotionCommand or a term with its attributes, "
             f"got a {type(command).__name__} without {', '.join(missing)}."
         )
-    body_columns(command, body_names)
+    if body_names is not None:
+        unknown = [name for name in body_names if name not in _tracked(command)]
+        if unknown or not body_names:
+            warnings.warn(
+                f"body_names: expected tracked bodies, got {unknown or ()}, ignored. Available: "
+                f"{list(_tracked(command))}.",
+                UserWarning,
+                stacklevel=2,
+            )
     for name, value in (("std", std), ("threshold", threshold)):
         if value is not None:
-            check_positive(name, value)
+            with warned():
+                check_positive(name, value)
 
 
 def body_columns(command: MotionReader, body_names: tuple[str, ...] | None) -> slice | torch.Tensor:
-    """Return the columns of `body_names` (None: all) among the tracked bodies, in their order.
-
-    Raises:
-        ValueError: a body is not tracked, or `body_names` is empty.
-    """
+    """Return the columns of `body_names` (None: all) among the tracked bodies, in their order."""
     if body_names is None:
         return slice(None)
-    tracked = command.body_names if isinstance(command, MotionReader) else command.cfg.body_names
     device = str(command.body_pos_relative_w.device)
-    return _columns_of(tuple(body_names), tuple(tracked), device)
+    return _columns_of(tuple(body_names), tuple(_tracked(command)), device)
+
+
+def _tracked(command: MotionReader) -> Sequence[str]:
+    return command.body_names if isinstance(command, MotionReader) else command.cfg.body_names
 
 
 @functools.lru_cache(maxsize=256)
 def _columns_of(body_names: tuple[str, ...], tracked: tuple[str, ...], device: str) -> torch.Tensor:
-    unknown = [name for name in body_names if name not in tracked]
-    if unknown or not body_names:
-        raise ValueError(
-            f"body_names: expected tracked bodies, got {unknown or ()}. Available: {list(tracked)}."
-        )
     columns = [i for i, name in enumerate(tracked) if name in body_names]
-    return torch.tensor(columns, device=device)
+    return torch.tensor(columns, dtype=torch.long, device=device)
 
 
 # Checks of config and robot.

@@ -18,6 +18,7 @@ import torch
 from mjlab.managers import TerminationTermCfg
 from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg, body_columns
 from mjlab.tasks.tracking.mdp.terminations import motion_ended
+from mjlab.utils.errors import check_exists
 from mjlab.utils.lab_api.math import quat_error_magnitude
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ def compute_ee_position_error(
         return torch.zeros(
             len(command.robot_joint_vel), dtype=torch.float32, device=command.body_indexes.device
         )
+    for name in ee_body_names:
+        check_exists("tracked body", name, command.body_names)
     columns = body_columns(command, ee_body_names)
     distance = (command.body_pos_relative_w - command.robot_body_pos_w).norm(dim=-1)
     return distance[:, columns].mean(dim=1)
@@ -79,6 +82,8 @@ def compute_ee_orientation_error(
         return torch.zeros(
             len(command.robot_joint_vel), dtype=torch.float32, device=command.body_indexes.device
         )
+    for name in ee_body_names:
+        check_exists("tracked body", name, command.body_names)
     columns = body_columns(command, ee_body_names)
     angle = quat_error_magnitude(command.body_quat_relative_w, command.robot_body_quat_w)
     return angle[:, columns].mean(dim=1)

@@ -12,7 +12,7 @@ from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import check_range, checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.rewards import velocity_command
 from mjlab.tasks.velocity.mdp.velocity_command import RANGES
-from mjlab.utils.errors import check_exists
+from mjlab.utils.errors import check_exists, warned
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -126,9 +126,11 @@ def _check_stages(
         if "step" not in stage:
             raise ValueError(f"velocity_stages: expected a stage with 'step', got {dict(stage)}.")
         for key, bounds in stage.items():
-            kind = f"range in velocity_stages (step {stage['step']})"
-            check_exists(kind, key, ("step", *RANGES))
-            if key != "step" and bounds is not None:
+            if key not in ("step", *RANGES):
+                # Ignored, as in releases 1.x.
+                with warned():
+                    check_exists(f"range in velocity_stages (step {stage['step']})", key, RANGES)
+            elif key != "step" and bounds is not None:
                 check_range(f"velocity_stages: {key} of the stage of step {stage['step']}", bounds)
 
 

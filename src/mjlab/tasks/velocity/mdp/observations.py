@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -85,13 +86,19 @@ def foot_contact_forces(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tenso
 
 def check_feet_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
     """Raise unless `sensor_name` is a contact sensor with `found` and one slot per foot."""
+    sensor = check_one_slot(env, sensor_name)
+    require_fields(sensor, "found")
+
+
+def check_one_slot(env: ManagerBasedRlEnv, sensor_name: str) -> ContactSensor:
+    """Return a contact sensor; raise unless it has one slot per foot."""
     sensor = require_sensor(env, sensor_name, ContactSensor)
     if sensor.cfg.num_slots != 1:
         raise ValueError(
             f"Contact sensor {sensor_name!r} num_slots: expected 1 slot per foot, got "
             f"{sensor.cfg.num_slots}; use reduce='netforce' for the sum of all contacts of a foot."
         )
-    require_fields(sensor, "found")
+    return sensor
 
 
 def check_builtin_sensor(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
@@ -148,21 +155,26 @@ def site_columns(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> Source:
 
 
 def check_same_feet(env: ManagerBasedRlEnv, source: Source, other: Source) -> None:
-    """Raise `ValueError` unless the columns of two sources belong to the same feet, in order.
+    """Warn unless the columns of two sources belong to the same feet, in order.
 
     Two columns match if they are on the same body, or one is on a descendant of the other's body.
+    Raises `ValueError` if the numbers of columns differ, unless one is 1, used for all feet.
     """
     model = env.sim.mj_model
-    fits = len(source.columns) == len(other.columns) and all(
+    counts = len(source.columns), len(other.columns)
+    if counts[0] == counts[1] and all(
         _is_within(model, a, b) or _is_within(model, b, a)
         for (_, a), (_, b) in zip(source.columns, other.columns, strict=True)
+    ):
+        return
+    message = (
+        f"Columns of {source.name} and {other.name}: expected the same feet in the same order, got "
+        f"{[name for name, _ in source.columns]} and {[name for name, _ in other.columns]}. "
+        "Contacts and sites are in model order, heights in the order of the sensor's frames."
     )
-    if not fits:
-        raise ValueError(
-            f"Columns of {source.name} and {other.name}: expected the same feet in the same order, got "
-            f"{[name for name, _ in source.columns]} and {[name for name, _ in other.columns]}. Contacts and sites are in model order, heights in "
-            "the order of the sensor's frames."
-        )
+    if counts[0] != counts[1] and 1 not in counts:
+        raise ValueError(message)
+    warnings.warn(message, UserWarning, stacklevel=2)
 
 
 def _element(env: ManagerBasedRlEnv, kind: str, name: str, entity: str | None) -> tuple[str, int]:

@@ -9,6 +9,8 @@ feet in the same order. The terms check the order when they are built.
 
 from __future__ import annotations
 
+import math
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,8 +25,8 @@ from mjlab.tasks.velocity.mdp.observations import (
     Source,
     check_air_time_sensor,
     check_builtin_sensor,
-    check_feet_sensor,
     check_force_sensor,
+    check_one_slot,
     check_same_feet,
     contact_columns,
     height_columns,
@@ -34,7 +36,7 @@ from mjlab.tasks.velocity.mdp.terrain_utils import (
     check_terrain_sensors,
     terrain_normal_from_sensors,
 )
-from mjlab.utils.errors import check_positive
+from mjlab.utils.errors import check_in_range, check_positive, warned
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
@@ -65,9 +67,10 @@ _BODY_Z_COLOR = (0.2, 0.4, 1.0, 0.8)
 def check_command(
     env: ManagerBasedRlEnv, command_name: str | None = None, std: float = 1.0, **_: Any
 ) -> None:
-    """Raise `ValueError` unless the command exists and `std` > 0."""
+    """Raise `ValueError` unless the command exists; warn unless `std` > 0."""
     require_command(env, command_name)
-    check_positive("std", std)
+    with warned():
+        check_positive("std", std)
 
 
 @checked_when_built(check_command)
@@ -130,7 +133,8 @@ class upright:
     _transient = {"_normal"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
-        check_positive("std", cfg.params["std"])
+        with warned():
+            check_positive("std", cfg.params["std"])
         self._env = env
         self._asset_cfg: SceneEntityCfg = cfg.params.get("asset_cfg", _DEFAULT_ASSET_CFG)
         self._body = single_body(env, self._asset_cfg)
@@ -252,8 +256,8 @@ class variable_posture:
         walking_threshold: Minimum commanded motion of walking.
         running_threshold: Minimum commanded motion of running.
 
-    Raises, when built: `ValueError` for tables that do not match the joints, standard deviations <= 0,
-    walking_threshold > running_threshold, or an unknown command.
+    Raises, when built: `ValueError` for tables that do not match the joints or an unknown command.
+    Warns of standard deviations <= 0 and of walking_threshold > running_threshold.
     """
 
     # Derived from the config; not checkpointed.
@@ -263,11 +267,8 @@ class variable_posture:
         params = cfg.params
         require_command(env, params["command_name"])
         thresholds = params.get("walking_threshold", 0.5), params.get("running_threshold", 1.5)
-        if thresholds[0] > thresholds[1]:
-            raise ValueError(
-                f"walking_threshold: expected at most running_threshold {thresholds[1]}, got "
-                f"{thresholds[0]}."
-            )
+        with warned():
+            check_in_range("walking_threshold", thresholds[0], -math.inf, thresholds[1])
         # Resolved names are in the order of the joint ids.
         joints = params["asset_cfg"].joint_names
         if joints is None:
@@ -316,8 +317,11 @@ def _check_air_time(
     check_air_time_sensor(env, sensor_name)
     require_command(env, command_name)
     if threshold_min >= threshold_max:
-        raise ValueError(
-            f"threshold_min: expected less than threshold_max {threshold_max}, got {threshold_min}."
+        warnings.warn(
+            f"threshold_min: expected less than threshold_max {threshold_max}, got {threshold_min}; "
+            "no air time counts.",
+            UserWarning,
+            stacklevel=2,
         )
 
 
@@ -418,7 +422,8 @@ class feet_swing_height:
         params = cfg.params
         require_command(env, params["command_name"])
         check_air_time_sensor(env, params["sensor_name"])
-        check_positive("target_height", params["target_height"])
+        with warned():
+            check_positive("target_height", params["target_height"])
         contacts = contact_columns(env, params["sensor_name"])
         self._check_heights(env, params, contacts)
         self.peak_heights = torch.zeros(
@@ -506,7 +511,7 @@ def _check_landing(
 ) -> None:
     require_command(env, command_name)
     check_air_time_sensor(env, sensor_name)
-    check_feet_sensor(env, sensor_name)
+    check_one_slot(env, sensor_name)
     check_force_sensor(env, sensor_name)
 
 
@@ -598,8 +603,9 @@ def values_of_joints(
         allow_zero: Accept 0, besides numbers > 0.
 
     Raises:
-        ValueError: a joint matches no pattern or several, a pattern matches no joint, or a value is
-            negative or not allowed to be 0.
+        ValueError: a joint matches no pattern or several, or a pattern matches no joint.
+
+    Warns of values that are negative or not allowed to be 0.
     """
     try:
         _, covered, values = resolve_matching_names_values(table, joints)
@@ -613,7 +619,7 @@ def values_of_joints(
     wrong = {p: v for p, v in table.items() if not (v >= 0.0 if allow_zero else v > 0.0)}
     if wrong:
         bound = ">= 0" if allow_zero else "> 0"
-        raise ValueError(f"{name}: expected numbers {bound}, got {wrong}.")
+        warnings.warn(f"{name}: expected numbers {bound}, got {wrong}.", UserWarning, stacklevel=2)
     return [float(value) for value in values]
 
 

@@ -13,7 +13,7 @@ from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.term_checks import check_range, require_entity
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
-from mjlab.utils.errors import check_field, check_in_range
+from mjlab.utils.errors import check_field, check_in_range, warned
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply, wrap_to_pi
 
@@ -112,7 +112,7 @@ class UniformVelocityCommandCfg(CommandTermCfg):
 
 
 def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
-    """Raise `ValueError` for invalid ranges, fractions or heading settings."""
+    """Raise `ValueError` for invalid ranges or heading settings; warn of invalid fractions."""
     for name in RANGES:
         check_range(f"ranges.{name}", getattr(cfg.ranges, name))
     if cfg.heading_command != (cfg.ranges.heading is not None):
@@ -124,7 +124,8 @@ def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
     if cfg.ranges.heading is not None:
         check_range("ranges.heading", cfg.ranges.heading)
     for name in _PROBABILITIES:
-        check_in_range(name, getattr(cfg, name), 0.0, 1.0)
+        with warned():
+            check_in_range(f"UniformVelocityCommandCfg {name}", getattr(cfg, name), 0.0, 1.0)
 
 
 class UniformVelocityCommand(CommandTerm):
