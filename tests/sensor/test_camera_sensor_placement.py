@@ -8,7 +8,7 @@ import torch
 
 from mjlab.entity import EntityCfg
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
-from mjlab.managers import EventTermCfg
+from mjlab.managers import EventTermCfg, SceneEntityCfg
 from mjlab.scene import SceneCfg
 from mjlab.sensor import CameraSensorCfg
 from mjlab.terrains import BoxFlatTerrainCfg, TerrainEntityCfg, TerrainGeneratorCfg
@@ -31,7 +31,7 @@ GRID = TerrainEntityCfg(
 )
 
 
-def make_env(sensor, engine="native", num_envs=3, joint="<freejoint/>", terrain=PLANE):
+def make_env(sensor, engine="native", num_envs=3, joint="<freejoint/>", terrain=PLANE, **events):
     xml = BALL.format(fixed=CAMERA, joint=joint)
     ball = EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_string(xml))
     # A fixed base is attached at the initial position.
@@ -46,7 +46,7 @@ def make_env(sensor, engine="native", num_envs=3, joint="<freejoint/>", terrain=
             env_spacing=4.0,
         ),  # fmt: skip
         observations={},
-        events={"start": EventTermCfg(func=mdp.reset_scene_to_default, mode="reset")},
+        events={"start": EventTermCfg(func=mdp.reset_scene_to_default, mode="reset"), **events},
         episode_length_s=10.0,
     )
     cfg.sim.mujoco.gravity = (0.0, 0.0, 0.0)
@@ -104,6 +104,30 @@ def test_camera_follows_the_origin_of_its_environment(engine):
     expected = env.scene.env_origins + torch.tensor([0.0, 0.0, 2.5])
     torch.testing.assert_close(places, expected)
     assert places[1, 0] != places[0, 0]
+    env.close()
+
+
+@pytest.mark.parametrize("mode", ["startup", "reset", "interval"])
+def test_randomized_camera_stays_in_its_environment(mode):
+    higher = EventTermCfg(
+        func=mdp.dr.cam_pos,
+        mode=mode,
+        interval_range_s=(0.001, 0.001) if mode == "interval" else None,
+        params={
+            "ranges": {2: (1.0, 1.0)},
+            "operation": "add",
+            "asset_cfg": SceneEntityCfg("ball", camera_names=("above",)),
+        },
+    )
+    env = make_env(eye(camera_name="ball/above"), terrain=GRID, higher=higher)
+    env.reset()
+    for _ in range(2):
+        env.step(torch.zeros(3, 0))
+    env.reset(env_ids=torch.tensor([1]))
+    env.step(torch.zeros(3, 0))
+    places = env.sim.data.cam_xpos[:, env.scene["eye"].camera_idx]
+    expected = env.scene.env_origins + torch.tensor([0.0, 0.0, 3.5])
+    torch.testing.assert_close(places, expected)
     env.close()
 
 

@@ -610,6 +610,7 @@ class ManagerBasedRlEnv(Tabular):
             moved: Environments moved before the resets, (N,) bool. None: no environment. Excludes
                 moves by resets, covered by `reset_ids`: reading them would synchronize with the GPU.
         """
+        self.scene.place_cameras(self.sim.model)
         full = reset_ids
         if moved is not None:
             full = moved.index_fill(0, reset_ids, True).nonzero().flatten()
@@ -644,7 +645,6 @@ class ManagerBasedRlEnv(Tabular):
                 env_ids=env_ids,
                 global_env_step_count=self._sim_step_counter // self.cfg.decimation,
             )
-        self.scene.place_cameras(self.sim.model, env_ids)
         if any(entity.seeds_lengths for entity in self.scene.entities.values()):
             self.sim.forward(env_ids, stage="pos")
         for entity in self.scene.entities.values():

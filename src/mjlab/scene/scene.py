@@ -361,18 +361,22 @@ class Scene(Tabular):
             self._sensor_context = SensorContext(mj_model, model, data, cameras, rays, self._device)
         warn_oddities(self, mj_model)
 
-    def place_cameras(self, model: Any, env_ids: EnvIds = None) -> None:
-        """Move the world cameras of sensors along with the origins of environments.
+    def place_cameras(self, model: Any, env_ids: EnvIds = None, *, at_world: bool = False) -> None:
+        """Move the world cameras of sensors to the origins of environments.
 
-        `model`: model fields of the simulation, with per-environment `cam_pos`.
+        Args:
+            model: Model fields of the simulation, with per-environment `cam_pos`.
+            env_ids: Environments; None for all.
+            at_world: Move the cameras back to the origin of the world.
         """
         if not self.world_cameras:
             return
         # Not a read by a user.
         origins = self._env_origins if self._terrain is None else vars(self._terrain)["env_origins"]
         rows = as_index(env_ids)
-        moved = origins[rows] - self._camera_origins[rows]
-        self._camera_origins[rows] = origins[rows]
+        places = torch.zeros_like(origins[rows]) if at_world else origins[rows]
+        moved = places - self._camera_origins[rows]
+        self._camera_origins[rows] = places
         for camera in self.world_cameras:
             model.cam_pos[rows, camera] += moved
 

@@ -12,6 +12,7 @@ from mjlab.managers.term_checks import checked_when_built
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs.mdp.dr._core import Selection
     from mjlab.envs.mdp.dr._types import Ranges
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
@@ -23,11 +24,21 @@ cam_intrinsic = field_term(
     CAMERA,
     "Randomize camera intrinsics: focal lengths x, y and principal point x, y (m).",
 )
+
+
+def _take_to_world(selection: Selection) -> None:
+    """Move cameras of the world to its origin, where the default is; the environment places them."""
+    env = selection.env
+    env.scene.place_cameras(env.sim.model, selection.rows, at_world=True)
+
+
 cam_pos = field_term(
     __name__,
     "cam_pos",
     CAMERA,
-    "Randomize camera positions x, y, z (m) in the body frame. Affects only cameras of mode fixed.",
+    "Randomize camera positions x, y, z (m) in the body frame; of the world, from the environment's "
+    "origin. Affects only cameras of mode fixed.",
+    before=_take_to_world,
 )
 cam_quat = rotation_term(
     __name__, "cam_quat", CAMERA, "Perturb camera orientations in the body frame."
