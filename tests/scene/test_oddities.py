@@ -109,28 +109,55 @@ def test_static_elements_of_floating_bases_warn_once(world, named):
         _, _, said = build(thing(order, init_state=HIGH))
         assert len([text for text in said if named in text]) == len(said) == 1
     if "mocap" not in world:
-        assert "fixed to the world" not in "".join(build(thing(world + LINK))[2])
+        assert not build(thing(world + LINK))[2]
 
 
-def test_links_that_pass_through_their_own_floor_warn():
-    _, _, said = build(thing(FLOOR + LINK), terrain=None)
-    assert len(said) == 1
-    assert "['link'] pass through geoms ['floor']" in said[0]
-    # What overlaps from the beginning is meant to.
-    assert not build(thing('<geom size=".5" pos="0 0 1"/>' + LINK), terrain=None)[2]
-
-
-def test_excludes_of_the_world_hold_in_the_scene():
-    leg = LINK.replace(
-        "</body>", '<body name="leg"><joint axis="0 1 0"/><geom size=".2"/></body></body>'
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_links_touch_the_world_of_their_file(engine):
+    """A link falls on a geom of the world, 0.4 m high, in each environment."""
+    cfg = thing('<geom name="table" size=".2" pos="0 0 .2"/>' + LINK)
+    scene = Scene(SceneCfg(num_envs=2, terrain=PLANE, entities={"thing": cfg}), "cpu")
+    sim = Simulation(2, SimulationCfg(engine=engine), spec=scene.spec, device="cpu")
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    pose = scene["thing"].data.default_root_state.clone()
+    pose[:, :3] += scene.env_origins
+    scene["thing"].write_mocap_pose_to_sim(pose)
+    sim.step(600)
+    torch.testing.assert_close(
+        scene["thing"].data.joint_pos, torch.full((2, 1), -0.5), atol=5e-3, rtol=0.0
     )
-    table = '<geom name="table" size=".3" pos="0 0 1"/>'
-    exclude = '<contact><exclude body1="world" body2="leg"/></contact>'
-    for rest, count in (("", 1), (exclude, 0)):
-        sim, _, _ = build(thing(table + leg, rest), num_envs=1, terrain=None)
-        data = mujoco.MjData(sim.mj_model)
-        mujoco.mj_forward(sim.mj_model, data)
-        assert data.ncon == count
+
+
+def contacts(model: mujoco.MjModel, prefix: str) -> set[tuple[str, ...]]:
+    """Return the pairs of geoms that touch in the initial state."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return {
+        tuple(sorted(model.geom(int(geom)).name.removeprefix(prefix) for geom in contact.geom))
+        for contact in data.contact[: data.ncon]
+    }
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        "",
+        '<contact><exclude body1="world" body2="leg"/></contact>',
+        '<contact><exclude body1="link" body2="world"/></contact>',
+        '<contact><exclude body1="base" body2="link"/></contact>',
+        '<contact><pair geom1="table" geom2="foot"/></contact>',
+        '<option><flag filterparent="disable"/></option>',
+    ],
+)
+def test_contacts_are_those_of_the_file(rest):
+    world = """<geom name="table" size=".3" pos="0 0 1"/>
+      <body name="base" pos="0 0 1"><geom name="foot" size=".1" contype="2" conaffinity="3"/>
+        <body name="link"><joint axis="0 1 0"/><geom name="shin" size=".2" conaffinity="2"/>
+          <body name="leg"><joint axis="0 1 0"/><geom name="toe" size=".2" conaffinity="0"/></body>
+        </body></body>"""
+    alone = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{world}</worldbody>{rest}</mujoco>")
+    sim, _, _ = build(thing(world, rest), num_envs=1, terrain=None)
+    assert contacts(sim.mj_model, "thing_0/") == contacts(alone, "")
 
 
 # Grounds and initial states.

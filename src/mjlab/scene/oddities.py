@@ -74,9 +74,7 @@ def warn_oddities(scene: Scene, model: mujoco.MjModel) -> None:
         _warn_initial_joints(name, entity, model)
         if scene.env_origins.any():
             _warn_world_elements(name, entity, model)
-        if entity.is_fixed_base:
-            _warn_passed_geoms(name, entity, model, data)
-        else:
+        if not entity.is_fixed_base:
             _warn_buried(name, entity, model, data)
         grounds += [
             f"geom {short or '(unnamed)'!r} of entity {name!r}"
@@ -176,39 +174,6 @@ def _warn_world_elements(name: str, entity: Entity, model: mujoco.MjModel) -> No
             f"Entity {name!r}: {', '.join(listed)} are fixed to the world, so all environments share "
             "them at the world's origin; move them to a separate entity, because each environment "
             "places its own fixed bases, or to the terrain."
-        )
-
-
-def _warn_passed_geoms(
-    name: str, entity: Entity, model: mujoco.MjModel, data: mujoco.MjData
-) -> None:
-    """Warn of geoms of the XML's world that the links attached to it pass through.
-
-    MuJoCo filters contacts of a body with its parent, but not with the world, whose place the mocap
-    base takes. Links that touch the geoms initially are meant to overlap.
-    """
-    root, ids = entity.indexing.root_body_id, entity.indexing.geom_ids.tolist()
-    weld, parent = model.body_weldid, model.body_parentid
-    body = {i: int(model.geom_bodyid[i]) for i in ids}
-    links = [i for i in ids if weld[body[i]] != root and weld[parent[weld[body[i]]]] == root]
-    pairs = [
-        (i, j)
-        for i in ids
-        for j in links
-        if body[i] == root
-        and (
-            model.geom_contype[i] & model.geom_conaffinity[j]
-            or model.geom_contype[j] & model.geom_conaffinity[i]
-        )
-        and mujoco.mj_geomDistance(model, data, i, j, _DEEP, None) > 0
-    ]
-    if pairs:
-        geoms = dict.fromkeys(model.geom(i).name for i, _ in pairs)
-        bodies = dict.fromkeys(model.body(body[j]).name for _, j in pairs)
-        _warn(
-            f"Entity {name!r}: bodies {_names(bodies)} pass through geoms {_names(geoms)} of the world "
-            "body, because a fixed base is one body with them, and a body does not touch its "
-            "parent; move these geoms to a separate entity, or to the terrain."
         )
 
 

@@ -117,10 +117,18 @@ def _setting_paths() -> tuple[str, ...]:
 
 
 def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a spec, suppressing MuJoCo's warning about empty prefixes; see `attach`."""
+    """Compile a spec, suppressing MuJoCo's warning about empty prefixes; see `attach`.
+
+    Links collide with the mocap base of their entity as with the world, in whose place it stands.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=_EMPTY_PREFIX)
-        return spec.compile()
+        model = spec.compile()
+    for body in range(1, model.nbody):
+        if model.body(body).name.rsplit("/", 1)[-1] == MOCAP_BASE_NAME:
+            # MuJoCo filters contacts between a body and its parent, but not with the world.
+            model.body_weldid[model.body_weldid == body] = 0
+    return model
 
 
 def compile_spec(spec: mujoco.MjSpec) -> mujoco.MjModel:
