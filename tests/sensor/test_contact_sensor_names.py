@@ -208,7 +208,10 @@ def test_name_of_a_primary_may_be_a_sensor():
 
 
 def test_two_sensors_of_one_name_are_refused():
-    with pytest.raises(ValueError, match="SceneCfg.sensors.*'touch'"):
+    with (
+        pytest.warns(UserWarning, match="SceneCfg.sensors.*'touch'"),
+        pytest.raises(ValueError, match="'touch'.*already has MuJoCo sensors"),
+    ):
         compose(sense(geom("box")), sense(body("box")), box=BOX)
 
 
