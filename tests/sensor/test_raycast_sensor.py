@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import re
 import typing
 from dataclasses import dataclass
 
@@ -443,7 +444,7 @@ def test_a_sensor_that_cannot_work_is_refused_by_name_when_the_scene_is_built(kw
 def test_scan_that_cannot_hit_warns_once(fields, message, engine):
     with pytest.warns(UserWarning, match=message) as caught:
         sim, scene = scene_with(scan(**fields), engine=engine)
-    assert sum("'scan'" in str(one.message) for one in caught) == 1
+    assert sum(bool(re.search(message, str(one.message))) for one in caught) == 1
     sense(sim)
     distances = scene["scan"].data.distances
     assert (distances == -1.0).all()
