@@ -21,11 +21,13 @@ def algorithm(parts: int) -> dict:
 @pytest.mark.parametrize(
     ("networks", "most"), [({}, 8 * 5), ({"critic": RECURRENT}, 8)], ids=["plain", "recurrent"]
 )
-def test_more_mini_batches_than_data_are_refused(make_runner, networks, most):
+def test_more_mini_batches_than_data_warn(make_runner, networks, most, recwarn):
     make_runner(num_envs=8, algorithm=algorithm(most), **networks).learn(1)
-    for parts in (0, most + 1):
-        with pytest.raises(ValueError, match=rf"num_mini_batches.*1 to {most}.*got {parts}"):
-            make_runner(num_envs=8, algorithm=algorithm(parts), **networks).learn(1)
+    assert not [one for one in recwarn if "num_mini_batches" in str(one.message)]
+    with pytest.warns(UserWarning, match=rf"num_mini_batches.*1 to {most}.*got {most + 1}"):
+        runner = make_runner(num_envs=8, algorithm=algorithm(most + 1), **networks)
+        runner.learn(1)
+    assert runner.current_learning_iteration == 1
 
 
 def test_a_runner_that_only_acts_takes_any_number_of_environments(make_runner):

@@ -82,9 +82,13 @@ def test_actions_are_clipped_before_the_environment_sees_them():
     assert env.action_space.shape == (3, 2)
 
 
-def test_a_clip_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="clip_actions.*0.0"):
-        RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg()), clip_actions=0.0)
+@pytest.mark.parametrize("clip", [0.0, -1.0])
+def test_a_clip_of_everything_warns(clip):
+    with pytest.warns(UserWarning, match=f"clip_actions.*{clip}"):
+        env = wrapped(clip_actions=clip)
+    # As `torch.clamp` with exchanged bounds.
+    env.step(torch.rand(3, 2))
+    assert env.unwrapped.seen_actions.unique().tolist() == [clip]
 
 
 def test_attributes_are_those_of_the_environment():

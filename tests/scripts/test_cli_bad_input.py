@@ -235,11 +235,9 @@ def test_a_number_of_environments_below_one_is_refused(attempt, count):
         ("--env.episode-length-s", "-1"),
         ("--env.episode-length-s", "0"),
         ("--agent.num-steps-per-env", "0"),
-        ("--agent.max-iterations", "0"),
         ("--agent.save-interval", "0"),
         ("--agent.algorithm.num-mini-batches", "0"),
         ("--agent.algorithm.num-learning-epochs", "-1"),
-        ("--video-length", "0"),
     ],
 )
 def test_other_numbers_that_cannot_be_are_refused_by_name(attempt, flag, value):

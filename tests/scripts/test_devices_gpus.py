@@ -74,7 +74,7 @@ def test_train_starts_a_process_for_each_gpu_with_the_same_flags(gpus, run, monk
     flags = ["--gpu-ids", "[3,1]", "--num-envs", "8", "--gpu-ids", "all"]
     assert command == [sys.executable, "-m", "mjlab.scripts.train", TASK, *flags]
     assert (count, environment) == (2, {"CUDA_VISIBLE_DEVICES": "7,5"})
-    assert run("train", TASK, "--gpu-ids", "all", "--agent.max-iterations", "0").status == 1
+    assert run("train", TASK, "--gpu-ids", "all", "--agent.save-interval", "0").status == 1
     assert len(started) == 1
 
 

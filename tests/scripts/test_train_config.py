@@ -16,12 +16,6 @@ def no_gpu(monkeypatch):
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (["--agent.class-name", "Foo"], "'Foo'"),
-        (["--agent.class_name=Foo"], "'Foo'"),
-        (["--wandb-run-path", "me/project/abc"], "--agent.resume True"),
-        (["--agent.load-run", "2026.*"], "--agent.resume True"),
-        (["--agent.load-checkpoint", "model_1.pt"], "--agent.resume True"),
-        (["--wandb-checkpoint-name", "model_1.pt"], "--wandb-run-path"),
         (["--gpu-ids", "[0]", "--device", "cpu"], "--device cpu"),
         (["--gpu-ids", "all"], "expected a visible GPU"),
     ],
@@ -33,6 +27,29 @@ def test_a_typed_flag_that_would_be_ignored_ends_with_status_2(run, tmp_path, fl
     assert named in outcome.message
     assert flags[0].partition("=")[0].replace("_", "-") in outcome.message
     assert not (tmp_path / "logs").exists()
+
+
+def test_flags_without_effect_train_with_a_notice(run, tmp_path):
+    flags = {
+        "--agent.class_name": "Foo",
+        "--wandb-run-path": "me/project/abc",
+        "--agent.load-run": "2026.*",
+        "--agent.load-checkpoint": "model_1.pt",
+        "--video-length": "0",
+    }
+    argv = ["--log-root", str(tmp_path), "--agent.max-iterations", "1"]
+    outcome = run("train", TASK, *SMALL, *argv, *(word for pair in flags.items() for word in pair))
+    assert outcome.status == 0, outcome.err
+    for flag in [*flags][:4]:
+        assert outcome.err.count(flag.replace("_", "-")) == 1
+    assert len(list(tmp_path.glob("cartpole/*/model_0.pt"))) == 1
+
+
+def test_no_iterations_train_nothing(run, tmp_path):
+    argv = ["--log-root", str(tmp_path), "--agent.max-iterations", "0"]
+    outcome = run("train", TASK, *SMALL, *argv)
+    assert outcome.status == 0, outcome.err
+    assert not list(tmp_path.glob("cartpole/*/model_*.pt"))
 
 
 @pytest.mark.parametrize("flag", ["--agent.seed", "--agent.run-name"])

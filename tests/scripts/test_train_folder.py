@@ -89,24 +89,19 @@ def test_what_a_killed_run_was_writing_is_removed_at_the_next_start(tmp_path):
     assert sorted(files) == sorted([older / "model_0.pt", Path(running.name)])
 
 
-@pytest.mark.parametrize("name", ["a/b", "../up", "/abs", "a\\b"])
-def test_a_run_name_with_a_separator_is_refused(attempt, tmp_path, name):
-    outcome, left = attempt("--agent.run-name", name)
-    assert outcome.status == 1
-    assert "--agent.run-name: " in outcome.message
-    assert repr(name) in outcome.message
-    assert left == []
-    assert [path.name for path in tmp_path.iterdir()] == ["logs"]
+def test_a_run_name_may_have_a_separator(attempt, tmp_path):
+    outcome, _ = attempt("--agent.run-name", "a/b")
+    assert outcome.status == 0, outcome.err
+    assert outcome.err.count("--agent.run-name: ") == 1
+    assert len(list(tmp_path.glob("logs/cartpole/*_a/b/model_1.pt"))) == 1
 
 
-@pytest.mark.parametrize("name", ["{outside}", "../up", "a/../../up", "..\\up"])
-def test_an_experiment_outside_the_folder_of_all_runs_is_refused(attempt, tmp_path, name):
+@pytest.mark.parametrize("name", ["{outside}", "../outside"])
+def test_an_experiment_may_be_anywhere(attempt, tmp_path, name):
     name = name.format(outside=tmp_path / "outside")
     outcome, _ = attempt("--agent.experiment-name", name)
-    assert outcome.status == 1
-    assert "--agent.experiment-name: " in outcome.message
-    assert repr(name) in outcome.message
-    assert [path.name for path in tmp_path.iterdir()] == ["logs"]
+    assert outcome.status == 0, outcome.err
+    assert len(list(tmp_path.glob("outside/*/model_1.pt"))) == 1
 
 
 def test_an_experiment_may_be_a_folder_in_a_folder(attempt, tmp_path):

@@ -150,9 +150,9 @@ def test_a_process_that_fails_before_training_is_named_and_leaves_no_folder(tmp_
 
 @pytest.mark.slow
 def test_what_is_wrong_in_all_processes_is_told_once(tmp_path):
-    first, second = ProcessRun(tmp_path, "--agent.max-iterations", "0").end()
+    first, second = ProcessRun(tmp_path, "--agent.save-interval", "0").end()
     assert (first.status, second.status) == (1, 3)
-    assert "--agent.max-iterations: expected an integer >= 1, got 0" in first.err
+    assert "--agent.save-interval: expected an integer >= 1, got 0" in first.err
     assert second.err == ""
 
 
@@ -196,10 +196,10 @@ def test_torchrun_trains_and_reports_a_failure(tmp_path):
     assert resumed.returncode == 0, resumed.stderr
     assert f"Resumed: {run_dir / 'model_1.pt'}, iteration 2" in resumed.stdout
     failed = subprocess.run(
-        [*command, "--agent.max-iterations", "0"], capture_output=True, text=True, check=False
+        [*command, "--agent.save-interval", "0"], capture_output=True, text=True, check=False
     )
     assert failed.returncode != 0
-    assert "--agent.max-iterations: expected an integer >= 1, got 0" in failed.stderr
+    assert "--agent.save-interval: expected an integer >= 1, got 0" in failed.stderr
 
 
 @pytest.mark.slow

@@ -125,7 +125,7 @@ def check_actor_distribution(cfg: Mapping[str, Any]) -> None:
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
-    """Raise ValueError if PPO's mini-batches would be empty: the loss is NaN, or no update is made."""
+    """Warn if PPO's mini-batches are empty: the loss is NaN, or no update is made."""
     algorithm = cfg["algorithm"]
     # Algorithms of other packages may divide their data differently.
     if resolve_callable(algorithm["class_name"]) is not PPO:
@@ -139,9 +139,11 @@ def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
     if not 1 <= parts <= most:
         of = counted(num_envs, "environment") + ("" if is_recurrent else f" times {steps} steps")
         why = ", which recurrent networks learn from as a whole" if is_recurrent else ""
-        raise ValueError(
+        warnings.warn(
             f"agent.algorithm num_mini_batches: expected 1 to {most} ({of}{why}), got {parts}; use "
-            "fewer mini-batches, or more environments."
+            "fewer mini-batches, or more environments.",
+            UserWarning,
+            stacklevel=3,
         )
 
 

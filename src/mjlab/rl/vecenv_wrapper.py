@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from mjlab.utils.errors import check_positive
 from mjlab.utils.spaces import batch_space
 
 if TYPE_CHECKING:
@@ -33,11 +33,14 @@ class RslRlVecEnvWrapper(VecEnv):
             env: Environment.
             clip_actions: Bound c: actions are clamped to [-c, c] before `env`. None: unbounded.
 
-        Raises:
-            ValueError: `clip_actions` is not positive.
         """
-        if clip_actions is not None:
-            check_positive("clip_actions", clip_actions)
+        if clip_actions is not None and not clip_actions > 0.0:
+            warnings.warn(
+                f"clip_actions: expected a number > 0, got {clip_actions}; all actions are the same. "
+                "None disables clipping.",
+                UserWarning,
+                stacklevel=2,
+            )
         self.env = env
         self.clip_actions = clip_actions
         self.num_envs = self.unwrapped.num_envs

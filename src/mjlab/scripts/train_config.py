@@ -15,12 +15,13 @@ from mjlab.scripts.flags import is_given
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import BadCallError, UserError, check_count
 from mjlab.utils.gpu import select_gpus
+from mjlab.utils.logging import print_notice
 from mjlab.utils.processes import ProcessRank, process_rank
 from mjlab.utils.random import process_seed
 from mjlab.utils.wandb import check_wandb_login
 from mjlab.viewer.page_server import check_address
 
-_AGENT_COUNTS = ("num_steps_per_env", "max_iterations", "save_interval")
+_AGENT_COUNTS = ("num_steps_per_env", "save_interval")
 _ALGORITHM_COUNTS = (
     "num_learning_epochs",
     "num_mini_batches",
@@ -124,17 +125,11 @@ class TrainConfig:
 def check_flags(cfg: TrainConfig) -> None:
     """Raise UserError or ValueError for flags that are invalid before anything is built."""
     _check_numbers(cfg)
-    # The run folder must not be placed outside `log_root`.
-    run_name, experiment = cfg.agent.run_name, cfg.agent.experiment_name
+    run_name = cfg.agent.run_name
     if "/" in run_name or "\\" in run_name:
-        raise UserError(
-            f"--agent.run-name: expected a name without path separators, got {run_name!r}; use "
-            "--agent.experiment-name to group runs."
-        )
-    if Path(experiment).is_absolute() or ".." in experiment.replace("\\", "/").split("/"):
-        raise UserError(
-            f"--agent.experiment-name: expected a folder within --log-root, not absolute and without "
-            f"'..', got {experiment!r}; use --log-root for another location."
+        print_notice(
+            f"--agent.run-name: expected a name without path separators, got {run_name!r}; `play` and "
+            "--agent.resume do not find this run. Use --agent.experiment-name to group runs."
         )
     if cfg.agent.logger == "wandb":
         check_wandb_login("--agent.logger wandb", records=True)
@@ -143,16 +138,16 @@ def check_flags(cfg: TrainConfig) -> None:
 
 
 def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
-    """Raise BadCallError for a flag on the command line that would be ignored."""
+    """Print a notice for each flag on the command line that is ignored.
+
+    Raises:
+        BadCallError: GPUs are selected and not visible, or together with a device.
+    """
     for flag in ("--wandb-run-path", "--agent.load-run", "--agent.load-checkpoint"):
         if is_given(flag, flags) and not cfg.agent.resume:
-            raise BadCallError(
-                f"{flag}: expected a run to resume, got a new run; use --agent.resume True."
-            )
+            print_notice(f"{flag} is ignored by a new run; use --agent.resume True to resume one.")
     if is_given("--wandb-checkpoint-name", flags) and cfg.wandb_run_path is None:
-        raise BadCallError(
-            "--wandb-checkpoint-name: expected a Weights & Biases run, got none; use --wandb-run-path."
-        )
+        print_notice("--wandb-checkpoint-name is ignored without --wandb-run-path.")
     if is_given("--gpu-ids", flags) and cfg.gpu_ids is not None:
         if cfg.device is not None and (
             process_rank().is_alone or not cfg.device.startswith("cuda")
@@ -169,9 +164,9 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
     kinds = {field.name: field.default for field in dataclasses.fields(cfg.agent)}
     name = getattr(cfg.agent, "class_name", None)
     if is_given("--agent.class-name", flags) and name != kinds["class_name"]:
-        raise BadCallError(
-            f"--agent.class-name: expected {kinds['class_name']!r}, got {name!r} (unused); "
-            "use runner_cls of register_mjlab_task for a runner, or --learner."
+        print_notice(
+            f"--agent.class-name: {name!r} is ignored; use runner_cls of register_mjlab_task for a "
+            "runner, or --learner."
         )
 
 
@@ -182,7 +177,9 @@ def _check_numbers(cfg: TrainConfig) -> None:
     # Each algorithm has a subset of the counts.
     counts = {f"--agent.{name}": getattr(agent, name) for name in _AGENT_COUNTS}
     counts |= {f"--agent.algorithm.{n}": algorithm[n] for n in _ALGORITHM_COUNTS if n in algorithm}
-    counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
+    if cfg.video:
+        counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
+    check_count("--agent.max-iterations", agent.max_iterations, minimum=0)
     for flag, value in counts.items():
         check_count(flag.replace("_", "-"), value)
     steps = agent.num_steps_per_env * algorithm.get("num_learning_epochs", 1)
