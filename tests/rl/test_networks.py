@@ -30,6 +30,13 @@ def test_more_mini_batches_than_data_warn(make_runner, networks, most, recwarn):
     assert runner.current_learning_iteration == 1
 
 
+def test_a_runner_without_folder_needs_no_save_interval(make_runner):
+    runner = make_runner(num_envs=2, algorithm=algorithm(1))
+    del runner.cfg["save_interval"]
+    runner.learn(2)
+    assert runner.current_learning_iteration == 2
+
+
 def test_a_runner_that_only_acts_takes_any_number_of_environments(make_runner):
     make_runner(num_envs=1, algorithm=algorithm(4), critic=RECURRENT)
 

@@ -17,7 +17,7 @@ def no_gpu(monkeypatch):
     ("flags", "named"),
     [
         (["--gpu-ids", "[0]", "--device", "cpu"], "--device cpu"),
-        (["--gpu-ids", "all"], "expected a visible GPU"),
+        (["--gpu-ids", "[0]"], "expected a visible GPU"),
     ],
 )
 @pytest.mark.usefixtures("no_gpu")

@@ -157,7 +157,7 @@ def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
 
     Raises:
         ValueError: a setting is missing or unknown, the function does not exist, or it does not
-            return its input rows and one or more mirrored copies of them.
+            return its input rows and mirrored copies of them.
     """
     symmetry = cfg["algorithm"].get("symmetry_cfg")
     if not symmetry:
@@ -178,7 +178,13 @@ def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
     actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
     mirrored, mirrored_actions = function(env=env, obs=observations, actions=actions)
     rows, action_rows = mirrored.batch_size[0], mirrored_actions.shape[0]
-    if rows != action_rows or rows < 2 * env.num_envs or rows % env.num_envs:
+    if rows == action_rows == env.num_envs:
+        warnings.warn(
+            f"symmetry_cfg {_SYMMETRY_FUNCTION} {symmetry[_SYMMETRY_FUNCTION]!r} returns no mirrored rows.",
+            UserWarning,
+            stacklevel=4,
+        )
+    elif rows != action_rows or rows < env.num_envs or rows % env.num_envs:
         raise ValueError(
             f"symmetry_cfg {_SYMMETRY_FUNCTION} {symmetry[_SYMMETRY_FUNCTION]!r}: expected the original "
             f"and the mirrored rows of {counted(env.num_envs, 'environment')}, got {rows} observations and "

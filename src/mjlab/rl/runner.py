@@ -160,7 +160,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if in_notebook() and not any(observer.shows_progress for observer in self.observers):
             self.observers.append(NotebookProgress(ProgressCfg.of_runner(self)))
         first, total, reason = self.current_learning_iteration, num_learning_iterations, ""
-        num_steps, save_interval = self.cfg["num_steps_per_env"], self.cfg["save_interval"]
+        num_steps = self.cfg["num_steps_per_env"]
         check_every_step = self.cfg.get("check_for_nan", True)
         uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
         with self._session() as stop, RunRescue(self._run_folder) as rescue:
@@ -216,7 +216,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 self._owes_evaluation = is_due and interrupted
                 is_solved = is_due and not interrupted and self._evaluate_solved(iteration + 1)
                 reason = self._agree_to_stop(is_solved, interrupted)
-                if not reason and iteration + 1 < total and iteration % save_interval == 0:
+                is_saving = self._run_folder is not None and not reason and iteration + 1 < total
+                if is_saving and iteration % self.cfg["save_interval"] == 0:
                     self._save_checkpoint()
             rescue.learned = None
             # A resumed run that is solved before its first iteration also writes a checkpoint.

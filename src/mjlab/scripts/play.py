@@ -80,7 +80,8 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         raise UserError(
             "--viewer none: expected --num-steps, because nothing else would end playing, got none."
         )
-    check_count("--video-length", cfg.video_length)
+    if cfg.video:
+        check_count("--video-length", cfg.video_length)
     check_address(cfg.host, cfg.port, "--")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)

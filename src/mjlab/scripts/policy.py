@@ -31,7 +31,7 @@ from mjlab.scripts.run_folder import (
     resolve_checkpoint,
 )
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
-from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.os import get_wandb_checkpoint_path
 
@@ -80,7 +80,6 @@ def parse_policy_flags(
 
     Raises:
         UnknownProfileError: unknown profile.
-        BadCallError: checkpoint set with an untrained agent.
     """
 
     def make_default(profile: str | None = None, learner: str | None = None) -> F:
@@ -93,12 +92,10 @@ def parse_policy_flags(
         return {} if profile is None else {"profile": profile}
 
     cfg = parse_with_choices(make_default, recorded, flags, prog=f"{command} {task}")
-    # --wandb-run-path is valid with any agent: a task may read other files from the run.
+    # --wandb-run-path has a use with any agent: a task may read other files from the run.
     for flag in ("--checkpoint-file", "--wandb-checkpoint-name"):
         if cfg.agent != "trained" and is_given(flag, flags):
-            raise BadCallError(
-                f"{flag}: expected a trained agent, got --agent {cfg.agent}; leave out one of them."
-            )
+            print_notice(f"{flag} is ignored with --agent {cfg.agent}.")
     return cfg
 
 

@@ -155,7 +155,7 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
             raise BadCallError(
                 f"--gpu-ids: expected no --device, got --device {cfg.device}; leave out one of them."
             )
-        if select_gpus(cfg.gpu_ids) == (None, 0):
+        if select_gpus(cfg.gpu_ids) == (None, 0) and cfg.gpu_ids != "all":
             raise BadCallError(
                 f"--gpu-ids: expected a visible GPU, got {cfg.gpu_ids} without visible GPUs; leave it "
                 "out to train on the CPU."

@@ -400,8 +400,8 @@ def test_a_joint_that_slides_is_mirrored_as_a_direction():
         ({"data_augmentation_func": "mjlab.nowhere:mirror"}, "cannot be imported"),
         ({"data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror"}, "cannot be imported"),
         (
-            {"data_augmentation_func": lambda env, obs, actions: (obs, actions)},
-            "got 2 observations",
+            {"data_augmentation_func": lambda env, obs, actions: (obs[:1], actions)},
+            "got 1 observation",
         ),
     ],
 )
@@ -410,6 +410,18 @@ def test_a_bad_symmetry_cfg_is_refused_when_the_runner_is_built(symmetry, messag
     rl_cfg = load_rl_cfg(FLAT_GO1)
     rl_cfg.algorithm.symmetry_cfg = symmetry
     with pytest.raises(ValueError, match=message):
+        MjlabOnPolicyRunner(env, asdict(rl_cfg), None, "cpu")
+    env.close()
+
+
+def test_a_symmetry_without_mirrored_rows_warns():
+    env = RslRlVecEnvWrapper(make_env(FLAT_GO1))
+    rl_cfg = load_rl_cfg(FLAT_GO1)
+    rl_cfg.algorithm.symmetry_cfg = {
+        "data_augmentation_func": lambda env, obs, actions: (obs, actions),
+        "use_data_augmentation": True,
+    }
+    with pytest.warns(UserWarning, match="returns no mirrored rows"):
         MjlabOnPolicyRunner(env, asdict(rl_cfg), None, "cpu")
     env.close()
 
