@@ -11,17 +11,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import accept_older_methods
-from mjlab.entity import Entity
 from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import (
     BuiltTermsManager,
     DebugVisSwitches,
-    ManagerBase,
     ManagerTermBase,
     NullManager,
 )
 from mjlab.managers.nonfinite import finite_mean
-from mjlab.sensor import Sensor
 from mjlab.utils.errors import UnsupportedError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import sample_uniform
@@ -123,13 +120,7 @@ class CommandTerm(ManagerTermBase):
         else:
             # `_update_metrics` updates all environments. Metrics that accumulate would count a step
             # that the other environments have not made.
-            with changes_undone(
-                [self] if len(env_ids) < self.num_envs else [],
-                env_ids,
-                self.num_envs,
-                generators=False,
-                shared=(Entity, ManagerBase, Sensor),
-            ):
+            with changes_undone([self], env_ids, self.num_envs, generators=False):
                 self._update_metrics()
             self.time_left[env_ids] -= dt
             due = env_ids[self.time_left[env_ids] <= 0.0]

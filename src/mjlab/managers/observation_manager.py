@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import functools
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,19 +14,21 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.entity import Entity
-from mjlab.managers.action_manager import ActionTerm
-from mjlab.managers.command_manager import CommandTerm
 from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
 from mjlab.managers.term_checks import check_real
-from mjlab.sensor import Sensor
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.errors import WrongTypeError, check_exists
-from mjlab.utils.indexing import as_ids, as_index, is_empty
+from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
-from mjlab.utils.state import changes_undone, stateful
+from mjlab.utils.state import (
+    capture_state,
+    changes_undone,
+    is_same_state,
+    is_stateful,
+    stateful,
+)
 from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, format_shape, function_name
 
@@ -37,9 +38,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 NanPolicy = Literal["disabled", "warn", "sanitize", "error"]
 Observation = torch.Tensor | dict[str, torch.Tensor]
-
-# Objects that terms refer to and do not own.
-_SHARED = (ActionTerm, CommandTerm, Entity, ManagerBase, Sensor)
 
 
 @dataclass
@@ -124,10 +122,9 @@ class ObservationManager(ManagerBase):
     Every term function is called once during construction, to infer its shape.
 
     Only `compute` and `compute_group` with `update_history` advance state: delays, histories, noise
-    models, class-based terms (their attributes, and the objects that these own), and random numbers.
+    models, class-based terms, and random numbers.
     """
 
-    _transient = {"_new_ids"}
     _title = "observations"
 
     def __init__(
@@ -140,9 +137,8 @@ class ObservationManager(ManagerBase):
                 self.cfg[name] = group = copy.copy(group)
                 group.terms = {key: copy.deepcopy(term) for key, term in group.terms.items()}
         self._groups: dict[str, ObservationGroup] = {}
-        self._obs_buffer: dict[str, Observation] | None = None
-        # Environments reset since the last step.
-        self._new_ids: list[torch.Tensor | slice | None] = []
+        self._obs_buffer: dict[str, Observation] = {}
+        # False after a reset, until the next observation.
         self._is_current = False
         super().__init__(env)
 
@@ -229,18 +225,17 @@ class ObservationManager(ManagerBase):
                 "ObservationManager.compute env_ids: expected update_history=True, because env_ids "
                 "fills histories, got False."
             )
-        if update_history or self._obs_buffer is None or not self._is_current:
-            self._obs_buffer = self._compute(self._groups, update_history, env_ids)
+        if update_history:
+            self._obs_buffer = self._compute(self._groups, True, env_ids)
             self._is_current = True
-            if update_history:
-                self._new_ids = []
+        elif not self._is_current:
+            return self._compute(self._groups, False, None)
         return self._obs_buffer
 
     def preview(self) -> dict[str, Observation]:
         """Return the result of `compute(update_history=True)` without side effects."""
-        terms = self._terms(self._groups)
-        roots = [*terms, *(term.state for term in terms)]
-        with preserved_rng(), changes_undone(roots, num_envs=self.num_envs, shared=_SHARED):
+        terms = _terms(self._groups)
+        with preserved_rng(), changes_undone([*terms, *_stateful_parts(terms)]):
             return {name: group.compute(True, None) for name, group in self._groups.items()}
 
     def compute_group(
@@ -262,8 +257,7 @@ class ObservationManager(ManagerBase):
         self._is_current = False
         super().reset(env_ids)
         if not is_empty(env_ids):
-            self._new_ids.append(env_ids)
-            for term in self._terms(self._groups):
+            for term in _terms(self._groups):
                 term.reset(env_ids)
         return {}
 
@@ -286,46 +280,51 @@ class ObservationManager(ManagerBase):
             for term_name, value in group.split(observations[group_name]).items()
         ]
 
-    def _terms(self, groups: Mapping[str, ObservationGroup]) -> list[ObservationTerm]:
-        return [term for group in groups.values() for term in group.terms.values()]
-
     def _compute(
         self,
         groups: Mapping[str, ObservationGroup],
         update_history: bool,
         env_ids: torch.Tensor | None,
     ) -> dict[str, Observation]:
-        if update_history and env_ids is None:
-            return {name: group.compute(True, None) for name, group in groups.items()}
-        # Environments that advance.
-        ids = as_ids([] if env_ids is None else env_ids, self.num_envs, self.device)
-        others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        others[ids] = False
-        if not others.any():
+        ids = None if env_ids is None else as_ids(env_ids, self.num_envs, self.device)
+        if update_history and (ids is None or len(ids) == self.num_envs):
             return {name: group.compute(True, ids) for name, group in groups.items()}
-        # Environments without an observation of their episode.
-        for new_ids in self._new_ids:
-            others[as_index(new_ids)] = False
-        terms = self._terms(groups)
-        roots: list[Any] = [term.state for term in terms]
+        terms = _terms(groups)
+        parts = _stateful_parts(terms)
         with contextlib.ExitStack() as stack:
-            if not update_history:
+            if update_history:
+                # Delays and histories fill only rows `ids` by themselves.
+                undone = changes_undone(parts, ids, self.num_envs, generators=False)
+            else:
                 stack.enter_context(preserved_rng())
-                roots += terms
-            kept = changes_undone(
-                roots, ids, self.num_envs, generators=not update_history, shared=_SHARED
-            )
-            advanced = stack.enter_context(kept)
-            computed = {
-                name: group.compute(update_history, env_ids) for name, group in groups.items()
-            }
-        last = self._obs_buffer or {}
-        changed = {terms[k].label for k in advanced if k < len(terms)}
-        for name in groups.keys() & last.keys():
-            now, before = (groups[name].split(obs[name]) for obs in (computed, last))
-            for key in [k for k in now if f"{name}/{k}" in changed]:
-                now[key][others] = before[key][others]
+                undone = changes_undone([*parts, *terms])
+            before = stack.enter_context(undone)
+            computed = {name: group.compute(update_history, ids) for name, group in groups.items()}
+            changed = [
+                part
+                for part, state in zip(parts, before, strict=False)
+                if not is_same_state(state, capture_state(part))
+            ]
+        if changed and (update_history or self._is_current):
+            self._show_last(groups, computed, changed, ids)
         return computed
+
+    def _show_last(
+        self,
+        groups: Mapping[str, ObservationGroup],
+        computed: dict[str, Observation],
+        changed: list[Any],
+        ids: torch.Tensor | None,
+    ) -> None:
+        """Put the last values of terms with `changed` state into rows other than `ids`."""
+        others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        if ids is not None:
+            others[ids] = False
+        for name in groups.keys() & self._obs_buffer.keys():
+            now, last = (groups[name].split(obs[name]) for obs in (computed, self._obs_buffer))
+            for key, term in groups[name].terms.items():
+                if any(part is own for part in changed for own in _stateful_parts([term])):
+                    now[key][others] = last[key][others]
 
     def _prepare_terms(self) -> None:
         for name, group_cfg in self._enabled(self.cfg, ObservationGroupCfg):
@@ -542,15 +541,6 @@ class ObservationTerm:
             cfg.params,
         )
 
-    @property
-    def state(self) -> dict[str, Any]:
-        """Objects that a call may change, but for delay and history."""
-        func = self.cfg.func
-        while isinstance(func, functools.partial):
-            func = func.func
-        owner = getattr(func, "__self__", func)
-        return {"func": owner, "params": self.cfg.params, "noise_model": self._noise_model}
-
     def reset(self, env_ids: torch.Tensor | slice | None) -> None:
         """Clear delay and history and reset the noise model of `env_ids` (None: all)."""
         for part in (self._delay, self._history, self._noise_model):
@@ -627,6 +617,16 @@ class ObservationTerm:
 
 def _warn(message: str) -> None:
     warnings.warn(message, UserWarning, stacklevel=3)
+
+
+def _terms(groups: Mapping[str, ObservationGroup]) -> list[ObservationTerm]:
+    return [term for group in groups.values() for term in group.terms.values()]
+
+
+def _stateful_parts(terms: Sequence[ObservationTerm]) -> list[Any]:
+    """Return the objects that a call of the terms may change, but for delays and histories."""
+    parts = [part for term in terms for part in (term.cfg.func, term._noise_model)]
+    return [part for part in parts if is_stateful(part)]
 
 
 def scale_tensor(name: str, scale: Any, raw_shape: torch.Size, device: str) -> torch.Tensor:

@@ -10,7 +10,7 @@ import mujoco
 import torch
 
 from mjlab.utils.errors import UnknownAttributeError
-from mjlab.utils.state import capture_state, restore_state
+from mjlab.utils.state import changes_undone
 
 if TYPE_CHECKING:
     from mjlab.sensor.camera_sensor import CameraSensor
@@ -131,13 +131,10 @@ class SensorContext:
     def results_kept(self) -> Generator[None]:
         """Restore the results of all sensors after the block. The block may call `sense`."""
         sensors = (*self._camera_sensors, *self._raycast_sensors)
-        before = [capture_state(sensor) for sensor in sensors]
-        try:
+        with changes_undone(sensors):
             yield
-        finally:
-            for sensor, state in zip(sensors, before, strict=True):
-                restore_state(sensor, state)
-                sensor.invalidate_cache()
+        for sensor in sensors:
+            sensor.invalidate_cache()
 
     def prepare(self) -> None:
         """Compute all rays in the world frame."""

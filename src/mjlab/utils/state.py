@@ -3,21 +3,16 @@
 Managers, terms, buffers and actuators keep their run-time state in plain attributes. Instead of
 requiring a `state_dict` of each class (and of users' terms), this module walks the attributes of
 objects whose class is marked `stateful` and saves all data: tensors, arrays, numbers, strings,
-random generators, and lists, tuples, deques and dicts of these. `changes_undone` also walks objects
-of other classes, because it needs no names for them in a file.
+random generators, and lists, tuples, deques and dicts of these.
 """
 
 from __future__ import annotations
 
 import contextlib
 import enum
-import inspect
 import logging
-import math
-import sys
 from collections import deque
 from collections.abc import Generator, Sequence
-from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,7 +26,8 @@ _CLASS_KEY = "__class__"
 # Attributes for device and size of an object, set by the new run.
 _SETTINGS = frozenset({"device", "_device", "num_envs", "_num_envs"})
 _TRANSIENT = "_transient"
-_ROW_DIMS = "_row_dims"
+# Tensors whose rows are not along the first dimension of `num_envs` elements, by class and attribute.
+_ROW_DIMS = {("CircularBuffer", "_buffer"): 1}
 # Exact types only: a torch.Size or named tuple describes an object, not its run-time state.
 _SEQUENCES = (list, tuple, deque)
 
@@ -94,45 +90,76 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def changes_undone(
-    roots: Sequence[Any],
+    objects: Sequence[Any],
     env_ids: torch.Tensor | None = None,
     num_envs: int = 0,
     *,
     generators: bool = True,
-    shared: tuple[type, ...] = (),
-) -> Generator[list[int]]:
-    """Undo the changes of the block to the objects in `roots`, except rows `env_ids`.
+) -> Generator[list[dict[str, Any]]]:
+    """Undo the changes of the block to the state of `objects`, except rows `env_ids`.
 
-    Attributes, items and values of objects, containers, tensors and arrays are restored, and
-    references to these stay valid. Rows are those of tensors and arrays with `num_envs` as first or
-    second dimension, and items of sequences and dicts with one item per environment. Other state,
-    such as counters and running means, is restored completely. Tensors of more than 2**20 values
-    without rows are data and are not restored.
+    Rows are those of tensors and arrays with `num_envs` as first or second dimension, and items of
+    sequences with one item per environment. Other state, such as counters and running means, is
+    restored completely.
 
     Args:
-        roots: Objects whose state is kept, with all that they own.
+        objects: Instances of `stateful` classes.
         env_ids: Environments that keep their changes, (n,) int64. None: no environment.
         num_envs: Number of environments.
-        generators: Restore random number generators.
-        shared: Classes of objects that the roots refer to but do not own.
+        generators: Restore random generators.
 
-    Yields a list. After the block it holds the indices of the roots whose state outside `env_ids`
-    changed; it stays empty without `env_ids`.
+    Yields the states captured before the block.
     """
-    tables = [_noted(root, {}, shared, num_envs) for root in roots]
-    changed: list[int] = []
+    before = [capture_state(obj, generators=generators) for obj in objects]
     try:
-        yield changed
+        yield before
     finally:
-        if env_ids is not None:
-            rows = _Rows(env_ids, num_envs, shared)
-            for k, (root, table) in enumerate(zip(roots, tables, strict=True)):
-                if rows.take(table, root, root, set()):
-                    changed.append(k)
-        with torch.no_grad():
-            for table in tables:
-                for value, kept in table.values():
-                    _put_back(value, kept, table, generators)
+        for obj, state in zip(objects, before, strict=True):
+            if env_ids is not None:
+                after = capture_state(obj, generators=generators)
+                state = _with_rows(state, after, env_ids.tolist(), num_envs)
+            for name in vars(obj).keys() - state.keys() - _transient_names(type(obj)):
+                # A counter created in the block, which hides an attribute of the class.
+                if plain_scalar(vars(obj)[name]) is not SKIP:
+                    delattr(obj, name)
+            restore_state(obj, state)
+
+
+def is_same_state(a: Any, b: Any) -> bool:
+    """Return True if two captured states are equal."""
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return a.dtype == b.dtype and torch.equal(a, b)
+    if isinstance(a, dict) and isinstance(b, dict):
+        return a.keys() == b.keys() and all(is_same_state(v, b[key]) for key, v in a.items())
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(map(is_same_state, a, b))
+    return type(a) is type(b) and a == b
+
+
+def _with_rows(
+    before: Any, after: Any, ids: list[int], num_envs: int, dim: int | None = None
+) -> Any:
+    """Return the captured state `before` with rows `ids`, along `dim`, of `after`."""
+    if isinstance(before, torch.Tensor) and isinstance(after, torch.Tensor):
+        if num_envs not in before.shape[:2] or before.shape != after.shape:
+            return before
+        dim = before.shape.index(num_envs) if dim is None else dim
+        merged = before.clone()
+        merged.movedim(dim, 0)[ids] = after.movedim(dim, 0)[ids].to(merged.dtype)
+        return merged
+    if isinstance(before, dict) and isinstance(after, dict):
+        owner = before.get(_CLASS_KEY)
+        return {
+            name: _with_rows(value, after.get(name), ids, num_envs, _ROW_DIMS.get((owner, name)))
+            for name, value in before.items()
+        }
+    if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        if len(before) == num_envs and not any(isinstance(x, (torch.Tensor, dict)) for x in before):
+            return [after[k] if k in ids else value for k, value in enumerate(before)]
+        pairs = zip(before, after, strict=True)
+        return [_with_rows(old, new, ids, num_envs) for old, new in pairs]
+    # A tensor created by the block is kept.
+    return after if before is None and isinstance(after, torch.Tensor) else before
 
 
 def shape_differences(saved: Any, current: Any, path: str = "") -> list[str]:
@@ -268,173 +295,3 @@ def _transient_names(cls: type) -> set[str]:
     for base in cls.__mro__:
         names |= set(base.__dict__.get(_TRANSIENT, ()))
     return names
-
-
-# Larger tensors without rows are data, such as motions, and not copied at every reset.
-_LARGEST = 2**20
-
-# State of objects in the same process: original objects with copies of their contents, by `id`.
-_Table = dict[int, tuple[Any, Any]]
-
-
-def _noted(value: Any, table: _Table, shared: tuple[type, ...], num_envs: int) -> _Table:
-    """Add `value` and all that it owns to `table`."""
-    if id(value) in table:
-        return table
-    if isinstance(value, (torch.Tensor, np.ndarray)):
-        is_table = math.prod(value.shape) > _LARGEST and num_envs not in value.shape[:2]
-        if isinstance(value, np.ndarray):
-            if value.dtype.kind in "biuf" and not is_table:
-                table[id(value)] = value, value.copy()
-        elif not (is_table or isinstance(value, torch.nn.Parameter)) and _owns_its_values(value):
-            table[id(value)] = value, value.detach().clone()
-    elif isinstance(value, torch.Generator):
-        table[id(value)] = value, value.get_state()
-    elif isinstance(value, np.random.Generator):
-        table[id(value)] = value, value.bit_generator.state
-    elif (parts := _parts(value, shared)) is not None:
-        table[id(value)] = value, parts
-        for part in parts.values():
-            _noted(part, table, shared, num_envs)
-    return table
-
-
-def _parts(value: Any, shared: tuple[type, ...]) -> dict[Any, Any] | None:
-    """Return items or attributes of a container or an object; None for other values."""
-    if isinstance(value, (list, tuple, deque, set)):
-        return dict(enumerate(value))
-    if isinstance(value, dict):
-        return dict(value)
-    if not _is_owned(value, shared):
-        return None
-    transient = _transient_names(type(value))
-    return {name: part for name, part in vars(value).items() if name not in transient}
-
-
-def _is_owned(value: Any, shared: tuple[type, ...]) -> bool:
-    if isinstance(value, shared):
-        return False
-    if is_stateful(value) or isinstance(value, SimpleNamespace):
-        return True
-    if not hasattr(value, "__dict__") or isinstance(value, (type, ModuleType, enum.Enum)):
-        return False
-    # The environment, configs and MuJoCo objects, also of subclasses, belong to others.
-    homes = {base.__module__.partition(".")[0] for base in type(value).__mro__}
-    is_library = type(value).__module__.partition(".")[0] in sys.stdlib_module_names
-    return not (is_library or inspect.isroutine(value) or homes & {"mjlab", "mujoco", "warp"})
-
-
-def _put_back(value: Any, kept: Any, table: _Table, generators: bool) -> None:
-    """Restore the contents `kept` of an original object."""
-    if isinstance(value, torch.Tensor):
-        if not _is_locked(value):
-            value.copy_(kept)
-    elif isinstance(value, np.ndarray):
-        value[...] = kept
-    elif isinstance(value, torch.Generator):
-        if generators:
-            value.set_state(kept)
-    elif isinstance(value, np.random.Generator):
-        if generators:
-            value.bit_generator.state = kept
-    elif not isinstance(value, tuple):
-        # Tensors that cannot be written are replaced.
-        parts = {
-            name: table[id(part)][1] if _is_locked(part) and id(part) in table else part
-            for name, part in kept.items()
-        }
-        if isinstance(value, list):
-            value[:] = parts.values()
-        elif isinstance(value, deque):
-            value.clear()
-            value.extend(parts.values())
-        elif isinstance(value, set):
-            value.clear()
-            value.update(parts.values())
-        elif isinstance(value, dict):
-            value.clear()
-            value.update(parts)
-        else:
-            held = vars(value)
-            for name in held.keys() - parts.keys() - _transient_names(type(value)):
-                del held[name]
-            held.update(parts)
-
-
-def _is_locked(value: Any) -> bool:
-    """Return True for inference tensors outside `inference_mode`."""
-    is_inference = isinstance(value, torch.Tensor) and value.is_inference()
-    return is_inference and not torch.is_inference_mode_enabled()
-
-
-class _Rows:
-    """Moves rows of environments from current objects into the noted contents of originals."""
-
-    def __init__(self, env_ids: torch.Tensor, num_envs: int, shared: tuple[type, ...]) -> None:
-        self._ids, self._num_envs, self._shared = env_ids.cpu(), num_envs, shared
-
-    def take(
-        self, table: _Table, old: Any, now: Any, seen: set[int], dim: int | None = None
-    ) -> bool:
-        """Take the rows of `old` from `now`; return True if other values differ."""
-        if id(old) not in table:
-            both = plain_scalar(old), plain_scalar(now)
-            return old is not now and (SKIP in both or both[0] != both[1])
-        if id(old) in seen:
-            return False
-        seen.add(id(old))
-        kept = table[id(old)][1]
-        if isinstance(old, (torch.Tensor, np.ndarray)):
-            return self._take_values(kept, now, dim)
-        current = _parts(now, self._shared) if type(now) is type(old) else None
-        if current is None:
-            return isinstance(kept, dict)
-        differs = current.keys() != kept.keys()
-        if isinstance(old, (list, tuple, deque, dict)) and self._is_per_env(kept, current):
-            for k in self._ids.tolist():
-                _forget(table, kept[k])
-                kept[k] = current[k]
-        dims = getattr(type(old), _ROW_DIMS, {})
-        for name, part in list(kept.items()):
-            now = current.get(name)
-            differs |= self.take(table, part, now, seen, dims.get(name))
-            if part is None and self._is_created(now):
-                kept[name] = now
-        kept |= {k: v for k, v in current.items() if k not in kept and self._is_created(v)}
-        return differs
-
-    def _take_values(self, kept: Any, now: Any, dim: int | None) -> bool:
-        if type(now) is not type(kept) or (now.shape, now.dtype) != (kept.shape, kept.dtype):
-            return True
-        dim = self._dim(now) if dim is None else dim
-        both = torch.as_tensor(kept), torch.as_tensor(now)
-        if dim is None:
-            return not torch.equal(*both)
-        old, new = (values.movedim(dim, 0) for values in both)
-        ids = self._ids.to(old.device)
-        old[ids] = new[ids]
-        return not torch.equal(old, new)
-
-    def _dim(self, value: Any) -> int | None:
-        """Return the dimension of rows of a tensor or array; None if it has none."""
-        if not isinstance(value, (torch.Tensor, np.ndarray)):
-            return None
-        sizes = tuple(value.shape[:2])
-        return sizes.index(self._num_envs) if self._num_envs in sizes else None
-
-    def _is_created(self, value: Any) -> bool:
-        """Return True for per-environment values to keep, if the block created them."""
-        return len(self._ids) > 0 and self._dim(value) is not None
-
-    def _is_per_env(self, kept: dict[Any, Any], current: dict[Any, Any]) -> bool:
-        if not kept.keys() == current.keys() == set(range(self._num_envs)):
-            return False
-        noted = [_noted(part, {}, self._shared, self._num_envs) for part in kept.values()]
-        return all(self._dim(value) is None for table in noted for value, _ in table.values())
-
-
-def _forget(table: _Table, value: Any) -> None:
-    """Remove `value` and all that it owns from `table`."""
-    _, kept = table.pop(id(value), (None, None))
-    for part in kept.values() if isinstance(kept, dict) else ():
-        _forget(table, part)

@@ -21,8 +21,6 @@ class CircularBuffer:
     """
 
     _transient = frozenset({"_rows", "_max_len", "_batch_size"})
-    # Dimension of the rows, for `changes_undone`.
-    _row_dims = {"_buffer": 1}
 
     def __init__(self, max_len: int, batch_size: int, device: str) -> None:
         """Create an empty buffer. Raises `ValueError` if `max_len` < 1."""
