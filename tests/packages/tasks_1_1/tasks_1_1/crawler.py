@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
+import torch
 
 from mjlab.actuator import BuiltinPositionActuatorCfg, DelayedActuatorCfg
 from mjlab.asset_zoo.robots import GO1_ACTION_SCALE
@@ -13,6 +15,7 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.envs.mdp import sync_actuator_delays
 from mjlab.envs.mdp.actions import JointPositionActionCfg
 from mjlab.managers.event_manager import EventTermCfg
+from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.rl import RslRlModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg
@@ -35,6 +38,23 @@ _LEGS = DelayedActuatorCfg(
 assert isinstance(_LEGS, DelayedActuatorCfg)
 _ACTION_SCALE = 0.25 * _LEGS.base_cfg.effort_limit / _LEGS.base_cfg.stiffness
 assert set(GO1_ACTION_SCALE) == {".*_hip_joint", ".*_thigh_joint", ".*_calf_joint"}
+
+
+@dataclass(kw_only=True)
+class FeetContactCfg(ContactSensorCfg):
+    """Contacts of feet with the ground, whose fields say nothing of the air time that it tracks."""
+
+    fields: tuple[str, ...] = ("force",)
+    reduce: str = "netforce"
+    track_air_time: bool = True
+
+
+def time_in_air(env, sensor_name: str) -> torch.Tensor:
+    data = env.scene[sensor_name].data
+    assert data.current_air_time.shape == (env.num_envs, len(_FEET))
+    # A foot is in the air or on the ground.
+    assert (data.current_air_time + data.current_contact_time >= 0.0).all()
+    return data.current_air_time.mean(dim=1)
 
 
 def get_spec() -> mujoco.MjSpec:
@@ -72,9 +92,14 @@ def crawler_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
         num_slots=1,
         track_air_time=True,
     )
+    feet_air = FeetContactCfg(
+        name="feet_air",
+        primary=ContactMatch(mode="geom", pattern=_FOOT_GEOMS, entity="robot"),
+        secondary=ContactMatch(mode="body", pattern="terrain"),
+    )
     # The template of this release brings one sensor, the scan of the terrain.
     kept = tuple(sensor for sensor in cfg.scene.sensors if sensor.name != "terrain_scan")
-    cfg.scene.sensors = (*kept, feet_ground)
+    cfg.scene.sensors = (*kept, feet_ground, feet_air)
     cfg.scene.terrain.terrain_type = "plane"
     cfg.scene.terrain.terrain_generator = None
     for group in cfg.observations.values():
@@ -103,6 +128,9 @@ def crawler_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     for reward in ("foot_clearance", "foot_swing_height", "foot_slip"):
         cfg.rewards[reward].params["asset_cfg"].site_names = _FEET
     cfg.rewards["air_time"].weight = 0.5
+    cfg.rewards["time_in_air"] = RewardTermCfg(
+        func=time_in_air, weight=0.1, params={"sensor_name": "feet_air"}
+    )
 
     if play:
         cfg.episode_length_s = int(1e9)

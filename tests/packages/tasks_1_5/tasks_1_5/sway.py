@@ -132,6 +132,14 @@ def reset_joints_together(env, env_ids: torch.Tensor, spread: float) -> None:
     assert torch.equal(both, position.expand_as(both))
 
 
+def tilt_gravity(env, env_ids: torch.Tensor, spread: float) -> None:
+    """Set the gravity of environments, without expanding the field."""
+    gravity = torch.zeros(len(env_ids), 3, device=env.device)
+    gravity[:, 0] = spread * (torch.rand(len(env_ids), device=env.device) - 0.5)
+    gravity[:, 2] = -9.81
+    env.sim.model.opt.gravity[env_ids] = gravity
+
+
 def follow(env, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     error = env.command_manager.get_command("motion") - env.scene[asset_cfg.name].data.joint_pos
     return torch.exp(-torch.square(error).sum(dim=-1))
@@ -176,7 +184,8 @@ def sway_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
             )
         },
         events={
-            "reset": EventTermCfg(func=reset_joints_together, mode="reset", params={"spread": 0.2})
+            "reset": EventTermCfg(func=reset_joints_together, mode="reset", params={"spread": 0.2}),
+            "gravity": EventTermCfg(func=tilt_gravity, mode="reset", params={"spread": 1.0}),
         },
         rewards={
             "follow": RewardTermCfg(

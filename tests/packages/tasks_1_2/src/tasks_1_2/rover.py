@@ -25,7 +25,13 @@ from mjlab.managers import (
 )
 from mjlab.rl import RslRlModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 from mjlab.scene import SceneCfg
-from mjlab.sensor import ContactMatch, ContactSensorCfg
+from mjlab.sensor import (
+    ContactMatch,
+    ContactSensorCfg,
+    GridPatternCfg,
+    ObjRef,
+    RayCastSensorCfg,
+)
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.mdp import UniformVelocityCommand, UniformVelocityCommandCfg
@@ -79,6 +85,15 @@ _SENSORS = (
         secondary_policy="any",
         fields=("found",),
     ),
+    # As in the velocity template of this release, with the default geom groups.
+    RayCastSensorCfg(
+        name="terrain_scan",
+        frame=ObjRef(type="body", name="chassis", entity="robot"),
+        ray_alignment="yaw",
+        pattern=GridPatternCfg(size=(0.6, 0.4), resolution=0.2),
+        max_distance=5.0,
+        exclude_parent_body=True,
+    ),
 )
 
 
@@ -94,6 +109,7 @@ def rover_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     }
     critic_terms = {
         **terms,
+        "scan": ObservationTermCfg(func=mdp.height_scan, params={"sensor_name": "terrain_scan"}),
         "wheel_height": ObservationTermCfg(
             func=mdp.foot_height, params={"asset_cfg": _wheel_sites()}
         ),

@@ -3,11 +3,18 @@
 from mjlab.tasks.registry import register_mjlab_task
 
 from . import names as names
-from .push import push_env_cfg, push_rl_cfg
+from .push import SearchRunner, push_env_cfg, push_rl_cfg
 
 register_mjlab_task(
     task_id="Tasks14-Push",
     env_cfg=push_env_cfg(),
     play_env_cfg=push_env_cfg(play=True),
     rl_cfg=push_rl_cfg(),
+)
+register_mjlab_task(
+    task_id="Tasks14-Search",
+    env_cfg=push_env_cfg(),
+    play_env_cfg=push_env_cfg(play=True),
+    rl_cfg=push_rl_cfg(),
+    runner_cls=SearchRunner,
 )

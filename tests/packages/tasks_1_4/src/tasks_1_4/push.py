@@ -208,3 +208,37 @@ def push_rl_cfg() -> RslRlOnPolicyRunnerCfg:
         algorithm=RslRlPpoAlgorithmCfg(num_mini_batches=1),
         experiment_name="tasks_1_4_push",
     )
+
+
+class SearchRunner:
+    """Runner that shares nothing with those of rsl_rl: it searches for a constant action."""
+
+    def __init__(self, env, train_cfg: dict, log_dir: str | None = None, device: str = "cpu"):
+        self.env, self.log_dir, self.device = env, log_dir, device
+        self.steps = train_cfg["num_steps_per_env"]
+        self.action = torch.zeros(env.num_actions, device=device)
+
+    def add_git_repo_to_log(self, repo_file_path: str) -> None:
+        pass
+
+    def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
+        best = -float("inf")
+        for _ in range(num_learning_iterations):
+            action = torch.rand_like(self.action) - 0.5
+            rewards = [
+                self.env.step(action.expand(self.env.num_envs, -1))[1].mean()
+                for _ in range(self.steps)
+            ]
+            if sum(rewards) > best:
+                best, self.action = sum(rewards), action
+        if self.log_dir is not None:
+            self.save(str(Path(self.log_dir) / f"model_{num_learning_iterations}.pt"))
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        torch.save({"action": self.action, "infos": infos}, path)
+
+    def load(self, path: str, **kwargs) -> None:
+        self.action = torch.load(path, map_location=self.device)["action"]
+
+    def get_inference_policy(self, device: str | None = None):
+        return lambda obs: self.action.expand(self.env.num_envs, -1)

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import torch
+from rsl_rl.algorithms import PPO
 
 from mjlab.actuator import BuiltinPdActuatorCfg
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
@@ -37,6 +38,7 @@ from mjlab.rl import (
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
+from mjlab.utils.lab_api import math as math_utils
 from mjlab.utils.spec_config import CollisionCfg
 from mjlab.utils.wrappers import VideoRecorder
 
@@ -91,6 +93,20 @@ class PointRecorder(RecorderTerm):
             raise AssertionError("a recorder term was called and returned")
 
 
+@torch.jit.script
+def tip_direction(quat: torch.Tensor) -> torch.Tensor:
+    """Return the direction of the arm, (N, 3)."""
+    axis = torch.zeros_like(quat[..., :3])
+    axis[..., 0] = 1.0
+    return math_utils.quat_apply(quat, axis)
+
+
+def arm_direction(env) -> torch.Tensor:
+    robot = env.scene["robot"]
+    arm = robot.body_names.index("arm")
+    return tip_direction(robot.data.body_link_quat_w[:, arm])
+
+
 def pointing(env, command_name: str, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     angle = env.scene[asset_cfg.name].data.joint_pos[:, asset_cfg.joint_ids].squeeze(-1)
     command = env.command_manager.get_command(command_name)
@@ -101,6 +117,7 @@ def turntable_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     terms = {
         "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
         "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel),
+        "direction": ObservationTermCfg(func=arm_direction),
         "heading": ObservationTermCfg(
             func=mdp.generated_commands, params={"command_name": "heading"}
         ),
@@ -203,6 +220,49 @@ class PointRunner(MjlabOnPolicyRunner):
         assert list(folder.glob("*.mp4")), "no video was written"
 
 
+class PointPPO(PPO):
+    """PPO with the arguments of this release, and a learning rate that never changes."""
+
+    def __init__(
+        self,
+        actor,
+        critic,
+        storage,
+        num_learning_epochs=5,
+        num_mini_batches=4,
+        clip_param=0.2,
+        gamma=0.99,
+        lam=0.95,
+        value_loss_coef=1.0,
+        entropy_coef=0.01,
+        learning_rate=1e-3,
+        max_grad_norm=1.0,
+        optimizer="adam",
+        use_clipped_value_loss=True,
+        schedule="adaptive",
+        desired_kl=0.01,
+        normalize_advantage_per_mini_batch=False,
+        device="cpu",
+        rnd_cfg=None,
+        symmetry_cfg=None,
+        multi_gpu_cfg=None,
+    ):
+        super().__init__(
+            actor,
+            critic,
+            storage,
+            num_learning_epochs=num_learning_epochs,
+            num_mini_batches=num_mini_batches,
+            entropy_coef=entropy_coef,
+            learning_rate=learning_rate,
+            schedule="fixed",
+            device=device,
+            rnd_cfg=rnd_cfg,
+            symmetry_cfg=symmetry_cfg,
+            multi_gpu_cfg=multi_gpu_cfg,
+        )
+
+
 def turntable_rl_cfg() -> RslRlOnPolicyRunnerCfg:
     return RslRlOnPolicyRunnerCfg(
         actor=RslRlModelCfg(
@@ -215,6 +275,8 @@ def turntable_rl_cfg() -> RslRlOnPolicyRunnerCfg:
             },
         ),
         critic=RslRlModelCfg(hidden_dims=(16,), obs_normalization=True),
-        algorithm=RslRlPpoAlgorithmCfg(num_mini_batches=1),
+        algorithm=RslRlPpoAlgorithmCfg(
+            num_mini_batches=1, class_name="tasks_1_6.turntable:PointPPO"
+        ),
         experiment_name="tasks_1_6_turntable",
     )
