@@ -107,14 +107,16 @@ class UniformVelocityCommandCfg(CommandTermCfg):
             )
 
     def build(self, env: ManagerBasedRlEnv) -> UniformVelocityCommand:
-        """Build the term. Raises `ValueError` for invalid ranges or fractions."""
+        """Build the term. Raises `ValueError` for contradictory heading settings."""
         return UniformVelocityCommand(self, env)
 
 
 def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
-    """Raise `ValueError` for invalid ranges or heading settings; warn of invalid fractions."""
+    """Raise `ValueError` for contradictory heading settings; warn of odd ranges and fractions."""
     for name in RANGES:
-        check_range(f"ranges.{name}", getattr(cfg.ranges, name))
+        # A curriculum may replace them before they are used.
+        with warned():
+            check_range(f"UniformVelocityCommandCfg ranges.{name}", getattr(cfg.ranges, name))
     if cfg.heading_command != (cfg.ranges.heading is not None):
         expected = "a range" if cfg.heading_command else "None"
         raise ValueError(
@@ -122,7 +124,8 @@ def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
             f"{cfg.ranges.heading}."
         )
     if cfg.ranges.heading is not None:
-        check_range("ranges.heading", cfg.ranges.heading)
+        with warned():
+            check_range("UniformVelocityCommandCfg ranges.heading", cfg.ranges.heading)
     for name in _PROBABILITIES:
         with warned():
             check_in_range(f"UniformVelocityCommandCfg {name}", getattr(cfg, name), 0.0, 1.0)
