@@ -194,12 +194,6 @@ def test_a_profiles_name_is_one_word(name):
         )
 
 
-def test_a_task_without_a_learner_is_refused():
-    with pytest.raises(ValueError, match="'Test' rl_cfg"):
-        register_mjlab_task("Test", env_cfg())
-    assert "Test" not in list_tasks()
-
-
 @pytest.mark.parametrize("load", [load_env_cfg, load_rl_cfg, load_runner_cls, require_task])
 def test_an_unknown_task_is_a_key_error_with_the_nearest_names(load):
     with pytest.raises(UnknownTaskError, match="did you mean 'Mjlab-Cartpole-Balance'") as caught:
@@ -277,3 +271,9 @@ def test_the_file_that_registers_a_task_is_its_source():
     source = task_source("Mjlab-Cartpole-Swingup")
     assert source is not None
     assert source.endswith("mjlab/tasks/cartpole/__init__.py")
+
+
+def test_a_task_without_a_learner_has_the_default():
+    with pytest.warns(UserWarning, match="'NoLearner' rl_cfg: expected a learner config"):
+        register_mjlab_task("NoLearner", env_cfg(), env_cfg(), None)
+    assert load_rl_cfg("NoLearner") == RslRlOnPolicyRunnerCfg()

@@ -20,6 +20,7 @@ import logging
 import pkgutil
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -44,6 +45,7 @@ ENTRY_POINT_GROUP = "mjlab.tasks"
 _COMPAT_MODULES = frozenset({"torchrunx", "mediapy", "moviepy"})
 _tasks: dict[str, _Task] = {}
 _discovered = False
+_DEFAULT_RL_CFG = "mjlab.rl.config:RslRlOnPolicyRunnerCfg"
 
 
 def register_mjlab_task(
@@ -63,7 +65,7 @@ def register_mjlab_task(
             function as `module:function`. Names are imported on first use.
         play_env_cfg: Play environment config, in the forms of `env_cfg`. None: the function of
             `env_cfg`, called with `play=True` if it has that parameter, or the config of `env_cfg`.
-        rl_cfg: Learner config, in the forms of `env_cfg`.
+        rl_cfg: Learner config, in the forms of `env_cfg`. None: the default PPO, with a warning.
         runner_cls: Runner class, or its name as `module:Class`. None: the default runner.
         profiles: Named variants of the configs, such as `cpu` for training on a few cores. Each is a
             function `(env_cfg, rl_cfg)`, or its name as `module:function`, that edits copies of
@@ -75,13 +77,16 @@ def register_mjlab_task(
             `TaskOptions`), or its name as `module:Class`.
 
     Raises:
-        ValueError: the name is taken, `rl_cfg` is missing, or a profile name is not a single word.
+        ValueError: the name is taken, or a profile name is not a single word.
     """
     if task_id in _tasks:
         raise ValueError(f"A task named {task_id!r} is registered already; choose another name.")
     if rl_cfg is None:
-        raise ValueError(
-            f"Task {task_id!r} rl_cfg: expected a learner config, such as RslRlOnPolicyRunnerCfg, got None."
+        rl_cfg = _DEFAULT_RL_CFG
+        warnings.warn(
+            f"Task {task_id!r} rl_cfg: expected a learner config, got None; {rl_cfg}() is used.",
+            UserWarning,
+            stacklevel=2,
         )
     for profile in profiles or {}:
         if not profile.replace("-", "_").isidentifier() or profile == "None":
