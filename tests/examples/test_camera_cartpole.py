@@ -42,7 +42,5 @@ def test_it_trains(example, tmp_path, monkeypatch) -> None:
     sizes = ["--num-envs", "4", "--agent.max-iterations", "1", "--agent.num-steps-per-env", "4"]
     argv = ["mjlab", "train", TASK, *sizes, "--device", "cpu", "--log-root", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", argv)
-    with pytest.raises(SystemExit) as ended:
-        example["main"]()
-    assert not ended.value.code
+    example["main"]()
     assert list(tmp_path.glob("camera_cartpole/*/*.onnx"))

@@ -72,7 +72,7 @@ def run_script(script: str, *argv: str) -> Outcome:
 def run_main(main: Callable[[], None], name: str, *argv: str) -> Outcome:
     """Call the entry point `main` as the command `name` with `argv`."""
     out, err = io.StringIO(), io.StringIO()
-    before = sys.argv
+    before, status = sys.argv, 0
     sys.argv = [name, *argv]
     try:
         with (

@@ -12,6 +12,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.runners import OnPolicyRunner
 
 from mjlab.rl import MjlabOnPolicyRunner
+from mjlab.scripts import train
 from mjlab.scripts.run_folder import read_run_info
 from mjlab.tasks import registry
 
@@ -148,6 +149,14 @@ def test_files_of_a_runner_resume_and_play(run, own_task, tmp_path):
         outcome = run(*flags)
         assert outcome.status == 0, outcome.err
         assert SEEN["loaded"] == 0.5
+
+
+def test_main_returns_after_training(own_task, tmp_path, monkeypatch):
+    own_task(OwnRunner)
+    argv = ["train", OWN, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "3"]
+    monkeypatch.setattr("sys.argv", argv)
+    train.main()
+    assert SEEN["learned"] == 3
 
 
 def test_a_failed_runner_keeps_its_folder(run, own_task, tmp_path):

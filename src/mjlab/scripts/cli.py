@@ -15,7 +15,6 @@ import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NoReturn
 
 from mjlab.scripts import prepare_threads
 from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
@@ -383,8 +382,8 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
     getattr(importlib.import_module(module), function)(argv, prog)
 
 
-def run_alias(name: str) -> NoReturn:
-    """Run the subcommand `name` with the arguments of this process, and exit."""
+def run_alias(name: str) -> None:
+    """Run the subcommand `name` with the arguments of this process; exits on errors."""
     run_command(lambda argv: run_subcommand(_BY_NAME[name], argv, name))
 
 
@@ -473,8 +472,8 @@ class _Once(logging.Filter):
         return is_new
 
 
-def run_command(command: Callable[[list[str]], None]) -> NoReturn:
-    """Run `command` with the command line's arguments and exit.
+def run_command(command: Callable[[list[str]], None]) -> None:
+    """Run `command` with the command line's arguments; return if it succeeds, else exit.
 
     Errors that a user can fix (`MjlabError`, `ValueError`, `OSError`) are printed as one message;
     the exit status is `MjlabError.exit_status`, else 1. Other errors keep their traceback.
@@ -520,7 +519,6 @@ def run_command(command: Callable[[list[str]], None]) -> NoReturn:
             print(f"error{process}: {text}", file=sys.stderr)
             print(f"(Set {TRACEBACK_VARIABLE}=1 for the traceback.)", file=sys.stderr)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
-    sys.exit(0)
 
 
 if __name__ == "__main__":
