@@ -162,6 +162,21 @@ def test_keyframe_of_the_xml_holds():
     env.close()
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_controls_of_the_keyframe_start_episodes(engine):
+    key = '<keyframe><key qpos="0 0 1 1 0 0 0 .03 .03" ctrl=".5 .02 0"/></keyframe>'
+    actuators = '<motor joint="f1"/><position joint="f2" kp="1"/><position joint="f1" kp="1"/>'
+    env = make_env(actuators, key=key, engine=engine)
+    env.reset()
+    expected = torch.tensor([[0.5, 0.02, 0.03]] * 2)
+    torch.testing.assert_close(env.sim.data.ctrl.clone(), expected)
+    env.sim.data.ctrl[:] = 0.7
+    env.reset(env_ids=torch.tensor([1]))
+    torch.testing.assert_close(env.sim.data.ctrl[1].clone(), expected[1])
+    assert env.sim.data.ctrl[0].eq(0.7).all()
+    env.close()
+
+
 def test_targets_of_reset_events_stay():
     def close(env, env_ids):
         env.sim.data.ctrl[env_ids] = 0.01

@@ -17,6 +17,7 @@ from mjlab.actuator.fused_group import FusedActuatorGroup
 from mjlab.actuator.position_hold import PositionHold
 from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS
 from mjlab.entity.building import (
+    KEY_NAME,
     Found,
     add_key,
     build_actuators,
@@ -48,7 +49,8 @@ class EntityArticulationInfoCfg:
 
     actuators: tuple[ActuatorCfg, ...] = ()
     """Actuators to add, or to take over from the XML. XML actuators that no config lists stay in
-    the model with zero control; position actuators among them hold their length after a reset."""
+    the model. After a reset, position actuators among them hold their length, and others have zero
+    control; with a keyframe as initial state, both have its control."""
     soft_joint_pos_limit_factor: float = 1.0
     """Range of the soft joint limits as a fraction of the joint range, about the same center."""
 
@@ -282,7 +284,9 @@ class Entity:
         self._fused_group.initialize(data.nworld, device)
         ids = [actuator.id for actuator in self._spec.actuators]
         listed = {i for one in self._actuators for i in one.global_element_ids.tolist()}
-        self._position_hold = PositionHold(mj_model, data, ids, {*ids} - listed, device)
+        uses_key = self.xml_key is not None and self.cfg.init_state.joint_pos is None
+        keyframe = mj_model.key(KEY_NAME).ctrl if uses_key else None
+        self._position_hold = PositionHold(mj_model, data, ids, {*ids} - listed, keyframe, device)
         if self.has_tendon_actuators:
             # Engines compute a field after its first access.
             _ = self._data.tendon_len
@@ -623,7 +627,7 @@ class Entity:
 
         A reset sets all targets to zero, so position actuators would pull toward zero until the
         first action. Called after the reset events, this holds joints and tendons where the events
-        placed them, and sets the controls of position actuators without a config. With
+        placed them, and sets the controls of XML actuators without a config. With
         `seeds_lengths`, `sim.forward(env_ids, stage="pos")` must precede.
         """
         rows = as_index(env_ids)
