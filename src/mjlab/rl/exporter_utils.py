@@ -412,6 +412,11 @@ def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
     try:
         policy = OnnxPolicy(path, device, env.unwrapped.num_envs)
         policy.check_fits(env.unwrapped)
+        if not policy.metadata.keys() & set(_INTERFACE):
+            logger.warning(
+                "The policy %s has no metadata of observations and actions: their order and scale are "
+                "taken from this environment.", path
+            )  # fmt: skip
         # One call, so that a damaged graph raises here.
         shapes = env.unwrapped.observation_manager.group_obs_dim
         policy({name: torch.zeros(2, *shapes[name], device=device) for name in policy.groups})

@@ -98,6 +98,19 @@ def test_the_exported_policy_is_played_and_scored_as_its_checkpoint_is(make_runn
         run_evaluate(G1_BLIND, cfg)
 
 
+def test_a_policy_without_metadata_is_one_warning(make_runner, tmp_path, caplog):
+    runner = make_runner()
+    path = tmp_path / "run" / "run.onnx"
+    runner.save(str(path.with_name("model_0.pt")))
+    load_onnx_policy(path, runner.env, "cpu")
+    assert "no metadata" not in caplog.text
+    model = onnx.load(path)
+    del model.metadata_props[:]
+    onnx.save(model, path)
+    load_onnx_policy(path, runner.env, "cpu")
+    assert caplog.text.count("run.onnx has no metadata") == 1
+
+
 def test_the_motions_are_kept_in_the_folder_of_the_run(make_runner, tmp_path):
     runner = make_runner(tmp_path / "run")
     runner.learn(1)
