@@ -89,7 +89,9 @@ def test_a_folder_does_not_hide_the_robot_of_its_name(tmp_path: Path, monkeypatc
         ),
         (
             "mesh.urdf",
-            URDF.format(geometry='<mesh filename="package://x/b.stl"/>'),
+            URDF.format(geometry='<mesh filename="package://x/b.stl"/>').replace(
+                "visual", "collision"
+            ),
             "'package://x/b.stl' not found",
         ),
         ("robot.pdf", "", "robot.pdf"),
