@@ -28,7 +28,7 @@ from mjlab.utils.noise import (
     NoiseModelWithAdditiveBiasCfg,
     UniformNoiseCfg,
 )
-from mjlab.utils.state import capture_state, restore_state, stateful
+from mjlab.utils.state import capture_state, restore_state
 
 
 def state(env):
@@ -387,9 +387,8 @@ def test_only_steps_fill_an_empty_history(env):
 # State that advances once per step.
 
 
-@stateful
 class Tally:
-    """Helper object that counts the calls of each environment."""
+    """Helper object, not marked, that counts the calls of each environment."""
 
     def __init__(self, num_envs):
         self.values = torch.zeros(num_envs, 1)
@@ -569,6 +568,33 @@ def test_compute_group_shows_the_last_values(env, kind):
     for _ in range(2):
         manager.compute(update_history=True)
     assert manager.compute_group("g").tolist() == [[2.0]] * 4
+
+
+def test_differences_stay_in_other_rows(env):
+    class Rate(ManagerTermBase):
+        def __init__(self, cfg, env):
+            super().__init__(env)
+            self.last = torch.zeros(env.num_envs, 1)
+
+        def reset(self, env_ids=None):
+            self.last[env_ids] = 0.0
+
+        def __call__(self, env):
+            now = env.state[:, :1].clone()
+            rate, self.last = now - self.last, now
+            return rate
+
+    env.state = torch.zeros_like(env.state)
+    manager = make(env, ObservationTermCfg(func=Rate))
+    manager.reset()
+    manager.compute(update_history=True)
+    env.state = env.state + 2.0
+    manager.compute(update_history=True)
+    ids = torch.tensor([1])
+    manager.reset(ids)
+    assert manager.compute(update_history=True, env_ids=ids)["g"].tolist() == [[2.0]] * 4
+    assert manager.compute_group("g").tolist() == [[2.0]] * 4
+    assert manager.compute(update_history=True)["g"].tolist() == [[0.0]] * 4
 
 
 def test_counters_do_not_count_partial_resets(env):

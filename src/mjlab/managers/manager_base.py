@@ -25,7 +25,7 @@ from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.managers.term_checks import check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
-from mjlab.utils.state import SKIP, plain_scalar, stateful
+from mjlab.utils.state import SKIP, mark_stateful, plain_scalar, stateful
 from mjlab.utils.string import counted, suggest
 from mjlab.utils.tables import Table, Tabular, function_name
 
@@ -267,10 +267,8 @@ class ManagerBase(Tabular, ABC):
         with label_errors(label), label_warnings(label):
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):
-            # Plain classes have run-time state too. Types not created by a class statement, such as
-            # functools.partial, cannot be marked and hold no state.
-            with contextlib.suppress(TypeError):
-                stateful(type(cfg.func))
+            # Plain classes have run-time state too.
+            mark_stateful(cfg.func)
             self._class_terms[name] = cfg.func
 
     def _construct(self, label: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> Any:
@@ -393,6 +391,7 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
                     f"{self._label(name)}: expected {type(term_cfg).__name__}.build to return "
                     f"{self._term_type.__name__}, got {type(term).__name__}."
                 )
+            mark_stateful(term)
             self._terms[name] = term
             self._live_cfgs[name] = term.cfg
 

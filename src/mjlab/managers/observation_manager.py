@@ -23,10 +23,9 @@ from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
 from mjlab.utils.state import (
-    capture_state,
     changes_undone,
-    is_same_state,
     is_stateful,
+    mark_stateful,
     stateful,
 )
 from mjlab.utils.string import counted
@@ -215,8 +214,8 @@ class ObservationManager(ManagerBase):
                 since the last reset is returned unchanged.
             env_ids: Environments that start an episode: only their state advances.
 
-        Environments that do not advance show the last values of terms whose state a call changes,
-        and current values of other terms.
+        Environments that do not advance show the last values of terms with state, and current
+        values of other terms.
 
         Raises `ValueError` for `env_ids` without `update_history`.
         """
@@ -300,30 +299,27 @@ class ObservationManager(ManagerBase):
                 undone = changes_undone([*parts, *terms])
             before = stack.enter_context(undone)
             computed = {name: group.compute(update_history, ids) for name, group in groups.items()}
-            changed = [
-                part
-                for part, state in zip(parts, before, strict=False)
-                if not is_same_state(state, capture_state(part))
-            ]
-        if changed and (update_history or self._is_current):
-            self._show_last(groups, computed, changed, ids)
+        # Also those with the same state as before: differences to the last call would be zero.
+        with_state = [part for part, state in zip(parts, before, strict=False) if state]
+        if with_state and (update_history or self._is_current):
+            self._show_last(groups, computed, with_state, ids)
         return computed
 
     def _show_last(
         self,
         groups: Mapping[str, ObservationGroup],
         computed: dict[str, Observation],
-        changed: list[Any],
+        with_state: list[Any],
         ids: torch.Tensor | None,
     ) -> None:
-        """Put the last values of terms with `changed` state into rows other than `ids`."""
+        """Put the last values of terms `with_state` into rows other than `ids`."""
         others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if ids is not None:
             others[ids] = False
         for name in groups.keys() & self._obs_buffer.keys():
             now, last = (groups[name].split(obs[name]) for obs in (computed, self._obs_buffer))
             for key, term in groups[name].terms.items():
-                if any(part is own for part in changed for own in _stateful_parts([term])):
+                if any(part is own for part in with_state for own in _stateful_parts([term])):
                     now[key][others] = last[key][others]
 
     def _prepare_terms(self) -> None:
@@ -592,7 +588,9 @@ class ObservationTerm:
         noise = self.cfg.noise
         if not isinstance(noise, NoiseModelCfg):
             return None
-        return noise.class_type(noise, num_envs=self._env.num_envs, device=self._env.device)
+        model = noise.class_type(noise, num_envs=self._env.num_envs, device=self._env.device)
+        mark_stateful(model)
+        return model
 
     def _build_delay(self) -> DelayBuffer | None:
         cfg = self.cfg

@@ -49,6 +49,21 @@ def stateful(cls: C) -> C:
     return cls
 
 
+def mark_stateful(obj: Any) -> None:
+    """Mark the class of `obj`, and the classes of objects with tensors of its own package in it.
+
+    A term written for this package often keeps its state in a helper, such as a filter.
+    """
+    with contextlib.suppress(TypeError):
+        # Types that no class statement created, such as functools.partial, hold no state.
+        stateful(type(obj))
+    for value in getattr(obj, "__dict__", {}).values():
+        items = value.values() if isinstance(value, dict) else value
+        for part in items if isinstance(value, (*_SEQUENCES, dict)) else (value,):
+            if not is_stateful(part) and _is_helper(part, type(obj)):
+                mark_stateful(part)
+
+
 def is_stateful(obj: Any) -> bool:
     """Return True if the class of `obj` is marked `stateful`."""
     return getattr(type(obj), _MARK, False)
@@ -123,17 +138,6 @@ def changes_undone(
                 if plain_scalar(vars(obj)[name]) is not SKIP:
                     delattr(obj, name)
             restore_state(obj, state)
-
-
-def is_same_state(a: Any, b: Any) -> bool:
-    """Return True if two captured states are equal."""
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        return a.dtype == b.dtype and torch.equal(a, b)
-    if isinstance(a, dict) and isinstance(b, dict):
-        return a.keys() == b.keys() and all(is_same_state(v, b[key]) for key, v in a.items())
-    if isinstance(a, list) and isinstance(b, list):
-        return len(a) == len(b) and all(map(is_same_state, a, b))
-    return type(a) is type(b) and a == b
 
 
 def _with_rows(
@@ -248,6 +252,17 @@ def _owns_its_values(tensor: torch.Tensor) -> bool:
     return not any(
         stride == 0 and size > 1 for stride, size in zip(tensor.stride(), tensor.shape, strict=True)
     )
+
+
+def _is_helper(obj: Any, owner: type) -> bool:
+    """Return True for an object with tensors of the same package as `owner`."""
+    package = owner.__module__.partition(".")[0]
+    if isinstance(obj, type) or type(obj).__module__.partition(".")[0] != package:
+        return False
+    if any(base.__module__.startswith("mjlab.") for base in type(obj).__mro__):
+        return False  # Environments and entities save their own state.
+    values = getattr(obj, "__dict__", {}).values()
+    return any(isinstance(value, (torch.Tensor, np.ndarray)) for value in values)
 
 
 def _restored(current: Any, saved: Any) -> Any:
