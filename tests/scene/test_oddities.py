@@ -160,6 +160,15 @@ def test_contacts_are_those_of_the_file(rest):
     assert contacts(sim.mj_model, "thing_0/") == contacts(alone, "")
 
 
+def test_only_bases_with_links_count_as_world():
+    """Rays are slower with geoms of a mocap body that count as world."""
+    table = '<body name="table"><geom size=".1"/></body>'
+    model = build(thing(table), thing(LINK), thing(table + LINK))[0].mj_model
+    is_world = [model.body(f"thing_{k}/mocap_base").weldid.item() == 0 for k in range(3)]
+    assert is_world == [False, True, True]
+    assert model.body("thing_2/table").weldid.item() == 0
+
+
 # Grounds and initial states.
 
 
@@ -184,6 +193,12 @@ def test_a_robot_that_starts_in_the_ground_warns_with_the_depth():
         assert re.search("'thing_0'.*0.350 m.*'home'.*0.35", said[0])
     init = EntityCfg.InitialStateCfg(pos=(0.0, 0.0, 0.35))
     assert not build(thing(leg, key, init_state=init))[2]
+
+
+@pytest.mark.parametrize("links", ["", LINK.replace("0 0 1", "5 0 1", 1)])
+def test_a_start_in_a_fixed_base_does_not_warn(links):
+    wall = thing('<geom size=".2" pos="0 0 1"/>' + links)
+    assert not build(wall, thing(BALL, init_state=HIGH))[2]
 
 
 # Settings.

@@ -178,18 +178,19 @@ def _warn_world_elements(name: str, entity: Entity, model: mujoco.MjModel) -> No
 
 
 def _warn_buried(name: str, entity: Entity, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Warn of a floating base whose initial state is deep in static geoms.
+    """Warn of a floating base whose initial state is deep in geoms of the world.
 
     Objects without a configured position are placed by an event or a command.
     """
     pos, key = entity.cfg.init_state.pos, entity.xml_key
     if not (any(pos) or entity.is_articulated or key):
         return
+    ground = (model.body_weldid == 0) & (model.body_mocapid[model.body_rootid] < 0)
     depth = 0.0
     for contact in data.contact[: data.ncon]:
         bodies = [model.geom_bodyid[geom] for geom in contact.geom if geom >= 0]
         is_own = entity.indexing.root_body_id in model.body_rootid[bodies]
-        if is_own and 0 in model.body_weldid[bodies]:
+        if is_own and ground[bodies].any():
             depth = max(depth, -float(contact.dist))
     if depth > _DEEP:
         known = key is not None and key.root_pos not in (None, tuple(pos))

@@ -124,10 +124,15 @@ def compile_composed(spec: mujoco.MjSpec) -> mujoco.MjModel:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=_EMPTY_PREFIX)
         model = spec.compile()
-    for body in range(1, model.nbody):
-        if model.body(body).name.rsplit("/", 1)[-1] == MOCAP_BASE_NAME:
-            # MuJoCo filters contacts between a body and its parent, but not with the world.
-            model.body_weldid[model.body_weldid == body] = 0
+    for base in range(1, model.nbody):
+        if model.body(base).name.rsplit("/", 1)[-1] != MOCAP_BASE_NAME:
+            continue
+        welded = model.body_weldid == base
+        # MuJoCo filters contacts between a body and its parent, but not with the world. Bases
+        # without links keep their id, because rays are slower with geoms that are welded to the
+        # world and placed by a mocap body.
+        if (welded[model.body_parentid] & ~welded).any():
+            model.body_weldid[welded] = 0
     return model
 
 
