@@ -325,7 +325,7 @@ def test_the_render_context_is_that_of_warp():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"width": 0}, r"width: expected an integer >= 1, got 0"),
+        ({"width": -1}, r"width: expected an integer >= 0, got -1"),
         ({"height": -3}, r"height.* -3"),
         ({"width": 3.5}, r"width.* 3.5"),
         ({"data_types": ()}, r"data_types.*'rgb', 'depth', 'segmentation'.*\(\)"),
@@ -378,6 +378,16 @@ def test_odd_camera_warns_once(changes, message, engine):
     depth = scene["cam"].data.depth
     middle = depth[0, depth.shape[1] // 2, depth.shape[2] // 2]
     assert middle.item() == pytest.approx(1.5, abs=0.02)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_images_of_no_pixels_warn_once(engine):
+    with pytest.warns(UserWarning, match="expected at least 1 x 1 pixels, got 0 x 5") as caught:
+        sim, scene = scene_with(camera(width=0), camera("eye"), engine=engine)
+    assert len(caught) == 1
+    sense(sim)
+    assert scene["cam"].data.depth.shape == (1, 5, 0, 1)
+    assert scene["eye"].data.depth.max() > 0.0
 
 
 def test_a_camera_that_can_see_nothing_is_told_to_people(caplog):

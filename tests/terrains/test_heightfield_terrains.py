@@ -327,14 +327,14 @@ def test_colors_follow_height_on_one_scale():
         (rough(noise_step=0.004), "noise_step: .*vertical_scale = 0.005.*got 0.004"),
         (rough(downsampled_scale=0.05), "downsampled_scale: .*horizontal_scale = 0.1 .*got 0.05"),
         (rough(downsampled_scale=5.0), r"downsampled_scale: expected .*got 5.0"),
+        (rough(noise_step=-0.02), "noise_range: .*direction of noise_step.*got "),
         (rough(noise_range=(0.1, 0.0)), r"noise_range: expected .*got \(0.1, 0.0\)"),
         (rough(border_width=0.05), "border_width: .*>= 0.1 m.*got 0.05"),
-        (rough(border_width=4.0), r"size: .*2 x 2 pixels.*got \(8.0, 8.0\)"),
         (rough(horizontal_scale=0.0), r"horizontal_scale: expected .*got 0.0"),
         (rough(horizontal_scale=float("nan")), r"horizontal_scale: expected .*got nan"),
         (rough(vertical_scale=-0.005), r"vertical_scale: expected .*got -0.005"),
         (rough(base_thickness_ratio=0.0), r"base_thickness_ratio: expected .*got 0.0"),
-        (rough(size=(8.0, 0.1)), r"HfRandomUniformTerrainCfg.size: .*horizontal_scale = 0.1 .*got \(8.0, 0.1\)"),
+        (rough(size=(8.0, 0.1)), r"HfRandomUniformTerrainCfg.size: .*horizontal_scale = 0.1, got \(8.0, 0.1\)"),
         (wave(num_waves=0), r"HfWaveTerrainCfg.num_waves: expected .*got 0"),
         (rough(horizontal_scale=1e-320), "horizontal_scale: .*at most 10,000,000 pixels.*got 1e-320"),
         (rough(horizontal_scale=1e-3), "horizontal_scale: .*64,000,000.*got 0.001"),
@@ -384,6 +384,21 @@ def test_values_of_other_releases_are_accepted(cfg):
     surface = build(cfg).surface
     assert np.isfinite(surface).all()
     assert np.ptp(surface) < 3.0
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("border", [4.0, 4.5, 20.0])
+def test_fields_that_are_all_border_are_flat(kind, border):
+    for size in ((8.0, 8.0), (8.1, 8.1), (8.0, 12.0)):
+        built = build(ALL[kind](size=size, border_width=border))
+        assert not built.surface.any()
+        assert built.height_at(4.05, 4.05) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_noise_step_may_be_negative_like_its_range():
+    built = build(rough(noise_range=(0.1, 0.0), noise_step=-0.02, border_width=0.0))
+    levels = np.unique(built.surface.round(4))
+    np.testing.assert_allclose(levels, [0.0, 0.02, 0.04, 0.06, 0.08, 0.1], atol=1e-4)
 
 
 def test_ranges_may_fall_with_the_difficulty():

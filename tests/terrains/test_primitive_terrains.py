@@ -360,6 +360,13 @@ def test_values_of_other_releases_are_accepted(cfg):
     assert (built.model.geom_size[:, :2] > 0.0).all()
 
 
+def test_a_tilted_grid_of_negative_width_has_no_columns():
+    built = ground(BoxTiltedGridTerrainCfg(size=SIZE, grid_width=-0.5))
+    # Border, floor and platform.
+    assert built.model.ngeom == 6
+    assert [built.height(x, 4.0) for x in (0.1, 2.0, 4.0)] == pytest.approx([0.2, -2.0, 0.2])
+
+
 def test_beams_may_widen_with_the_difficulty():
     widths = []
     for difficulty, ends in ((0.0, (0.4, 0.2)), (1.0, (0.2, 0.4))):

@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from mjlab.terrains import (
     BoxFlatTerrainCfg,
     BoxPyramidStairsTerrainCfg,
+    BoxTiltedGridTerrainCfg,
     FlatPatchSamplingCfg,
+    HfPyramidSlopedTerrainCfg,
     HfRandomUniformTerrainCfg,
     SubTerrainCfg,
     TerrainGenerator,
@@ -296,9 +298,6 @@ def test_unrequested_flat_patches_are_dropped():
          "sub_terrains: .*proportion > 0"),
         ({"sub_terrains": {"a": BoxFlatTerrainCfg(proportion=0.0)}},
          r"sub_terrains: .*proportion > 0.*\{'a': "),
-        ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
-            step_height_range=(0, 0.1), step_width=0.3, border_width=2.0)}},
-         r"border_width: .* 2.0\).*got 2.0"),
         ({"sub_terrains": {"a": BoxFlatTerrainCfg(flat_patch_sampling=sampling(-1, 0.5))}},
          r"'a' \(BoxFlatTerrainCfg\) flat_patch_sampling\['spawn'\] num_patches: .*>= 0, got -1"),
         ({"sub_terrains": {"a": HfRandomUniformTerrainCfg(
@@ -325,7 +324,13 @@ def test_what_cannot_be_built_is_refused_before_anything_is(fields, message):
          r"'a' \(BoxPyramidStairsTerrainCfg\) platform_width: .* 4.0 m, got 5.0"),
         ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
             step_height_range=(0, 0.1), step_width=0.3, border_width=-1.0)}},
-         "border_width: .*>= 0 m, got -1.0"),
+         r"border_width: .*in \[0, 2.0\) m.*, got -1.0"),
+        ({"sub_terrains": {"a": BoxPyramidStairsTerrainCfg(
+            step_height_range=(0, 0.1), step_width=0.3, border_width=2.0)}},
+         r"border_width: .* 2.0\).*got 2.0"),
+        ({"sub_terrains": {"a": HfPyramidSlopedTerrainCfg(
+            slope_range=(0.1, 0.2), border_width=3.0)}}, r"border_width: .* 2.0\).*got 3.0"),
+        ({"sub_terrains": {"a": BoxTiltedGridTerrainCfg(grid_width=-0.5)}}, "grid_width: .* > 0 m"),
     ],
 )  # fmt: skip
 def test_odd_values_warn_once(fields, message):
@@ -378,9 +383,13 @@ def test_origin_must_be_a_point():
 
     with pytest.raises(ValueError, match="'a' at difficulty .*three numbers"):
         build(sub_terrains={"a": Wrong()})
-    with pytest.warns(UserWarning, match="got NaN") as caught:
-        build(sub_terrains={"a": Wrong(place=(0.0, np.nan, 0.0))}, num_rows=2)
-    assert len(caught) == 1
+    for fields in (
+        {"sub_terrains": {"a": Wrong(place=(0.0, np.nan, 0.0))}, "num_rows": 2},
+        {"size": (np.inf, 8.0)},
+    ):
+        with pytest.warns(UserWarning, match="got NaN") as caught:
+            build(**fields)
+        assert len(caught) == 1
 
 
 def test_fields_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):

@@ -111,9 +111,11 @@ class CameraSensor(Sensor[CameraSensorData]):
         super().__init__()
         self.cfg = cfg
         owner = f"Camera sensor {cfg.name!r}"
-        check_count(f"{owner} width", cfg.width)
-        check_count(f"{owner} height", cfg.height)
+        check_count(f"{owner} width", cfg.width, minimum=0)
+        check_count(f"{owner} height", cfg.height, minimum=0)
         odd = []
+        if cfg.width * cfg.height == 0:
+            odd.append(f"expected at least 1 x 1 pixels, got {cfg.width} x {cfg.height}")
         for field, allowed in (
             ("data_types", CAMERA_DATA_TYPES), ("enabled_geom_groups", range(NUM_GEOM_GROUPS)),
         ):  # fmt: skip

@@ -87,7 +87,9 @@ class SensorContext:
         ]
         for camera in self._camera_sensors:
             camera.set_context(self)
-        self._views = tuple(camera.view for camera in self._camera_sensors)
+        # Images of 0 pixels are not rendered.
+        self._rendered = [s for s in self._camera_sensors if s.view.width * s.view.height > 0]
+        self._views = tuple(camera.view for camera in self._rendered)
 
     @property
     def has_cameras(self) -> bool:
@@ -123,7 +125,7 @@ class SensorContext:
         for query in self._queries:
             query.cast(raycast)
         if self._views:
-            for camera, images in zip(self._camera_sensors, render(self._views), strict=True):
+            for camera, images in zip(self._rendered, render(self._views), strict=True):
                 camera.set_images(images)
         self.finalize()
 

@@ -27,7 +27,7 @@ from mjlab.terrains.utils import (
     lerp,
     resample_linear,
 )
-from mjlab.utils.errors import check_field, check_field_range, check_fields_positive
+from mjlab.utils.errors import check_field, check_fields_positive
 
 # A thin sheet lets fast or deep contacts through to the other side.
 MIN_BASE_THICKNESS = 0.5
@@ -186,11 +186,10 @@ class HfRandomUniformTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain, with the spawn point at the maximum height within 1 m."""
-        check_heightfield(self, "vertical_scale", "noise_step")
+        check_heightfield(self, "vertical_scale")
         pixels = divide_into_pixels(self)
-        check_field_range(self, "noise_range")
         step = int(self.noise_step / self.vertical_scale)
-        check_field(self, "noise_step", step >= 1, f">= vertical_scale = {self.vertical_scale:g} m")
+        check_field(self, "noise_step", step != 0, f">= vertical_scale = {self.vertical_scale:g} m")
         # At least two heights along each side.
         coarse, most = self.downsampled_scale, min(pixels.inner_size) / 2
         fits = coarse is None or self.horizontal_scale <= coarse <= most
@@ -201,7 +200,11 @@ class HfRandomUniformTerrainCfg(SubTerrainCfg):
         low, high = (int(factor * end / self.vertical_scale) for end in self.noise_range)
         # The first axis is the row (y).
         counts = [int(extent / spacing) for extent in pixels.inner_size[::-1]]
-        drawn = rng.choice(np.arange(low, high + step, step), size=counts)
+        levels = np.arange(low, high + step, step)
+        check_field(
+            self, "noise_range", len(levels) > 0, "(low, high) in the direction of noise_step"
+        )
+        drawn = rng.choice(levels, size=counts)
         field = add_noise(self, spec, pixels.with_border(interpolate_cubic(drawn, pixels.inner)))
         return finish(self, field, field.max_height_near_center(), rng)
 
@@ -301,11 +304,16 @@ class Pixels:
 
     @property
     def inner(self) -> tuple[int, int]:
-        """Number of rows and columns inside the border."""
-        return self.rows - 2 * self.border, self.cols - 2 * self.border
+        """Number of rows and columns inside the border, at least 2."""
+        return max(self.rows - 2 * self.border, 2), max(self.cols - 2 * self.border, 2)
 
     def with_border(self, inner: np.ndarray) -> np.ndarray:
-        """Pad heights inside the border, (rows, cols), to the whole field."""
+        """Pad heights inside the border, (rows, cols), to the whole field.
+
+        A field without 2 x 2 pixels inside the border is flat.
+        """
+        if min(self.rows, self.cols) - 2 * self.border < 2:
+            return np.zeros((self.rows, self.cols), inner.dtype)
         return np.pad(inner, self.border)
 
 
@@ -315,7 +323,7 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
     Columns divide the x size and rows the y size, both rounded down.
 
     Raises:
-        ValueError: pixels or border do not fit the size.
+        ValueError: pixels do not fit the size, or the border is smaller than a pixel.
     """
     check_fields_positive(cfg, pixel_field)
     pixel, border_width = getattr(cfg, pixel_field), getattr(cfg, "border_width")  # noqa: B009
@@ -329,14 +337,12 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
     border = max(int(border_width / pixel), 0)
     cols, rows = (int(extent / pixel) for extent in cfg.size)
     check_field(
-        cfg, "size", min(rows, cols) - 2 * border >= 2,
-        f"at least 2 x 2 pixels inside the border with {pixel_field} = {pixel:g} and border_width "
-        f"= {border_width:g}",
+        cfg, "size", min(rows, cols) >= 2, f"at least 2 x 2 pixels with {pixel_field} = {pixel:g}",
     )  # fmt: skip
+    pixels = Pixels(rows, cols, border, (cfg.size[0], cfg.size[1]))
     if border == 0:
-        return Pixels(rows, cols, 0, (cfg.size[0], cfg.size[1]))
-    inner_size = ((cols - 2 * border) * pixel, (rows - 2 * border) * pixel)
-    return Pixels(rows, cols, border, inner_size)
+        return pixels
+    return Pixels(rows, cols, border, (pixels.inner[1] * pixel, pixels.inner[0] * pixel))
 
 
 def check_heightfield(cfg: SubTerrainCfg, *scales: str) -> None:

@@ -393,9 +393,10 @@ class _Grid:
 def _lay_out(
     cfg: BoxRandomGridTerrainCfg | BoxTiltedGridTerrainCfg, center: tuple[float, float]
 ) -> _Grid:
-    check_fields_positive(cfg, "grid_width")
+    check_field(cfg, "grid_width", cfg.grid_width != 0.0, "a number > 0")
+    # A negative width has negative numbers of cells, and so none.
     counts = tuple(int((side - 2.0 * cfg.border_width) / cfg.grid_width) for side in cfg.size)
-    check_field(cfg, "grid_width", min(counts) >= 1, "a width that fits inside the border")
+    check_field(cfg, "grid_width", 0 not in counts, "a width that fits inside the border")
     border = tuple(
         (side - count * cfg.grid_width) / 2 for side, count in zip(cfg.size, counts, strict=True)
     )

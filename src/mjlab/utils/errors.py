@@ -115,14 +115,6 @@ def check_fields_positive(cfg: Any, *fields: str) -> None:
         check_field(cfg, field, 0.0 < getattr(cfg, field) < math.inf, "a finite number > 0")
 
 
-def check_field_range(cfg: Any, field: str, lowest: float = -math.inf) -> None:
-    """Raise `ValueError` unless the field is (low, high) with `lowest` <= low <= high, finite."""
-    low, high = getattr(cfg, field)
-    holds = math.isfinite(low) and math.isfinite(high) and lowest <= low <= high
-    bound = "" if lowest == -math.inf else f"{lowest:g} <= "
-    check_field(cfg, field, holds, f"finite (low, high) with {bound}low <= high")
-
-
 def check_exists(
     kind: str, name: str, available: Iterable[str], error: type[Exception] = ValueError
 ) -> None:
