@@ -79,6 +79,31 @@ def test_columns_are_found_by_the_names_of_a_header(tmp_path, mark):
     np.testing.assert_allclose(motion.joint_pos, expected.joint_pos, atol=1e-6)
 
 
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+def test_quaternions_may_stand_before_positions(tmp_path, order):
+    expected = motion_of(tmp_path, table())
+    quat = [f"q{letter}" for letter in order]
+    columns = [*("xyzw".index(letter) + 3 for letter in order), 0, 1, 2, *range(7, 36)]
+    header = ",".join([*quat, "x", "y", "z", *JOINTS])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        motion = motion_of(tmp_path, table()[:, columns], header)
+    np.testing.assert_allclose(motion.body_pos_w, expected.body_pos_w, atol=1e-6)
+
+
+def test_headers_without_the_joints_warn(tmp_path):
+    expected = motion_of(tmp_path, table())
+    names = [*("x", "y", "z", "qx", "qy", "qz", "qw"), "other", *JOINTS[1:]]
+    with pytest.warns(UserWarning, match=f"{JOINTS[0]}.*order of the robot") as warned:
+        motion = motion_of(tmp_path, table(), ",".join(names))
+    assert len(warned) == 1
+    np.testing.assert_array_equal(motion.body_pos_w, expected.body_pos_w)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        motion = motion_of(tmp_path, table(), ",".join(map(str, range(36))))
+    np.testing.assert_array_equal(motion.body_pos_w, expected.body_pos_w)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -102,6 +102,14 @@ def test_quaternions_with_w_last_are_found(order):
         assert_equal(arranged("", motion, G1), NO_NAMES)
 
 
+def test_joints_that_move_alike_stay_in_their_columns():
+    squat = replace(read_motion(shipped_motions()["squat"]), joint_names=(), body_names=())
+    motion = replace(squat, body_quat_w=np.roll(squat.body_quat_w, -1, axis=-1))
+    with pytest.warns(UserWarning, match="0 joints and 0 bodies"):
+        found = arranged("", motion, G1)
+    np.testing.assert_array_equal(found.joint_pos, squat.joint_pos)
+
+
 def test_columns_follow_the_names_of_the_file():
     joints, bodies = shuffled()
     motion = replace(

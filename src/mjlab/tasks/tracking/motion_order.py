@@ -34,6 +34,8 @@ _NOTABLE = 1e-2
 # Retargeted motions exceed limits by some tenths.
 _OUTSIDE = 0.4
 _WITHIN = 0.1
+# Difference in error (m, chord) between joints that move alike, such as two at rest.
+_ALIKE = 1e-5
 _MAX_TELLING = 32
 _NUM_SPREAD = 8
 
@@ -354,6 +356,9 @@ class _Frames:
             away = torch.maximum(torch.cdist(pos, self.pos[:, bodies_left]), chord)
             # (choices, bodies left)
             error = away.amax(dim=0).numpy()
+            if tuple(columns) in choices:
+                # Joints that move alike stay in their columns.
+                error[choices.index(tuple(columns))] -= _ALIKE
             choice, found = np.unravel_index(error.argmin(), error.shape)
             if error[choice, found] > _TOLERANCE:
                 return None

@@ -213,8 +213,8 @@ def read_csv(
     """Read a recording from a CSV file.
 
     With a header, joints are found by name, with or without the ending `_joint` or `_dof`; columns of
-    the root by their last letter (`qw`, `root_rot_x`); columns `frame` and `time` are not read. Without
-    these letters, the quaternion is taken as (w, x, y, z), with a warning, if only then the robot
+    the root by their last letter (`qw`, `root_rot_x`); columns `frame` and `time` are not read. A header
+    without the joints is a warning, and not used. Without these letters, the quaternion is taken as (w, x, y, z), with a warning, if only then the robot
     stands upright.
 
     Args:
@@ -248,6 +248,15 @@ def read_csv(
     if not np.isfinite(table).all():
         line = int(np.argwhere(~np.isfinite(table))[0][0]) + first
         raise MotionFileError(f"Line {line} of {path}: expected finite numbers, got NaN or inf.")
+    if names and not is_named:
+        plain = [_plain(name) for name in names]
+        warnings.warn(
+            f"{path}: expected one column for each joint of the robot in the header, got others for "
+            f"{[name for name in joint_names if plain.count(_plain(name)) != 1]}; the names are "
+            "ignored, and the columns taken in the order of the robot.",
+            UserWarning,
+            stacklevel=2,
+        )
     quat = table[:, root[3:]]
     norms = np.linalg.norm(quat, axis=1, keepdims=True)
     wrong = np.flatnonzero(np.abs(norms[:, 0] - 1.0) > _QUAT_TOLERANCE)
@@ -291,8 +300,10 @@ def _columns(names: Sequence[str], joint_names: Sequence[str]) -> tuple[list[int
     }
     rest = [i for i in range(len(names)) if i not in {*joints, *skipped}]
     letters = "".join(plain[i][-1] for i in rest)
-    # The quaternion is the block with w.
-    for start in (3, 0) if len(rest) == _ROOT_COLUMNS else ():
+    # The quaternion is the block with w, and its names differ in the last letter only: in
+    # qx qy qz qw x y z, it is not qw x y z.
+    starts = (3, 0) if len(rest) == _ROOT_COLUMNS else ()
+    for start in sorted(starts, key=lambda k: len({plain[i][:-1] for i in rest[k : k + 4]})):
         quat, pos = rest[start : start + 4], rest[:start] + rest[start + 4 :]
         letter = {i: letters[rest.index(i)] for i in rest}
         if sorted(letter[i] for i in quat) == list("wxyz"):
@@ -314,13 +325,15 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
     try:
         with path.open(encoding="utf-8") as file:
             cells = file.readline().lstrip("\ufeff# ").rstrip().split(",")
-            is_header = len(cells) > 1 and not any(map(_is_number, cells))
+            is_named = len(cells) > 1 and not any(map(_is_number, cells))
+            # Some tools number the columns of a table without names.
+            is_header = is_named or cells == [str(i) for i in range(len(cells))]
             file.seek(0)
             with warnings.catch_warnings():
                 # np.loadtxt warns about empty files; `read_csv` raises for them.
                 warnings.simplefilter("ignore", UserWarning)
                 table = np.loadtxt(file, delimiter=",", ndmin=2, skiprows=int(is_header))
-        return cells if is_header else [], table
+        return cells if is_named else [], table
     except ValueError as error:
         raise MotionFileError(
             f"{path} is not a table of numbers (comma-separated): {error}"
