@@ -233,23 +233,24 @@ def test_generators_continue_on_request():
     assert draw(True) == draw(True) == draw(False) != draw(True)
 
 
-def test_helpers_with_tensors_are_marked():
+def test_helpers_with_rows_are_marked():
     class Filter:
         def __init__(self):
             self.values = torch.zeros(3)
 
-    class Settings:
-        size = 3.0
+    class Motion:
+        def __init__(self):
+            self.values = torch.zeros(100, 2)
 
     class Term:
         def __init__(self):
             self.filters = {"a": Filter()}
-            self.settings = Settings()
+            self.motion = Motion()
             self.network = torch.nn.Linear(1, 1)
 
     term = Term()
-    mark_stateful(term)
+    mark_stateful(term, 3)
     assert is_stateful(term)
     assert is_stateful(term.filters["a"])
-    assert not is_stateful(term.settings)
+    assert not is_stateful(term.motion)
     assert not is_stateful(term.network)

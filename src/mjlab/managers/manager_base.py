@@ -268,7 +268,7 @@ class ManagerBase(Tabular, ABC):
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):
             # Plain classes have run-time state too.
-            mark_stateful(cfg.func)
+            mark_stateful(cfg.func, self.num_envs)
             self._class_terms[name] = cfg.func
 
     def _construct(self, label: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> Any:
@@ -391,7 +391,7 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
                     f"{self._label(name)}: expected {type(term_cfg).__name__}.build to return "
                     f"{self._term_type.__name__}, got {type(term).__name__}."
                 )
-            mark_stateful(term)
+            mark_stateful(term, self.num_envs)
             self._terms[name] = term
             self._live_cfgs[name] = term.cfg
 

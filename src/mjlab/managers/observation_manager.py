@@ -589,7 +589,7 @@ class ObservationTerm:
         if not isinstance(noise, NoiseModelCfg):
             return None
         model = noise.class_type(noise, num_envs=self._env.num_envs, device=self._env.device)
-        mark_stateful(model)
+        mark_stateful(model, self._env.num_envs)
         return model
 
     def _build_delay(self) -> DelayBuffer | None:

@@ -49,10 +49,10 @@ def stateful(cls: C) -> C:
     return cls
 
 
-def mark_stateful(obj: Any) -> None:
-    """Mark the class of `obj`, and the classes of objects with tensors of its own package in it.
+def mark_stateful(obj: Any, num_envs: int) -> None:
+    """Mark the class of `obj`, and those of helpers in it with a row per environment, such as filters.
 
-    A term written for this package often keeps its state in a helper, such as a filter.
+    Helpers are objects of the same package. Others, such as motions, hold data and no state.
     """
     with contextlib.suppress(TypeError):
         # Types that no class statement created, such as functools.partial, hold no state.
@@ -60,8 +60,8 @@ def mark_stateful(obj: Any) -> None:
     for value in getattr(obj, "__dict__", {}).values():
         items = value.values() if isinstance(value, dict) else value
         for part in items if isinstance(value, (*_SEQUENCES, dict)) else (value,):
-            if not is_stateful(part) and _is_helper(part, type(obj)):
-                mark_stateful(part)
+            if not is_stateful(part) and _is_helper(part, type(obj), num_envs):
+                mark_stateful(part, num_envs)
 
 
 def is_stateful(obj: Any) -> bool:
@@ -254,15 +254,15 @@ def _owns_its_values(tensor: torch.Tensor) -> bool:
     )
 
 
-def _is_helper(obj: Any, owner: type) -> bool:
-    """Return True for an object with tensors of the same package as `owner`."""
+def _is_helper(obj: Any, owner: type, num_envs: int) -> bool:
     package = owner.__module__.partition(".")[0]
     if isinstance(obj, type) or type(obj).__module__.partition(".")[0] != package:
         return False
     if any(base.__module__.startswith("mjlab.") for base in type(obj).__mro__):
         return False  # Environments and entities save their own state.
     values = getattr(obj, "__dict__", {}).values()
-    return any(isinstance(value, (torch.Tensor, np.ndarray)) for value in values)
+    arrays = [value for value in values if isinstance(value, (torch.Tensor, np.ndarray))]
+    return any(array.shape[:1] == (num_envs,) for array in arrays)
 
 
 def _restored(current: Any, saved: Any) -> Any:
