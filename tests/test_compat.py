@@ -220,6 +220,32 @@ def test_managers_answer_attributes_of_earlier_releases(cartpole):
     assert not terminations.time_outs.any()
 
 
+@ignore_older
+def test_running_returns_are_read_by_name(cartpole):
+    rewards = cartpole.reward_manager
+    sums = rewards._episode_sums
+    assert list(sums) == rewards.active_terms
+    (name, *_) = sums
+    assert sums[name][torch.tensor([1])].shape == (1,)
+    assert torch.equal(sums[name], rewards.episode_sum(name))
+    assert (sums[name] > 0.0).all()
+    sums[name][1] = 0.0
+    assert rewards.episode_sum(name)[1] == 0.0
+
+
+@ignore_older
+def test_terms_are_listed_by_older_attributes(cartpole):
+    observations, events = cartpole.observation_manager, cartpole.event_manager
+    for name in ("dim", "term_dim", "concatenate"):
+        value = getattr(observations, f"_group_obs_{name}")
+        assert value == getattr(observations, f"group_obs_{name}")
+    assert observations._group_obs_term_names == observations.active_terms
+    assert events._mode_term_names == events.active_terms
+    name = events.active_terms["reset"][0]
+    assert events._mode_term_cfgs["reset"][0] is events.get_term_cfg(name)
+    assert cartpole.curriculum_manager._curriculum_state == {}
+
+
 def test_applied_generalized_forces_warn_once_and_are_read(cartpole):
     robot = next(e for e in cartpole.scene.entities.values() if e.num_joints == 2)
     cartpole.sim.data.qfrc_applied[:] = torch.tensor([[1.0, 2.0], [3.0, 4.0]])

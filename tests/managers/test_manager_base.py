@@ -281,6 +281,22 @@ def test_partial_functions_are_terms(env, kind):
     manager.reset(None)
 
 
+def scaled(function):
+    @functools.wraps(function)
+    def term(env, by, **params):
+        return function(env, **params) * by
+
+    return term
+
+
+def test_decorated_terms_take_their_own_parameters(env):
+    cfg = RewardTermCfg(func=scaled(value), weight=1.0, params={"by": 3.0})
+    manager = RewardManager({"a": cfg}, env, scale_by_dt=False)
+    assert torch.equal(manager.compute(1.0), 3.0 * env.value)
+    with pytest.raises(TypeError, match="term 'a'.*'bi'"):
+        RewardManager({"a": RewardTermCfg(func=scaled(value), weight=1.0, params={"bi": 3.0})}, env)
+
+
 def test_the_printed_table_names_every_term(env):
     term = ObservationTermCfg(func=lambda env: env.value.unsqueeze(-1))
     managers = [

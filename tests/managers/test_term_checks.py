@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,6 +35,18 @@ def term(seen: list[dict], error: Exception | None = None):
 def cfg(func, **changes):
     params = {"size": 3, "asset_cfg": SceneEntityCfg("robot", joint_names=("joint_b",)), "other": 1}
     return RewardTermCfg(func=func, weight=1.0, params={**params, **changes})
+
+
+def test_checks_skip_decorated_terms_with_other_parameters(make_env, seen):
+    cost = term(seen)
+
+    @functools.wraps(cost)
+    def of_size_five(env):
+        return cost(env, 5, None)
+
+    manager = RewardManager({"a": RewardTermCfg(func=of_size_five, weight=1.0)}, make_env())
+    assert (manager.compute(1.0) == 5.0).all()
+    assert not seen
 
 
 def test_a_check_gets_the_parameters_with_selections_resolved(make_env, seen):

@@ -209,10 +209,22 @@ for _module, _passed in _PASSED_THROUGH.items():
 _ATTRIBUTES: dict[str, dict[str, str]] = {
     "Actuator": {"base_actuator": "base_actuator", "command_field": "command_field"},
     "ContactSensor": {"_slots": "contact_slots"},
+    "CurriculumManager": {"_curriculum_state": "curriculum_state"},
     "DifferentialIKAction": {"_joint_ids": "ik_joint_ids"},
     "EntityData": {"generalized_force": "generalized_force"},
+    "EventManager": {
+        "_mode_term_cfgs": "mode_term_cfgs",
+        "_mode_term_names": "mode_term_names",
+    },
     "MetricsManager": {"_episode_sums": "episode_sums", "_step_count": "step_count"},
-    "ObservationManager": {"_group_obs_term_cfgs": "group_obs_term_cfgs"},
+    "ObservationManager": {
+        "_group_obs_concatenate": "group_obs_concatenate",
+        "_group_obs_dim": "group_obs_dim",
+        "_group_obs_term_cfgs": "group_obs_term_cfgs",
+        "_group_obs_term_dim": "group_obs_term_dim",
+        "_group_obs_term_names": "group_obs_term_names",
+    },
+    "RewardManager": {"_episode_sums": "reward_sums"},
     "TerminationManager": {
         "_term_dones": "term_dones",
         "_terminated_buf": "terminated_buf",

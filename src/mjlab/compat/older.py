@@ -29,8 +29,11 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.envs.mdp.actions import DifferentialIKAction
     from mjlab.managers import (
+        CurriculumManager,
+        EventManager,
         MetricsManager,
         ObservationManager,
+        RewardManager,
         SceneEntityCfg,
         TerminationManager,
     )
@@ -352,6 +355,49 @@ def step_count(manager: MetricsManager) -> torch.Tensor:
 def episode_sums(manager: MetricsManager) -> dict[str, torch.Tensor]:
     """Return the sums of metrics over current episodes, views (N,) by name."""
     return dict(zip(manager.active_terms, manager._sum, strict=True))
+
+
+def reward_sums(manager: RewardManager) -> dict[str, torch.Tensor]:
+    """Return the sums of weighted rewards over current episodes, views (N,) by name."""
+    return {name: manager.episode_sum(name) for name in manager.active_terms}
+
+
+def curriculum_state(manager: CurriculumManager) -> dict[str, Any]:
+    """Return the last result of each term."""
+    return manager._state
+
+
+def mode_term_names(manager: EventManager) -> dict[str, list[str]]:
+    """Return the names of the events of each mode."""
+    return manager.active_terms
+
+
+def mode_term_cfgs(manager: EventManager) -> dict[str, list[Any]]:
+    """Return the live configs of the events of each mode."""
+    return {
+        mode: [manager.get_term_cfg(name) for name in names]
+        for mode, names in manager.active_terms.items()
+    }
+
+
+def group_obs_concatenate(manager: ObservationManager) -> dict[str, bool]:
+    """Return True for each group whose terms are concatenated."""
+    return manager.group_obs_concatenate
+
+
+def group_obs_dim(manager: ObservationManager) -> dict[str, Any]:
+    """Return the shape of each group, or the shapes of its terms."""
+    return manager.group_obs_dim
+
+
+def group_obs_term_dim(manager: ObservationManager) -> dict[str, list[tuple[int, ...]]]:
+    """Return the shapes of the terms of each group."""
+    return manager.group_obs_term_dim
+
+
+def group_obs_term_names(manager: ObservationManager) -> dict[str, list[str]]:
+    """Return the names of the terms of each group."""
+    return manager.active_terms
 
 
 def group_obs_term_cfgs(manager: ObservationManager) -> dict[str, list[Any]]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import offers_older_attributes
 from mjlab.managers.manager_base import ManagerTermBaseCfg, NullManager, TermListManager
 from mjlab.utils.indexing import as_index
 
@@ -23,6 +24,7 @@ class CurriculumTermCfg(ManagerTermBaseCfg):
     """
 
 
+@offers_older_attributes
 class CurriculumManager(TermListManager):
     """Calls its terms at every reset, before the state of the old episode is overwritten."""
 

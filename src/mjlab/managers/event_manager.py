@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import torch
 
-from mjlab.compat import accepts_older_fields
+from mjlab.compat import accepts_older_fields, offers_older_attributes
 from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import (
     ManagerTermBaseCfg,
@@ -60,6 +60,7 @@ class EventTermCfg(ManagerTermBaseCfg):
     0: every reset."""
 
 
+@offers_older_attributes
 class EventManager(TermFunctionSwitches, TermListManager):
     """Triggers events and recomputes the model constants that depend on their changes.
 

@@ -466,6 +466,10 @@ def check_params(
         return
     except TypeError as error:
         cause = error
+    # Decorators made with `functools.wraps` may take other parameters than the term they wrap.
+    with contextlib.suppress(TypeError, ValueError):
+        inspect.signature(function, follow_wrapped=False).bind(*leading, **params)
+        return
     owner = getattr(function, "__qualname__", type(function).__name__)
     parameters = signature.parameters.values()
     positional = [p.name for p in parameters if p.kind is not p.KEYWORD_ONLY][: len(leading)]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import offers_older_attributes
 from mjlab.managers.manager_base import (
     ManagerTermBaseCfg,
     TermFunctionSwitches,
@@ -35,6 +36,7 @@ class RewardTermCfg(ManagerTermBaseCfg):
     as a warning; it raises at the first step with another weight."""
 
 
+@offers_older_attributes
 class RewardManager(TermFunctionSwitches, TermListManager):
     """Sums weighted reward terms per step and per episode.
 
@@ -49,8 +51,8 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     _cfg_type = RewardTermCfg
     _title = "rewards"
     _shown = {"weight": "weight"}
-    # Views of `_rates`.
-    _transient = {"_step_reward", "_rows", "_scale_by_dt", "nonfinite"}
+    # Views of `_rates`, settings, and a name that state of earlier releases uses.
+    _transient = {"_step_reward", "_rows", "_scale_by_dt", "nonfinite", "_episode_sums"}
 
     def __init__(
         self,
@@ -74,7 +76,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         size = (len(self._term_names), self.num_envs)
         # Terms first: each term writes to contiguous memory.
         self._rates = torch.zeros(size, dtype=torch.float32, device=self.device)
-        self._episode_sums = torch.zeros(size, dtype=torch.float32, device=self.device)
+        self._sums = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
         labels = [self._label(name) for name in self._term_names]
@@ -99,7 +101,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         if bad is not None:
             self._rates.masked_fill_(bad, 0.0)
         scale = dt if self._scale_by_dt else 1.0
-        self._episode_sums.add_(self._rates, alpha=scale)
+        self._sums.add_(self._rates, alpha=scale)
         # Sequential, so that the sum is bitwise equal for any number of threads.
         self._reward_buf.zero_()
         for row in self._rows:
@@ -112,7 +114,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         Raises `ValueError`, listing the valid names, if the term is unknown.
         """
         self.get_term_cfg(term_name)
-        return self._episode_sums[self._term_names.index(term_name)]
+        return self._sums[self._term_names.index(term_name)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, torch.Tensor]:
         """Return `Episode_Reward/<term>` and zero the sums of `env_ids`.
@@ -125,10 +127,10 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             return {}
         index = as_index(env_ids)
         duration = self._env.max_episode_length_s
-        means = self._episode_sums[:, index].mean(dim=1)
+        means = self._sums[:, index].mean(dim=1)
         if duration > 0.0:
             means /= duration
-        self._episode_sums[:, index] = 0.0
+        self._sums[:, index] = 0.0
         return {
             f"Episode_Reward/{name}": mean
             for name, mean in zip(self._term_names, means, strict=True)

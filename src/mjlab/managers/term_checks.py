@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 from collections.abc import Callable
 from numbers import Real
@@ -49,8 +50,14 @@ def checked_when_built(check: Callable[..., object]) -> Callable[[F], F]:
 def check_term(function: Any, env: ManagerBasedRlEnv, params: dict[str, Any]) -> None:
     """Run the check attached to a term function by `checked_when_built`, if any."""
     check = getattr(function, _ATTRIBUTE, None)
-    if check is not None:
-        check(env, **params)
+    if check is None:
+        return
+    try:
+        inspect.signature(check).bind(env, **params)
+    except TypeError:
+        # `functools.wraps` copies the check to decorated terms with other parameters.
+        return
+    check(env, **params)
 
 
 # Scene and commands.
