@@ -85,13 +85,39 @@ def test_floating_bases_tied_to_the_world_warn_once(kind):
 
 def test_references_with_the_world_first_are_named():
     sensor = '<sensor><subtreecom name="all" body="world"/></sensor>'
+    sensor += '<actuator><adhesion name="glue" body="world" ctrlrange="0 1"/></actuator>'
     weld = '<equality><weld name="glue" body1="world" body2="{}"/></equality>'
     _, scene, said = build(thing(BALL, weld.format("ball") + sensor, init_state=HIGH))
     assert len(said) == 1
-    assert re.search("'thing_0'.*equality 'glue'.*sensor 'all'", said[0])
+    assert re.search("'thing_0'.*equality 'glue'.*sensor 'all'.*actuator 'glue'", said[0])
     sim, _, said = build(thing(LINK, weld.format("link") + sensor))
     assert not said
-    assert (sim.mj_model.neq, sim.mj_model.nsensor) == (1, 1)
+    assert (sim.mj_model.neq, sim.mj_model.nsensor, sim.mj_model.nu) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("rest", "named"),
+    [
+        (
+            '<contact><exclude body1="world" body2="ball"/></contact>',
+            "excludes [\"of 'world' and 'ball'\"]",
+        ),
+        ('<contact><exclude name="no" body1="ball" body2="world"/></contact>', "excludes ['no']"),
+        (
+            '<sensor><contact name="touch" body1="ball" body2="world" data="found"/></sensor>',
+            "contact sensors ['touch']",
+        ),
+        (
+            '<sensor><contact name="touch" body1="world" body2="ball" data="found"/></sensor>',
+            "contact sensors ['touch']",
+        ),
+    ],
+)
+def test_contact_filters_that_miss_the_terrain_warn_once(rest, named):
+    (said,) = build(thing(BALL, rest, init_state=HIGH))[2]
+    assert named in said
+    assert not build(thing(BALL, rest, init_state=HIGH), terrain=None)[2]
+    assert not build(thing(LINK.replace("link", "ball"), rest))[2]
 
 
 @pytest.mark.parametrize(

@@ -178,7 +178,7 @@ class Scene(Tabular):
             warnings.warn(
                 f"Entity {name!r}: dropped {', '.join(dropped)}, because MuJoCo cannot attach them; "
                 "state the world as the second body of an equality, and a body of the entity in "
-                "a sensor.",
+                "a sensor or an actuator.",
                 UserWarning,
                 stacklevel=4,
             )

@@ -231,13 +231,16 @@ def _refer_to_base(spec: mujoco.MjSpec) -> None:
             replace(sensor, "refname", "world")
     for element in (*spec.cameras, *spec.lights):
         replace(element, "targetbody", "world")
+    for actuator in spec.actuators:
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_BODY:
+            replace(actuator, "target", "world")
 
 
 def drop_references_to_world(spec: mujoco.MjSpec) -> list[str]:
     """Delete what MuJoCo cannot attach with a prefix, and return its descriptions.
 
-    These are equalities with the world as first body, and sensors of the world. As second body, the
-    world is kept.
+    These are equalities with the world as first body, and sensors and actuators of the world. As
+    second body, the world is kept.
     """
     dropped = []
     for equality in _body_equalities(spec):
@@ -249,6 +252,10 @@ def drop_references_to_world(spec: mujoco.MjSpec) -> list[str]:
     for sensor in filter(_is_of_world, spec.sensors):
         dropped.append(f"sensor {sensor.name!r} of 'world'")
         spec.delete(sensor)
+    for actuator in spec.actuators:
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_BODY and actuator.target == "world":
+            dropped.append(f"actuator {actuator.name!r} of 'world'")
+            spec.delete(actuator)
     return dropped
 
 
