@@ -570,6 +570,24 @@ def test_compute_group_shows_the_last_values(env, kind):
     assert manager.compute_group("g").tolist() == [[2.0]] * 4
 
 
+def test_terms_with_slots_run(env):
+    class Slots:
+        __slots__ = ("scale",)
+
+        def __init__(self, cfg, env):
+            self.scale = 2.0
+
+        def __call__(self, env):
+            return self.scale * env.state
+
+    manager = make(env, ObservationTermCfg(func=Slots))
+    manager.reset()
+    assert torch.equal(manager.compute(update_history=True)["g"], 2.0 * env.state)
+    manager.reset(torch.tensor([1]))
+    assert torch.equal(manager.compute_group("g"), 2.0 * env.state)
+    capture_state(manager)
+
+
 def test_differences_stay_in_other_rows(env):
     class Rate(ManagerTermBase):
         def __init__(self, cfg, env):

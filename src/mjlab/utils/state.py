@@ -55,8 +55,10 @@ def mark_stateful(obj: Any, num_envs: int) -> None:
     Helpers are objects of the same package. Others, such as motions, hold data and no state.
     """
     with contextlib.suppress(TypeError):
-        # Types that no class statement created, such as functools.partial, hold no state.
-        stateful(type(obj))
+        # Types that no class statement created, such as functools.partial, hold no state; that in
+        # `__slots__` is not read.
+        if hasattr(obj, "__dict__"):
+            stateful(type(obj))
     for value in getattr(obj, "__dict__", {}).values():
         items = value.values() if isinstance(value, dict) else value
         for part in items if isinstance(value, (*_SEQUENCES, dict)) else (value,):
