@@ -36,12 +36,12 @@ class Lookup:
     def plan(self, mask: torch.Tensor, *inputs: torch.Tensor | float) -> Lookup:
         """Plan the lookup of `mask`, (N,) bool, a function of `inputs`; return self."""
         self.mask, self.ids = mask, None
-        self._inputs, self._stamps = inputs, [version_of(value) for value in inputs]
+        self._inputs, self._stamps = inputs, [_stamp(value) for value in inputs]
         return self
 
     def take(self, *inputs: torch.Tensor | float) -> torch.Tensor | None:
         """Return the ids; None if they were not looked up or the inputs changed."""
-        if self.ids is None or self._stamps != [version_of(value) for value in inputs]:
+        if self.ids is None or self._stamps != [_stamp(value) for value in inputs]:
             return None
         return self.ids
 
@@ -62,8 +62,7 @@ def look_up(lookups: Sequence[Lookup]) -> None:
         lookup.ids = ids.to(masks.device, non_blocking=True)
 
 
-def version_of(value: torch.Tensor | float) -> Any:
-    """Return a value that differs after a write to a tensor, or for another tensor or number."""
+def _stamp(value: torch.Tensor | float) -> Any:
     if not isinstance(value, torch.Tensor):
         return value
     # Inference tensors have no version counter; a new object makes them always differ.

@@ -217,19 +217,26 @@ def test_stages_change_no_config_that_others_hold(make_env):
     assert env.cfg.commands == before
 
 
-@pytest.mark.parametrize(
-    ("stage", "message"),
-    [
-        ({"lin_vel_x": (0.0, 1.0)}, "with 'step'"),
-        ({"step": 7, "ang_vel_z": (1.0, -1.0)}, "ang_vel_z of the stage of step 7"),
-    ],
-)
-def test_stages_that_make_no_sense_are_refused_when_the_term_is_built(make_env, stage, message):
+def test_stages_without_a_step_are_an_error(make_env):
     def edit(cfg):
-        cfg.curriculum["command_vel"].params["velocity_stages"] = [stage]
+        cfg.curriculum["command_vel"].params["velocity_stages"] = [{"lin_vel_x": (0.0, 1.0)}]
 
-    with pytest.raises(ValueError, match=f"'command_vel': .*velocity_stages.*{message}"):
+    with pytest.raises(ValueError, match="'command_vel': .*velocity_stages.*with 'step'"):
         make_env(edit=edit)
+
+
+@pytest.mark.parametrize("bounds", [2.0, (1.0, -1.0), (0.0, 1.0, 2.0), (float("nan"), 1.0)])
+def test_odd_ranges_of_later_stages_warn(make_env, bounds):
+    def edit(cfg):
+        cfg.curriculum["command_vel"].params["velocity_stages"] = [
+            {"step": 0, "ang_vel_z": (0.0, 0.7)},
+            {"step": 10**9, "ang_vel_z": bounds},
+        ]
+
+    with pytest.warns(UserWarning, match="'command_vel': .*ang_vel_z of the stage of step 1000000"):
+        env = make_env(edit=edit)
+    env.reset()
+    assert env.command_manager.get_term("twist").cfg.ranges.ang_vel_z == (0.0, 0.7)
 
 
 @pytest.mark.parametrize("key", ["lin_vel", "lin_vel_X", "heading"])

@@ -120,6 +120,33 @@ def test_one_foot_counts_for_all_contacts(make_env):
     env.step(torch.zeros(env.num_envs, 12))
 
 
+def test_one_foot_counts_for_all_slots(make_env):
+    def edit(cfg):
+        params_of(cfg, "foot_slip")["asset_cfg"].site_names = ("FR",)
+        cfg.scene.sensors = tuple(
+            dataclasses.replace(s, num_slots=2, reduce="maxforce")
+            if s.name == "feet_ground_contact"
+            else s
+            for s in cfg.scene.sensors
+        )
+        cfg.rewards = {"foot_slip": cfg.rewards["foot_slip"]}
+        del cfg.observations["critic"]
+
+    with pytest.warns(UserWarning, match="'foot_slip': .*num_slots.*got 2"):
+        env = make_env(edit=edit)
+    env.reset()
+    env.scene["robot"].data.joint_vel[:] = 1.0
+    params = env.cfg.rewards["foot_slip"].params | {"command_threshold": -1.0}
+    foot = env.scene["robot"].site_names.index("FR")
+    env.sim.forward()
+    speed = env.scene["robot"].data.site_lin_vel_w[:, foot, :2].square().sum(dim=1)
+    found = env.scene["feet_ground_contact"].data.found
+    assert found.shape[1] == 8
+    slip = env.reward_manager.get_term_cfg("foot_slip")
+    cost = slip.func(env, **(params | {"asset_cfg": slip.params["asset_cfg"]}))
+    torch.testing.assert_close(cost, (found > 0).sum(dim=1) * speed)
+
+
 def test_a_foot_less_is_refused(make_env):
     def edit(cfg):
         params_of(cfg, "foot_slip")["asset_cfg"].site_names = ("FR", "FL", "RR")

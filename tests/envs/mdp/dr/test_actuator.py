@@ -52,6 +52,16 @@ def test_servo_gains_scale_the_defaults_and_keep_their_signs(make_world: Any, en
     assert model.actuator_biasprm[:, 0, 2].tolist() == [-2.0, -6.0, -2.0, -2.0]
 
 
+def test_the_first_two_of_three_numbers_are_the_range(make_world: Any) -> None:
+    world = make_world(actuators=(POSITION,))
+    with pytest.warns(UserWarning, match=r"kp_range: .*first two"):
+        world.apply(dr.pd_gains, kp_range=(2.0, 2.0, 9.0), kd_range=(1.0, 1.0))
+    assert world.sim.model.actuator_gainprm[:, 0, 0].tolist() == [40.0] * 4
+    with pytest.warns(UserWarning, match=r"effort_limit_range: .*first two"):
+        world.apply(dr.effort_limits, effort_limit_range=(2.0, 2.0, 9.0))
+    assert world.sim.model.actuator_forcerange[0, 0].tolist() == [-10.0, 10.0]
+
+
 def test_single_actuators_are_selected_across_groups(make_world: Any) -> None:
     # "ankle" is the third actuator, and the second target of the second group.
     world = make_world(actuators=(POSITION, IDEAL))

@@ -6,8 +6,9 @@ tensors.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -84,7 +85,7 @@ def pd_gains(
         TypeError: a selected actuator has no gains, such as a motor or a muscle.
     """
     dist, op = resolve_distribution(distribution), _operation("pd_gains", operation)
-    bounds = read_bounds(kp_range, "kp_range"), read_bounds(kd_range, "kd_range")
+    bounds = _first_two(kp_range, "kp_range"), _first_two(kd_range, "kd_range")
     chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     locations = [_locate_gains(env, selected) for selected in chosen]
     for selected, gains in zip(chosen, locations, strict=True):
@@ -133,7 +134,7 @@ def effort_limits(
             commands but without an effort limit.
     """
     dist, op = resolve_distribution(distribution), _operation("effort_limits", operation)
-    bounds = read_bounds(effort_limit_range, "effort_limit_range")
+    bounds = _first_two(effort_limit_range, "effort_limit_range")
     chosen = list(selected_actuators(env, as_ids(env_ids, env.num_envs, env.device), asset_cfg))
     locations = [_locate_limits(env, selected) for selected in chosen]
     for selected, (columns, targets) in zip(chosen, locations, strict=True):
@@ -150,6 +151,18 @@ def effort_limits(
                 # Effort = control * gain; only XML motors have a gain other than 1.
                 unit = _default(env, selected.rows, columns, "actuator_gainprm", 0).abs()
             _write(env, selected.rows, at, parameter, op, samples, unit)
+
+
+def _first_two(bounds: Any, name: str) -> tuple[float, float]:
+    """Return the first two numbers of a range; warn of more."""
+    if isinstance(bounds, (tuple, list)) and len(bounds) > 2:
+        warnings.warn(
+            f"{name}: expected a pair of numbers, got {bounds!r}; using the first two.",
+            UserWarning,
+            stacklevel=3,
+        )
+        bounds = bounds[:2]
+    return read_bounds(bounds, name)
 
 
 def _operation(function: str, operation: Operation | str) -> Operation:

@@ -20,7 +20,13 @@ from mjlab.entity.building import short_name
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.managers import RewardTermCfg, SceneEntityCfg
 from mjlab.managers.scene_entity_config import columns_of
-from mjlab.managers.term_checks import checked_when_built, require_command
+from mjlab.managers.term_checks import (
+    checked_when_built,
+    require_command,
+    require_fields,
+    require_sensor,
+)
+from mjlab.sensor import ContactSensor
 from mjlab.tasks.velocity.mdp.observations import (
     Source,
     check_air_time_sensor,
@@ -479,7 +485,15 @@ def _check_slip(
     **_: Any,
 ) -> None:
     require_command(env, command_name)
-    check_same_feet(env, contact_columns(env, sensor_name), site_columns(env, asset_cfg))
+    sites = site_columns(env, asset_cfg)
+    sensor = require_sensor(env, sensor_name, ContactSensor)
+    if len(sites.columns) > 1 or sensor.cfg.num_slots == 1:
+        check_same_feet(env, contact_columns(env, sensor_name), sites)
+        return
+    # The speed of a single site counts for every slot.
+    require_fields(sensor, "found")
+    with warned():
+        check_one_slot(env, sensor_name)
 
 
 @checked_when_built(_check_slip)
