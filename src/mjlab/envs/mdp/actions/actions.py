@@ -10,7 +10,6 @@ import torch
 
 from mjlab.actuator.actuator import TransmissionType, constant_within_step
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
-from mjlab.managers.lookup import version_of
 from mjlab.managers.manager_base import label_errors
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names, resolve_matching_names_values
@@ -59,7 +58,6 @@ class BaseAction(ActionTerm):
         "_own_offset",
         "_default_field",
         "_default",
-        "_default_stamp",
         "_clip",
     }
     # Field of the entity's default values that are the offset; None: a fixed offset.
@@ -118,7 +116,11 @@ class BaseAction(ActionTerm):
     @property
     def _offset(self) -> torch.Tensor | float:
         if self._default_field is not None:
-            self._follow_default(getattr(self._entity.data, self._default_field))
+            # Only changed default values, because package terms may write to the offset.
+            current = getattr(self._entity.data, self._default_field)[:, self._columns]
+            own = self._own_offset
+            torch.where(current != self._default, current, own, out=own)
+            self._default.copy_(current)
         return self._own_offset
 
     @_offset.setter
@@ -151,18 +153,7 @@ class BaseAction(ActionTerm):
     def _use_default_offset(self, field: str) -> None:
         self._default = getattr(self._entity.data, field)[:, self._columns].clone()
         self._offset = self._default.clone()
-        self._default_field, self._default_stamp = field, None
-
-    def _follow_default(self, default: torch.Tensor) -> None:
-        """Copy default values that an event changed; the version of the tensor says if one did."""
-        stamp = version_of(default)
-        if stamp == self._default_stamp:
-            return
-        self._default_stamp = stamp
-        current = default[:, self._columns]
-        changed = current != self._default
-        self._own_offset = torch.where(changed, current, self._own_offset)
-        self._default = current.clone()
+        self._default_field = field
 
     def _find_targets(self) -> tuple[list[int], list[str]]:
         names, ordered = self.cfg.actuator_names, self.cfg.preserve_order
