@@ -408,7 +408,8 @@ class ManagerBasedRlEnv(Tabular):
         such environments have neither entry. The flags do not affect trajectories.
 
         Args:
-            action: Float tensor, (N, A); arrays and lists are converted.
+            action: Float tensor, (N, A); arrays and lists are converted. NaN and infinite values
+                are logged once.
 
         Returns:
             Observations (of the new episode in environments that were reset); reward (N,);
@@ -416,7 +417,7 @@ class ManagerBasedRlEnv(Tabular):
             overwrites only the extras.
 
         Raises:
-            ValueError: action of the wrong shape, not numeric, or not finite.
+            ValueError: action of the wrong shape, or not numeric.
             RuntimeError: without `auto_reset`, an environment is done and was not reset.
         """
         if not self.cfg.auto_reset and self._pending_reset.any():
@@ -427,6 +428,7 @@ class ManagerBasedRlEnv(Tabular):
             )
         with self._checking_terms():
             self._clear_extras()
+            self.action_manager.nonfinite.begin_step(self.diverged, self.common_step_counter + 1)
             self.action_manager.process_action(action)
             self._run_physics()
             self.episode_length_buf += 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import torch
 
 from mjlab.actuator.actuator import is_constant_within_step
 from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase
+from mjlab.managers.nonfinite import NonFiniteWatch
 from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import as_index
 from mjlab.utils.spaces import Box, Space, batch_space
@@ -20,9 +20,6 @@ from mjlab.utils.tables import Table, settings_of
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-
-# Number of environments listed in an error about non-finite actions.
-_MAX_SHOWN = 10
 
 
 @dataclass(kw_only=True)
@@ -81,13 +78,13 @@ class ActionTerm(ManagerTermBase):
 class ActionManager(BuiltTermsManager[ActionTerm]):
     """Splits the action among its terms and stores the last three actions.
 
-    The config is kept by reference.
+    Terms may be objects of any class with the methods of `ActionTerm`. The config is kept by
+    reference. `nonfinite` counts NaN and infinite actions.
     """
 
-    _transient = {"_action", "_prev_action", "_prev_prev_action", "_action_parts"}
+    _transient = {"_action", "_prev_action", "_prev_prev_action", "_action_parts", "nonfinite"}
     _title = "actions"
     _cfg_type = ActionTermCfg
-    _term_type = ActionTerm
 
     def __init__(self, cfg: Mapping[str, ActionTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
@@ -96,10 +93,9 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         self._history = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._action, self._prev_action, self._prev_prev_action = self._history
         self._action_parts = self._action.split(self.action_term_dim, dim=1)
-        self._check_finite = check_now
-        if torch.device(self.device).type == "cuda":
-            event = torch.cuda.Event()
-            self._check_finite = DeferredCheck(*self._action.shape, self.device, event)
+        self.nonfinite = NonFiniteWatch(
+            ["Action"], "NaN or infinite", "reaches the physics", self.num_envs, self.device
+        )
 
     def tables(self) -> list[Table]:
         """Return the table of the active terms; `targets` are the driven joints, tendons or sites."""
@@ -110,8 +106,8 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
                 type(term).__name__,
                 term.action_dim,
                 getattr(term, "target_names", None),
-                getattr(term.cfg, "scale", None),
-                settings_of(term.cfg, "actuator_names", "scale", "transmission_type"),
+                getattr(self._live_cfgs[name], "scale", None),
+                settings_of(self._live_cfgs[name], "actuator_names", "scale", "transmission_type"),
             )
             for name, term in self._terms.items()
         ]
@@ -158,16 +154,14 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
     @property
     def needs_substep(self) -> bool:
         """True if `apply_action` must be called before every physics substep."""
-        return any(term.needs_substep for term in self._terms.values())
+        return any(getattr(term, "needs_substep", True) for term in self._terms.values())
 
     def process_action(self, action: torch.Tensor) -> None:
         """Split the action of this step, (num_envs, total_action_dim), among the terms.
 
-        Arrays and lists are converted by `as_action`.
+        Arrays and lists are converted by `as_action`. NaN and infinite values are logged once.
 
-        Raises `ValueError` for a wrong shape, and for NaN or infinite values: on a CPU immediately,
-        before any state changes; on a GPU at the next step, after the bad action has acted for one
-        step, because checking immediately would synchronize with the GPU.
+        Raises `ValueError` for a wrong shape.
         """
         action = as_action(action, self.device)
         # One action for all environments.
@@ -179,7 +173,8 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
                 f"got {tuple(action.shape)}; components by term: "
                 f"{dict(zip(self._terms, self.action_term_dim, strict=True))}."
             )
-        self._check_finite(action)
+        # x - x is NaN unless x is finite; a sum of large values may overflow.
+        self.nonfinite.check((action - action).sum(dim=1).unsqueeze(0))
         self._prev_prev_action.copy_(self._prev_action)
         self._prev_action.copy_(self._action)
         self._action.copy_(action)
@@ -220,61 +215,3 @@ def as_action(action: Any, device: str) -> torch.Tensor:
             f"action: expected a float tensor, array or list of shape (environments, components), "
             f"got {type(action).__name__} ({error})."
         ) from error
-
-
-def check_now(action: torch.Tensor) -> None:
-    """Raise `ValueError`, listing environments and values, if `action` (N, A) is not finite."""
-    # A finite sum proves that all values are finite; large finite values may overflow the sum.
-    if math.isfinite(action.sum().item()):
-        return
-    bad = ~torch.isfinite(action).all(dim=1)
-    if bad.any():
-        raise ValueError(_message(bad, action))
-
-
-class DeferredCheck:
-    """Checks actions on a GPU without synchronizing: each call raises for earlier actions.
-
-    A flag is copied to the host asynchronously; the first call after the copy raises if the flag is
-    set. Bad values stay on the device until then.
-
-    Args:
-        num_envs: Number of environments N.
-        action_dim: Number of action components A.
-        device: Device of the actions.
-        event: Completion of the copy, with `record()` and `query()` of `torch.cuda.Event`.
-    """
-
-    def __init__(self, num_envs: int, action_dim: int, device: str, event: Any) -> None:
-        self._event = event
-        self._bad = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._values = torch.zeros(num_envs, action_dim, dtype=torch.float32, device=device)
-        pinned = torch.device(device).type == "cuda"
-        self._flag = torch.zeros((), dtype=torch.bool, pin_memory=pinned)
-        self._pending = False
-
-    def __call__(self, action: torch.Tensor) -> None:
-        """Raise `ValueError` if an earlier action was not finite, then check `action`."""
-        if self._pending and self._event.query():
-            self._pending = False
-            if self._flag:
-                message = _message(self._bad, self._values)
-                self._bad.zero_()
-                raise ValueError(f"In the previous step: {message}")
-        bad = ~torch.isfinite(action).all(dim=1)
-        torch.where(bad.unsqueeze(1), action.to(self._values), self._values, out=self._values)
-        self._bad.logical_or_(bad)
-        if not self._pending:
-            self._flag.copy_(self._bad.any(), non_blocking=True)
-            self._event.record()
-            self._pending = True
-
-
-def _message(bad: torch.Tensor, action: torch.Tensor) -> str:
-    ids = bad.nonzero().flatten()
-    rows = [f"env {i}: {action[i].tolist()}" for i in ids[:_MAX_SHOWN].tolist()]
-    more = f", and {len(ids) - _MAX_SHOWN} more" if len(ids) > _MAX_SHOWN else ""
-    return (
-        f"action: expected finite numbers, got NaN or infinite values in {len(ids)} of {len(bad)} "
-        f"environments ({'; '.join(rows)}{more}); check the policy's input and output."
-    )

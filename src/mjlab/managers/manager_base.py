@@ -361,7 +361,8 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
     """Manager of terms constructed by `build` of their configs. The config is kept by reference."""
 
     _cfg_type: type[Any]
-    _term_type: type[TermT]
+    # Class of the terms. `object`: terms of any class.
+    _term_type: type[Any] = object
 
     def __init__(self, cfg: Mapping[str, Any], env: ManagerBasedRlEnv) -> None:
         self.cfg = cfg
@@ -393,7 +394,7 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
                 )
             mark_stateful(term, self.num_envs)
             self._terms[name] = term
-            self._live_cfgs[name] = term.cfg
+            self._live_cfgs[name] = getattr(term, "cfg", term_cfg)
 
 
 class NullManager:

@@ -19,7 +19,7 @@ class NonFiniteWatch:
     Args:
         labels: Name of each term in messages.
         fault: Description of bad values in messages, e.g. "NaN or infinite".
-        counted_as: Replacement of bad values in messages, e.g. "0".
+        outcome: Effect of bad values in messages, e.g. "counts as 0".
         num_envs: Number of environments N.
         device: Device of the values.
 
@@ -31,9 +31,9 @@ class NonFiniteWatch:
     """
 
     def __init__(
-        self, labels: Sequence[str], fault: str, counted_as: str, num_envs: int, device: str
+        self, labels: Sequence[str], fault: str, outcome: str, num_envs: int, device: str
     ) -> None:
-        self._labels, self.fault, self._counted_as = labels, fault, counted_as
+        self._labels, self.fault, self._outcome = labels, fault, outcome
         self._on_cpu = torch.device(device).type == "cpu"
         self.excluded = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self.count = torch.zeros((), dtype=torch.long, device=device)
@@ -81,9 +81,9 @@ class NonFiniteWatch:
                 continue
             self._named.add(k)
             logger.warning(
-                "%s was %s in %d of %s in step %d and counts as %s; not logged again.",
+                "%s was %s in %d of %s in step %d and %s; not logged again.",
                 self._labels[k], self.fault, int(self._first_counts[k]),
-                counted(len(self.excluded), "environment"), step, self._counted_as,
+                counted(len(self.excluded), "environment"), step, self._outcome,
             )  # fmt: skip
 
     def streaks(self) -> dict[str, int]:

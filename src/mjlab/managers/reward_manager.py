@@ -80,7 +80,9 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
         labels = [self._label(name) for name in self._term_names]
-        self.nonfinite = NonFiniteWatch(labels, "NaN or infinite", "0", self.num_envs, self.device)
+        self.nonfinite = NonFiniteWatch(
+            labels, "NaN or infinite", "counts as 0", self.num_envs, self.device
+        )
         # Weighted rates of the last step, not multiplied by dt, (num_envs, terms).
         self._step_reward = self._rates.t()
 

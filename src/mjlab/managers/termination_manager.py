@@ -51,7 +51,7 @@ class TerminationManager(TermListManager):
         self._terminated, self._time_outs, self._dones = falses(), falses(), falses()
         labels = [self._label(name) for name in self._term_names]
         self.nonfinite = NonFiniteWatch(
-            labels, "neither 0 nor 1", "true", self.num_envs, self.device
+            labels, "neither 0 nor 1", "counts as true", self.num_envs, self.device
         )
         # Index of a term that returns floats to NaN if the value is neither 0 nor 1, else 0,
         # (num_envs,).

@@ -76,6 +76,7 @@ class RolloutWatch:
                 f"The physics diverged in {diverged} of {counted(self._env.num_envs, 'environment')} within "
                 f"{num_steps} steps: {cause}"
             )
+        self._env.action_manager.nonfinite.report()
         for manager in (self._env.reward_manager, self._env.termination_manager):
             manager.nonfinite.report()
             for term, steps in manager.nonfinite.streaks().items():

@@ -83,8 +83,8 @@ def check_positive(name: str, value: float) -> None:
 
 
 def check_count(name: str, value: Any, minimum: int = 1) -> None:
-    """Raise `ValueError` unless `value` is an integer >= `minimum`."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < minimum:
+    """Raise `ValueError` unless `value` is an integer >= `minimum`. True is 1."""
+    if not isinstance(value, Integral) or value < minimum:
         raise ValueError(f"{name}: expected an integer >= {minimum}, got {value!r}.")
 
 
