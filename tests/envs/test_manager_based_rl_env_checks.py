@@ -117,7 +117,7 @@ def warnings_of(term):
     cfg = cartpole()
     cfg.rewards["new"] = RewardTermCfg(func=term, weight=1.0)
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+        warnings.simplefilter("default")
         env = ManagerBasedRlEnv(cfg, device="cpu")
         env.reset()
         for _ in range(3):

@@ -135,7 +135,8 @@ class ManagerBasedRlEnv(Tabular):
     ) -> None:
         """Build scene, simulation and managers of `cfg` on `device` (`cpu`, `cuda:0`, ...).
 
-        A `device` of None is the first GPU, or the CPU if there is none. `render_mode` is None or `rgb_array`. Additional keyword arguments are ignored.
+        A `device` of None is the first GPU, or the CPU if there is none. `render_mode` is None or
+        `rgb_array`. Additional keyword arguments are ignored.
 
         Raises:
             ValueError: invalid config, named by field, or unknown device.
@@ -345,9 +346,9 @@ class ManagerBasedRlEnv(Tabular):
         """Start new episodes in `env_ids` (None: all); return observations and extras.
 
         A `seed` reseeds every random number generator. All environments are observed, but only
-        `env_ids` advance the state of observation terms; see `ObservationManager.compute`. Forces and accelerations are current in
-        `env_ids`, and those of the last substep in other environments, as after `step`; before
-        the first substep they are current everywhere.
+        `env_ids` advance the state of observation terms; see `ObservationManager.compute`. Forces
+        and accelerations are current in `env_ids`, and those of the last substep in other
+        environments, as after `step`; before the first substep they are current everywhere.
 
         Raises:
             ValueError: `env_ids` out of range, not integers, or a mask of the wrong length.

@@ -210,11 +210,7 @@ def columns_of(asset_cfg: SceneEntityCfg, kind: str, env: ManagerBasedRlEnv) -> 
     """
     if kind not in asset_cfg._read:
         asset_cfg._read |= {kind}
-        # Terms may create a selection at every step.
-        key, known = f"{kind} of {asset_cfg!r}", vars(env).setdefault("_read_selections", set())
-        if key not in known:
-            known.add(key)
-            _warn_of_ids(asset_cfg, kind, env)
+        _warn_of_ids(asset_cfg, kind, env)
     return as_columns(getattr(asset_cfg, f"{kind}_ids"), env.device)
 
 

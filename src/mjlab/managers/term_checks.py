@@ -6,7 +6,6 @@ import contextlib
 import inspect
 import math
 from collections.abc import Callable
-from numbers import Real
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
@@ -146,12 +145,6 @@ def check_range(name: str, bounds: Any) -> None:
         low, high = math.nan, math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low <= high):
         raise ValueError(f"{name}: expected finite (low, high) with low <= high, got {bounds!r}.")
-
-
-def is_interval(bounds: Any) -> bool:
-    """Return True for a pair of real numbers (low, high) with low <= high. False for NaN."""
-    is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
-    return is_pair and all(isinstance(b, Real) for b in bounds) and bounds[0] <= bounds[1]
 
 
 def check_real(value: torch.Tensor, label: Callable[..., str], *args: Any) -> None:

@@ -88,6 +88,9 @@ class FakeScene(dict):
         self.env_origins = torch.zeros(num_envs, 3)
         self.terrain: Any = None
 
+    def place_cameras(self, *_: Any, **__: Any) -> None:
+        """Do nothing: no camera belongs to the world."""
+
 
 class World:
     """The attributes of an environment that terms read."""

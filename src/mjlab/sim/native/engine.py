@@ -609,9 +609,13 @@ def _as_tensor(array: np.ndarray[Any, Any]) -> torch.Tensor:
     if array.dtype == np.uint64:
         # Torch supports few operations on uint64.
         array = array.view(np.int64)
-    with torch.inference_mode(False), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return torch.from_numpy(array)
+    with torch.inference_mode(False):
+        if array.flags.writeable:
+            return torch.from_numpy(array)
+        # Not in steps: afterwards, Python shows again the warnings that it had shown.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.from_numpy(array)
 
 
 def _like_mujoco(name: str, tensor: torch.Tensor) -> torch.Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -62,6 +62,7 @@ class BaseAction(ActionTerm):
     }
     # Field of the entity's default values that are the offset; None: a fixed offset.
     _default_field: str | None = None
+    _own_offset: Any
 
     def __init__(self, cfg: BaseActionCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
