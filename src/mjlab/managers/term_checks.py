@@ -51,11 +51,12 @@ def check_term(function: Any, env: ManagerBasedRlEnv, params: dict[str, Any]) ->
     check = getattr(function, _ATTRIBUTE, None)
     if check is None:
         return
-    try:
-        inspect.signature(check).bind(env, **params)
-    except TypeError:
-        # `functools.wraps` copies the check to decorated terms with other parameters.
-        return
+    if getattr(getattr(function, "__wrapped__", None), _ATTRIBUTE, None) is check:
+        # Copied by `functools.wraps` to a decorated term, perhaps with other parameters.
+        try:
+            inspect.signature(check).bind(env, **params)
+        except TypeError:
+            return
     check(env, **params)
 
 
