@@ -363,7 +363,7 @@ def test_a_body_that_does_not_exist_and_a_name_that_is_taken_are_refused():
     ("changes", "message"),
     [
         ({"enabled_geom_groups": (0, 1, 6)}, r"enabled_geom_groups.*\(0, 1, 6\)"),
-        ({"parent_body": "ball/ball"}, "parent_body.*'room/down'.*'ball/ball', which is ignored"),
+        ({"parent_body": "ball/ball"}, "parent_body.*'room/down'.*'ball/ball'; it is not used"),
         ({"camera_name": None, "pos": (0.0, 0.0, 3.0), "fovy": -1.0}, r"\(0, 180\), got -1.0"),
         ({"camera_name": None, "pos": (0.0, 0.0, 3.0), "fovy": 0.0}, r"\(0, 180\), got 0.0"),
     ],

@@ -405,7 +405,7 @@ class BuiltinDcMotorActuator(DirectActuator[BuiltinDcMotorActuatorCfg]):
         if cfg.mode == DcMotorInputMode.VELOCITY and cfg.integral_gain != 0.0:
             warnings.warn(
                 f"{type(cfg).__name__} for {cfg.target_names_expr} integral_gain: expected 0 in mode "
-                f"VELOCITY, got {cfg.integral_gain}, which has no effect; use mode POSITION.",
+                f"VELOCITY, got {cfg.integral_gain} without effect; use mode POSITION.",
                 UserWarning,
                 stacklevel=2,
             )

@@ -60,8 +60,8 @@ class LearnedMlpActuator(DcMotorActuator[LearnedMlpActuatorCfg]):
 
     With e = p* - l, the inputs of a joint are [pos_scale (e_t, .., e_{t-H+1}), vel_scale (l'_t, ..,
     l'_{t-H+1})], newest first, with blocks swapped for `input_order="vel_pos"`. The network input has
-    one row per joint and environment, (N n, 2 H); its output is (N n, 1) or (N n,). The first values after a
-    reset fill the whole history. Velocity and effort targets are not used.
+    one row per joint and environment, (N n, 2 H); its output is (N n, 1) or (N n,). The first values
+    after a reset fill the whole history. Velocity and effort targets are not used.
     """
 
     _transient = {"network"}

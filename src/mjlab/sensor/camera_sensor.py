@@ -136,7 +136,7 @@ class CameraSensor(Sensor[CameraSensorData]):
         if cfg.camera_name is not None and cfg.parent_body is not None:
             odd.append(
                 f"parent_body: expected None for the existing camera {cfg.camera_name!r}, got "
-                f"{cfg.parent_body!r}, which is ignored"
+                f"{cfg.parent_body!r}; it is not used"
             )
         if odd:
             warnings.warn(f"{owner} {'; '.join(odd)}.", UserWarning, stacklevel=2)

@@ -163,7 +163,7 @@ class VariantValues:
         return tuple(self._values)
 
     def drop(self, field: str) -> None:
-        """Remove one of `fields`, which has the compiled value in all environments."""
+        """Remove one of `fields`. It has the compiled value in all environments."""
         del self._values[field]
 
     def get(self, field: str) -> np.ndarray:

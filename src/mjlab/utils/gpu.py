@@ -13,9 +13,8 @@ def select_gpus(
 
     Args:
         gpu_ids: Indices into the visible GPUs (negative: from the end), or "all", or None for the
-            CPU. Visible GPUs are the
-            entries of `CUDA_VISIBLE_DEVICES` if set (numbers, or strings as for MIG devices), else
-            all GPUs of the machine.
+            CPU. Visible GPUs are the entries of `CUDA_VISIBLE_DEVICES` if set (numbers, or strings as
+            for MIG devices), else all GPUs of the machine.
 
     Without a GPU, returns the CPU for any `gpu_ids`. Raises `ValueError`, listing the valid
     indices, for an index out of range.
