@@ -76,6 +76,40 @@ def cart_pos(env: Any) -> torch.Tensor:
 # The order.
 
 
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_terms_with_networks_need_no_gradients(make, engine):
+    network = torch.nn.Linear(1, 1)
+    torch.nn.init.constant_(network.weight, 2.0)
+    torch.nn.init.constant_(network.bias, 0.0)
+
+    def cart(env):
+        return env.sim.data.qpos[:, :1].clone()
+
+    def place(env, env_ids):
+        env.sim.data.qpos[env_ids, 0] = network(torch.full((len(env_ids), 1), 0.1))[:, 0]
+
+    def learned(cfg):
+        cfg.sim.engine = engine
+        cfg.events["place"] = EventTermCfg(func=place, mode="reset")
+        cfg.rewards = {"net": RewardTermCfg(lambda env: network(cart(env))[:, 0], weight=1.0)}
+        cfg.metrics = {"net": MetricsTermCfg(lambda env: network(cart(env))[:, 0])}
+        cfg.observations["critic"].terms["net"] = ObservationTermCfg(
+            lambda env: network(cart(env)), history_length=2
+        )
+
+    env = make(learned)
+    assert torch.allclose(cart(env), torch.tensor(0.2))
+    for _ in range(3):
+        observations, reward, *_ = env.step(torch.zeros(NUM_ENVS, 1))
+    assert torch.allclose(reward, 2.0 * cart(env)[:, 0] * env.step_dt, atol=1e-6)
+    assert torch.equal(observations["critic"][:, -1:], 2.0 * cart(env))
+    # Also where a user writes between two steps.
+    env.sim.data.qpos[:, 0] = network(torch.full((NUM_ENVS, 1), 0.2))[:, 0]
+    env.sim.forward()
+    env.step(torch.zeros(NUM_ENVS, 1))
+    assert torch.allclose(cart(env), torch.tensor(0.4), atol=1e-2)
+
+
 def test_the_parts_of_a_step_come_in_their_order(make):
     calls: list[str] = []
 

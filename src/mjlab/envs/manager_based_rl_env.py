@@ -336,6 +336,7 @@ class ManagerBasedRlEnv(Tabular):
 
     # The loop.
 
+    @torch.no_grad()
     def reset(
         self,
         *,
@@ -373,8 +374,9 @@ class ManagerBasedRlEnv(Tabular):
             self.recorder_manager.record_post_reset(env_ids)
         return self.obs_buf, self.extras
 
+    @torch.no_grad()
     def step(self, action: torch.Tensor) -> VecEnvStepReturn:
-        """Advance all environments by one environment step.
+        """Advance all environments by one environment step, without gradients.
 
         Order: process actions; `decimation` physics substeps; terminations and rewards; step and
         interval events; resets of environments that are done; `forward`; commands; observations.
