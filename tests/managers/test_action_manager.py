@@ -133,6 +133,14 @@ def test_one_action_serves_all_environments(env):
     assert manager.action.tolist() == [[1.0, 2.0]] * 4
 
 
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int64, torch.float64])
+def test_actions_of_every_type_become_float(env, dtype):
+    manager = make(env, 2)
+    manager.process_action(torch.ones(4, 2, dtype=dtype))
+    assert manager.action.tolist() == [[1.0, 1.0]] * 4
+    assert manager.action.dtype == torch.float32
+
+
 def test_an_action_with_gradients_is_detached(env):
     manager = make(env, 2)
     for _ in range(2):

@@ -548,17 +548,19 @@ def test_every_kind_of_state_advances_per_step(env):
     ]
 
 
-def test_a_partial_reset_starts_the_state_of_its_rows(env):
+@pytest.mark.parametrize("ids", [[2], [2, 2, 2, 2]])
+def test_a_partial_reset_starts_the_state_of_its_rows(env, ids):
     group = ObservationGroupCfg(counting_terms(), enable_corruption=True)
     manager = ObservationManager({"g": group}, env)
     manager.reset()
     for _ in range(3):
         manager.compute(update_history=True)
-    ids = torch.tensor([2])
+    ids = torch.tensor(ids)
     manager.reset(ids)
     assert set(manager.compute(update_history=True, env_ids=ids)["g"][2].tolist()) == {1.0}
     obs = manager.compute(update_history=True)["g"]
     assert obs[2, : len(KINDS)].tolist() == [2.0] * len(KINDS)
+    assert obs[0, : len(KINDS)].tolist() == [4.0] * len(KINDS)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -173,11 +173,11 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
                 f"got {tuple(action.shape)}; components by term: "
                 f"{dict(zip(self._terms, self.action_term_dim, strict=True))}."
             )
-        # x - x is NaN unless x is finite; a sum of large values may overflow.
-        self.nonfinite.check((action - action).sum(dim=1).unsqueeze(0))
         self._prev_prev_action.copy_(self._prev_action)
         self._prev_action.copy_(self._action)
         self._action.copy_(action)
+        # x - x is NaN unless x is finite; a sum of large values may overflow.
+        self.nonfinite.check((self._action - self._action).sum(dim=1).unsqueeze(0))
         for term, part in zip(self._terms.values(), self._action_parts, strict=True):
             term.process_actions(part)
 

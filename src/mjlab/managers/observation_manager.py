@@ -286,7 +286,7 @@ class ObservationManager(ManagerBase):
         env_ids: torch.Tensor | None,
     ) -> dict[str, Observation]:
         ids = None if env_ids is None else as_ids(env_ids, self.num_envs, self.device)
-        if update_history and (ids is None or len(ids) == self.num_envs):
+        if update_history and (ids is None or len(ids.unique()) == self.num_envs):
             return {name: group.compute(True, ids) for name, group in groups.items()}
         terms = _terms(groups)
         parts = _stateful_parts(terms)
