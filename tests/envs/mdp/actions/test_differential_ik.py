@@ -658,3 +658,13 @@ def test_a_subclass_may_say_where_the_frame_is(arm: Any) -> None:
     plain._desired_pos.copy_(tool._desired_pos)
     assert not tool.compute_dq().abs().gt(1e-3).any()
     assert plain.compute_dq().abs().gt(1e-3).any()
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_bad_action_stays_in_its_environment(arm: Any, bad: float) -> None:
+    ik = term(arm)
+    action = torch.zeros(NUM_ENVS, ik.action_dim)
+    action[0, 0] = bad
+    ik.process_actions(action)
+    ik.apply_actions()
+    assert arm.robot.data.joint_pos_target[1:].isfinite().all()
