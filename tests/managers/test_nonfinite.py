@@ -126,3 +126,11 @@ def test_a_broken_term_is_not_told_as_diverged_physics(make_env, tmp_path):
     env.sim.data.qvel[:, 1] = 1e4
     with pytest.raises(BrokenTermError, match="term 'mine'"):
         learn(env, tmp_path)
+
+
+def test_training_stops_when_every_action_is_bad(make_env, tmp_path):
+    env = make_env()
+    process = env.action_manager.process_action
+    env.action_manager.process_action = lambda action: process(action * NAN)
+    with pytest.raises(BrokenTermError, match="Action was NaN .*20 steps.*policy"):
+        learn(env, tmp_path)

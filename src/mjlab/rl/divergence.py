@@ -24,7 +24,7 @@ class DivergedError(MjlabError, RuntimeError):
 
 
 class BrokenTermError(MjlabError, ValueError):
-    """Reward or termination that was NaN or infinite in every environment for an iteration."""
+    """Action, reward or termination that was NaN or infinite in all environments for an iteration."""
 
 
 class RolloutWatch:
@@ -60,8 +60,8 @@ class RolloutWatch:
 
         Raises:
             DivergedError: most environments diverged, in at least 4 episodes.
-            BrokenTermError: a reward was NaN or infinite, or a termination a float other than 0 and 1, in
-                every environment and every step (at least 16 steps).
+            BrokenTermError: an action or reward was NaN or infinite, or a termination a float other
+                than 0 and 1, in every environment and every step (at least 16 steps).
         """
         if self._resets_before is None:
             return
@@ -76,14 +76,17 @@ class RolloutWatch:
                 f"The physics diverged in {diverged} of {counted(self._env.num_envs, 'environment')} within "
                 f"{num_steps} steps: {cause}"
             )
-        self._env.action_manager.nonfinite.report()
-        for manager in (self._env.reward_manager, self._env.termination_manager):
+        env = self._env
+        for manager in (env.action_manager, env.reward_manager, env.termination_manager):
+            remedy = "correct the term, or set it to None"
+            if manager is env.action_manager:
+                remedy = "check the policy, and use a smaller learning rate"
             manager.nonfinite.report()
             for term, steps in manager.nonfinite.streaks().items():
                 if steps >= max(num_steps, _MIN_BROKEN_STEPS):
                     raise BrokenTermError(
                         f"{term} was {manager.nonfinite.fault} in every environment for {steps} steps in a "
-                        "row; correct the term, or set it to None."
+                        f"row; {remedy}."
                     )
 
     @contextmanager
