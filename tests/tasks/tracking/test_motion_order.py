@@ -189,6 +189,34 @@ def test_slides_anchors_and_several_joints_per_body():
     assert_equal(found, motion)
 
 
+def test_many_joints_with_three_on_each_body():
+    random = np.random.default_rng(0)
+    spec = mujoco.MjSpec()
+    bodies = [spec.worldbody.add_body(name="base")]
+    bodies[0].add_freejoint()
+    for i in range(12):
+        body = bodies[random.integers(len(bodies))].add_body(name=f"body{i}")
+        body.pos = 0.2 * random.normal(size=3)
+        for k, axis in enumerate(np.eye(3)):
+            body.add_joint(name=f"joint{i}_{k}", axis=axis)
+        bodies.append(body)
+    for body in bodies:
+        body.add_geom(size=[0.05, 0.0, 0.0])
+    skeleton = Skeleton.of_entity(EntityCfg(spec_fn=lambda: spec).build())
+    t = np.linspace(0.0, 2.0, 60)[:, None]
+    joint_pos = 0.8 * np.sin(t * random.uniform(1.0, 4.0, 36) + random.uniform(0.0, 6.0, 36))
+    recording = Recording(
+        fps=50.0,
+        root_pos=np.hstack((t, 0 * t, 1 + 0 * t)),
+        root_quat=np.hstack((np.cos(t), 0 * t, 0 * t, np.sin(t))),
+        joint_pos=joint_pos,
+    )
+    motion = make_motion(recording, skeleton.model)
+    order = random.permutation(36), random.permutation(13)
+    with pytest.warns(UserWarning, match="order of the robot"):
+        assert_equal(arranged("", in_order(*order, motion), skeleton), motion)
+
+
 def test_the_command_plays_another_order_rightly(make_env, tmp_path):
     path = tmp_path / "breadth_first.npz"
     motion = in_order(*breadth_first())

@@ -36,7 +36,6 @@ _OUTSIDE = 0.4
 _WITHIN = 0.1
 # Difference in error (m, chord) between joints that move alike, such as two at rest.
 _ALIKE = 1e-5
-_MAX_TELLING = 32
 _NUM_SPREAD = 8
 
 
@@ -91,25 +90,26 @@ class Skeleton:
     def place(
         self, body: int, pos: torch.Tensor, quat: torch.Tensor, values: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the pose of a body (..., 3), (..., 4).
+        """Return the poses of a body, (n, 3) and (n, 4), for n positions of its joints.
 
         Args:
             body: Id of the body.
-            pos: Position of its parent, (..., 3).
-            quat: Orientation of its parent, (..., 4).
-            values: Positions of its joints (rad or m), (..., joints).
+            pos: Position of its parent, (3,).
+            quat: Orientation of its parent, (4,).
+            values: Positions of its joints (rad or m), (n, joints).
         """
+        model, n = self.model, len(values)
 
-        def row(array: np.ndarray, index: int, like: torch.Tensor) -> torch.Tensor:
-            return torch.from_numpy(array[index].copy()).expand_as(like)
+        def rows(vector: np.ndarray) -> torch.Tensor:
+            return torch.from_numpy(vector.copy()).expand(n, -1)
 
-        model = self.model
-        pos = pos + quat_apply(quat, row(model.body_pos, body, pos))
-        quat = quat_mul(quat, row(model.body_quat, body, quat))
-        for k, column in enumerate(self.joints_of(body)):
+        pos, quat = pos.expand(n, 3), quat.expand(n, 4)
+        pos = pos + quat_apply(quat, rows(model.body_pos[body]))
+        quat = quat_mul(quat, rows(model.body_quat[body]))
+        for column, value in zip(self.joints_of(body), values.unbind(-1), strict=True):
             joint = self.joints[column]
-            anchor, axis = row(model.jnt_pos, joint, pos), row(model.jnt_axis, joint, pos)
-            value = values[..., k] - float(model.qpos0[model.jnt_qposadr[joint]])
+            anchor, axis = rows(model.jnt_pos[joint]), rows(model.jnt_axis[joint])
+            value = value - float(model.qpos0[model.jnt_qposadr[joint]])
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
                 pos = pos + quat_apply(quat, axis) * value.unsqueeze(-1)
                 continue
@@ -165,12 +165,6 @@ def arranged(
     away, chord = frames.errors(named)
     if max(away, chord) <= _TOLERANCE:
         return _reordered(motion, named)
-    if motion.joint_pos.shape[1] == nj and max(frames.errors(stored)) <= _TOLERANCE:
-        _warn(
-            f"Motion {path}: the names of joints or bodies are not in the order of the columns, by "
-            "forward kinematics; the columns are in the order of the robot."
-        )
-        return _reordered(motion, stored)
     order = frames.find_order()
     if order is None:
         if max(away, chord) <= _NOTABLE:
@@ -186,11 +180,14 @@ def arranged(
         _warn(f"{problem} The motion is played as it is.")
         return _reordered(motion, named)
     moved = [sum(i != j for i, j in enumerate(columns)) for columns in (order.joints, order.bodies)]
-    quats = ", and quaternions are (x, y, z, w)" if order.w_last else ""
+    got = f"an order in which {moved[0]} joints and {moved[1]} bodies are elsewhere"
+    if order == stored:
+        got = "names of joints or bodies that are not in the order of the columns"
+    quats = ", and quaternions (x, y, z, w)" if order.w_last else ""
     _warn(
-        f"Motion {path}: expected the order of the robot, got an order in which {moved[0]} joints and "
-        f"{moved[1]} bodies are elsewhere{quats}, by forward kinematics; that order is applied. Use "
-        "`mjlab csv-to-npz` to write the motion with names and in order."
+        f"Motion {path}: expected the order of the robot, got {got}{quats}, by forward kinematics; the "
+        "order of the poses is applied. Use `mjlab csv-to-npz` to write the motion with names and in "
+        "order."
     )
     return _reordered(motion, order)
 
@@ -290,7 +287,7 @@ class _Frames:
         if len(joints):
             # Frames in which a joint is farthest from its mean: joints that are equal in all other
             # frames differ there.
-            telling = np.abs(joints - joints.mean(axis=0)).argmax(axis=0)[:_MAX_TELLING]
+            telling = np.abs(joints - joints.mean(axis=0)).argmax(axis=0)
             spread = np.linspace(0, len(joints) - 1, _NUM_SPREAD).astype(int)
             telling = np.union1d(telling, spread)
             joints, pos, quat = joints[telling], pos[telling], quat[telling]
@@ -309,7 +306,7 @@ class _Frames:
         for joint_pos, pos, quat in zip(
             self.joint_pos.numpy(),
             self.pos.numpy()[:, bodies],
-            self.quat.numpy()[:, bodies],
+            self.quats(order.w_last).numpy()[:, bodies],
             strict=True,
         ):
             data.qpos[free], data.qpos[joints] = [*pos[0], *quat[0]], joint_pos[list(order.joints)]
@@ -319,52 +316,57 @@ class _Frames:
             away = max(away, float(np.linalg.norm(data.xpos[ids] - pos, axis=-1).max()))
         return away, chord
 
+    def quats(self, w_last: bool) -> torch.Tensor:
+        """Return the orientations (w, x, y, z) of the file, (F, bodies, 4)."""
+        return convert_quat(self.quat, "wxyz") if w_last else self.quat
+
     def find_order(self) -> _Order | None:
         """Return the order that explains the poses; None without one."""
         if self.pos.shape[1] < len(self.skeleton.bodies) or not len(self.pos):
             return None
-        for w_last in (False, True):
-            quat = convert_quat(self.quat, "wxyz") if w_last else self.quat
-            for root in range(self.pos.shape[1]):
-                order = self._follow(root, quat)
-                if order is not None:
-                    return replace(order, w_last=w_last)
+        for w_last, root in itertools.product((False, True), range(self.pos.shape[1])):
+            order = self._follow(root, w_last)
+            if order is not None and max(self.errors(order)) <= _TOLERANCE:
+                return order
         return None
 
-    def _follow(self, root: int, quat: torch.Tensor) -> _Order | None:
-        """Find each body where its parent in the file and one of the joints left place it."""
-        skeleton = self.skeleton
+    def _follow(self, root: int, w_last: bool) -> _Order | None:
+        """Find each body where its parent in the file and some of the joints left place it."""
+        skeleton, quat = self.skeleton, self.quats(w_last)
         joints: dict[int, int] = {}
         bodies = {skeleton.bodies[0]: root}
         for body in skeleton.bodies[1:]:
             columns = skeleton.joints_of(body)
             joints_left = sorted(set(range(self.joint_pos.shape[1])) - set(joints.values()))
             bodies_left = sorted(set(range(self.pos.shape[1])) - set(bodies.values()))
-            choices = list(itertools.permutations(joints_left, len(columns)))
             parent = bodies[skeleton.model.body_parentid[body]]
-            # (F, choices, joints of the body)
-            values = self.joint_pos[:, torch.tensor(choices).long().reshape(len(choices), -1)]
-            shape = (len(self.pos), len(choices))
-            pos, turn = skeleton.place(
-                body,
-                self.pos[:, parent, None].expand(*shape, 3),
-                quat[:, parent, None].expand(*shape, 4),
-                values,
-            )
-            there = quat[:, bodies_left]
-            chord = torch.minimum(torch.cdist(turn, there), torch.cdist(turn, -there))
-            away = torch.maximum(torch.cdist(pos, self.pos[:, bodies_left]), chord)
-            # (choices, bodies left)
-            error = away.amax(dim=0).numpy()
-            if tuple(columns) in choices:
-                # Joints that move alike stay in their columns.
-                error[choices.index(tuple(columns))] -= _ALIKE
-            choice, found = np.unravel_index(error.argmin(), error.shape)
-            if error[choice, found] > _TOLERANCE:
-                return None
+            choices = np.array(list(itertools.permutations(joints_left, len(columns))), dtype=int)
+            # Largest errors of the choices so far, (choices, bodies left). Frames leave fewer.
+            errors = torch.zeros(len(choices), len(bodies_left), dtype=torch.float64)
+            for frame in range(len(self.pos)):
+                pos, turn = skeleton.place(
+                    body,
+                    self.pos[frame, parent],
+                    quat[frame, parent],
+                    self.joint_pos[frame][choices],
+                )
+                there = quat[frame, bodies_left]
+                chord = torch.minimum(torch.cdist(turn, there), torch.cdist(turn, -there))
+                away = torch.cdist(pos, self.pos[frame, bodies_left])
+                errors = errors.maximum(away).maximum(chord)
+                fits = errors <= _TOLERANCE
+                if not fits.any():
+                    return None
+                choices, errors = choices[fits.any(dim=1).numpy()], errors[fits.any(dim=1)]
+                if fits.sum() == 1:
+                    break
+            # Joints that move alike stay in their columns.
+            errors[torch.from_numpy((choices == columns).all(axis=1))] -= _ALIKE
+            choice, found = divmod(int(errors.argmin()), len(bodies_left))
             bodies[body] = bodies_left[found]
-            joints |= dict(zip(columns, choices[choice], strict=True))
+            joints |= dict(zip(columns, choices[choice].tolist(), strict=True))
         return _Order(
             tuple(joints[i] for i in range(len(skeleton.joints))),
             tuple(bodies[body] for body in skeleton.bodies),
+            w_last,
         )
