@@ -20,6 +20,7 @@ from mjlab.envs.mdp.actions import JointPositionActionCfg
 from mjlab.managers import (
     CommandTerm,
     CommandTermCfg,
+    CurriculumTermCfg,
     EventTermCfg,
     ObservationGroupCfg,
     ObservationTermCfg,
@@ -113,6 +114,12 @@ def pointing(env, command_name: str, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     return angle.cos() * command[:, 0] + angle.sin() * command[:, 1]
 
 
+def share_of_return(env, env_ids: torch.Tensor, reward_name: str) -> torch.Tensor:
+    """Return the mean of a reward per second, which curricula compare with a threshold."""
+    sums = env.reward_manager._episode_sums[reward_name]
+    return torch.mean(sums[env_ids]) / env.max_episode_length_s
+
+
 def turntable_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     terms = {
         "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
@@ -182,6 +189,9 @@ def turntable_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
                     "asset_cfg": SceneEntityCfg("robot", joint_names=("turn",)),
                 },
             )
+        },
+        curriculum={
+            "pointing": CurriculumTermCfg(func=share_of_return, params={"reward_name": "pointing"})
         },
         recorders={"point": RecorderTermCfg(func=PointRecorder)},
         terminations={"time_out": TerminationTermCfg(func=mdp.time_out, time_out=True)},
