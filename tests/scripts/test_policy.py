@@ -153,12 +153,9 @@ def test_fields_of_the_environment_are_flags_of_evaluate_and_play(run):
     assert "6 episodes ended" in played.out
 
 
-@pytest.mark.parametrize(
-    ("flag", "value"), [("--port", "99999"), ("--port", "0"), ("--video-length", "0")]
-)
+@pytest.mark.parametrize(("flag", "value"), [("--port", "99999"), ("--port", "0")])
 def test_numbers_of_play_that_cannot_be_are_refused(run, flag, value):
-    video = ("--video",) if flag == "--video-length" else ()
-    outcome = run("play", TASK, "--agent", "zero", *video, flag, value)
+    outcome = run("play", TASK, "--agent", "zero", flag, value)
     assert outcome.status == 1
     assert flag in outcome.message
     assert value in outcome.message

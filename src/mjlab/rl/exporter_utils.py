@@ -116,8 +116,9 @@ def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
     """Write `model`, the result of rsl_rl's `as_onnx`, to `path`, with batch size 1.
 
     The graph computes any batch size, because the export with a dynamic batch dimension keeps reshapes
-    from fixing it; `OnnxPolicy` reads such a file for any number of environments. The tracing exporter (`dynamo=False`) writes a single file and needs neither the compiler nor
-    onnxscript, whose imports alone take longer than the whole export.
+    from fixing it; `OnnxPolicy` reads such a file for any number of environments. The tracing exporter
+    (`dynamo=False`) writes a single file and needs neither the compiler nor onnxscript, whose imports
+    alone take longer than the whole export.
     """
     if getattr(model, "obs_dim_1d", None) == 0:
         model = _ImagesOnly(model)

@@ -21,6 +21,7 @@ from mjlab.scripts.policy import (
 from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.scripts.run_folder import is_run_folder
 from mjlab.utils.errors import UserError, check_count
+from mjlab.utils.logging import print_notice
 from mjlab.utils.torch import threads_for_policy
 from mjlab.viewer.base import run_headless
 from mjlab.viewer.page_server import check_address, open_browser
@@ -80,8 +81,10 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         raise UserError(
             "--viewer none: expected --num-steps, because nothing else would end playing, got none."
         )
-    if cfg.video:
-        check_count("--video-length", cfg.video_length)
+    if cfg.video and cfg.video_length < 1:
+        print_notice(
+            f"--video-length: expected at least 1 frame, got {cfg.video_length}; one is recorded."
+        )
     check_address(cfg.host, cfg.port, "--")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
@@ -93,7 +96,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         if checkpoint is not None and is_run_folder(checkpoint.parent):
             folder = checkpoint.parent / "videos" / "play"
         video = VideoCfg(
-            length=cfg.num_steps or cfg.video_length,
+            length=cfg.num_steps or max(cfg.video_length, 1),
             suffix=cfg.video_format,
             height=cfg.video_height,
             width=cfg.video_width,

@@ -178,7 +178,7 @@ def _check_numbers(cfg: TrainConfig) -> None:
     counts = {f"--agent.{name}": getattr(agent, name) for name in _AGENT_COUNTS}
     counts |= {f"--agent.algorithm.{n}": algorithm[n] for n in _ALGORITHM_COUNTS if n in algorithm}
     if cfg.video:
-        counts |= {"--video-length": cfg.video_length, "--video-interval": cfg.video_interval}
+        counts["--video-interval"] = cfg.video_interval
     check_count("--agent.max-iterations", agent.max_iterations, minimum=0)
     for flag, value in counts.items():
         check_count(flag.replace("_", "-"), value)

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import subprocess
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.utils.errors import check_count, check_one_of
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.os import create_locked, remove_temporary_files, rename_locked, temporary_path
 from mjlab.utils.signals import NEW_GROUP
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
@@ -67,19 +68,25 @@ class VideoRecorder(ManagerBasedRlEnv):
                 per episode; True records the episode.
             step_trigger: Function of the step index (from 0), called before every step; True
                 starts a clip.
-            video_length: Frames per clip. None: record until the end of environment 0's episode.
+            video_length: Frames per clip; below 1, one frame with a warning. None: record until the
+                end of environment 0's episode.
             name_prefix: Prefix of file names.
             disable_logger: Do not log the names of written files.
 
         Raises:
-            ValueError: No trigger, or `video_length` is not positive.
+            ValueError: No trigger.
         """
         if episode_trigger is None and step_trigger is None:
             raise ValueError(
                 "VideoRecorder: expected an episode_trigger or a step_trigger, got neither."
             )
-        if video_length is not None:
-            check_count("video_length", video_length)
+        if video_length is not None and video_length < 1:
+            warnings.warn(
+                f"VideoRecorder video_length: expected at least 1 frame, got {video_length}; clips of one "
+                "frame are recorded.",
+                UserWarning,
+                stacklevel=2,
+            )
         self.video_folder = Path(video_folder)
         self.written: list[Path] = []
         self.unavailable_reason: str | None = None
@@ -192,7 +199,7 @@ class VideoRecorder(ManagerBasedRlEnv):
             self._episode_steps = 0
         if self._clip is None:
             return
-        full = self._clip.num_frames == self._video_length
+        full = self._video_length is not None and self._clip.num_frames >= self._video_length
         if full or (self._video_length is None and episode_over):
             self._finish_clip()
 
