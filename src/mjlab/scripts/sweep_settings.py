@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from mjlab.scripts.reference import ENDED
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info, runs_named
 from mjlab.utils.errors import BadCallError
+from mjlab.utils.string import is_number
 
 if TYPE_CHECKING:
     from mjlab.scripts.train_config import TrainConfig
@@ -53,7 +54,7 @@ class Axis:
         name = name.strip().lstrip("-").replace("_", "-")
         scale = text.removesuffix(":log")
         ends = tuple(scale.split(".."))
-        if len(ends) == 2 and all(map(_is_number, ends)):
+        if len(ends) == 2 and all(map(is_number, ends)):
             low, high = map(float, ends)
             is_log = scale != text
             if not low < high or (is_log and low <= 0.0):
@@ -69,14 +70,6 @@ class Axis:
                 "--over agent.algorithm.learning-rate=1e-4,3e-4."
             )
         return cls(name, text, tuple(dict.fromkeys(values)))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _split(text: str) -> Iterator[str]:

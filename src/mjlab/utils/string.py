@@ -99,6 +99,15 @@ def name_list(names: Sequence[str], near: Iterable[str]) -> str:
     return f"{shown} and {len(names) - len(shown)} others"
 
 
+def is_number(text: str) -> bool:
+    """Return True if `text` is a number, as `float` reads it."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun: "1 environment", "4,096 environments"."""
     return f"{count} {noun}" if count == 1 else f"{count:,} {noun}s"

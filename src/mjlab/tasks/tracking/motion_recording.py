@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from mjlab.tasks.tracking.motion_file import Motion, MotionFileError
+from mjlab.utils.string import is_number
 
 _ROOT_COLUMNS = 7
 _QUAT_TOLERANCE = 1e-2
@@ -325,7 +326,7 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
     try:
         with path.open(encoding="utf-8") as file:
             cells = file.readline().lstrip("\ufeff# ").rstrip().split(",")
-            is_named = len(cells) > 1 and not any(map(_is_number, cells))
+            is_named = len(cells) > 1 and not any(map(is_number, cells))
             # Some tools number the columns of a table without names.
             is_header = is_named or cells == [str(i) for i in range(len(cells))]
             file.seek(0)
@@ -338,14 +339,6 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
         raise MotionFileError(
             f"{path} is not a table of numbers (comma-separated): {error}"
         ) from error
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def write_csv(path: str | Path, recording: Recording) -> None:
