@@ -50,7 +50,7 @@ class PlacementReport:
                 f"pose_range={{}} and asset_cfg=SceneEntityCfg({names[0]!r}). Scenery that all environments "
                 "share can stay.",
                 UserWarning,
-                stacklevel=5,  # Caller of `step` or `reset`, which call this in a context manager.
+                stacklevel=6,  # Caller of `step` or `reset`: past a context manager and a decorator.
             )
 
 
