@@ -250,6 +250,24 @@ def test_a_checkpoint_of_rsl_rl_continues_at_the_next_iteration(make_runner, tmp
     assert runner.load(str(tmp_path / "model_4.pt")) == {}
 
 
+def test_a_checkpoint_is_read_once(make_runner, tmp_path: Path):
+    path = str(tmp_path / "model_0.pt")
+    trained = make_runner()
+    trained.learn(1)
+    trained.save(path, infos={"note": "mine"})
+    trained.learn(2)
+    one, other = make_runner(), make_runner()
+    content = load_checkpoint(path)
+    os.remove(path)
+    assert one.load_content(content, path)["note"] == "mine"
+    assert other.load_content(content, path)["note"] == "mine"
+    one.learn(2)
+    other.learn(2)
+    for actor in (one.alg.actor, other.alg.actor):
+        for found, expected in zip(actor.parameters(), trained.alg.actor.parameters(), strict=True):
+            assert torch.equal(found, expected)
+
+
 def test_infos_come_back_with_the_step_counter(make_runner, tmp_path: Path):
     runner = make_runner()
     runner.env.unwrapped.common_step_counter = 5

@@ -13,7 +13,7 @@ import io
 import logging
 import os
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -443,7 +443,26 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             CheckpointError: the file is missing, corrupt, hostile, malformed, or of a different
                 network. Nothing was changed.
         """
-        checkpoint = migrate(load_checkpoint(path), str(path))
+        return self.load_content(load_checkpoint(path), path, load_cfg=load_cfg, strict=strict)
+
+    def load_content(
+        self,
+        content: Mapping[str, Any],
+        path: str | os.PathLike[str],
+        *,
+        load_cfg: dict | None = None,
+        strict: bool = True,
+    ) -> dict:
+        """Load a checkpoint that was read by `load_checkpoint`; see `load`.
+
+        Args:
+            content: Content of the checkpoint; not modified.
+            path: Checkpoint file: for messages, and to find its replay.
+            load_cfg: Parts to load; None: all.
+            strict: Require every parameter to fit.
+        """
+        # torch's optimizers keep the loaded tensors, and write to them.
+        checkpoint = migrate(copy.deepcopy(content), str(path))
         if load_algorithm(self.alg, checkpoint, load_cfg, strict, str(path)):
             finished = checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1)
             self.current_learning_iteration = finished

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -103,18 +105,19 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         except Exception as error:
             logger.warning("Motions not recorded in %s: %s", folder, error)
 
-    def load(
+    def load_content(
         self,
-        path: str,
+        content: Mapping[str, Any],
+        path: str | os.PathLike[str],
+        *,
         load_cfg: dict | None = None,
         strict: bool = True,
-        map_location: str | None = None,
     ) -> dict:
         """Load a checkpoint; a full load also restores failure statistics of matching size.
 
-        Arguments, result and errors are those of `MjlabOnPolicyRunner.load`.
+        Arguments, result and errors are those of `MjlabOnPolicyRunner.load_content`.
         """
-        infos = super().load(path, load_cfg, strict, map_location)
+        infos = super().load_content(content, path, load_cfg=load_cfg, strict=strict)
         sampler, failed = self._sampler, infos.get(_FAILURES)
         if load_cfg is None and sampler is not None and failed is not None:
             if failed.shape == sampler.failed.shape:
