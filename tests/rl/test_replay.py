@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from mjlab.rl.checkpoint import CheckpointError
+from mjlab.rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 
+Damage = Callable[[dict[str, Any]], Any]
 NUM_ENVS = 3
 GOES_ON, TERMINATED, TIMED_OUT, CUT_OFF = range(4)
 
@@ -119,7 +124,7 @@ def test_contents_survive_a_file(tmp_path):
     files = ReplayFiles(tmp_path / "model_6.pt")
     files.write(history.storage)
     restored = History(4, [])
-    files.read(restored.storage)
+    restored.storage.load_state_dict(files.read(restored.storage))
     restored.kinds, restored.ends = history.kinds, history.ends
     restored.check(2, 0.9)
     one, other = (
@@ -141,14 +146,82 @@ def test_only_the_newest_checkpoint_keeps_its_replay(tmp_path):
 def test_a_replay_of_other_environments_is_left_out(tmp_path, caplog):
     files = ReplayFiles(tmp_path / "model_1.pt")
     files.write(History(2, [[GOES_ON] * NUM_ENVS]).storage)
-    longer = History(3, []).storage
-    files.read(longer)
-    assert longer.num_filled == 0
+    assert files.read(History(3, []).storage) is None
     assert "starts empty" in caplog.text
 
 
-def test_a_damaged_replay_is_refused(tmp_path):
+# Files: each damage is an error that names the entry and the cure, and changes nothing.
+
+
+def set_entry(name: str, value: Any) -> Damage:
+    return lambda state: state.__setitem__(name, value)
+
+
+def set_tensor(name: str, edit: Callable[[torch.Tensor], Any]) -> Damage:
+    def damage(state: dict[str, Any]) -> None:
+        state["tensors"][name] = edit(state["tensors"][name].clone())
+
+    return damage
+
+
+DAMAGES: dict[str, tuple[str, Damage]] = {
+    "another type of entry": ("num_filled", set_entry("num_filled", 2.0)),
+    "a truth value": ("num_ends_stored", set_entry("num_ends_stored", True)),
+    "more rows than there are": ("num_filled", set_entry("num_filled", 5)),
+    "fewer than none": ("num_filled", set_entry("num_filled", -1)),
+    "a row past the end": ("row", set_entry("row", 5)),
+    "a negative row": ("row", set_entry("row", -1)),
+    "negative ends": ("num_ends_stored", set_entry("num_ends_stored", -3)),
+    "ends never stored": ("end_numbers", set_entry("num_ends_stored", 0)),
+    "no row": ("row", lambda state: state.pop("row")),
+    "no tensors": ("tensors", lambda state: state.pop("tensors")),
+    "tensors of another type": ("tensors", set_entry("tensors", [1, 2])),
+    "no rewards": ("rewards", lambda state: state["tensors"].pop("rewards")),
+    "no ends": ("ends/actor", lambda state: state["tensors"].pop("ends/actor")),
+    "a number for a tensor": ("kinds", set_tensor("kinds", lambda x: 3)),
+    "doubles": ("actions", set_tensor("actions", torch.Tensor.double)),
+    "kinds of another type": ("kinds", set_tensor("kinds", torch.Tensor.long)),
+    "an unknown kind": ("kinds", set_tensor("kinds", lambda x: x.fill_(7))),
+    "NaN": ("observations/actor", set_tensor("observations/actor", lambda x: x.fill_(math.nan))),
+    "infinite": ("rewards", set_tensor("rewards", lambda x: x.fill_(math.inf))),
+    "NaN in an end": ("ends/actor", set_tensor("ends/actor", lambda x: x.fill_(math.nan))),
+    "fewer rows": ("actions", set_tensor("actions", lambda x: x[:-1])),
+    "one dimension": ("rewards", set_tensor("rewards", torch.Tensor.flatten)),
+    "nothing": ("rewards", set_tensor("rewards", lambda x: x[:, :0])),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_a_damaged_replay_is_an_error(tmp_path, what):
+    name, damage = DAMAGES[what]
     files = ReplayFiles(tmp_path / "model_1.pt")
-    files.path.write_bytes(b"nothing")
-    with pytest.raises(CheckpointError):
+    files.write(History(4, [[GOES_ON, TERMINATED, TIMED_OUT]] * 6).storage)
+    state = load_checkpoint(files.path)
+    damage(state)
+    save_checkpoint(state, files.path)
+    storage = History(4, []).storage
+    with pytest.raises(CheckpointError, match=f"{name}.*delete this file") as caught:
+        files.read(storage)
+    assert str(files.path) in str(caught.value)
+    assert storage.num_filled == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing", b"PK\x03\x04 cut"])
+def test_an_unreadable_replay_is_an_error(tmp_path, content):
+    files = ReplayFiles(tmp_path / "model_1.pt")
+    files.path.write_bytes(content)
+    with pytest.raises(CheckpointError, match="delete this file"):
         files.read(History(2, []).storage)
+
+
+@pytest.mark.parametrize(
+    ("written", "wanted"), [("a-1", "b-1"), ("a-1", "a-2"), ("a-1", None), (None, "a-1")]
+)
+def test_a_replay_of_another_checkpoint_is_an_error(tmp_path, written, wanted):
+    files = ReplayFiles(tmp_path / "model_1.pt")
+    storage = History(2, [[GOES_ON] * NUM_ENVS]).storage
+    files.write(storage, written)
+    with pytest.raises(CheckpointError, match="another one.*delete this file"):
+        files.read(storage, wanted)
+    # That of the checkpoint itself, and of checkpoints of earlier versions.
+    assert files.read(storage, written) is not None

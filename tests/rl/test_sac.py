@@ -15,6 +15,7 @@ from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
 from tensordict import TensorDict
 
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+from mjlab.rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg, RslRlSacAlgorithmCfg
 
 
@@ -133,6 +134,53 @@ def test_a_run_says_that_it_resumes_without_its_replay(tmp_path, caplog):
     resumed.load(str(tmp_path / "model_1.pt"))
     assert "replay starts empty" in caplog.text
     resumed.learn(3)
+
+
+def test_a_checkpoint_and_its_replay_have_one_identity(tmp_path):
+    torch.manual_seed(3)
+    make_runner(tmp_path).learn(2)
+    torch.manual_seed(4)
+    make_runner(tmp_path / "other").learn(2)
+    replay = tmp_path / "replay_model_1.pt"
+    mine, kept = (load_checkpoint(path) for path in (tmp_path / "model_1.pt", replay))
+    assert isinstance(mine["identity"], str)
+    assert mine["identity"] == kept["identity"]
+    replay.write_bytes((tmp_path / "other" / replay.name).read_bytes())
+    resumed = make_runner()
+    before = everything(resumed)
+    with pytest.raises(CheckpointError, match=f"{replay}.*delete this file"):
+        resumed.load(str(tmp_path / "model_1.pt"))
+    # Neither networks nor replay are loaded in part.
+    assert_same_bits(everything(resumed), before)
+    assert resumed.current_learning_iteration == 0
+    replay.unlink()
+    resumed.load(str(tmp_path / "model_1.pt"))
+    resumed.learn(3)
+
+
+def test_a_checkpoint_without_identity_takes_its_replay(tmp_path):
+    make_runner(tmp_path).learn(2)
+    for path in tmp_path.glob("*model_1.pt"):
+        content = load_checkpoint(path)
+        del content["identity"]
+        save_checkpoint(content, path)
+    resumed = make_runner()
+    resumed.load(str(tmp_path / "model_1.pt"))
+    assert resumed.alg.storage.num_filled == 10
+
+
+def test_a_state_saved_again_keeps_its_identity(tmp_path):
+    runner = make_runner(tmp_path)
+    runner.learn(2)
+    path = tmp_path / "model_1.pt"
+    before = load_checkpoint(path)["identity"]
+    runner.save(str(path))
+    assert load_checkpoint(path)["identity"] == before
+    runner.learn(3)
+    assert load_checkpoint(tmp_path / "model_2.pt")["identity"] != before
+    runner.load(str(path))
+    runner.save(str(tmp_path / "again.pt"))
+    assert load_checkpoint(tmp_path / "again.pt")["identity"] != before
 
 
 def test_what_goes_wrong_while_learning_ends_the_run():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
-from mjlab.utils.errors import check_count
+from mjlab.rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from mjlab.utils.errors import check_count, check_in_range
 
 logger = logging.getLogger(__name__)
 
@@ -22,6 +22,8 @@ logger = logging.getLogger(__name__)
 _CONTINUES, _TERMINATED, _TIMED_OUT, _CUT_OFF = range(4)
 # Steps per slot for final observations: time-outs are rare.
 _STEPS_PER_TIME_OUT = 32
+# Prefixes of the tensors of an observation group.
+_PER_GROUP = ("observations", "ends")
 
 
 @dataclass
@@ -209,23 +211,28 @@ class ReplayStorage:
             "num_ends_stored": self._num_ends_stored,
         }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the contents of `state_dict`.
 
         Raises:
             ValueError: the state is of different environments, observations or capacity. Nothing was
                 changed.
         """
-        own, saved = self._tensors(), state["tensors"]
-        expected = {name: tuple(tensor.shape) for name, tensor in own.items()}
-        found = {name: tuple(tensor.shape) for name, tensor in saved.items()}
-        if expected != found:
-            raise ValueError(f"Replay tensors: expected {expected}, got {found}.")
-        for name, tensor in own.items():
-            tensor.copy_(saved[name])
+        self.check_fits(state)
+        for name, tensor in self._tensors().items():
+            tensor.copy_(state["tensors"][name])
         self._row = state["row"]
         self._num_filled = state["num_filled"]
         self._num_ends_stored = state["num_ends_stored"]
+
+    def check_fits(self, state: Mapping[str, Any]) -> None:
+        """Raise ValueError if `state` is of different environments, observations or capacity."""
+        expected, found = (
+            {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+            for tensors in (self._tensors(), state["tensors"])
+        )
+        if expected != found:
+            raise ValueError(f"Replay tensors: expected {expected}, got {found}.")
 
     def _put(self, observations: TensorDict) -> None:
         for name, stored in self._observations.items():
@@ -242,11 +249,60 @@ class ReplayStorage:
         }
 
 
+def check_contents(state: Mapping[str, Any]) -> None:
+    """Check a result of `ReplayStorage.state_dict` that was read from a file.
+
+    Raises:
+        ValueError: entries are missing, of another type, out of range, NaN or infinite, or of shapes
+            that do not fit one another. The message names the first.
+    """
+    tensors = state.get("tensors")
+    if not isinstance(tensors, Mapping):
+        raise ValueError(f"Replay tensors: expected a dict, got {type(tensors).__name__}.")
+    groups = {name.partition("/")[2] for name in map(str, tensors) if "/" in name}
+    dtypes = dict.fromkeys(("actions", "rewards"), torch.float32)
+    dtypes |= {"kinds": torch.int8, "end_numbers": torch.int64}
+    dtypes |= {f"{part}/{name}": torch.float32 for name in groups for part in _PER_GROUP}
+    for name, dtype in dtypes.items():
+        tensor = tensors.get(name)
+        found = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
+        if not isinstance(tensor, torch.Tensor) or tensor.dtype != dtype:
+            raise ValueError(f"Replay {name}: expected a tensor of {dtype}, got {found}.")
+        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
+            raise ValueError(f"Replay {name}: expected finite values, got NaN or infinite ones.")
+    shape = tensors["rewards"].shape
+    if len(shape) != 2 or 0 in shape:
+        raise ValueError(f"Replay rewards: expected shape (rows, environments), got {shape}.")
+    rows = shape[0]
+    for name in dtypes:
+        if not name.startswith("ends/") and tensors[name].shape[:2] != shape:
+            raise ValueError(
+                f"Replay {name}: expected {tuple(shape)} as first sizes, as rewards, got "
+                f"{tuple(tensors[name].shape)}."
+            )
+    for name in ("row", "num_filled", "num_ends_stored"):
+        if type(state.get(name)) is not int:
+            raise ValueError(f"Replay {name}: expected an integer, got {state.get(name)!r}.")
+    check_in_range("Replay num_filled", state["num_filled"], 0, rows - 1)
+    # Rows are written from 0 on, until all are.
+    is_full = state["num_filled"] == rows - 1
+    first, last = (0, rows - 1) if is_full else (state["num_filled"],) * 2
+    check_in_range("Replay row", state["row"], first, last)
+    stored = state["num_ends_stored"]
+    check_count("Replay num_ends_stored", stored, minimum=0)
+    for name, low, high in (
+        ("kinds", _CONTINUES, _CUT_OFF),
+        ("end_numbers", 0, max(stored - 1, 0)),
+    ):
+        for value in tensors[name].aminmax():
+            check_in_range(f"Replay {name}", int(value), low, high)
+
+
 class ReplayFiles:
     """Replay file of a checkpoint: `replay_model_100.pt` next to `model_100.pt`.
 
     The file is separate because it is a thousand times as large as the networks; only the newest
-    checkpoint of a folder has one.
+    checkpoint of a folder has one. File and checkpoint carry the same `identity`.
     """
 
     def __init__(self, checkpoint: str | os.PathLike[str]) -> None:
@@ -255,30 +311,50 @@ class ReplayFiles:
         self.path = path.with_name(f"replay_{path.name}")
         """Path of the replay file."""
 
-    def write(self, storage: ReplayStorage) -> None:
-        """Write the contents of `storage`.
+    def write(self, storage: ReplayStorage, identity: str | None = None) -> None:
+        """Write the contents of `storage`, for the checkpoint with `identity`.
 
         Raises:
             CheckpointError: the file could not be written.
         """
-        save_checkpoint(storage.state_dict(), self.path)
+        save_checkpoint({**storage.state_dict(), "identity": identity}, self.path)
 
-    def read(self, storage: ReplayStorage) -> None:
-        """Fill `storage`; warn if the file is missing or of different environments.
+    def read(self, storage: ReplayStorage, identity: str | None = None) -> dict[str, Any] | None:
+        """Return the contents, checked, for `storage.load_state_dict`.
+
+        Return None, with a warning, if the file is missing or of different environments, observations
+        or capacity than `storage`, which is not changed.
 
         Raises:
-            CheckpointError: the file is damaged.
+            CheckpointError: the file is damaged, malformed, or not of the checkpoint with `identity`
+                (None: a checkpoint of an earlier version, without identity).
         """
         if not self.path.exists():
             logger.warning(
                 "The replay starts empty: %s not found. Training continues from new steps only.",
                 self.path,
             )
-            return
+            return None
+        cure = "delete this file, and the replay starts empty. Nothing was changed."
         try:
-            storage.load_state_dict(load_checkpoint(self.path))
-        except (KeyError, ValueError) as error:
+            state = load_checkpoint(self.path)
+            check_contents(state)
+        except (CheckpointError, ValueError) as error:
+            reason = str(error.__cause__ or error).partition("\n")[0]
+            raise CheckpointError(
+                f"Replay {str(self.path)!r} is damaged ({reason}); {cure}"
+            ) from error
+        if (found := state.get("identity")) != identity:
+            raise CheckpointError(
+                f"Replay {str(self.path)!r}: expected the replay of its checkpoint (identity "
+                f"{identity!r}), got that of another one (identity {found!r}); {cure}"
+            )
+        try:
+            storage.check_fits(state)
+        except ValueError as error:
             logger.warning("The replay starts empty: the saved replay does not fit. %s", error)
+            return None
+        return state
 
     def remove_others(self) -> None:
         """Delete the replay files of the folder's other checkpoints."""

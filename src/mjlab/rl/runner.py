@@ -12,6 +12,7 @@ import copy
 import io
 import logging
 import os
+import secrets
 import time
 from collections.abc import Generator, Mapping
 from pathlib import Path
@@ -114,6 +115,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.stop_reason: str | None = None
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
+        # Part of the identity of checkpoints: which states are of the same training.
+        self._token = secrets.token_hex(4)
         self._state_to_resume: dict[str, Any] | None = None
         # True if an evaluation was due after the last iteration but skipped to stop sooner.
         self._owes_evaluation = False
@@ -411,7 +414,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if saves_replay:
             # First, so that the newest checkpoint has a replay even if writing is interrupted.
             storage: Any = self.alg.storage
-            ReplayFiles(path).write(storage)
+            ReplayFiles(path).write(storage, str(checkpoint["identity"]))
         save_checkpoint(checkpoint, path)
         if saves_replay:
             ReplayFiles(path).remove_others()
@@ -463,6 +466,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """
         # torch's optimizers keep the loaded tensors, and write to them.
         checkpoint = migrate(copy.deepcopy(content), str(path))
+        storage: Any = getattr(self.alg, "storage", None)
+        replay = None
+        if load_cfg is None and isinstance(storage, ReplayStorage):
+            # First, because an error must leave everything unchanged.
+            replay = ReplayFiles(path).read(storage, checkpoint.get("identity"))
         if load_algorithm(self.alg, checkpoint, load_cfg, strict, str(path)):
             finished = checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1)
             self.current_learning_iteration = finished
@@ -473,10 +481,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
-        storage = getattr(self.alg, "storage", None)
-        if load_cfg is None and isinstance(storage, ReplayStorage):
-            ReplayFiles(path).read(storage)
+        if replay is not None:
+            storage.load_state_dict(replay)
         self._observations = None
+        self._token = secrets.token_hex(4)
         return infos
 
     def load_teacher(self, path: str) -> None:
@@ -513,6 +521,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             "infos": {**(infos or {}), "env_state": {"common_step_counter": int(counter)}},
             "last_evaluated": self._solved_check.last_iteration,
             "owes_evaluation": self._owes_evaluation,
+            # Of the state, not of the file: the same if it is saved again before the next iteration.
+            "identity": f"{self._token}-{done}",
         }
 
     # Export.

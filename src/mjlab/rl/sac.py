@@ -32,7 +32,7 @@ from torch import nn
 from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
-from mjlab.utils.errors import check_field
+from mjlab.utils.errors import check_count, check_field
 
 # Range of scaled returns if `value_range` is None.
 _SCALED_RANGE = (-5.0, 5.0)
@@ -394,6 +394,9 @@ class SAC:
         """
         self._wait()
         cfg = dict.fromkeys(_PARTS, True) if load_cfg is None else load_cfg
+        if load_cfg is None:
+            for name in ("num_steps", "num_updates"):
+                check_count(f"sac_state_dict {name}", loaded_dict["sac_state_dict"][name], 0)
         if cfg.get("actor"):
             for model in (self.actor, self._policy):
                 model.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
@@ -412,7 +415,8 @@ class SAC:
             self._generator.set_state(state["generator"].cpu())
             self._num_steps, self._num_updates_made = state["num_steps"], state["num_updates"]
             self._noise.load_state_dict(state["noise"])
-            if self._reward_scale is not None:
+            # None in runs with a `value_range`.
+            if self._reward_scale is not None and state["reward_scale"] is not None:
                 self._reward_scale.load_state_dict(state["reward_scale"])
         return cfg.get("iteration", False)
 
