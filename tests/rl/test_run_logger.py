@@ -118,6 +118,34 @@ def test_the_exploring_return_does_not_wait_for_episodes_and_is_free_of_the_time
     assert finish(logger, 2).exploring_length == (1000 if with_time_outs else 1)
 
 
+def test_the_time_left_is_without_the_warm_up(monkeypatch):
+    logger = make_logger(RunLogger, rnd=False)
+    now, left = 0.0, []
+    monkeypatch.setattr("mjlab.rl.run_logger.time.perf_counter", lambda: now)
+    # The first iteration compiles; the fourth evaluates. A session resumes after three iterations.
+    for it, seconds in zip(range(3, 9), (600.0, 2.0, 2.0, 8.0, 2.0, 2.0), strict=True):
+        now += seconds
+        logger.process_env_step(torch.zeros(NUM_ENVS), torch.zeros(NUM_ENVS), {})
+        stats = logger.finish_iteration(
+            iteration=it, first_iteration=3, total_iterations=9, losses={}, collection_time=0.8,
+            learning_time=0.7, rnd_weight=None, **REPORT,
+        )  # fmt: skip
+        left.append(stats.time_left)
+    assert left == [None, None, 2.0 * 3, 4.0 * 2, 3.5, 0.0]
+
+
+def test_custom_loops_write_the_exploring_return():
+    logger = make_logger(RunLogger, rnd=False)
+    logger._reward_unit, logger._episode_steps = 0.02, 1000
+    extras = {"time_outs": torch.zeros(NUM_ENVS, dtype=torch.bool)}
+    logger.process_env_step(torch.full((NUM_ENVS,), 0.015), torch.zeros(NUM_ENVS), extras)
+    logger.log(
+        it=0, start_it=0, total_it=3, loss_dict={}, collect_time=0.8, learn_time=0.7,
+        rnd_weight=None, **REPORT,
+    )  # fmt: skip
+    assert logger.writer.scalars["Train/exploring_return", 0] == pytest.approx(750.0)
+
+
 def test_a_resumed_run_goes_on_with_both_parts_of_the_reward():
     whole, first, resumed = (make_logger(RunLogger, rnd=True) for _ in range(3))
     for seed in (1, 2):

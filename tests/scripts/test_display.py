@@ -13,18 +13,22 @@ from commands import run_script
 from rich.console import Console
 
 from mjlab.rl.evaluation import EvaluationResult, MeanAndInterval
-from mjlab.rl.progress import ProgressCfg, duration, sparkline
+from mjlab.rl.progress import ProgressCfg, sparkline
 from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts import display
 from mjlab.scripts.display import TrainingDisplay, usual_iteration
 from mjlab.scripts.results import next_commands
 from mjlab.scripts.train import TrainConfig, parse_train_flags
-from mjlab.utils.string import clock, counted
+from mjlab.utils.string import clock, counted, duration
 
 SWINGUP = "Mjlab-Cartpole-Swingup"
 GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
 RETURN = {"solved_return": 900.0, "trigger_fraction": 0.8}
-BOUNDS = {"solved_below": {"lin_vel_error": 0.25, "failure_rate": 0.05}, "min_interval": 8}
+BOUNDS = {
+    "solved_below": {"lin_vel_error": 0.25, "failure_rate": 0.05},
+    "units": {"lin_vel_error": "m/s"},
+    "min_interval": 8,
+}
 STATS = IterationStats(
     iteration=3,
     total_iterations=10,
@@ -98,7 +102,7 @@ def test_the_exploring_return_stands_beside_the_return_that_solves():
     panel = " ".join(shown.drawn().split())
     assert "return 741, exploring; 900 solves" in panel
     assert "at iteration 4" in panel
-    assert "return=741(exploring) mean_return=none/900 " in shown.text
+    assert "return=741(exploring) goal=900 steps/s=51200" in shown.text
     shown.iterate(4, mean_step_reward=0.5, exploring_return=500.0)
     assert "from exploring return 720 on" in shown.drawn()
 
@@ -111,13 +115,14 @@ def test_other_bounds_have_the_last_evaluation_beside_them_and_its_trend():
     shown.panel.on_evaluation(9, outcome(error=0.31, failures=0.075), solved=False)
     shown.iterate(9)
     rows = [" ".join(line.split()) for line in shown.drawn().splitlines()]
-    assert "last eval lin vel error 0.31 falling at most 0.25" in rows
+    assert "last eval lin vel error 0.31 m/s falling at most 0.25 m/s" in rows
     assert "failure rate 7.5 % rising at most 5 %" in rows
     assert "next eval at iteration 17" in rows
     line = shown.panel.line()
-    assert "lin_vel_error=0.31/0.25 failure_rate=7.5%/5% evaluated_at=9" in line
+    assert "lin_vel_error=0.31(at_most_0.25_m/s) failure_rate=7.5%(at_most_5%) " in line
+    assert "evaluated_at=9" in line
     shown.panel.on_evaluation(17, outcome(error=0.2), solved=False)
-    assert "0.2 met" in " ".join(shown.drawn().split())
+    assert "0.2 m/s met" in " ".join(shown.drawn().split())
 
 
 @pytest.mark.parametrize(
@@ -128,7 +133,7 @@ def test_other_bounds_have_the_last_evaluation_beside_them_and_its_trend():
         (RETURN, "finished", outcome(mean_return=899.9), ["899.9 of 900, missed by 0.1"]),
         (RETURN, "finished", outcome(mean_return=950.0), ["Finished: all bounds met"]),
         (RETURN, "finished", None, ["unsolved", "741, exploring", "not evaluated", "Goal: return at least 900"]),
-        (BOUNDS, "finished", outcome(), ["unsolved", "0.31 (at most 0.25), missed by 0.06", "missed by 2.5 points"]),
+        (BOUNDS, "finished", outcome(), ["unsolved", "0.31 m/s (at most 0.25 m/s), missed by 0.06 m/s", "missed by 2.5 points"]),
         ({}, "finished", None, ["Finished at iteration 10 of 10, ", "Return 741, exploring."]),
         (RETURN, "interrupted", None, ["Interrupted at iteration 10 of 10"]),
         (RETURN, "failed", None, ["Failed at iteration 10 of 10"]),
@@ -152,7 +157,7 @@ def test_rates_are_shown_as_observed_beside_what_is_judged():
     shown.iterate(10)
     none_failed = dataclasses.replace(outcome(failures=0.0), failure_interval=(0.0, 0.0876))
     shown.panel.on_evaluation(10, none_failed, solved=False)
-    assert "failure_rate=0%(judged:4.38%)/5%" in shown.panel.line()
+    assert "failure_rate=0%(judged_4.38%_at_most_5%)" in shown.panel.line()
     shown.panel.on_end("finished")
     *_, ending = shown.text.splitlines()
     assert "ailure rate 0 % (judged: 4.38 %) (at most 5 %)" in ending
@@ -184,10 +189,32 @@ def test_no_border_is_drawn_and_characters_fit_the_encoding():
 def test_the_time_left_is_at_most_and_the_usual_end_is_named():
     shown = Shown(RETURN, usual_iteration=8)
     shown.iterate(3)
-    assert "s left; usually solved near iteration 8, in " in shown.drawn()
+    # 65 s are left for 7 iterations, 5 of them until the task is usually solved.
+    drawn = " ".join(shown.drawn().split())
+    assert "usually solved near iteration 8, in 46.4 s; at most 1:05 min left" in drawn
+    line = shown.panel.line()
+    assert "usually_solved_near=8(in_0:46)" in line
+    assert "left" not in line
     shown.iterate(9)
+    assert "left_at_most=1:05" in shown.panel.line()
     assert "near iteration 8, in" not in shown.drawn()
     assert "usually" not in Shown(RETURN, usual_iteration=11).drawn()
+
+
+def test_a_line_has_no_estimate_that_says_little():
+    for facts, words in (({}, []), ({"usual_iteration": 8}, ["usually_solved_near=8"])):
+        shown = Shown(RETURN, **facts)
+        shown.iterate(1, time_left=None)
+        parts = shown.text.split()
+        assert parts[2:] == ["return=741(exploring)", "goal=900", "steps/s=51200", *words]
+        assert "starting ..." in shown.drawn()
+
+
+def test_an_evaluated_return_stands_beside_the_goal():
+    shown = Shown(RETURN)
+    shown.panel.on_evaluation(3, outcome(mean_return=964.0), solved=True)
+    shown.iterate(3)
+    assert "return=741(exploring) evaluated_return=964 goal=900 evaluated_at=3" in shown.text
 
 
 @pytest.mark.parametrize(

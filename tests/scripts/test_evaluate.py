@@ -24,6 +24,7 @@ METRICS = {
     "success_rate": None,
     "failure_interval": (0.0, 0.5),
     "metrics": {},
+    "units": {},
     "notes": [],
 }
 
@@ -42,6 +43,14 @@ def test_failures_are_listed_by_termination_without_time_limits(terms, failed, e
     ended = {"time_out": 1.0 - failed, "fell": failed}
     metrics = {**METRICS, "failure_rate": failed, "terminations": ended}
     assert expected in evaluate._table(metrics, terms).splitlines()
+
+
+def test_metrics_have_their_units():
+    error = {"mean": 0.25, "interval": None}
+    metrics = {**METRICS, "failure_rate": None, "metrics": {"speed": error, "share": error}}
+    lines = evaluate._table({**metrics, "units": {"speed": "m/s"}}, []).splitlines()
+    assert "speed        0.25 m/s   no interval" in lines
+    assert "share        0.25   no interval" in lines
 
 
 def test_a_terminal_shows_a_bar_and_clears_it():

@@ -25,6 +25,7 @@ DEVIATIONS: dict[str, set[str]] = {
 _TRACKING_ERRORS = {
     name: f"tasks.velocity.rl.ppo:{name}" for name in ("lin_vel_error", "ang_vel_error")
 }
+_UNITS = {"lin_vel_error": "m/s", "ang_vel_error": "rad/s"}
 for task, positions in {
     "Mjlab-Velocity-Flat-Unitree-Go1": [],
     "Mjlab-Velocity-Flat-Unitree-G1": [2],
@@ -36,13 +37,14 @@ for task, positions in {
         for position in positions
     } | {
         "rl.evaluation is default in the table, and "
-        f"{ {'_': 'EvaluationCfg', 'metrics': _TRACKING_ERRORS}!r} here"
+        f"{ {'_': 'EvaluationCfg', 'metrics': _TRACKING_ERRORS, 'units': _UNITS}!r} here"
     }
 
 _PLACEMENT = {
     "metrics": {
         n: f"tasks.manipulation.config.yam.rl_cfg:{n}" for n in ("position_error", "at_goal")
     },
+    "units": {"position_error": "m"},
     "success_func": "tasks.manipulation.config.yam.rl_cfg:placed_at_goal",
 }
 for task in (
@@ -82,6 +84,7 @@ _MOTION_ENDED = {
 _MOTION_EVALUATION = {
     "_": "EvaluationCfg",
     "metrics": _MOTION_ERRORS,
+    "units": dict(zip(_MOTION_ERRORS, ("m", "m", "rad/s", "m", "rad"), strict=True)),
     "success_is_survival": True,
     "prepare_env": "tasks.tracking.mdp.metrics:play_motions_once",
 }

@@ -26,6 +26,12 @@ def test_it_steps_as_often_as_asked_and_reports_rewards_and_episodes() -> None:
     assert (result.num_steps, result.mean_step_reward, result.num_episodes) == (5, 2.0, 1)
 
 
+def test_rewards_are_told_in_their_unit() -> None:
+    env = FakeEnv(1)
+    plain = run_headless(env, push(), 2).mean_step_reward
+    assert run_headless(env, push(), 2, reward_unit=0.02).mean_step_reward == plain / 0.02
+
+
 def test_it_takes_the_four_results_of_the_learning_wrapper() -> None:
     env = FakeEnv(2)
     plain_step = env.step

@@ -214,6 +214,8 @@ class EvaluationCfg:
     metrics: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
     """Metrics besides the return: `func(env) -> (num_envs,)` by name, averaged over the steps of an
     episode."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units of `metrics` by name, shown beside their values."""
     stop_when_solved: bool = True
     """Stop training once the task is solved and a second evaluation, on unused episodes, confirms
     it."""

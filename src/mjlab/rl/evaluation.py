@@ -275,6 +275,8 @@ class Bound:
     """Bound."""
     is_upper: bool
     """True for an upper bound."""
+    unit: str = ""
+    """Unit of the value; empty for returns and rates."""
 
     def is_met(self, result: EvaluationResult) -> bool:
         """Return whether `result` meets the bound. NaN does not."""
@@ -286,8 +288,10 @@ class Bound:
         """Return the bounds of an `EvaluationCfg` as a dict, the return first."""
         target = cfg.get("solved_return")
         bounds = [] if target is None else [Bound("mean_return", target, is_upper=False)]
-        bounds += [Bound(*item, is_upper=True) for item in (cfg.get("solved_below") or {}).items()]
-        bounds += [Bound(*item, is_upper=False) for item in (cfg.get("solved_above") or {}).items()]
+        units = {"mean_length": "steps", **(cfg.get("units") or {})}
+        for field, is_upper in (("solved_below", True), ("solved_above", False)):
+            limits = cfg.get(field) or {}
+            bounds += [Bound(n, v, is_upper, units.get(n, "")) for n, v in limits.items()]
         return bounds
 
 

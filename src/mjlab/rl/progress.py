@@ -23,7 +23,7 @@ from rich.text import Text
 
 from mjlab.rl.evaluation import Bound, EvaluationResult, trigger_return
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
-from mjlab.utils.string import clock, counted
+from mjlab.utils.string import clock, counted, duration, number
 
 if TYPE_CHECKING:
     from mjlab.rl.runner import MjlabOnPolicyRunner
@@ -85,8 +85,8 @@ class TrainingProgress(TrainingObserver):
         self._stride = 1
         self._first = self._total = 0
         self._started = time.perf_counter()
-        # Duration of this session until its last iteration, and until its end (s).
-        self._trained = self._spent = 0.0
+        # Duration of this session (s), once it has ended.
+        self._spent = 0.0
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Start the clock."""
@@ -97,7 +97,7 @@ class TrainingProgress(TrainingObserver):
 
     def on_iteration(self, stats: IterationStats) -> None:
         """Keep the statistics."""
-        self.stats, self._trained = stats, self.spent
+        self.stats = stats
         if stats.iteration % self._stride == 0:
             self._returns.append(self._exploring(stats))
         if len(self._returns) > _MOST_READINGS:
@@ -131,12 +131,20 @@ class TrainingProgress(TrainingObserver):
 
     @property
     def left_at_most(self) -> float | None:
-        """Time until the last iteration (s), evaluations and checkpoints included, None if unknown."""
-        return self._time_until(self._total)
+        """Time until the last iteration (s), None if unknown: `IterationStats.time_left`."""
+        return None if self.stats is None else self.stats.time_left
 
-    def _time_until(self, iteration: int) -> float | None:
-        done = self.iteration - self._first
-        return None if done == 0 else self._trained / done * max(iteration - self.iteration, 0)
+    @property
+    def usual_end(self) -> tuple[int, float | None] | None:
+        """Iteration at which the task is usually solved, and the time until then (s, None if unknown).
+
+        None if that iteration is unknown or over.
+        """
+        usual, left = self._cfg.usual_iteration, self.left_at_most
+        if usual is None or not self.iteration < usual <= self._total:
+            return None
+        share = (usual - self.iteration) / (self._total - self.iteration)
+        return usual, None if left is None else share * left
 
     @staticmethod
     def _exploring(stats: IterationStats) -> float:
@@ -185,16 +193,28 @@ class TrainingProgress(TrainingObserver):
         parts = [f"[{stats.iteration}/{self._total}]", clock(self.spent)]
         values = [(name, f"{number(self._exploring(stats))}(exploring)")]
         for bound in self._bounds:
-            value = shown(bound, self._evaluations[-1][1]) if self._evaluations else "none"
-            values.append((bound.name, f"{value}/{limit(bound)}"))
-        # Without separators, for programs that read the line.
-        drop = str.maketrans("", "", " ,")
-        parts += [f"{name}={value.translate(drop)}" for name, value in values]
+            evaluated = _texts(bound, self._evaluations[-1][1]) if self._evaluations else None
+            if bound.name == "mean_return":
+                if evaluated:
+                    values.append(("evaluated_return", evaluated[0]))
+                values.append(("goal", limit(bound)))
+            elif evaluated:
+                observed, judged = evaluated
+                note = (
+                    required(bound) if judged == observed else f"judged {judged} {required(bound)}"
+                )
+                values.append((bound.name, f"{observed.removesuffix(f' {bound.unit}')}({note})"))
         if self._evaluations:
-            parts.append(f"evaluated_at={self._evaluations[-1][0]}")
-        parts.append(f"steps/s={stats.steps_per_second:.0f}")
-        if (left := self.left_at_most) is not None:
-            parts.append(f"left_at_most={clock(left)}")
+            values.append(("evaluated_at", str(self._evaluations[-1][0])))
+        values.append(("steps/s", f"{stats.steps_per_second:.0f}"))
+        if (usual := self.usual_end) is not None:
+            when = "" if usual[1] is None else f"(in {clock(usual[1])})"
+            values.append(("usually_solved_near", f"{usual[0]}{when}"))
+        elif self.left_at_most:
+            values.append(("left_at_most", clock(self.left_at_most)))
+        # Words without spaces, for programs that read the line.
+        drop = str.maketrans(" ", "_", ",")
+        parts += [f"{name}={value.replace(' %', '%').translate(drop)}" for name, value in values]
         return " ".join(parts)
 
     def ending(self) -> str:
@@ -236,7 +256,7 @@ class TrainingProgress(TrainingObserver):
                 text = f"{label(bound.name)} {shown(bound, result)} ({required(bound)})"
             if not bound.is_met(result):
                 missed = abs(result.judged(bound.name) - bound.limit)
-                text += f", missed by {formatted(bound.name, missed).replace('%', 'points')}"
+                text += f", missed by {formatted(bound, missed).replace('%', 'points')}"
             parts.append(text)
         scores = "; ".join(parts)
         when = "" if iteration == self.iteration else f" at iteration {iteration}"
@@ -288,17 +308,13 @@ class TrainingProgress(TrainingObserver):
         )
 
     def _time_left(self) -> str:
-        left = self.left_at_most
-        if left is None:
-            return "starting ..."
-        text = f"at most {duration(left)} left"
-        usual = self._cfg.usual_iteration
-        if usual is None or usual > self._total:
+        left, usual = self.left_at_most, self.usual_end
+        text = "starting ..." if left is None else f"at most {duration(left)} left"
+        if usual is None:
             return text
-        until = self._time_until(usual) if usual > self.iteration else None
-        return f"{text}; usually solved near iteration {usual}" + (
-            "" if until is None else f", in {duration(until)}"
-        )
+        iteration, until = usual
+        when = "" if until is None else f", in {duration(until)}"
+        return f"usually solved near iteration {iteration}{when}; {text}"
 
     def _episodes(self, stats: IterationStats) -> str:
         noise = f"action noise {stats.action_std:.2f}"
@@ -387,32 +403,16 @@ def in_notebook() -> bool:
 # Formats.
 
 
-def number(value: float) -> str:
-    """Format a return: `741`, `3,704`, `7.41`."""
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
-def duration(seconds: float) -> str:
-    """Format seconds: `8.4 s`, `3:05 min`, `2:10 h`."""
-    if round(seconds, 1) < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes}:{rest:02d} min"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d} h"
-
-
 def label(name: str) -> str:
     """Return the name of an evaluation's value in words."""
     return "return" if name == "mean_return" else name.replace("_", " ")
 
 
-def formatted(name: str, value: float) -> str:
-    """Format a value of evaluations; rates in percent."""
-    if name in ("failure_rate", "success_rate"):
+def formatted(bound: Bound, value: float) -> str:
+    """Format a value of evaluations with the unit of `bound`; rates in percent."""
+    if bound.name in ("failure_rate", "success_rate"):
         return f"{100.0 * value:.3g} %"
-    return number(value)
+    return f"{number(value)} {bound.unit}".rstrip()
 
 
 def shown(bound: Bound, result: EvaluationResult) -> str:
@@ -420,19 +420,23 @@ def shown(bound: Bound, result: EvaluationResult) -> str:
 
     For rates, the observed one, then the one that is judged: `7.5 % (judged: 11.2 %)`.
     """
+    observed, judged = _texts(bound, result)
+    return observed if judged == observed else f"{observed} (judged: {judged})"
+
+
+def _texts(bound: Bound, result: EvaluationResult) -> tuple[str, str]:
+    """Format the observed and the judged value."""
     value = result.judged(bound.name)
-    text = formatted(bound.name, value)
-    if text == limit(bound) and not bound.is_met(result):
-        text = f"{100.0 * value:.6g} %" if text.endswith("%") else f"{value:.7g}"
-    observed = formatted(bound.name, result.value(bound.name))
-    if text.endswith("%") and observed != text:
-        return f"{observed} (judged: {text})"
-    return text
+    judged = formatted(bound, value)
+    is_rate = judged.endswith("%")
+    if judged == limit(bound) and not bound.is_met(result):
+        judged = f"{100.0 * value:.6g} %" if is_rate else f"{value:.7g} {bound.unit}".rstrip()
+    return formatted(bound, result.value(bound.name)) if is_rate else judged, judged
 
 
 def limit(bound: Bound) -> str:
     """Format the limit of `bound`."""
-    return formatted(bound.name, bound.limit)
+    return formatted(bound, bound.limit)
 
 
 def required(bound: Bound) -> str:

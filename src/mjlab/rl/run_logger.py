@@ -10,6 +10,7 @@ import os
 import statistics
 import subprocess
 import threading
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 # rsl_rl's class names of logging services, accepted by the config.
 _LOGGER_TYPES = {"WandbLogWriter": "wandb", "NeptuneLogWriter": "neptune"}
+# Iterations after the first of a session that an estimate of the time left needs.
+_MEASURED = 2
 # Folders of installed packages.
 _INSTALLED = ("site-packages", "dist-packages")
 
@@ -48,11 +51,12 @@ class IterationStats:
     """Time spent updating the policy, in seconds."""
     steps_per_second: float
     """Environment steps per second of collection and learning time."""
-    time_left: float
-    """Estimated time until the last iteration, in seconds."""
+    time_left: float | None
+    """Estimated time until the last iteration, evaluations and checkpoints included, in seconds. None
+    in the first iterations of a session, which say little: the first one also warms up."""
     mean_reward: float | None
-    """Mean sum of rewards, as scaled by the environment, over the last 100 finished episodes. None
-    until an episode has finished."""
+    """Mean sum of rewards, as scaled by the environment, over the last 100 finished episodes: rsl_rl's
+    `Train/mean_reward`, not in the unit of evaluations. None until an episode has finished."""
     mean_episode_length: float | None
     """Mean length of the last 100 finished episodes, in environment steps. None until one finished."""
     mean_step_reward: float
@@ -145,7 +149,8 @@ class RunLogger(Logger):
         self._uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
         # rsl_rl's default is the repository around the virtual environment.
         self.git_status_repos = []
-        self._session_time = 0.0
+        # Iterations finished, and the time, at the end of the first iteration of this session.
+        self._warmed_up = (0, 0.0)
         # Sums over the running episodes, and buffers of the last finished ones.
         self._episode_sums = [
             (self.cur_reward_sum, self.rewbuffer),
@@ -257,9 +262,13 @@ class RunLogger(Logger):
 
         The arguments are those of rsl_rl's `Logger.log`.
         """
-        mean_step_reward, _ = self._collect_rewards()
+        mean_step_reward, failures = self._collect_rewards()
         super().log(it, *args, **kwargs)
-        self.write_scalars({"Train/mean_step_reward": mean_step_reward}, it)
+        scalars = {"Train/mean_step_reward": mean_step_reward}
+        if self._episode_steps is not None:
+            length = mean_length(failures, self._episode_steps)
+            scalars["Train/exploring_return"] = mean_step_reward * length
+        self.write_scalars(scalars, it)
 
     def finish_iteration(
         self,
@@ -279,8 +288,6 @@ class RunLogger(Logger):
         duration = collection_time + learning_time
         self.tot_timesteps += steps
         self.tot_time += duration
-        self._session_time += duration
-        per_iteration = self._session_time / (iteration + 1 - first_iteration)
         mean_step_reward, failures = self._collect_rewards()
         length = None if self._episode_steps is None else mean_length(failures, self._episode_steps)
         stats = IterationStats(
@@ -290,7 +297,7 @@ class RunLogger(Logger):
             collection_time=collection_time,
             learning_time=learning_time,
             steps_per_second=steps / max(duration, 1e-9),
-            time_left=per_iteration * (total_iterations - iteration - 1),
+            time_left=self._time_left(iteration + 1, first_iteration, total_iterations),
             mean_reward=statistics.fmean(self.rewbuffer) if self.rewbuffer else None,
             mean_episode_length=statistics.fmean(self.lenbuffer) if self.lenbuffer else None,
             mean_step_reward=mean_step_reward,
@@ -414,6 +421,16 @@ class RunLogger(Logger):
         self._step_rewards.clear()
         self._failures.clear()
         return mean / self._reward_unit, failures
+
+    def _time_left(self, iteration: int, first_iteration: int, total: int) -> float | None:
+        now = time.perf_counter()
+        if iteration == first_iteration + 1:
+            self._warmed_up = (iteration, now)
+        begin, since = self._warmed_up
+        if iteration >= total:
+            return 0.0
+        done = iteration - begin
+        return None if done < _MEASURED else (now - since) / done * (total - iteration)
 
     def _environment_means(self) -> dict[str, float]:
         values: dict[str, list[torch.Tensor]] = {}

@@ -21,13 +21,12 @@ from mjlab.rl.progress import (
     TrainingProgress,
     in_notebook,
     label,
-    number,
 )
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.scripts.reference import DATA, Kind, Reference, reference_path, referenced_tasks
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.logging import print_notice
-from mjlab.utils.string import counted
+from mjlab.utils.string import counted, number
 
 if TYPE_CHECKING:
     from mjlab.scripts.run_folder import NewRunFolder
@@ -107,7 +106,11 @@ class TrainingDisplay(TrainingProgress):
             metrics = [
                 f"return {number(result.mean_return)} in {counted(result.num_episodes, 'episode')}"
             ]
-            metrics += [f"{label(name)} {number(v.mean)}" for name, v in result.metrics.items()]
+            units = self._cfg.evaluation.get("units") or {}
+            metrics += [
+                f"{label(name)} {number(value.mean)} {units.get(name, '')}".rstrip()
+                for name, value in result.metrics.items()
+            ]
             if result.failure_rate and result.failure_interval is not None:
                 low, high = result.failure_interval
                 metrics.append(f"{result.failure_rate:.1%} failed ({low:.1%} to {high:.1%})")

@@ -107,6 +107,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
         "num_envs": num_envs,
         "success_definition": success_definition(solved),
         **result.to_dict(),
+        "units": dict(solved.units),
     }
     print(json.dumps(metrics, indent=2) if cfg.json else _table(metrics, failures))
     return metrics
@@ -188,7 +189,8 @@ def _table(metrics: dict[str, Any], failures: list[str]) -> str:
             + (f"   (ended by: {ended})" if ended else "")
         )
     for name, value in metrics["metrics"].items():
-        lines.append(f"{name:<12} {value['mean']:.4g}   {_interval(value['interval'], '.4g')}")
+        mean = f"{value['mean']:.4g} {metrics['units'].get(name, '')}".rstrip()
+        lines.append(f"{name:<12} {mean}   {_interval(value['interval'], '.4g')}")
     lines += [f"Note         {note}" for note in metrics["notes"]]
     return "\n".join(lines)
 

@@ -85,6 +85,9 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         print_notice(
             f"--video-length: expected at least 1 frame, got {cfg.video_length}; one is recorded."
         )
+    # Imported late: `--help` does not need it.
+    from mjlab.rl.evaluation import reward_unit
+
     check_address(cfg.host, cfg.port, "--")
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
@@ -114,7 +117,8 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         with threads_for_policy(policy, env.num_envs, device):
             if cfg.viewer == "none" and cfg.num_steps is not None:
-                print(run_headless(env, policy, cfg.num_steps).summary(env.num_envs))
+                result = run_headless(env, policy, cfg.num_steps, reward_unit=reward_unit(env))
+                print(result.summary(env.num_envs))
             else:
                 viewer = _make_viewer(task, cfg, env, policy, checkpoint, device)
                 viewer.run(num_steps=cfg.num_steps)

@@ -120,6 +120,22 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def number(value: float) -> str:
+    """Format a value with three digits, or without decimals: `7.41`, `741`, `3,704`."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def duration(seconds: float) -> str:
+    """Format seconds: `8.4 s`, `3:05 min`, `2:10 h`."""
+    if round(seconds, 1) < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes}:{rest:02d} min"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d} h"
+
+
 def suggest(name: str, available: Iterable[str]) -> str:
     """Return a hint for an unknown `name`: "did you mean 'y'? Available: ['x', 'y']."."""
     names = list(available)

@@ -441,7 +441,8 @@ class HeadlessResult:
     num_steps: int
     """Number of environment steps taken."""
     mean_step_reward: float
-    """Reward per step, averaged over steps and environments."""
+    """Weighted reward per step, averaged over steps and environments. As `Train/mean_step_reward`, before
+    scaling by the step's duration if `run_headless` is given its factor."""
     num_episodes: int
     """Number of episodes that ended, over all environments."""
 
@@ -459,6 +460,7 @@ def run_headless(
     policy: PolicyProtocol,
     num_steps: int,
     on_step: Callable[[int], None] | None = None,
+    reward_unit: float = 1.0,
 ) -> HeadlessResult:
     """Step `env` with `policy` as fast as possible.
 
@@ -468,6 +470,8 @@ def run_headless(
         policy: Maps observations to actions (num_envs, num_actions).
         num_steps: Number of environment steps to take.
         on_step: Called after each step with the number of steps taken.
+        reward_unit: Factor from weighted rewards to those that `step` returns
+            (`mjlab.rl.evaluation.reward_unit`).
 
     Raises:
         ValueError: The number of steps is negative.
@@ -484,7 +488,8 @@ def run_headless(
             episodes += (dones != 0).sum()
             if on_step is not None:
                 on_step(step + 1)
-    return HeadlessResult(num_steps, float(reward_sum) / max(num_steps, 1), int(episodes))
+    mean = float(reward_sum) / max(num_steps, 1) / reward_unit
+    return HeadlessResult(num_steps, mean, int(episodes))
 
 
 def done_mask(results: tuple[Any, ...]) -> torch.Tensor:

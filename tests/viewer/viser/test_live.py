@@ -11,8 +11,9 @@ from mjlab.viewer.viser.live import LiveViewer, progress_html
 STATS = {
     "iteration": 30,
     "total_iterations": 120,
-    "mean_reward": None,
-    "mean_episode_length": 421.4,
+    "mean_step_reward": 0.75,
+    "exploring_return": 3155.2,
+    "exploring_length": 421.4,
     "steps_per_second": 15321.0,
     "time_left": 3725.0,
 }
@@ -81,18 +82,31 @@ def test_the_page_says_how_far_training_has_got(page) -> None:
     viewer.tick()
     assert "Waiting for the first iteration" in viewer._panel.content
     viewer.tick()
-    for part in ("A task", "30 of 120", "width:25.0%", "421 steps", "15,321 steps/s", "1:02:05"):
+    for part in (
+        "A task",
+        "30 of 120",
+        "width:25.0%",
+        "421 steps",
+        "15,321 steps/s",
+        "1:02 h left",
+    ):
         assert part in viewer._panel.content
     # Values stay until newer ones arrive.
     viewer.tick()
     assert "30 of 120" in viewer._panel.content
 
 
-def test_what_is_not_known_yet_is_a_dash_and_titles_are_text() -> None:
-    content = progress_html("<b>", STATS, age=7.2)
-    assert "<strong>Mean reward:</strong> —" in content
+def test_titles_are_text_and_times_may_be_unknown() -> None:
+    content = progress_html("<b>", STATS | {"time_left": None}, age=7.2)
     assert "&lt;b&gt;" in content
     assert "7 s old" in content
-    assert "1:02:05 left" in content
-    day = progress_html("", STATS | {"time_left": 93_784.0}, age=0.0)
-    assert "26:03:04 left" in day
+    assert "starting" in content
+    assert "left" not in content
+
+
+def test_the_page_has_the_return_of_the_terminal() -> None:
+    assert "<strong>Return:</strong> 3,155, exploring" in progress_html("", STATS, age=0.0)
+    endless = STATS | {"exploring_return": None, "exploring_length": None}
+    content = progress_html("", endless, age=0.0)
+    assert "<strong>Reward per step:</strong> 0.75, exploring" in content
+    assert "Episodes" not in content

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from mjlab.utils.string import clock
+from mjlab.utils.string import duration, number
 from mjlab.viewer.viser.viewer import ViserPlayViewer
 
 if TYPE_CHECKING:
@@ -116,20 +116,20 @@ def progress_html(title: str, stats: Stats | None, age: float) -> str:
         f'<div style="width:{100.0 * done / max(total, 1):.1f}%;height:6px;background:#1c7ed6;'
         'border-radius:2px"></div></div>'
     )
-    time_left = clock(max(stats["time_left"], 0.0))
+    left, value = stats["time_left"], stats["exploring_return"]
+    unit = "Return" if value is not None else "Reward per step"
+    value = stats["mean_step_reward"] if value is None else value
     rows = [
         ("Iteration", f"{done:,} of {total:,}"),
-        ("Mean reward", _number(stats["mean_reward"])),
-        ("Episode length", f"{_number(stats['mean_episode_length'], 0)} steps"),
-        ("Speed", f"{stats['steps_per_second']:,.0f} steps/s, {time_left} left"),
+        ("Time", "starting …" if left is None else f"at most {duration(left)} left"),
+        (unit, f"{number(value)}, exploring"),
+        ("Speed", f"{stats['steps_per_second']:,.0f} steps/s"),
         ("Policy", f"{age:.0f} s old"),
     ]
+    if stats["exploring_length"] is not None:
+        rows.insert(3, ("Episodes", f"{stats['exploring_length']:,.0f} steps"))
     lines = "".join(f"<div><strong>{row}:</strong> {value}</div>" for row, value in rows)
     lines += (
         '<div style="opacity:0.6">The view runs at low priority; training takes precedence.</div>'
     )
     return f'<div style="{style}">{name}{bar}{lines}</div>'
-
-
-def _number(value: float | None, decimals: int = 2) -> str:
-    return "—" if value is None else f"{value:,.{decimals}f}"

@@ -136,6 +136,14 @@ TRACKING_ERRORS = {
     "ee_ori_error": ee_ori_error,
 }
 """Evaluation metrics by name."""
+UNITS = {
+    "mpkpe": "m",
+    "r_mpkpe": "m",
+    "joint_vel_error": "rad/s",
+    "ee_pos_error": "m",
+    "ee_ori_error": "rad",
+}
+"""Units of `TRACKING_ERRORS`."""
 
 
 def play_motions_once(cfg: Any) -> None:

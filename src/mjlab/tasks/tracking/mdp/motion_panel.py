@@ -144,10 +144,9 @@ class MotionPanel:
         rows = zip(
             frame.body_names, distance.tolist(), in_world.tolist(), angle.tolist(), strict=True
         )
-        lines = ["| body | cm | in the world | degrees |", "| --- | --- | --- | --- |"]
+        lines = ["| body | m | in the world (m) | rad |", "| --- | --- | --- | --- |"]
         lines += [
-            f"| {name} | {100 * near:.1f} | {100 * far:.1f} | {57.2958 * turn:.1f} |"
-            for name, near, far, turn in rows
+            f"| {name} | {near:.3f} | {far:.3f} | {turn:.3f} |" for name, near, far, turn in rows
         ]
         return "\n".join(lines)
 

@@ -71,7 +71,7 @@ def velocity_ppo_runner_cfg(experiment_name: str, max_iterations: int) -> RslRlO
         algorithm=RslRlPpoAlgorithmCfg(entropy_coef=0.01),
         experiment_name=experiment_name,
         max_iterations=max_iterations,
-        evaluation=EvaluationCfg(metrics=dict(TRACKING_ERRORS)),
+        evaluation=EvaluationCfg(metrics=dict(TRACKING_ERRORS), units=dict(UNITS)),
     )
 
 
@@ -89,6 +89,8 @@ def ang_vel_error(env: Any) -> torch.Tensor:
 
 TRACKING_ERRORS = {"lin_vel_error": lin_vel_error, "ang_vel_error": ang_vel_error}
 """Velocity errors by their names in evaluations."""
+UNITS = {"lin_vel_error": "m/s", "ang_vel_error": "rad/s"}
+"""Units of `TRACKING_ERRORS`."""
 
 
 # Profiles.

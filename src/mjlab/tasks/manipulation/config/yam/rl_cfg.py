@@ -62,7 +62,9 @@ def yam_lift_cube_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
         experiment_name="yam_lift_cube",
         save_interval=100,
         max_iterations=5_000,
-        evaluation=EvaluationCfg(success_func=placed_at_goal, metrics=dict(PLACEMENT)),
+        evaluation=EvaluationCfg(
+            success_func=placed_at_goal, metrics=dict(PLACEMENT), units={"position_error": "m"}
+        ),
     )
 
 
@@ -95,7 +97,9 @@ def _vision(experiment_name: str) -> RslRlOnPolicyRunnerCfg:
         experiment_name=experiment_name,
         save_interval=100,
         max_iterations=3_000,
-        evaluation=EvaluationCfg(success_func=placed_at_goal, metrics=dict(PLACEMENT)),
+        evaluation=EvaluationCfg(
+            success_func=placed_at_goal, metrics=dict(PLACEMENT), units={"position_error": "m"}
+        ),
     )
 
 

@@ -28,7 +28,7 @@ from mjlab.rl.config import (
 from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.tasks.easing import Easing, Undo, ease_weight
 from mjlab.tasks.tracking.mdp.commands import motion_command
-from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, play_motions_once
+from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, UNITS, play_motions_once
 
 _COMMAND = "motion"
 _ACTION_RATE = "action_rate_l2"
@@ -52,6 +52,7 @@ def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
         max_iterations=30_000,
         evaluation=EvaluationCfg(
             metrics=dict(TRACKING_ERRORS),
+            units=dict(UNITS),
             prepare_env=play_motions_once,
             success_is_survival=True,
         ),
