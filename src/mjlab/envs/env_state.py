@@ -7,25 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.managers.manager_base import NullManager
+from mjlab.envs.curriculum_state import COUNTERS, curriculum_state, load_attributes, managers_of
 from mjlab.utils.state import capture_state, restore_state, shape_differences
 from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
 
-_COUNTERS = ("common_step_counter", "_sim_step_counter")
 _BUFFERS = ("episode_length_buf", "_pending_reset", "_nan_resets")
-_MANAGERS = (
-    "event_manager",
-    "command_manager",
-    "action_manager",
-    "observation_manager",
-    "termination_manager",
-    "reward_manager",
-    "curriculum_manager",
-    "metrics_manager",
-)
 
 
 def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
@@ -33,16 +22,17 @@ def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
     return {
         "num_envs": env.num_envs,
         # Copies of lists of names, or of dicts of such lists.
-        "terms": {name: copy.copy(getattr(env, name).active_terms) for name in _managers(env)},
+        "terms": {name: copy.copy(one.active_terms) for name, one in managers_of(env).items()},
         "terrain": _terrain_fingerprint(env),
-        "counters": {name: getattr(env, name) for name in _COUNTERS},
+        "counters": {name: getattr(env, name) for name in COUNTERS},
         "buffers": {name: getattr(env, name).clone() for name in _BUFFERS},
         "observations": _cloned(env.obs_buf),
         "sim": env.sim.state_dict(),
         "scene": capture_state(env.scene),
-        "managers": {name: capture_state(getattr(env, name)) for name in _managers(env)},
+        "managers": {name: capture_state(one) for name, one in managers_of(env).items()},
         # Edits of term configs by curricula: weights, parameters, command ranges.
-        "config_edits": {name: getattr(env, name).config_edits() for name in _managers(env)},
+        "config_edits": {name: one.config_edits() for name, one in managers_of(env).items()},
+        "curriculum": curriculum_state(env),
     }
 
 
@@ -57,9 +47,11 @@ def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         setattr(env, name, value)
     for name, value in state["buffers"].items():
         getattr(env, name).copy_(value)
-    for name in _managers(env):
-        restore_state(getattr(env, name), state["managers"][name])
-        getattr(env, name).apply_config_edits(state["config_edits"][name])
+    for name, manager in managers_of(env).items():
+        restore_state(manager, state["managers"][name])
+        manager.apply_config_edits(state["config_edits"][name])
+    if "curriculum" in state:
+        load_attributes(env, state["curriculum"])
     restore_state(env.scene, state["scene"])
     # Physics comes last, because some entity buffers are views of simulation fields.
     env.sim.load_state_dict(state["sim"])
@@ -111,10 +103,6 @@ def _terrain_fingerprint(env: ManagerBasedRlEnv) -> torch.Tensor | None:
     weights = [torch.linspace(1.0, 2.0, len(part), dtype=torch.float64) for part in flat]
     sums = [part @ weight for part, weight in zip(flat, weights, strict=True)]
     return torch.stack([*sums, *(torch.tensor(float(len(part))) for part in flat)])
-
-
-def _managers(env: ManagerBasedRlEnv) -> list[str]:
-    return [name for name in _MANAGERS if not isinstance(getattr(env, name), NullManager)]
 
 
 def _cloned(observations: dict[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.envs import env_state
+from mjlab.envs import curriculum_state, env_state
 from mjlab.envs.divergence import DivergenceLog
 from mjlab.envs.mdp.events import reset_scene_to_default
 from mjlab.envs.placement import PlacementReport
@@ -177,6 +177,8 @@ class ManagerBasedRlEnv(Tabular):
         self.observes_ends = self.observes_failures = False
         self.common_step_counter = 0
         self._holds_common_steps = False
+        # State before the first reset, which curricula may change.
+        self._built_state: dict[str, Any] | None = None
         self._sim_step_counter = 0
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
@@ -357,6 +359,8 @@ class ManagerBasedRlEnv(Tabular):
         env_ids = as_reset_ids(env_ids, self.num_envs, self.device)
         if seed is not None:
             self.seed(seed)
+        if self._built_state is None:
+            self._built_state = curriculum_state.lasting_state(self)
         with self._checking_terms(resets=True):
             self._clear_extras()
             stepped = env_ids[self.episode_length_buf[env_ids] > 0]
@@ -721,6 +725,23 @@ class ManagerBasedRlEnv(Tabular):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a `state_dict`. Raises `ValueError` if task or number of environments differ."""
         env_state.load_state_dict(self, state)
+
+    def curriculum_state(self) -> dict[str, Any]:
+        """Return the part of `state_dict` that outlives episodes, for any number of environments.
+
+        The part holds step counters, edits of term configs (weights, parameters, command ranges),
+        changed attributes of terms and of the environment, changed settings (`episode_length_s`),
+        and terrain levels.
+        """
+        return curriculum_state.curriculum_state(self)
+
+    def load_curriculum_state(self, state: dict[str, Any]) -> list[str]:
+        """Restore a `curriculum_state`, and return the names of parts that do not fit this task.
+
+        Rows of environments, such as terrain levels, are spread over `num_envs` in order. Episodes
+        are those of before: `reset` starts new ones, within `curriculum_manager.held()`.
+        """
+        return curriculum_state.load_curriculum_state(self, state)
 
     def close(self) -> None:
         """Close the renderer, the recorders and the simulation."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -31,16 +32,30 @@ class CurriculumManager(TermListManager):
     _title = "curriculum"
     _cfg_type = CurriculumTermCfg
     _leading = ("env", "env_ids")
+    _transient = {"_is_held"}
 
     def __init__(self, cfg: Mapping[str, CurriculumTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         self._state: dict[str, Any] = dict.fromkeys(self._term_names)
+        self._is_held = False
+
+    @contextmanager
+    def held(self) -> Generator[None]:
+        """Call no terms within this context, so that resets do not change the curricula."""
+        before, self._is_held = self._is_held, True
+        try:
+            yield
+        finally:
+            self._is_held = before
 
     def compute(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Call all terms for the environments about to reset, and store their results.
 
-        Raises `ValueError` if a term returns a tensor without exactly one element.
+        Does nothing inside `held`. Raises `ValueError` if a term returns a tensor without exactly one
+        element.
         """
+        if self._is_held:
+            return
         index = as_index(env_ids)
         for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
             state = cfg.func(self._env, index, **cfg.params)

@@ -471,6 +471,54 @@ def capture_training_state(
     return state
 
 
+def capture_lasting_state(env: VecEnv, logger_state: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of the training state that new episodes continue: curricula and totals."""
+    unwrapped: Any = getattr(env, "unwrapped", env)
+    state: dict[str, Any] = {"version": VERSION, "num_envs": env.num_envs, "logger": logger_state}
+    if hasattr(unwrapped, "curriculum_state"):
+        state["env"] = {"curriculum": unwrapped.curriculum_state()}
+    return state
+
+
+def curricula_of(content: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the curriculum state in the content of a checkpoint, None if it has none."""
+    env = (content.get("training_state") or {}).get("env")
+    if not isinstance(env, dict):
+        return None
+    if "curriculum" in env or "config_edits" not in env:
+        return env.get("curriculum")
+    # A state of an earlier version: attributes of terms cannot be told from settings.
+    parts = {name: env[name] for name in ("num_envs", "counters", "config_edits")}
+    return {**parts, "changed": {}, "terrain_levels": None, "num_terrain_levels": 0}
+
+
+def restore_curricula(state: dict[str, Any], env: VecEnv) -> list[str]:
+    """Restore the curricula in a training state, and start new episodes under them.
+
+    Returns the names of parts left out.
+
+    Raises:
+        CheckpointError: the state is malformed.
+    """
+    curricula = curricula_of({"training_state": state})
+    unwrapped: Any = getattr(env, "unwrapped", env)
+    if not hasattr(unwrapped, "load_curriculum_state"):
+        return []
+    if curricula is None:
+        return ["curricula"]
+    try:
+        # Tensors created in the rollout can only be written to in inference mode.
+        with torch.inference_mode():
+            left_out = unwrapped.load_curriculum_state(_to(curricula, env.device))
+            with unwrapped.curriculum_manager.held():
+                env.reset()  # ty: ignore[missing-attribute]
+        return left_out
+    except torch.OutOfMemoryError:
+        raise
+    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
+        raise _malformed(error) from error
+
+
 def restore_training_state(
     state: dict[str, Any],
     env: VecEnv,
@@ -518,10 +566,14 @@ def restore_training_state(
     except torch.OutOfMemoryError:
         raise
     except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-        raise CheckpointError(
-            f"Checkpoint training_state is malformed ({type(error).__name__}: {error}); use an earlier "
-            "checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
-        ) from error
+        raise _malformed(error) from error
+
+
+def _malformed(error: Exception) -> CheckpointError:
+    return CheckpointError(
+        f"Checkpoint training_state is malformed ({type(error).__name__}: {error}); use an earlier "
+        "checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
+    )
 
 
 def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
@@ -536,7 +588,9 @@ def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
             f"training_state num_envs: expected {env.num_envs}, got {state['num_envs']}; use --num-envs "
             f"{state['num_envs']}."
         )
-    observations = state["observations"]
+    observations = state.get("observations")
+    if observations is None:
+        raise ValueError("The run ended within an iteration, so the checkpoint has no episodes.")
     found, expected = (
         {key: tuple(value.shape) for key, value in one.items()}
         for one in (observations, env.get_observations().flatten_keys("\n"))

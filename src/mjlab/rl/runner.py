@@ -27,11 +27,13 @@ from tensordict import TensorDict
 
 from mjlab.rl.checkpoint import (
     RunRescue,
+    capture_lasting_state,
     capture_training_state,
     check_fits,
     load_algorithm,
     load_checkpoint,
     migrate,
+    restore_curricula,
     restore_training_state,
     save_checkpoint,
 )
@@ -176,6 +178,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 begin = time.perf_counter()
                 if self._run_folder is not None and iteration > first:
                     rescue.learned = {**copy.deepcopy(self.alg.save()), **self._progress()}
+                    rescue.learned["training_state"] = capture_lasting_state(
+                        self.env, self.logger.state_dict()
+                    )
                 with self._watch.explaining(self.alg.get_policy()):
                     with torch.inference_mode():
                         with using_torch_threads(self._num_collecting_threads):
@@ -285,25 +290,24 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                     "Episodes and random numbers restart: not contained in the checkpoint."
                 )
             return None
-        if self.is_distributed:
-            # A checkpoint has the episodes of the first process only.
-            logger.warning(
-                "Episodes and random numbers restart, because several processes share the run."
-            )
-            self.logger.load_totals(state["logger"])
-            # Otherwise every session would repeat the random numbers of the first.
-            seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
-            return None
-        try:
-            return restore_training_state(
-                state, self.env, self.alg, self.logger.load_state_dict, self.device
-            )
-        except ValueError as error:
-            logger.warning(
-                "Weights, optimizer and iteration are resumed, but episodes and random numbers "
-                "restart, because the saved state does not fit. %s", error,
-            )  # fmt: skip
-            return None
+        # A checkpoint has the episodes of the first process only.
+        reason = "several processes share the run." if self.is_distributed else ""
+        if not reason:
+            try:
+                return restore_training_state(
+                    state, self.env, self.alg, self.logger.load_state_dict, self.device
+                )
+            except ValueError as error:
+                reason = f"the saved state does not fit. {error}"
+        # Otherwise every session would repeat the random numbers of the first.
+        seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
+        left_out = restore_curricula(state, self.env)
+        self.logger.load_totals(state["logger"])
+        logger.warning(
+            "Weights, optimizer, iteration and curricula are resumed, but episodes and random numbers "
+            "restart, because %s%s", reason, f" Not resumed: {', '.join(left_out)}." * bool(left_out),
+        )  # fmt: skip
+        return None
 
     def _bootstrapped(
         self, observations: TensorDict, rewards: torch.Tensor, extras: dict[str, Any]
@@ -435,7 +439,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             load_cfg: Parts to load (`actor`, `critic`, `student`, `teacher`, `optimizer`,
                 `iteration`, `rnd`).
                 None: all; `learn` then also resumes the environments and the random number
-                generators, if the number of environments is the same.
+                generators, if the number of environments is the same, and else the curricula.
             strict: Require every parameter to fit.
             map_location: Without effect: tensors are moved to the device of the networks.
 

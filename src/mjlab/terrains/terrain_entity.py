@@ -282,6 +282,10 @@ class TerrainEntity(Entity):
         finally:
             self._holds_levels = held
 
+    def set_levels(self, levels: torch.Tensor) -> None:
+        """Move all environments to `levels` (N,) of their columns. Does nothing on a plane."""
+        self._go_to_levels(torch.arange(self.cfg.num_envs, device=self._device), levels)
+
     def randomize_env_origins(self, env_ids: torch.Tensor) -> None:
         """Move environments to uniformly sampled cells. Does nothing on a plane."""
         if self.terrain_origins is None or self.terrain_types is None:

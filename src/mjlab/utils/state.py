@@ -12,7 +12,7 @@ import contextlib
 import enum
 import logging
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,8 +21,8 @@ import torch
 logger = logging.getLogger(__name__)
 C = TypeVar("C", bound=type)
 _MARK = "_is_stateful"
-# Marks the state of an object, to tell it from a plain dict.
-_CLASS_KEY = "__class__"
+CLASS_KEY = "__class__"
+"""Key of the class in the state of an object, to tell it from a plain dict."""
 # Attributes for device and size of an object, set by the new run.
 _SETTINGS = frozenset({"device", "_device", "num_envs", "_num_envs"})
 _TRANSIENT = "_transient"
@@ -71,7 +71,9 @@ def is_stateful(obj: Any) -> bool:
     return getattr(type(obj), _MARK, False)
 
 
-def capture_state(obj: Any, *, generators: bool = True) -> dict[str, Any]:
+def capture_state(
+    obj: Any, *, generators: bool = True, without: Sequence[Any] = ()
+) -> dict[str, Any]:
     """Return a copy of the run-time state of `obj`, an instance of a `stateful` class.
 
     The result holds only tensors, numbers, strings, None, lists and dicts, so it can be saved by
@@ -80,8 +82,15 @@ def capture_state(obj: Any, *, generators: bool = True) -> dict[str, Any]:
     Args:
         obj: The object.
         generators: Include the state of random generators.
+        without: Objects to leave out.
     """
-    return _capture_object(obj, set(), generators)
+    return _capture_object(obj, {id(part) for part in without}, generators)
+
+
+def capture_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a copy of the data in `values`, without random generators; see `capture_state`."""
+    captured = {name: _capture_value(value, set(), False) for name, value in values.items()}
+    return {name: value for name, value in captured.items() if value is not SKIP}
 
 
 def restore_state(obj: Any, state: dict[str, Any]) -> None:
@@ -92,17 +101,17 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
     """
     transient = _transient_names(type(obj))
     for name, value in state.items():
-        if name in transient or name == _CLASS_KEY:
+        if name in transient or name == CLASS_KEY:
             continue
         current = obj.__dict__.get(name)
-        is_object = isinstance(value, dict) and _CLASS_KEY in value
+        is_object = isinstance(value, dict) and CLASS_KEY in value
         if is_object and not is_stateful(current):
             logger.warning(
                 "%s.%s not restored: expected a %s, got %r.",
-                type(obj).__name__, name, value[_CLASS_KEY], current,
+                type(obj).__name__, name, value[CLASS_KEY], current,
             )  # fmt: skip
             continue
-        obj.__dict__[name] = _restored(current, value)
+        obj.__dict__[name] = restored(current, value)
 
 
 @contextlib.contextmanager
@@ -154,7 +163,7 @@ def _with_rows(
         merged.movedim(dim, 0)[ids] = after.movedim(dim, 0)[ids].to(merged.dtype)
         return merged
     if isinstance(before, dict) and isinstance(after, dict):
-        owner = before.get(_CLASS_KEY)
+        owner = before.get(CLASS_KEY)
         return {
             name: _with_rows(value, after.get(name), ids, num_envs, _ROW_DIMS.get((owner, name)))
             for name, value in before.items()
@@ -231,7 +240,7 @@ def _capture_value(value: Any, seen: set[int], generators: bool) -> Any:
         # Objects reached twice are saved once: state is a tree.
         if id(value) in seen:
             return SKIP
-        return {_CLASS_KEY: type(value).__name__, **_capture_object(value, seen, generators)}
+        return {CLASS_KEY: type(value).__name__, **_capture_object(value, seen, generators)}
     # Sequences keep their length: items that are not state are saved as None.
     if type(value) in _SEQUENCES:
         items = [_capture_value(item, seen, generators) for item in value]
@@ -267,7 +276,7 @@ def _is_helper(obj: Any, owner: type, num_envs: int) -> bool:
     return any(array.shape[:1] == (num_envs,) for array in arrays)
 
 
-def _restored(current: Any, saved: Any) -> Any:
+def restored(current: Any, saved: Any) -> Any:
     """Return the value that restores `saved` in an attribute that holds `current`."""
     if isinstance(saved, torch.Tensor):
         return _restored_tensor(current, saved)
@@ -276,13 +285,13 @@ def _restored(current: Any, saved: Any) -> Any:
         return current
     if type(current) in _SEQUENCES and isinstance(saved, list):
         if len(current) == len(saved):
-            saved = [_restored(item, value) for item, value in zip(current, saved, strict=True)]
+            saved = [restored(item, value) for item, value in zip(current, saved, strict=True)]
         if isinstance(current, deque):
             return deque(saved, maxlen=current.maxlen)
         return type(current)(saved)
     if isinstance(current, dict) and isinstance(saved, dict):
         for key, value in saved.items():
-            current[key] = _restored(current.get(key), value)
+            current[key] = restored(current.get(key), value)
         return current
     # Values that are not state were saved as None: keep them.
     if saved is None and not isinstance(current, torch.Tensor) and plain_scalar(current) is SKIP:
