@@ -29,7 +29,7 @@ import numpy as np
 import torch
 
 from mjlab.rl.learners import Learner
-from mjlab.utils.errors import MjlabError, check_count
+from mjlab.utils.errors import MjlabError, UserError, check_count, check_positive
 from mjlab.utils.os import replacing
 from mjlab.utils.random import rng_state, set_rng_state
 
@@ -318,19 +318,26 @@ def load_algorithm(
         strict: Require every parameter to fit.
         path: Checkpoint file, for messages.
 
+    An optimizer of another kind than the saved one keeps its own state, with a warning.
+
     Returns:
         True if the iteration count is to be loaded.
 
     Raises:
         CheckpointError: a part is missing, does not fit, or is not finite. Nothing was changed.
     """
+    optimizer, changed_from = algorithm.optimizer, None
     for name in ("actor", "critic", "student", "teacher"):
         model = getattr(algorithm, f"_raw_{name}", None)
         if strict and model is not None and (load_cfg is None or load_cfg.get(name)):
             check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)
     if load_cfg is None or load_cfg.get("optimizer"):
         saved = checkpoint.get("optimizer_state_dict")
-        check_optimizer_fits(algorithm.optimizer, saved, path=path)
+        changed_from = _other_kind(optimizer, saved)
+        if changed_from is not None:
+            checkpoint = {**checkpoint, "optimizer_state_dict": optimizer.state_dict()}
+        else:
+            check_optimizer_fits(optimizer, saved, path=path)
         broken = not_finite({name: checkpoint.get(name) for name in _LEARNING_ENTRIES})
         if broken:
             raise CheckpointError(
@@ -340,13 +347,71 @@ def load_algorithm(
     # rsl_rl loads one part after the other: an error leaves the algorithm partly loaded.
     before = copy.deepcopy(algorithm.save())
     try:
-        return algorithm.load(checkpoint, load_cfg, strict)
+        loads_iteration = algorithm.load(checkpoint, load_cfg, strict)
     except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
         algorithm.load(before, None, True)
         raise CheckpointError(
             f"Checkpoint {path!r} does not fit this algorithm: {error}. To load only its policy, use "
             "load_cfg={'actor': True}."
         ) from error
+    if hasattr(algorithm, "student"):
+        # rsl_rl's distillation loads the rate of its optimizer only.
+        algorithm.learning_rate = optimizer.param_groups[0]["lr"]
+    if changed_from is not None:
+        logger.warning(
+            "The optimizer starts fresh, with learning rate %g: the checkpoint has the state of %s, this "
+            "run uses %s.",
+            algorithm.learning_rate, changed_from, _kind_of(optimizer.param_groups[0]),
+        )  # fmt: skip
+    return loads_iteration
+
+
+def override_algorithm(algorithm: Any, name: str, value: Any) -> None:
+    """Set a restored setting of rsl_rl's `algorithm`; settings it was built with act already.
+
+    Args:
+        algorithm: An rsl_rl algorithm, or one with its methods, after `load_algorithm`.
+        name: Dotted name of the setting, without "algorithm".
+        value: Value of the setting.
+    """
+    optimizer = algorithm.optimizer
+    if name.startswith("rnd_cfg."):
+        rnd = getattr(algorithm, "rnd", None)
+        optimizer, name = getattr(rnd, "optimizer", None), name.removeprefix("rnd_cfg.")
+    elif name == "learning_rate":
+        # The adaptive schedule continues from here.
+        algorithm.learning_rate = float(value)
+    if optimizer is None:
+        return
+    # Names of torch: weight_decay, betas, momentum, ...
+    name = "lr" if name == "learning_rate" else name
+    for group in optimizer.param_groups:
+        if name in group and name != "params":
+            group[name] = tuple(value) if isinstance(value, list) else value
+
+
+def set_deviation(model: torch.nn.Module, name: str, value: float) -> None:
+    """Set the standard deviation of a restored policy that does not depend on its observations.
+
+    Args:
+        model: A model of rsl_rl.
+        name: Name of the model, for the message.
+        value: Standard deviation.
+
+    Raises:
+        UserError: the standard deviation depends on observations.
+    """
+    check_positive(f"agent.{name}.distribution_cfg.init_std", value)
+    distribution = getattr(model, "distribution", None)
+    for attribute, scaled in (("std_param", value), ("log_std_param", math.log(value))):
+        if (parameter := getattr(distribution, attribute, None)) is not None:
+            with torch.no_grad():
+                parameter.fill_(scaled)
+            return
+    raise UserError(
+        f"--agent.{name}.distribution-cfg.init-std: expected that of the resumed run, because its "
+        f"network has learned the standard deviation, got {value}; leave it out, or train a new run."
+    )
 
 
 def check_fits(
@@ -423,6 +488,34 @@ def check_optimizer_fits(
             f"Checkpoint {path!r}: expected an optimizer state that fits these networks. To load only "
             "its policy, use load_cfg={'actor': True}. Nothing was changed."
         )
+
+
+# A setting that no other kind of torch's optimizers has.
+_OPTIMIZERS = {"betas": "adam", "alpha": "rmsprop", "dampening": "sgd"}
+# Setting of adam and adamw, in torch since 2.7.
+_IS_ADAMW = "decoupled_weight_decay"
+
+
+def _kind_of(group: Mapping[str, Any]) -> str | None:
+    """Return the name of the optimizer with the settings `group`; None: unknown."""
+    kinds = [kind for name, kind in _OPTIMIZERS.items() if name in group]
+    if len(kinds) != 1:
+        return None
+    return "adamw" if group.get(_IS_ADAMW) else kinds[0]
+
+
+def _other_kind(optimizer: torch.optim.Optimizer, saved: Any) -> str | None:
+    """Return the name of the optimizer of the state `saved` if it is another one; else None."""
+    try:
+        group = dict(saved["param_groups"][0])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return None
+    own = optimizer.param_groups[0]
+    found, expected = _kind_of(group), _kind_of(own)
+    if found is None or expected is None or found == expected:
+        return None
+    is_unknown = _IS_ADAMW not in group or _IS_ADAMW not in own
+    return None if is_unknown and "betas" in group and "betas" in own else found
 
 
 def not_finite(value: Any, name: str = "") -> list[str]:

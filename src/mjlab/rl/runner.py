@@ -33,9 +33,11 @@ from mjlab.rl.checkpoint import (
     load_algorithm,
     load_checkpoint,
     migrate,
+    override_algorithm,
     restore_curricula,
     restore_training_state,
     save_checkpoint,
+    set_deviation,
 )
 from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
@@ -50,8 +52,9 @@ from mjlab.rl.networks import (
 from mjlab.rl.progress import NotebookProgress, ProgressCfg, in_notebook
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.run_logger import RunLogger, TrainingObserver
+from mjlab.utils.errors import UserError
 from mjlab.utils.processes import process_rank
-from mjlab.utils.random import seed_rng, session_seed
+from mjlab.utils.random import process_seed, seed_rng, session_seed
 from mjlab.utils.signals import StopRequest
 from mjlab.utils.torch import torch_threads, using_torch_threads
 
@@ -120,6 +123,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         # Part of the identity of checkpoints: which states are of the same training.
         self._token = secrets.token_hex(4)
         self._state_to_resume: dict[str, Any] | None = None
+        # Seed of the numbers drawn after a resume. None: the generators are restored.
+        self._new_seed: int | None = None
         # True if an evaluation was due after the last iteration but skipped to stop sooner.
         self._owes_evaluation = False
         self._solved_check = SolvedCheck(
@@ -271,6 +276,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             # `learn` was called before in this process: continue the episodes.
             return self._observations
         observations = self._resumed_observations()
+        if self._new_seed is not None:
+            # After the generators were restored.
+            seed_rng(self._new_seed)
+            self._new_seed = None
         if observations is None:
             if init_at_random_ep_len:
                 lengths = self.env.episode_length_buf
@@ -488,8 +497,46 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if replay is not None:
             storage.load_state_dict(replay)
         self._observations = None
+        self._new_seed = None
         self._token = secrets.token_hex(4)
         return infos
+
+    def override(self, settings: Mapping[str, Any]) -> None:
+        """Let settings that differ from those of the loaded run act, from the next iteration on.
+
+        Call it after `load`, on a runner built with these settings. `load` restores the state that
+        training has changed: learning rates, other settings of the optimizer, alpha, standard
+        deviations, random number generators. Here this state is set again; all other settings act
+        already, as the runner was built with them.
+
+        Args:
+            settings: Values by dotted name of the agent config: `algorithm.learning_rate`,
+                `algorithm.weight_decay`, `actor.distribution_cfg.init_std`, `seed`, ... A `seed` draws
+                new numbers; -1 is no seed.
+
+        Raises:
+            UserError: the setting cannot act, because the networks were trained with another one.
+        """
+        algorithm: Any = self.alg
+        for name, value in settings.items():
+            part, _, rest = name.partition(".")
+            if part == "obs_groups":
+                raise UserError(
+                    f"--agent.{name.replace('_', '-')}: expected the groups that the networks were "
+                    f"trained on, got {value}; leave it out, or train a new run."
+                )
+            if name == "seed" and value >= 0:
+                seed = process_seed(int(value), self.gpu_global_rank)
+                self.cfg["seed"] = seed
+                self._new_seed = session_seed(seed, self.current_learning_iteration)
+                if hasattr(algorithm, "override"):
+                    algorithm.override("seed", self._new_seed)
+            elif part == "algorithm" and hasattr(algorithm, "override"):
+                algorithm.override(rest, value)
+            elif part == "algorithm":
+                override_algorithm(algorithm, rest, value)
+            elif rest == "distribution_cfg.init_std" and hasattr(algorithm, f"_raw_{part}"):
+                set_deviation(getattr(algorithm, f"_raw_{part}"), part, value)
 
     def load_teacher(self, path: str) -> None:
         """Load the teacher of a distillation: the policy of a PPO checkpoint.

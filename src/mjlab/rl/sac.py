@@ -420,6 +420,25 @@ class SAC:
                 self._reward_scale.load_state_dict(state["reward_scale"])
         return cfg.get("iteration", False)
 
+    def override(self, name: str, value: Any) -> None:
+        """Set a setting that `load` restored: learning rates, weight decay, alpha, or the seed.
+
+        Settings with which the algorithm was built act already.
+        """
+        rates = ("critic_learning_rate", "actor_learning_rate", "alpha_learning_rate")
+        groups = self.optimizer.param_groups
+        if name in rates:
+            groups[rates.index(name)]["lr"] = float(value)
+            self.learning_rate = groups[1]["lr"]
+        elif name == "weight_decay":
+            for group in groups[:2]:
+                group[name] = float(value)
+        elif name == "init_alpha":
+            with torch.no_grad():
+                self._log_alpha.fill_(math.log(value))
+        elif name == "seed":
+            self._generator.manual_seed(value)
+
     def broadcast_parameters(self) -> None:
         """Broadcast the weights of the first process to all processes."""
         for model in (self.actor, self.critic, self._policy, self._target):
