@@ -34,7 +34,7 @@ sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
 from learning import EVALUATION_SEED  # noqa: E402
 from measure import output_of, processor  # noqa: E402
 
-from mjlab.rl.plot import plot_curves  # noqa: E402
+from mjlab.rl.plot import LABELS, plot_curves  # noqa: E402
 from mjlab.scripts.devices import resolve_device  # noqa: E402
 from mjlab.scripts.reference import (  # noqa: E402
     DATA,
@@ -405,7 +405,7 @@ def _draw(references: list[Reference], pages: Path) -> None:
         pages / f"{task}.png",
         title=task,
         xlabel="Samples (millions)",
-        ylabel="Mean evaluation return",
+        ylabel=LABELS["Evaluation/mean_return"],
     )
 
 

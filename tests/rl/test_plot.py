@@ -9,22 +9,54 @@ import pytest
 
 from mjlab.rl.plot import (
     DEFAULT_TAG,
+    LABELS,
     mean_and_std,
+    plot_curves,
     plot_run,
     plot_seeds,
+    read_all_scalars,
     read_scalars,
+    solved_at,
     visible_range,
 )
 
+EVALUATION = {"solved_return": 900.0, "num_episodes": 256}
+WALK = {
+    "solved_below": {"speed_error": 0.25, "failure_rate": 0.05},
+    "units": {"speed_error": "m/s"},
+    "num_episodes": 200,
+}
 
-def write_run(folder: Path, values: dict[int, float], tag: str = DEFAULT_TAG) -> Path:
+
+def write_run(
+    folder: Path,
+    values: dict[int, float],
+    tag: str = DEFAULT_TAG,
+    others: dict[str, dict[int, float]] | None = None,
+) -> Path:
     from torch.utils.tensorboard import SummaryWriter
 
     writer = SummaryWriter(str(folder))
-    for iteration, value in values.items():
-        writer.add_scalar(tag, value, iteration)
+    for name, curve in {tag: values, **(others or {})}.items():
+        for iteration, value in curve.items():
+            writer.add_scalar(name, value, iteration)
     writer.close()
     return folder
+
+
+@pytest.fixture
+def figures(monkeypatch) -> list:
+    """Figures, as they are saved."""
+    from matplotlib.figure import Figure
+
+    saved = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **kwargs: saved.append(self))
+    return saved
+
+
+def points_of(axes, label: str) -> list[tuple[float, float]]:
+    (line,) = (line for line in axes.lines if line.get_label() == label)
+    return [*zip(line.get_xdata(), line.get_ydata(), strict=True)]
 
 
 def is_png(path: Path) -> bool:
@@ -38,16 +70,30 @@ def test_all_values_of_a_long_run_are_read(tmp_path: Path):
     assert np.array_equal(values, iterations / 2)
 
 
-def test_mean_and_deviation_are_over_all_runs_at_every_iteration():
+def test_mean_and_deviation_are_where_all_runs_have_data():
     one = (np.array([0, 2, 4]), np.array([0.0, 2.0, 4.0]))
-    # This run was solved after iteration 2, so it stays at its last value.
-    other = (np.array([0, 1, 2]), np.array([0.0, 3.0, 4.0]))
+    # Resumed at iteration 1, and solved after 2.
+    other = (np.array([1, 2, 3]), np.array([3.0, 4.0, 5.0]))
     iterations, mean, std = mean_and_std([one, other])
-    assert iterations.tolist() == [0, 1, 2, 4]
-    assert mean.tolist() == [0.0, 2.0, 3.0, 4.0]
+    assert iterations.tolist() == [1, 2, 3]
+    assert mean.tolist() == [2.0, 3.0, 4.0]
     # Of two values, the sample standard deviation is their distance over the root of two.
-    assert std == pytest.approx(np.array([0.0, 2.0, 2.0, 0.0]) / np.sqrt(2))
+    assert std == pytest.approx(np.array([2.0, 2.0, 2.0]) / np.sqrt(2))
     assert mean_and_std([one])[2].tolist() == [0.0, 0.0, 0.0]
+    later = (np.array([5, 6]), np.array([1.0, 1.0]))
+    assert [part.tolist() for part in mean_and_std([one, later])] == [[], [], []]
+
+
+def test_single_runs_are_drawn_beyond_the_mean(tmp_path: Path):
+    seen = []
+    short, long = (np.arange(4), np.ones(4)), (np.arange(8), np.zeros(8))
+    plot_curves(
+        {"a": [short, long]}, tmp_path / "x.png", title="", ylabel="", draw=seen.append
+    )  # fmt: skip
+    (axes,) = seen
+    spans = [(line.get_xdata()[0], line.get_xdata()[-1]) for line in axes.lines]
+    assert spans == [(0, 3), (3, 7)]
+    assert axes.lines[0].get_linewidth() > axes.lines[1].get_linewidth()
 
 
 def test_one_run_and_several_seeds_become_pngs(tmp_path: Path):
@@ -117,3 +163,93 @@ def test_a_damaged_event_file_is_read_up_to_there_and_told(tmp_path: Path, caplo
     assert 30 < len(iterations) < 70
     assert values.tolist() == iterations.tolist()
     assert str(path) in caplog.text
+
+
+EACH = "Perf/collection_time"
+
+
+def test_the_parts_of_a_run_are_one_curve(tmp_path: Path):
+    scores = "Evaluation/mean_return"
+    first = {EACH: dict.fromkeys(range(6), 1.0), scores: {1: 10.0, 4: 40.0}}
+    one = write_run(tmp_path / "1", dict.fromkeys(range(6), 1.0), others=first)
+    # Killed after iteration 5, and resumed from the checkpoint after iteration 3.
+    second = {EACH: dict.fromkeys(range(3, 8), 1.0), scores: {7: 70.0}}
+    two = write_run(tmp_path / "2", dict.fromkeys(range(3, 8), 2.0), others=second)
+    # Solved at its start.
+    three = write_run(tmp_path / "3", {7: 77.0}, tag="Confirmation/mean_return")
+    curves = read_all_scalars([one, two, three])
+    assert curves[DEFAULT_TAG][0].tolist() == list(range(8))
+    assert curves[DEFAULT_TAG][1].tolist() == [1.0] * 3 + [2.0] * 5
+    assert curves[scores][0].tolist() == [1, 7]
+    assert curves["Confirmation/mean_return"][1].tolist() == [77.0]
+    # A policy of another tool was resumed.
+    (tmp_path / "0").mkdir()
+    assert read_scalars([tmp_path / "0", one], DEFAULT_TAG)[0].tolist() == list(range(6))
+
+
+def test_the_learning_curve_has_goal_evaluations_and_units(tmp_path: Path, figures):
+    others = {
+        "Evaluation/mean_return": {2: 850.0, 4: 950.0},
+        "Confirmation/mean_return": {4: 940.0},
+        "Perf/total_fps": dict.fromkeys(range(5), 1000.0),
+        EACH: dict.fromkeys(range(5), 1.5),
+        "Perf/learning_time": dict.fromkeys(range(5), 0.5),
+    }
+    run = write_run(tmp_path, {i: 100.0 * i for i in range(5)}, others=others)
+    plot_run(run, evaluation=EVALUATION)
+    (figure,) = figures
+    (axes,) = figure.axes
+    assert points_of(axes, "exploring policy")[-1] == (5, 400.0)
+    assert points_of(axes, "evaluation") == [(3, 850.0), (5, 950.0)]
+    assert points_of(axes, "confirmation") == [(5, 940.0)]
+    assert {y for _, y in points_of(axes, "goal")} == {900.0}
+    assert axes.get_xlabel() == "Iteration"
+    assert "sum of weighted rewards" in axes.get_ylabel()
+    (above,) = axes.child_axes
+    assert above.get_xlabel() == "Environment steps"
+    figure.canvas.draw()
+    low, high = axes.get_xlim()
+    assert above.get_xlim() == pytest.approx((2000.0 * low, 2000.0 * high))
+
+
+def test_goals_besides_the_return_have_their_own_axes(tmp_path: Path, figures):
+    others = {
+        "Evaluation/mean_return": {1: 3000.0},
+        "Evaluation/speed_error": {1: 0.3},
+        "Evaluation/failure_rate": {1: 0.1},
+    }
+    plot_run(write_run(tmp_path, {0: 1.0, 1: 2.0}, others=others), evaluation=WALK)
+    _, error, failures = figures[0].axes
+    assert error.get_title() == "Speed error (m/s)"
+    assert points_of(error, "evaluation") == [(2, pytest.approx(0.3))]
+    assert failures.get_title() == "Failure rate (%)"
+    assert points_of(failures, "evaluation") == [(2, pytest.approx(10.0))]
+    assert {y for _, y in points_of(failures, "goal")} == {5.0}
+
+
+@pytest.mark.parametrize("tag", ["Train/mean_step_reward", "Train/mean_reward"])
+def test_runs_without_a_return_have_another_unit(tmp_path: Path, figures, tag):
+    run = write_run(tmp_path, {0: 1.0, 1: 2.0}, tag=tag)
+    plot_run(run, evaluation=EVALUATION)
+    (axes,) = figures[0].axes
+    assert axes.get_ylabel() == LABELS[tag]
+    # A return is no goal of another unit.
+    assert len(axes.lines) == 1
+    plot_seeds([run, run], tmp_path / "seeds.png")
+    assert figures[1].axes[0].get_ylabel() == LABELS[tag]
+
+
+def test_a_run_is_solved_where_all_goals_are_met(tmp_path: Path):
+    def curves(group: str, **values: list[float]):
+        return {f"{group}/{k}": (np.arange(len(v)), np.array(v)) for k, v in values.items()}
+
+    returns = [800.0, 910.0, 890.0, 920.0]
+    to_the_end = {**EVALUATION, "stop_when_solved": False}
+    assert solved_at(curves("Evaluation", mean_return=returns), to_the_end) == 2
+    # Evaluations of runs that stop when solved are confirmed.
+    assert solved_at(curves("Evaluation", mean_return=returns), EVALUATION) is None
+    assert solved_at(curves("Confirmation", mean_return=returns), EVALUATION) == 2
+    # 10 failures in 200 episodes count as 5.8 %, 8 as 4.9 %.
+    walked = curves("Confirmation", speed_error=[0.3, 0.2, 0.2], failure_rate=[0.01, 0.05, 0.04])
+    assert solved_at(walked, WALK) == 3
+    assert solved_at(walked, {}) is None

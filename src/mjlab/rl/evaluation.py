@@ -278,6 +278,11 @@ class Bound:
     unit: str = ""
     """Unit of the value; empty for returns and rates."""
 
+    @property
+    def is_rate(self) -> bool:
+        """True for a fraction of the episodes, shown in percent."""
+        return self.name in ("failure_rate", "success_rate")
+
     def is_met(self, result: EvaluationResult) -> bool:
         """Return whether `result` meets the bound. NaN does not."""
         value = result.judged(self.name)

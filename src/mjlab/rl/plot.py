@@ -3,74 +3,145 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjlab.utils.string import suggest
+from mjlab.utils.string import counted, suggest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from mjlab.rl.evaluation import Bound
 
 logger = logging.getLogger(__name__)
 
-DEFAULT_TAG = "Train/mean_step_reward"
+DEFAULT_TAG = "Train/exploring_return"
+"""Tag of plots: the return, in the unit of evaluations."""
 LABELS = {
-    DEFAULT_TAG: "Mean reward per step",
-    "Train/exploring_return": "Return of exploring episodes",
-    "Train/mean_reward": "Mean reward of an episode",
+    DEFAULT_TAG: "Return per episode\n(sum of weighted rewards)",
+    "Train/mean_step_reward": "Weighted reward per step",
+    "Train/mean_reward": "Rewards of an episode, scaled by the time step",
     "Train/mean_episode_length": "Mean episode length (steps)",
-    "Evaluation/mean_return": "Mean evaluation return",
+    "Evaluation/mean_return": "Return per episode in evaluations\n(sum of weighted rewards)",
+    "Evaluation/mean_length": "Episode length in evaluations (steps)",
+    "Evaluation/failure_rate": "Failure rate in evaluations (fraction)",
+    "Evaluation/success_rate": "Success rate in evaluations (fraction)",
 }
 """Labels of axes, by tag."""
 
+# Written in every iteration, so the first value is the first iteration of a session.
+_EVERY_ITERATION = "Perf/collection_time"
+# Small axes side by side.
+_IN_A_ROW = 3
+# Instead of the default: endless episodes have no return, and runs of other packages lack both.
+_FALLBACKS = ("Train/mean_step_reward", "Train/mean_reward")
+
 Curve = tuple[np.ndarray, np.ndarray]
+"""Iterations, from 0, and values, each (P,)."""
+Run = str | Path | Sequence[str | Path]
+"""Folder of a run, or of each part of a resumed run, the first part first."""
 
 
-def read_scalars(run_dir: str | Path, tag: str) -> Curve:
-    """Return iterations and values of `tag` from the event files in `run_dir`.
-
-    If an iteration was written more than once, as after a resume into the same folder, the last
-    value counts.
+def read_scalars(run: Run, tag: str) -> Curve:
+    """Return iterations and values of `tag` from the event files of a run, see `read_all_scalars`.
 
     Raises:
         ValueError: no event files, or the tag is unknown; the message lists the tags.
     """
-    curves = read_all_scalars(run_dir)
-    if tag not in curves:
-        raise ValueError(f"Run {str(run_dir)!r}: unknown tag {tag!r}; {suggest(tag, curves)}")
-    return curves[tag]
+    return _curve(run, read_all_scalars(run), tag)
 
 
-def read_all_scalars(run_dir: str | Path) -> dict[str, Curve]:
-    """Return the result of `read_scalars` for each tag in the event files of `run_dir`.
+def read_all_scalars(run: Run) -> dict[str, Curve]:
+    """Return iterations and values by tag from the event files of a run.
 
-    A file that is damaged, or whose writer was killed, is read up to that point, with a warning.
+    Parts of a resumed run are joined: from its first iteration on, the later part counts. For tags that
+    end with `/time`, iterations are seconds. A file that is damaged, or whose writer was killed, is read
+    up to that point, with a warning.
 
     Raises:
         ValueError: no event files.
     """
-    run_dir = Path(run_dir)
-    paths = sorted(run_dir.glob("events.out.tfevents.*"))
+    folders = _folders(run)
+    paths = [path for part in folders for path in sorted(part.glob("events.out.tfevents.*"))]
     if not paths:
         raise ValueError(
-            f"run_dir: no TensorBoard event files in {str(run_dir)!r}; use the folder of a run, such as "
+            f"run: no TensorBoard event files in '{folders[-1]}'; use the folder of a run, such as "
             "logs/rsl_rl/<experiment>/<time>."
         )
     values: dict[str, dict[int, float]] = {}
     for path in paths:
+        new: dict[str, dict[int, float]] = {}
         for tag, step, value in _scalar_events(path):
-            curve = values.setdefault(tag, {})
-            # A resumed run continues from its checkpoint, before the last step it had written.
-            while curve and next(reversed(curve)) >= step:
-                curve.popitem()
+            curve = new.setdefault(tag, {})
+            _drop_from(step, curve)
             curve[step] = value
+        if _EVERY_ITERATION in new:
+            first = next(iter(new[_EVERY_ITERATION]))
+            for tag, curve in values.items():
+                if not tag.endswith("/time"):
+                    _drop_from(first, curve)
+        for tag, curve in new.items():
+            # Sessions solved at their start have evaluations only.
+            _drop_from(next(iter(curve)), values.setdefault(tag, {}))
+            values[tag] |= curve
     return {
         tag: (np.array([*curve]), np.array([*curve.values()], dtype=float))
         for tag, curve in values.items()
+        if curve
     }
+
+
+def _folders(run: Run) -> list[Path]:
+    return [Path(run)] if isinstance(run, (str, Path)) else [Path(part) for part in run]
+
+
+def _drop_from(step: int, curve: dict[int, float]) -> None:
+    """Drop the values from `step` on: a resumed run continues from its checkpoint."""
+    while curve and next(reversed(curve)) >= step:
+        curve.popitem()
+
+
+def _curve(run: Run, curves: Mapping[str, Curve], tag: str) -> Curve:
+    if tag not in curves:
+        folder = str(_folders(run)[-1])
+        raise ValueError(f"Run {folder!r}: unknown tag {tag!r}; {suggest(tag, curves)}")
+    return curves[tag]
+
+
+def default_tag(runs: Sequence[Mapping[str, Curve]]) -> str:
+    """Return the tag to plot: the return, or what else all `runs` have."""
+    for tag in (DEFAULT_TAG, *_FALLBACKS):
+        if all(tag in curves for curves in runs):
+            return tag
+    return DEFAULT_TAG
+
+
+def solved_at(curves: Mapping[str, Curve], evaluation: Mapping[str, Any]) -> int | None:
+    """Return the number of iterations until a task was solved, None if it was not.
+
+    Args:
+        curves: Result of `read_all_scalars`.
+        evaluation: `EvaluationCfg` of the run as a dict. If its training stops when solved, the
+            confirmation counts.
+    """
+    from mjlab.rl.evaluation import Bound, wilson_interval
+
+    bounds = Bound.all_of(evaluation)
+    group = "Confirmation" if evaluation.get("stop_when_solved", True) else "Evaluation"
+    met: dict[int, int] = {}
+    for bound in bounds:
+        for iteration, value in zip(*curves.get(f"{group}/{bound.name}", ((), ())), strict=True):
+            if bound.name in ("failure_rate", "success_rate"):
+                value = sum(wilson_interval(value, int(evaluation["num_episodes"]))) / 2
+            is_met = value <= bound.limit if bound.is_upper else value >= bound.limit
+            met[iteration] = met.get(iteration, 0) + int(is_met)
+    solved = [iteration for iteration, count in met.items() if count == len(bounds)]
+    return int(min(solved)) + 1 if solved else None
 
 
 def _scalar_events(path: Path) -> Generator[tuple[str, int, float]]:
@@ -96,19 +167,23 @@ def _scalar_events(path: Path) -> Generator[tuple[str, int, float]]:
 
 
 def plot_run(
-    run_dir: str | Path,
+    run: Run,
     output: str | Path | None = None,
     *,
-    tag: str = DEFAULT_TAG,
+    tag: str | None = None,
     title: str | None = None,
+    evaluation: Mapping[str, Any] | None = None,
 ) -> Path:
     """Plot the learning curve of one run.
 
     Args:
-        run_dir: Folder of the run.
-        output: PNG file; None: `<run_dir>/learning_curve.png`.
-        tag: Tag to plot, as in the event files.
+        run: Folder of the run, or of each part of a resumed run.
+        output: PNG file; None: `learning_curve.png` in the (last) folder.
+        tag: Tag to plot, as in the event files. None: the return of the exploring policy and of
+            evaluations.
         title: Title of the figure; None: the folder's name.
+        evaluation: `EvaluationCfg` of the run as a dict: without `tag`, its goals are drawn, each
+            besides the return on its own axes.
 
     Returns:
         Path of the PNG file.
@@ -116,56 +191,127 @@ def plot_run(
     Raises:
         ValueError: see `read_scalars`.
     """
-    run_dir = Path(run_dir)
-    iterations, values = read_scalars(run_dir, tag)
-    return plot_curves(
-        {},
-        run_dir / "learning_curve.png" if output is None else output,
-        title=run_dir.resolve().name if title is None else title,
-        ylabel=LABELS.get(tag, tag),
-        draw=lambda axes: axes.plot(iterations + 1, values),
-    )
+    from mjlab.rl.evaluation import Bound
+    from mjlab.rl.progress import label
+
+    folder, curves = _folders(run)[-1], read_all_scalars(run)
+    shown = default_tag([curves]) if tag is None else tag
+    iterations, values = _curve(run, curves, shown)
+    bounds = Bound.all_of(evaluation or {}) if tag is None else []
+    others = [b for b in bounds if b.name != "mean_return" and f"Evaluation/{b.name}" in curves]
+    figure, top, below = _new_figure(len(others))
+    top.plot(iterations + 1, values, color="tab:blue", label="exploring policy")
+    top.set(xlabel="Iteration", ylabel=LABELS.get(shown, shown))
+    if tag is None and shown == DEFAULT_TAG:
+        goals = [bound for bound in bounds if bound.name == "mean_return"]
+        _draw_evaluations(top, curves, "mean_return", goals[0] if goals else None)
+    for axes, bound in zip(below, others, strict=True):
+        _draw_evaluations(axes, curves, bound.name, bound)
+        axes.set_xlim(top.get_xlim())
+        name, unit = label(bound.name).capitalize(), "%" if bound.is_rate else bound.unit
+        axes.set_title(f"{name} ({unit})" if unit else name, fontsize="small")
+        axes.tick_params(labelsize="small")
+        if axes.dataLim.y0 >= 0.0:
+            axes.set_ylim(bottom=0.0)
+    _add_environment_steps(top, curves)
+    handles = {
+        text: handle
+        for axes in (top, *below)
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    if len(handles) > 1:
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False
+        )
+    title = folder.resolve().name if title is None else title
+    return _save(figure, folder / "learning_curve.png" if output is None else output, title)
+
+
+def _draw_evaluations(
+    axes: Axes, curves: Mapping[str, Curve], name: str, goal: Bound | None
+) -> None:
+    """Draw a value of evaluations and confirmations, and its goal."""
+    scale = 100.0 if goal is not None and goal.is_rate else 1.0
+    marks: dict[str, dict[str, Any]] = {
+        "Evaluation": {"ls": ":", "lw": 1, "marker": "o", "ms": 4, "color": "tab:orange"},
+        # Around the evaluation that it confirms.
+        "Confirmation": {"ls": "", "marker": "*", "ms": 15, "mfc": "none", "color": "tab:green"},
+    }
+    for group, style in marks.items():
+        if (curve := curves.get(f"{group}/{name}")) is not None:
+            axes.plot(curve[0] + 1, scale * curve[1], label=group.lower(), **style)
+    if goal is not None:
+        axes.axhline(scale * goal.limit, ls="--", lw=1, color="dimgray", zorder=1, label="goal")
+
+
+def _add_environment_steps(axes: Axes, curves: Mapping[str, Curve]) -> None:
+    """Add an axis of environment steps at the top, if all iterations have about as many."""
+    parts = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time")
+    if any(part not in curves for part in parts):
+        return
+    speed, collecting, learning = (curves[part][1] for part in parts)
+    if not len(speed) == len(collecting) == len(learning):
+        return
+    steps = speed * (collecting + learning)
+    if 0.0 < 0.99 * steps.max() < steps.min():
+        from matplotlib.ticker import EngFormatter
+
+        # The logged speed is rounded down.
+        each = float(steps.max())
+        above = axes.secondary_xaxis(
+            "top", functions=(lambda x: np.multiply(x, each), lambda x: np.divide(x, each))
+        )
+        above.set_xlabel("Environment steps", fontsize="small")
+        above.tick_params(labelsize="small")
+        above.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
 def plot_seeds(
-    run_dirs: Sequence[str | Path] | Mapping[str, Sequence[str | Path]],
+    runs: Sequence[Run] | Mapping[str, Sequence[Run]],
     output: str | Path,
     *,
-    tag: str = DEFAULT_TAG,
+    tag: str | None = None,
     title: str | None = None,
+    goal: float | None = None,
 ) -> Path:
     """Plot the mean over runs with different seeds, with one sample standard deviation shaded.
 
-    A run that stopped early keeps its last value, because a solved task stays solved: the mean is
-    over all runs at every iteration.
+    Where not all runs of a group have data, because some ended or were interrupted, single runs are
+    drawn instead.
 
     Args:
-        run_dirs: Folders of the runs; or several lists of folders by name, one curve each.
+        runs: Runs of distinct seeds; or several lists of runs by name, one curve each.
         output: PNG file.
-        tag: Tag to plot, as in the event files.
+        tag: Tag to plot, as in the event files. None: the return of the exploring policy.
         title: Title of the figure; None: the number of seeds.
+        goal: Value to mark by a line.
 
     Returns:
         Path of the PNG file.
 
     Raises:
-        ValueError: `run_dirs` is empty, or see `read_scalars`.
+        ValueError: `runs` is empty, or see `read_scalars`.
     """
-    groups = run_dirs if isinstance(run_dirs, Mapping) else {"": run_dirs}
+    groups = runs if isinstance(runs, Mapping) else {"": runs}
     if not groups or not all(groups.values()):
-        raise ValueError(f"run_dirs: expected at least one run folder, got {run_dirs}.")
-    curves = {
-        name: [
-            (iterations + 1, values)
-            for iterations, values in (read_scalars(run, tag) for run in runs)
-        ]
-        for name, runs in groups.items()
-    }
-    seeds = max(len(runs) for runs in groups.values())
-    default = f"Mean over {seeds} seeds (shaded: one sample standard deviation)"
-    return plot_curves(
-        curves, output, title=default if title is None else title, ylabel=LABELS.get(tag, tag)
-    )
+        raise ValueError(f"runs: expected at least one run folder, got {runs}.")
+    read = {name: [(run, read_all_scalars(run)) for run in of] for name, of in groups.items()}
+    tag = tag or default_tag([curves for of in read.values() for _, curves in of])
+    drawn: dict[str, list[Curve]] = {}
+    for name, of in read.items():
+        found = [_curve(run, curves, tag) for run, curves in of]
+        count = counted(len(found), "seed")
+        drawn[f"{name} ({count})" if name else ""] = [(i + 1, values) for i, values in found]
+    if title is None:
+        count = counted(max(map(len, drawn.values())), "seed")
+        over = "seeds" if any(groups) else count
+        title = f"Mean and standard deviation over {over}"
+
+    def draw(axes: Axes) -> None:
+        if goal is not None:
+            axes.axhline(goal, ls="--", lw=1, color="dimgray", zorder=1, label="goal")
+
+    return plot_curves(drawn, output, title=title, ylabel=LABELS.get(tag, tag), draw=draw)
 
 
 def plot_curves(
@@ -179,6 +325,8 @@ def plot_curves(
 ) -> Path:
     """Plot the mean over the curves of each group, with one sample standard deviation shaded.
 
+    The mean is drawn where all curves of a group have data; elsewhere, single curves are thin.
+
     Args:
         groups: Curves by group name; groups with an empty name are not in the legend.
         output: PNG file.
@@ -190,31 +338,54 @@ def plot_curves(
     Returns:
         Path of the PNG file.
     """
-    # pyplot would choose a window system and keep the figure.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
+    figure, axes, _ = _new_figure()
     for name, curves in groups.items():
         x, mean, std = mean_and_std(curves)
         (line,) = axes.plot(x, mean, label=name or None)
-        axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=line.get_color(), lw=0)
+        color = line.get_color()
+        axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=color, lw=0)
+        for one in curves:
+            # Up to the first and from the last point of the mean.
+            begin, end = (x[0], x[-1]) if len(x) else (np.inf, np.inf)
+            for part in (one[0] <= begin, one[0] >= end):
+                if part.sum() > 1:
+                    axes.plot(one[0][part], one[1][part], lw=0.8, alpha=0.6, color=color)
     if draw is not None:
         draw(axes)
     if axes.get_legend_handles_labels()[1]:
         axes.legend()
-    values = np.concatenate(
-        [np.asarray(line.get_ydata(), float) for line in axes.lines] or [np.zeros(0)]
-    )
-    if (limits := visible_range(values)) is not None:
-        axes.set_ylim(limits)
-        beyond = int(((values < limits[0]) | (values > limits[1])).sum())
-        axes.set_title(f"{beyond} beyond the axis", loc="right", fontsize="small")
-    axes.set(xlabel=xlabel, ylabel=ylabel, title=title)
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    return _save(figure, output, title)
+
+
+def _new_figure(below: int = 0) -> tuple[Figure, Axes, list[Axes]]:
+    """Return a figure, its axes, and small axes below them."""
+    # pyplot would choose a window system and keep the figure.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = 1 + math.ceil(below / _IN_A_ROW)
+    heights = [3.2] + [1.5] * (rows - 1)
+    figure = Figure(figsize=(7.0, 0.8 + sum(heights)), layout="constrained")
+    FigureCanvasAgg(figure)
+    columns = max(1, min(below, _IN_A_ROW))
+    grid = figure.add_gridspec(rows, columns, height_ratios=heights)
+    cells = [grid[1 + i // columns, i % columns] for i in range(below)]
+    return figure, figure.add_subplot(grid[0, :]), [figure.add_subplot(cell) for cell in cells]
+
+
+def _save(figure: Figure, output: str | Path, title: str) -> Path:
+    """Finish and write a figure."""
+    for axes in figure.axes:
+        lines = [np.asarray(line.get_ydata(), float) for line in axes.lines]
+        values = np.concatenate(lines or [np.zeros(0)])
+        if (limits := visible_range(values)) is not None:
+            axes.set_ylim(limits)
+            beyond = int(((values < limits[0]) | (values > limits[1])).sum())
+            axes.set_title(f"{beyond} beyond the axis", loc="right", fontsize="small")
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(title)
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=150)
@@ -222,12 +393,15 @@ def plot_curves(
 
 
 def mean_and_std(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return iterations, mean and sample standard deviation over `curves`, at all their iterations.
+    """Return iterations, mean and sample standard deviation over `curves`, where all have data.
 
-    The standard deviation divides by n - 1; for one curve it is 0. Curves are linear between their
-    points, and constant before the first and after the last point.
+    The iterations are those of any curve between the last begin and the first end, none if there is no
+    such range. The standard deviation divides by n - 1; for one curve it is 0. Curves are linear between
+    their points.
     """
     iterations = np.unique(np.concatenate([curve[0] for curve in curves]))
+    first, last = max(curve[0][0] for curve in curves), min(curve[0][-1] for curve in curves)
+    iterations = iterations[(iterations >= first) & (iterations <= last)]
     values = np.stack([np.interp(iterations, *curve) for curve in curves])
     std = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(len(iterations))
     return iterations, values.mean(axis=0), std

@@ -410,7 +410,7 @@ def label(name: str) -> str:
 
 def formatted(bound: Bound, value: float) -> str:
     """Format a value of evaluations with the unit of `bound`; rates in percent."""
-    if bound.name in ("failure_rate", "success_rate"):
+    if bound.is_rate:
         return f"{100.0 * value:.3g} %"
     return f"{number(value)} {bound.unit}".rstrip()
 
@@ -428,7 +428,7 @@ def _texts(bound: Bound, result: EvaluationResult) -> tuple[str, str]:
     """Format the observed and the judged value."""
     value = result.judged(bound.name)
     judged = formatted(bound, value)
-    is_rate = judged.endswith("%")
+    is_rate = bound.is_rate
     if judged == limit(bound) and not bound.is_met(result):
         judged = f"{100.0 * value:.6g} %" if is_rate else f"{value:.7g} {bound.unit}".rstrip()
     return formatted(bound, result.value(bound.name)) if is_rate else judged, judged

@@ -266,22 +266,12 @@ def read_scalars_of_sessions(run_dir: Path) -> dict[str, dict[int, float]]:
     """
     from mjlab.rl.plot import read_all_scalars
 
-    scalars: dict[str, dict[int, float]] = {}
-    for session in sessions_of(run_dir):
-        curves = read_all_scalars(session)
-        # Sessions solved at their start have evaluations only.
-        if _EVERY_ITERATION in curves:
-            first = int(curves[_EVERY_ITERATION][0][0])
-            scalars = {
-                tag: {i: value for i, value in curve.items() if i < first}
-                for tag, curve in scalars.items()
-            }
-        for tag, (iterations, values) in curves.items():
-            # Steps of the other tags are seconds.
-            if not tag.endswith("/time"):
-                new = zip(iterations.tolist(), values.tolist(), strict=True)
-                scalars.setdefault(tag, {}).update(new)
-    return scalars
+    # Steps of the other tags are seconds.
+    return {
+        tag: dict(zip(iterations.tolist(), values.tolist(), strict=True))
+        for tag, (iterations, values) in read_all_scalars(sessions_of(run_dir)).items()
+        if not tag.endswith("/time")
+    }
 
 
 def thinned(run: RunRecord, points: int = _POINTS) -> RunRecord:

@@ -65,7 +65,7 @@ def write_results(
 
     # A run solved at resume has no iterations.
     with contextlib.suppress(ValueError):
-        plot_run(run_dir, run_dir / "learning_curve.png", title=task)
+        plot_run(run_dir, title=task, evaluation=vars(cfg.agent.evaluation))
     checkpoint = latest_checkpoint(run_dir)
     if cfg.result_video and checkpoint is not None:
         from mjlab.viewer.offscreen_renderer import RenderingUnavailableError

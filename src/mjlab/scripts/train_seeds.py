@@ -136,9 +136,9 @@ def plot_command(argv: list[str], prog: str) -> None:
     parser.add_argument("--tag", help="TensorBoard tag of the metric to plot")
     parser.add_argument("--title", help="title of the plot")
     args = parser.parse_args(argv)
-    from mjlab.rl.plot import DEFAULT_TAG, plot_seeds
+    from mjlab.rl.plot import plot_seeds
 
-    path = plot_seeds(args.runs, args.output, tag=args.tag or DEFAULT_TAG, title=args.title)
+    path = plot_seeds(args.runs, args.output, tag=args.tag, title=args.title)
     print(path)
 
 

@@ -179,7 +179,7 @@ def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
 
 
 def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: Path) -> Path:
-    from mjlab.rl.plot import plot_curves
+    from mjlab.rl.plot import LABELS, plot_curves
 
     def draw(axes: Axes) -> None:
         for sign, label in ((-1, "band of a new seed"), (1, None)):
@@ -195,7 +195,7 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
         output,
         title=reference.task,
         xlabel="Samples (millions)",
-        ylabel="Mean evaluation return",
+        ylabel=LABELS["Evaluation/mean_return"],
         draw=draw,
     )
 
