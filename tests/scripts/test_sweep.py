@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,11 +18,14 @@ from typing import Any
 import pytest
 from commands import TASK
 
+from mjlab.managers import CurriculumTermCfg, TerminationTermCfg
+from mjlab.rl.config import EvaluationCfg
 from mjlab.scripts import cli
 from mjlab.scripts.reference import read_scalars_of_sessions
 from mjlab.scripts.run_folder import read_run_info, write_params, write_run_info
+from mjlab.scripts.sweep_objective import choose_objective
 from mjlab.scripts.sweep_settings import Axis, Sweep
-from mjlab.scripts.train_config import TrainConfig
+from mjlab.scripts.train_config import TrainConfig, return_differences
 from mjlab.utils.errors import BadCallError
 
 optuna = pytest.importorskip("optuna")
@@ -31,7 +35,10 @@ LEARNING = ("--over", f"{RATE}=1e-4,1e-3")
 
 
 class Machine:
-    """Stand-in for the processes of `train`: the return of a run is 1e4 times its learning rate."""
+    """Stand-in for the processes of `train`.
+
+    The return of a run is 1e4 times its learning rate, or `results` of its flags.
+    """
 
     def __init__(self) -> None:
         self.commands: list[list[str]] = []
@@ -40,6 +47,8 @@ class Machine:
         self.interrupts_after = 99
         self.fails: tuple[str, ...] = ()
         self.writes = True
+        self.status_of_interrupted = 0
+        self.results = lambda flags: {"mean_return": 1e4 * float(flags[f"--{RATE}"])}
         self._alive = 0
 
     def start(self, command, environment, output):
@@ -61,14 +70,15 @@ class Machine:
                 return None
             ended = "interrupted"
         else:
-            ended = "failed" if flags[f"--{RATE}"] in self.fails else "finished"
+            ended = "failed" if flags.get(f"--{RATE}") in self.fails else "finished"
         self._alive -= 1
         run_dir = Path(flags["--log-root"], flags["--agent.experiment-name"])
         run_dir /= f"2026-01-01_{len(self.commands)}_{flags['--agent.run-name']}"
         if self.writes:
-            write_run(run_dir, ended, 1e4 * float(flags[f"--{RATE}"]))
-        output.write(b"error: the pole broke\n" if ended == "failed" else b"")
-        process.returncode = int(ended == "failed")
+            write_run(run_dir, ended, self.results(flags))
+        output.write(b"error: the pole broke\n" if ended == "failed" else b"[3/3] 0:03\n")
+        status = {"failed": 1, "interrupted": self.status_of_interrupted}
+        process.returncode = status.get(ended, 0)
         return process.returncode
 
 
@@ -79,7 +89,7 @@ def flags_of(command: list[str]) -> dict[str, str]:
     return dict(pairs)
 
 
-def write_run(run_dir: Path, ended: str, value: float) -> None:
+def write_run(run_dir: Path, ended: str, results: dict[str, float]) -> None:
     """Write a run folder as training does."""
     from torch.utils.tensorboard import SummaryWriter
 
@@ -92,7 +102,9 @@ def write_run(run_dir: Path, ended: str, value: float) -> None:
         for i in range(3):
             writer.add_scalar("Perf/collection_time", 1.0, i)
             writer.add_scalar("Perf/learning_time", 1.0, i)
-            writer.add_scalar("Evaluation/mean_return", value * (i + 1) / 3, i)
+            writer.add_scalar("Perf/evaluation_time", 2.0, i)
+            for name, value in results.items():
+                writer.add_scalar(f"Evaluation/{name}", value * (i + 1) / 3, i)
 
 
 @pytest.fixture
@@ -127,7 +139,11 @@ def folder(database, tmp_path) -> Path:
 def sweep(run_main):
     """Return a function that runs `mjlab sweep`."""
     flags = ("--num-envs", "16", "--device", "cpu")
-    return lambda *argv: run_main(cli.main, "mjlab", "sweep", TASK, *argv, *flags)
+
+    def sweep(*argv: str, task: str = TASK):
+        return run_main(cli.main, "mjlab", "sweep", task, *argv, *flags)
+
+    return sweep
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -177,6 +193,219 @@ def test_ctrl_c_stops_all_runs_and_the_same_command_resumes_them(sweep, machine,
     assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
 
 
+@pytest.mark.parametrize("status", [0, 130, 143])
+def test_interrupted_runs_are_not_failed(sweep, machine, folder, status):
+    machine.interrupts_after, machine.status_of_interrupted = 3, status
+    outcome = sweep(*LEARNING, "--folder", str(folder), "--seeds", "2")
+    assert outcome.status == 130
+    assert "Failed" not in outcome.out
+    assert outcome.out.count("Saved  ") >= 1
+    assert {row["state"] for row in rows_of(folder)} <= {"finished", "interrupted"}
+    machine.interrupts_after = 99
+    assert sweep(*LEARNING, "--folder", str(folder), "--seeds", "2").status == 0
+    assert [row["state"] for row in rows_of(folder)] == ["finished", "finished"]
+
+
+LIFT, LIFT_WEIGHT = "Mjlab-Lift-Cube-Yam", "env.rewards.lift.weight"
+
+
+def by_weight(flags: dict[str, str]) -> dict[str, float]:
+    """Return results of a weight: the higher it is, the higher the return, and the fewer successes."""
+    weight = float(flags[f"--{LIFT_WEIGHT}"])
+    return {
+        "mean_return": 100.0 * weight,
+        "success_rate": 1.0 / weight,
+        "position_error": 0.1 * weight,
+        "failure_rate": 0.0,
+    }
+
+
+def test_reward_weights_are_compared_by_success(sweep, machine, folder):
+    machine.results = by_weight
+    argv = ("--over", f"{LIFT_WEIGHT}=10,1", "--seeds", "3", "--folder", str(folder))
+    outcome = sweep(*argv, task=LIFT)
+    assert outcome.status == 0, outcome.err
+    assert "compared by success_rate, because the settings change the reward" in outcome.out
+    assert "Best: weight=1, success_rate 1" in outcome.out
+    assert [(row["weight"], float(row["success_rate"])) for row in rows_of(folder)] == [
+        ("1", 1.0), ("10", pytest.approx(0.1)),
+    ]  # fmt: skip
+    assert "mean_return" not in rows_of(folder)[0]
+    assert f"--{LIFT_WEIGHT}=1" in outcome.out.partition("Next")[2]
+    # The task has no goal, and is evaluated all the same.
+    assert {"--agent.evaluation.trigger-return"} <= flags_of(machine.commands[0]).keys()
+
+
+def test_a_return_does_not_rank_reward_weights(sweep, machine, folder):
+    machine.results = by_weight
+    argv = ("--over", f"{LIFT_WEIGHT}=10,1", "--folder", str(folder))
+    outcome = sweep(*argv, "--objective", "Evaluation/mean_return", task=LIFT)
+    assert outcome.status == 0, outcome.err
+    assert "not ranked" in outcome.out
+    assert "leave out --objective to compare success_rate" in outcome.out
+    assert not {"Best", "Highest", "Next"} & set(re.findall(r"^\w+", outcome.out, re.MULTILINE))
+
+
+def test_goals_in_returns_neither_rank_nor_stop(sweep, machine, folder):
+    machine.results = lambda flags: {"mean_return": 900.0}
+    stop = "--agent.evaluation.stop-when-solved"
+    argv = ("--over", "env.rewards.smooth-reward.weight=1,10", "--folder", str(folder))
+    outcome = sweep(*argv, f"{stop}=True")
+    assert outcome.status == 0, outcome.err
+    assert "define success_func or metrics" in outcome.out
+    assert "return of 900" in outcome.out
+    assert "Best" not in outcome.out
+    assert all(flags_of(command)[stop] == "False" for command in machine.commands)
+
+
+def test_a_weight_of_all_runs_is_named_beside_the_goal(sweep, machine, folder):
+    argv = (*LEARNING, "--env.rewards.smooth-reward.weight", "9", "--folder", str(folder))
+    outcome = sweep(*argv)
+    assert "Best" in outcome.out or "Highest" in outcome.out
+    assert "goal of return 900" in outcome.err
+    assert "rewards.smooth_reward.weight" in outcome.err
+
+
+def test_noise_is_not_called_best(sweep, machine, folder):
+    returns = {("1e-4", "1"): 10.0, ("1e-4", "2"): 12.0, ("1e-3", "1"): 9.0, ("1e-3", "2"): 14.0}
+    machine.results = lambda flags: {
+        "mean_return": returns[flags[f"--{RATE}"], flags["--agent.seed"]]
+    }
+    argv = (*LEARNING, "--folder", str(folder))
+    assert "Best" not in sweep(*argv).out
+    outcome = sweep(*argv, "--seeds", "2")
+    assert "not distinguishable from learning-rate=1e-4 with 2 seeds" in outcome.out
+    assert "Best" not in outcome.out
+    first = rows_of(folder)[0]
+    # Mean of 9 and 14, and Student's t of one degree of freedom.
+    half = 12.706 * 2.5
+    assert float(first["mean_return"]) == pytest.approx(11.5)
+    assert float(first["low"]) == pytest.approx(11.5 - half, abs=0.01)
+    assert float(first["high"]) == pytest.approx(11.5 + half, abs=0.01)
+
+
+def test_what_is_left_and_evaluations_are_shown(sweep, machine, folder):
+    outcome = sweep(*LEARNING, "--folder", str(folder), "--seeds", "2")
+    left = [int(n) for n in re.findall(r"(\d+) runs? left", outcome.out)]
+    assert left == [3, 2, 1, 0]
+    # Two seconds of evaluation after two of collecting and learning.
+    assert "evaluations take 50% of the time" in outcome.out
+    assert {row["evaluating"] for row in rows_of(folder)} == {"50%"}
+
+
+def cfg_of(task: str, **env: Any) -> TrainConfig:
+    cfg = TrainConfig.from_task(task)
+    for name, value in env.items():
+        setattr(cfg.env, name, value)
+    return cfg
+
+
+def weighted(task: str, factor: float) -> TrainConfig:
+    """Return the config of a task with the weight of its first reward multiplied."""
+    cfg = TrainConfig.from_task(task)
+    term = next(term for term in cfg.env.rewards.values() if term is not None)
+    term.weight *= factor
+    return cfg
+
+
+@pytest.mark.parametrize(
+    ("task", "tag", "is_low"),
+    [
+        (LIFT, "Evaluation/success_rate", False),
+        ("Mjlab-Tracking-Flat-Unitree-G1", "Evaluation/success_rate", False),
+        ("Mjlab-Velocity-Flat-Unitree-Go1", "Evaluation/lin_vel_error", True),
+    ],
+)
+def test_bundled_tasks_have_a_measure_without_the_return(task, tag, is_low):
+    objective = choose_objective(task, [weighted(task, 1.0), weighted(task, 3.0)])
+    assert (objective.tag, objective.minimize, objective.is_ranked) == (tag, is_low, True)
+    assert "change the reward" in objective.reason
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"decimation": 10},
+        {"episode_length_s": 25.0},
+        {"scale_rewards_by_dt": False},
+        {"rewards": {}},
+        {"rewards": {"smooth_reward": None}},
+        {"curriculum": {"grow": CurriculumTermCfg(func=print)}},
+        {"terminations": {}},
+    ],
+)
+def test_what_enters_a_return_is_not_compared_by_it(changed):
+    cfgs = [cfg_of(TASK), cfg_of(TASK, **changed)]
+    objective = choose_objective(TASK, cfgs)
+    assert not objective.is_ranked
+    assert next(iter(changed)) in objective.reason
+    for cfg in cfgs:
+        cfg.agent.evaluation = EvaluationCfg(success_func=len, solved_return=900.0)
+    assert choose_objective(TASK, cfgs).tag == "Evaluation/success_rate"
+
+
+def test_parameters_and_time_steps_enter_the_return():
+    first, second, third = (TrainConfig.from_task(TASK) for _ in range(3))
+    second.env.rewards["smooth_reward"].params["scale"] = 2.0
+    third.env.sim.mujoco.timestep = 0.005
+    assert return_differences(first.env, second.env) == ["rewards.smooth_reward.params.scale"]
+    assert return_differences(first.env, third.env) == ["sim.mujoco.timestep"]
+    assert return_differences(first.env, TrainConfig.from_task(TASK).env) == []
+
+
+@pytest.mark.parametrize(
+    ("evaluation", "tag", "is_low"),
+    [
+        (EvaluationCfg(success_return=900.0), None, False),
+        (EvaluationCfg(solved_above={"success_rate": 0.9}, success_return=1.0), None, False),
+        (EvaluationCfg(success_is_survival=True), "Evaluation/success_rate", False),
+        (EvaluationCfg(metrics={"lag_error": len}), "Evaluation/lag_error", True),
+        (EvaluationCfg(metrics={"lag": len}, solved_below={"lag": 1.0}), "Evaluation/lag", True),
+        (
+            EvaluationCfg(metrics={"speed": len}, solved_above={"speed": 1.0}),
+            "Evaluation/speed",
+            False,
+        ),
+        # Unknown direction.
+        (EvaluationCfg(metrics={"speed": len}), None, False),
+    ],
+)
+def test_success_by_a_return_counts_as_the_return(evaluation, tag, is_low):
+    cfgs = [weighted(TASK, 1.0), weighted(TASK, 10.0)]
+    for cfg in cfgs:
+        cfg.agent.evaluation = evaluation
+    objective = choose_objective(TASK, cfgs)
+    assert objective.is_ranked == (tag is not None)
+    if tag is not None:
+        assert (objective.tag, objective.minimize) == (tag, is_low)
+    else:
+        assert "metrics" in objective.reason or "Evaluation/speed" in objective.reason
+        # The user knows better than the names.
+        assert choose_objective(TASK, cfgs, "Train/mean_episode_length").is_ranked
+        assert not choose_objective(TASK, cfgs, "Evaluation/success_rate").is_ranked
+        assert not choose_objective(TASK, cfgs, "Train/exploring_return").is_ranked
+
+
+def test_failures_rank_tasks_that_can_fail():
+    fell = TerminationTermCfg(func=len)
+    cfgs = [weighted(TASK, 1.0), weighted(TASK, 10.0)]
+    for cfg in cfgs:
+        cfg.env.terminations["fell"] = fell
+    objective = choose_objective(TASK, cfgs)
+    assert (objective.tag, objective.minimize) == ("Evaluation/failure_rate", True)
+    # Failures are not comparable if the settings change what a failure is.
+    cfgs[1].env.terminations["fell"] = TerminationTermCfg(func=len, params={"angle": 1.0})
+    assert not choose_objective(TASK, cfgs).is_ranked
+
+
+def test_other_settings_are_compared_by_the_return():
+    cfgs = [TrainConfig.from_task(TASK), TrainConfig.from_task(TASK)]
+    cfgs[1].agent.max_iterations = 3
+    objective = choose_objective(TASK, cfgs)
+    assert (objective.tag, objective.is_ranked) == ("Evaluation/mean_return", True)
+    assert (objective.reason, objective.past_goal) == ("", None)
+
+
 def test_a_closed_terminal_does_not_keep_runs_from_saving(sweep, machine, folder, monkeypatch):
     def print_(*words: Any, **options: Any) -> None:
         if "Saving" in words[0]:
@@ -197,7 +426,7 @@ def test_a_failed_run_is_named_and_retried_by_the_same_command(sweep, machine, f
     assert outcome.status == 1
     assert "the pole broke" in outcome.out
     assert str(folder / "runs" / "learning-rate=1e-4" / "seed_1.log") in outcome.message
-    assert [row["state"] for row in rows_of(folder)] == ["", "failed"]
+    assert [row["state"] for row in rows_of(folder)] == ["finished", "failed"]
     machine.fails = ()
     assert sweep(*argv).status == 0
     assert [flags_of(command)[f"--{RATE}"] for command in machine.commands] == [
@@ -255,7 +484,7 @@ def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path
     assert len(machine.commands) == 3
     rows = rows_of(tmp_path / "first" / "both")
     assert [(row["learning-rate"], row["state"]) for row in rows] == [
-        ("1e-3", "elsewhere"), ("1e-4", ""),
+        ("1e-3", "elsewhere"), ("1e-4", "finished"),
     ]  # fmt: skip
 
 

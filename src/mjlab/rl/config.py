@@ -202,8 +202,8 @@ class EvaluationCfg:
     """
 
     solved_return: float | None = None
-    """Mean evaluation return required for a solved task. None without other conditions: no
-    evaluations."""
+    """Mean evaluation return required for a solved task. None without other conditions: evaluations
+    with `trigger_return` only."""
     solved_below: dict[str, float] = field(default_factory=dict)
     """Upper bounds of metrics by name; all must hold for the task to be solved, and `solved_return`
     may then be None. Names: those of `metrics`, `failure_rate`, `success_rate`, `mean_length`. Rates

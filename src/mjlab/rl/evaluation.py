@@ -361,7 +361,8 @@ class SolvedCheck:
             mean_step_reward: Mean weighted reward per step of the last iteration, before scaling by
                 the step's duration.
         """
-        if not self._bounds or iteration - self.last_iteration < self._min_interval:
+        is_wanted = bool(self._bounds) or self._cfg.get("trigger_return") is not None
+        if not is_wanted or iteration - self.last_iteration < self._min_interval:
             return False
         if iteration < self._cfg.get("first_iteration", 0):
             return False

@@ -238,7 +238,7 @@ class TrainingProgress(TrainingObserver):
 
     def _scores(self) -> str:
         """Return the last evaluation beside its bounds; the exploring return without evaluations."""
-        if not self._evaluations:
+        if not self._evaluations or not self._bounds:
             exploring = ""
             if self.stats is not None:
                 exploring = f"Return {number(self._exploring(self.stats))}, exploring"

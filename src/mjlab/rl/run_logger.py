@@ -347,7 +347,9 @@ class RunLogger(Logger):
         if result.failure_rate is not None:
             scalars["failure_rate"] = result.failure_rate
         scalars |= {name: value.mean for name, value in result.metrics.items()}
-        self.write_scalars({f"{group}/{name}": v for name, v in scalars.items()}, iteration)
+        scalars = {f"{group}/{name}": value for name, value in scalars.items()}
+        scalars[f"Perf/{group.lower()}_time"] = result.duration
+        self.write_scalars(scalars, iteration)
 
     def stop_logging_writer(self) -> None:
         """Flush and close the event file."""

@@ -21,10 +21,10 @@ import re
 import shlex
 import subprocess
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mjlab.scripts.flags import is_given
 from mjlab.scripts.help import lookup
+from mjlab.scripts.sweep_objective import choose_objective
 from mjlab.scripts.sweep_settings import (
     MAX_NAME,
     Axis,
@@ -34,19 +34,18 @@ from mjlab.scripts.sweep_settings import (
     train_config,
     train_flags,
 )
+from mjlab.scripts.train_config import (
+    TrainConfig,
+    check_flags,
+    check_typed_flags,
+    report_moved_goal,
+)
 from mjlab.scripts.train_seeds import read_count
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.string import counted
 
-if TYPE_CHECKING:
-    from mjlab.scripts.train_config import TrainConfig
-
 ROOT = Path("logs/sweeps")
 """Folder of all sweeps."""
-EVALUATED = "Evaluation/mean_return"
-"""Default objective of tasks with evaluations: mean return of the last evaluation."""
-EXPLORED = "Train/exploring_return"
-"""Default objective of other tasks: return of the exploring episodes."""
 
 # Flags that the sweep sets, and alternatives.
 _RESERVED = {
@@ -61,8 +60,6 @@ _RESERVED = {
 }
 # Flags of this machine, the same for all settings.
 _MACHINE = ("--device", "--gpu-ids")
-# Episodes without a time limit have no return.
-_LONGEST_EPISODE_S = 1e6
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -133,15 +130,14 @@ def parse_sweep(argv: list[str], prog: str) -> Sweep:
         jobs=counts["jobs"],
         folder=ROOT,
         storage=args.storage,
-        objective=args.objective,
-        minimize=args.minimize,
     )
-    cfg = check_settings(sweep)
+    cfgs = check_settings(sweep)
+    report_moved_goal(task, cfgs[0])
     return dataclasses.replace(
         sweep,
-        axes=tuple(_with_type(axis, cfg) for axis in axes),
+        axes=tuple(_with_type(axis, cfgs[0]) for axis in axes),
         folder=Path(args.folder or ROOT / _name(sweep)),
-        objective=args.objective or default_objective(cfg),
+        objective=choose_objective(task, cfgs, args.objective, args.minimize),
     )
 
 
@@ -168,14 +164,12 @@ def _check_axes(axes: tuple[Axis, ...], flags: list[str], trials: int | None) ->
         )
 
 
-def check_settings(sweep: Sweep) -> TrainConfig:
-    """Parse every combination of values as `train` would; return the config of the first.
+def check_settings(sweep: Sweep) -> list[TrainConfig]:
+    """Return the config of every combination of values, parsed as `train` would.
 
     Of ranges, the ends are checked.
     """
-    from mjlab.scripts.train_config import check_flags, check_typed_flags
-
-    first: TrainConfig | None = None
+    cfgs = []
     for setting in sweep.combinations:
         flags = [*train_flags(sweep, setting), *sweep.machine_flags]
         try:
@@ -184,9 +178,8 @@ def check_settings(sweep: Sweep) -> TrainConfig:
             check_flags(cfg)
         except (UserError, ValueError) as error:
             raise BadCallError(f"{error} (In the setting {sweep.describe(setting)}.)") from error
-        first = first or cfg
-    assert first is not None
-    return first
+        cfgs.append(cfg)
+    return cfgs
 
 
 def _with_type(axis: Axis, cfg: TrainConfig) -> Axis:
@@ -202,13 +195,3 @@ def _name(sweep: Sweep) -> str:
     """Return the folder name of a sweep: the same for the same task, --over and flags."""
     keys = "_".join(sweep.short(axis.name) for axis in sweep.axes)
     return f"{sweep.task}_{keys}"[:MAX_NAME] + f"_{digest(repr(sweep.definition))}"
-
-
-def default_objective(cfg: TrainConfig) -> str:
-    """Return the tag to compare: of evaluations if the task has them, else the exploring return."""
-    from mjlab.rl.evaluation import Bound
-    from mjlab.rl.plot import DEFAULT_TAG
-
-    if Bound.all_of(vars(cfg.agent.evaluation)):
-        return EVALUATED
-    return EXPLORED if cfg.env.episode_length_s < _LONGEST_EPISODE_S else DEFAULT_TAG

@@ -14,15 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
+from mjlab.rl.evaluation import Bound
 from mjlab.scripts.resume import resume_flags
 from mjlab.scripts.run_folder import read_run_info
 from mjlab.scripts.sweep_settings import Setting, Sweep, train_config, train_flags
-from mjlab.scripts.sweep_study import Study, setting_of, value_of
+from mjlab.scripts.sweep_study import Study, TrainedRun, setting_of, trained_run
 from mjlab.scripts.train_seeds import train_command
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.processes import CORES_VARIABLE, PARENT_VARIABLE, available_cores
 from mjlab.utils.signals import FORWARDED, handled_signals, send_signal, start_in_background
-from mjlab.utils.string import counted
+from mjlab.utils.string import clock, counted
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -30,6 +31,12 @@ if TYPE_CHECKING:
 _SECONDS_BETWEEN_LOOKS = 0.1
 _EVALUATIONS = 10
 """Number of evaluations of a run."""
+_FIRST_REPORT_S = 60.0
+"""Time until what is left is printed, while no run ends (s); the times in between double."""
+# Exit statuses of a run stopped by SIGHUP, SIGINT or SIGTERM, from a shell and from the system.
+_STOPPED = (129, 130, 143, -1, -2, -15)
+# Number of finished iterations in the output of a run: `[12/100]`.
+_ITERATION = re.compile(rb"^\[(\d+)/\d+\]", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,23 @@ class _Run:
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     slot: dict[str, str]
+    begin: float
+    """Start (s), as `time.monotonic`."""
+    offset: int
+    """Size of the output of earlier sessions (bytes)."""
+    first: int
+    """Number of iterations of earlier sessions."""
+    total: int
+    """Number of iterations."""
+
+    @property
+    def iteration(self) -> int:
+        """Number of finished iterations, as in the output of the run."""
+        with open(self.log.name, "rb") as log:
+            size = log.seek(0, os.SEEK_END)
+            log.seek(max(self.offset, size - 4096))
+            lines = _ITERATION.findall(log.read())
+        return max(self.first, int(lines[-1])) if lines else self.first
 
 
 class Runs:
@@ -60,6 +84,14 @@ class Runs:
         # Unfinished seeds by trial.
         self._left: dict[int, int] = {}
         self._running: list[_Run] = []
+        self._num_jobs = len(self._slots)
+        self._num_ended = 0
+        # Time of all processes, and the number of runs that it trained.
+        self._spent, self._trained = 0.0, 0.0
+        self._begin = time.monotonic()
+        self._next_report = self._begin + _FIRST_REPORT_S
+        # Training and evaluations of the finished runs (s).
+        self._training, self._evaluating = 0.0, 0.0
 
     def train(self) -> None:
         """Train the runs that are not finished, until none is left or a signal arrives.
@@ -80,6 +112,9 @@ class Runs:
                 while self._running:
                     time.sleep(_SECONDS_BETWEEN_LOOKS)
                     self._update()
+                    if time.monotonic() > self._next_report:
+                        self._next_report += time.monotonic() - self._begin
+                        print(f"Running  {self._left_over()}", flush=True)
             finally:
                 # A second signal would stop runs that are saving.
                 if self._running and not self.interrupted:
@@ -117,6 +152,7 @@ class Runs:
             if self._sweep.finished_run(setting_of(trial), seed) is None
         ]
         self._left[trial.number] = len(seeds)
+        self._num_ended += self._sweep.seeds - len(seeds)
         self._queue.extend((trial, seed) for seed in seeds)
         if not seeds:
             self._study.finish(trial)
@@ -139,6 +175,8 @@ class Runs:
         flags += ["--gpu-ids", "all"] if "CUDA_VISIBLE_DEVICES" in slot else sweep.machine_flags
         flags += ["--log-root", str(folder.parent), "--agent.experiment-name", folder.name]
         flags += ["--agent.run-name", f"seed_{seed}"]
+        if sweep.objective.past_goal is not None:
+            flags += ["--agent.evaluation.stop-when-solved=False"]
         saved = sweep.last_checkpoint(setting, seed)
         flags += [] if saved is None else resume_flags(saved.parent, saved)
         command = train_command(sweep.task, flags, seed)
@@ -148,7 +186,12 @@ class Runs:
         log = open(sweep.log_file(setting, seed), "ab")  # noqa: SIM115
         environment = {**os.environ, **slot, PARENT_VARIABLE: str(os.getpid())}
         process = start_in_background(command, environment, log)
-        self._running.append(_Run(trial, seed, name, process, log, slot))
+        first = 0 if saved is None else int(saved.stem.removeprefix("model_")) + 1
+        total = max(1, train_config(sweep, setting).agent.max_iterations)
+        run = _Run(
+            trial, seed, name, process, log, slot, time.monotonic(), log.tell(), first, total
+        )
+        self._running.append(run)
 
     def _settle(self, run: _Run) -> None:
         """Print how a run ended; store the value of its trial after the last seed."""
@@ -157,20 +200,53 @@ class Runs:
         newest = next(iter(sweep.sessions(setting, run.seed)), None)
         info = {} if newest is None else read_run_info(newest)
         self._left[run.trial.number] -= 1
-        if (value := value_of(sweep, setting, run.seed)) is not None:
-            print(f"Finished {run.name}: {sweep.label} {value:.4g}", flush=True)
-        elif run.process.returncode == 0 and info.get("ended") == "interrupted":
+        status = run.process.returncode
+        if (trained := trained_run(sweep, setting, run.seed)) is not None:
+            self._count(run, trained)
+            value = f"{sweep.objective.label} {trained.value:.4g}"
+            print(f"Finished {run.name}: {value}; {self._left_over()}", flush=True)
+        elif status in _STOPPED or (status == 0 and info.get("ended") == "interrupted"):
             self.interrupted = True
-            print(f"Saved    {run.name}, iteration {info.get('iterations', 0)}", flush=True)
+            saved = f"Saved    {run.name}, iteration {info.get('iterations', 0)}"
+            is_saved = info.get("ended") == "interrupted"
+            print(saved if is_saved else f"Stopped  {run.name} without saving", flush=True)
             return
         elif self.interrupted:
             print(f"Stopped  {run.name} without saving", flush=True)
             return
         else:
+            self._num_ended += 1
             self.failed.append(sweep.log_file(setting, run.seed))
             print(f"Failed   {run.name}: {_last_error(self.failed[-1])}", flush=True)
         if self._left[run.trial.number] == 0:
             self._study.finish(run.trial)
+
+    def _count(self, run: _Run, trained: TrainedRun) -> None:
+        """Add a finished run to what the time left is estimated from."""
+        self._num_ended += 1
+        self._spent += time.monotonic() - run.begin
+        self._trained += 1.0 - run.first / run.total
+        self._training += trained.training_seconds
+        self._evaluating += trained.evaluation_seconds
+
+    def _left_over(self) -> str:
+        """Return the number of runs left here, the time they take, and the share of evaluations."""
+        elsewhere = sum(
+            trial.state.name in ("RUNNING", "COMPLETE") and not self._study.is_own(trial)
+            for trial in self._study.trials
+        )
+        left = (self._sweep.num_settings - elsewhere) * self._sweep.seeds - self._num_ended
+        done = [(run.iteration / run.total, run) for run in self._running]
+        spent = self._spent + sum(time.monotonic() - run.begin for run in self._running)
+        trained = self._trained + sum(part - run.first / run.total for part, run in done)
+        text = f"{counted(left, 'run')} left"
+        if left > 0 and trained > 0.0:
+            seconds = spent / trained * (left - sum(part for part, _ in done))
+            text += f", about {clock(seconds / min(left, self._num_jobs))}"
+        if self._evaluating:
+            share = self._evaluating / (self._training + self._evaluating)
+            text += f"; evaluations take {share:.0%} of the time"
+        return text
 
 
 def machine_slots(sweep: Sweep) -> list[dict[str, str]]:
@@ -199,7 +275,14 @@ def _print_summary(sweep: Sweep, slots: list[dict[str, str]]) -> None:
     print(f"Sweep:   {settings} x {counted(sweep.seeds, 'seed')} of {sweep.task}")
     print(f"Runs:    {len(slots)} side by side with {each} each, in {sweep.folder}")
     print(f"Output:  {sweep.folder / 'runs' / '*' / 'seed_*.log'}")
-    print(f"Compare: {sweep.objective}, {'lowest' if sweep.minimize else 'highest'} first")
+    objective = sweep.objective
+    order = "lowest" if objective.minimize else "highest"
+    print(f"Compare: {objective.reason or f'{objective.tag}, {order} first'}")
+    if objective.past_goal is not None:
+        print(
+            f"Goal:    the return of {objective.past_goal:g} was set for the registered rewards; it neither "
+            "ranks settings nor ends runs"
+        )
     print(f"Curves:  uv run tensorboard --logdir {sweep.folder / 'runs'}", flush=True)
 
 
@@ -208,8 +291,11 @@ def _evaluations(sweep: Sweep, setting: Setting) -> list[str]:
 
     Flags of the user come later and override them.
     """
-    total = train_config(sweep, setting).agent.max_iterations
-    interval = max(1, total // _EVALUATIONS)
+    agent = train_config(sweep, setting).agent
+    total, interval = agent.max_iterations, max(1, agent.max_iterations // _EVALUATIONS)
+    # A trigger also evaluates tasks without a goal.
+    if not (sweep.objective.is_evaluated or Bound.all_of(vars(agent.evaluation))):
+        return []
     settings = {
         "stop-when-solved": False,
         "trigger-return": -1e9,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.reference import ENDED
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info, runs_named
+from mjlab.scripts.sweep_objective import Objective
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.string import is_number
 
@@ -105,10 +106,8 @@ class Sweep:
     """Folder of the sweep."""
     storage: str | None
     """URL of the database. None: SQLite file in the folder."""
-    objective: str | None
-    """TensorBoard tag to compare. None: default of the task."""
-    minimize: bool
-    """Prefer low values of the objective."""
+    objective: Objective = Objective()
+    """Value to compare."""
 
     @property
     def combinations(self) -> list[Setting]:
@@ -127,12 +126,6 @@ class Sweep:
         """Properties that stay the same while a sweep continues."""
         over = {axis.name: axis.text for axis in self.axes}
         return {"task": self.task, "over": over, "flags": [*self.flags]}
-
-    @property
-    def label(self) -> str:
-        """Objective without its group, `mean_return`."""
-        assert self.objective is not None
-        return self.objective.rpartition("/")[2]
 
     def short(self, name: str) -> str:
         """Return the last part of a swept flag, or the flag if two have the same last part."""

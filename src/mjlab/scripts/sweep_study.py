@@ -26,6 +26,7 @@ from optuna.distributions import (
 from optuna.trial import FrozenTrial, TrialState
 
 from mjlab.scripts.reference import read_scalars_of_sessions
+from mjlab.scripts.sweep_objective import Objective
 from mjlab.scripts.sweep_settings import Axis, Setting, Sweep
 from mjlab.utils.errors import UserError
 from mjlab.utils.os import write_atomically
@@ -115,9 +116,9 @@ class Study:
         """Store the value of a trial, if it has no value yet: mean over seeds; failed if not finite."""
         setting = setting_of(trial)
         seeds = range(1, self._sweep.seeds + 1)
-        values = [value_of(self._sweep, setting, seed) for seed in seeds]
-        found = [value for value in values if value is not None and math.isfinite(value)]
-        if len(found) < len(values):
+        runs = [trained_run(self._sweep, setting, seed) for seed in seeds]
+        found = [run.value for run in runs if run is not None and math.isfinite(run.value)]
+        if len(found) < len(runs):
             self.fail(trial)
             return
         self._study.tell(trial.number, statistics.fmean(found), skip_if_finished=True)
@@ -199,8 +200,10 @@ def _check_same(owner: str, content: dict[str, Any], sweep: Sweep) -> None:
 def _open(sweep: Sweep) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     url = sweep.storage or f"sqlite:///{(sweep.folder / 'study.db').as_posix()}"
+    minimize = sweep.objective.minimize
     sampler: optuna.samplers.BaseSampler = optuna.samplers.RandomSampler()
-    if sweep.trials is not None:
+    # Without a ranking, there are no good values to stay near.
+    if sweep.trials is not None and sweep.objective.is_ranked:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             # Running trials count as bad, so that samples next to them are not drawn.
@@ -209,8 +212,8 @@ def _open(sweep: Sweep) -> optuna.Study:
         study = optuna.create_study(
             storage=url,
             # The runs can be compared by several objectives.
-            study_name=f"{sweep.folder.resolve().name} {'-' if sweep.minimize else '+'}{sweep.objective}",
-            direction="minimize" if sweep.minimize else "maximize",
+            study_name=f"{sweep.folder.resolve().name} {'-' if minimize else '+'}{sweep.objective.tag}",
+            direction="minimize" if minimize else "maximize",
             sampler=sampler,
             load_if_exists=True,
         )
@@ -232,35 +235,61 @@ def _open(sweep: Sweep) -> optuna.Study:
     return study
 
 
-def value_of(sweep: Sweep, setting: Setting, seed: int) -> float | None:
-    """Return the objective of a finished run: last evaluation, or mean over the last iterations.
+class TrainedRun:
+    """Results of a run that was trained to its end, over all its sessions."""
 
-    None for an unfinished run.
+    def __init__(self, folder: Path, objective: Objective) -> None:
+        """Read the event files of the run.
+
+        Raises:
+            UserError: the run did not log the objective.
+        """
+        self.folder = folder
+        self._objective = objective
+        self._scalars = read_scalars_of_sessions(folder)
+        if objective.tag not in self._scalars:
+            raise UserError(
+                f"--objective: unknown tag {objective.tag!r} in {folder}; "
+                f"{suggest(objective.tag, sorted(self._scalars))}"
+            )
+
+    @property
+    def curve(self) -> Curve:
+        """Iterations, from 1, and the objective, each (P,)."""
+        curve = sorted(self._scalars[self._objective.tag].items())
+        return np.array([i + 1 for i, _ in curve]), np.array([v for _, v in curve], dtype=float)
+
+    @property
+    def value(self) -> float:
+        """Objective: last evaluation, or mean over the last iterations."""
+        _, values = self.curve
+        count = 1 if self._objective.is_evaluated else _LAST_PART * len(values)
+        return float(values[-max(1, math.ceil(count)) :].mean())
+
+    def last(self, tag: str) -> float | None:
+        """Return the last value of a tag, None if it was not logged."""
+        values = self._scalars.get(tag)
+        return values[max(values)] if values else None
+
+    @property
+    def training_seconds(self) -> float:
+        """Time of collecting and learning (s)."""
+        return self._total("collection", "learning")
+
+    @property
+    def evaluation_seconds(self) -> float:
+        """Time of evaluations (s); 0 for runs of versions that did not log it."""
+        return self._total("evaluation", "confirmation")
+
+    def _total(self, *names: str) -> float:
+        return sum(sum(self._scalars.get(f"Perf/{name}_time", {}).values()) for name in names)
+
+
+def trained_run(sweep: Sweep, setting: Setting, seed: int) -> TrainedRun | None:
+    """Return the results of a finished run, None for others.
 
     Raises:
         UserError: the run did not log the objective.
     """
-    run_dir = sweep.finished_run(setting, seed)
-    if run_dir is None:
-        return None
-    _, values = curve_of(sweep, run_dir)
-    assert sweep.objective is not None
-    count = 1 if sweep.objective.startswith("Evaluation/") else _LAST_PART * len(values)
-    return float(values[-max(1, math.ceil(count)) :].mean())
-
-
-def curve_of(sweep: Sweep, run_dir: Path) -> Curve:
-    """Return iterations, from 1, and the objective of all sessions of a run, each (P,).
-
-    Raises:
-        UserError: the run did not log the objective.
-    """
-    scalars = read_scalars_of_sessions(run_dir)
-    assert sweep.objective is not None
-    if sweep.objective not in scalars:
-        raise UserError(
-            f"--objective: unknown tag {sweep.objective!r} in {run_dir}; "
-            f"{suggest(sweep.objective, sorted(scalars))}"
-        )
-    curve = sorted(scalars[sweep.objective].items())
-    return np.array([i + 1 for i, _ in curve]), np.array([value for _, value in curve], dtype=float)
+    folder = sweep.finished_run(setting, seed)
+    return None if folder is None else TrainedRun(folder, sweep.objective)

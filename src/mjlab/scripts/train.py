@@ -45,7 +45,12 @@ from mjlab.scripts.run_folder import (
     write_resumed,
     write_run_info,
 )
-from mjlab.scripts.train_config import TrainConfig, check_flags, check_typed_flags
+from mjlab.scripts.train_config import (
+    TrainConfig,
+    check_flags,
+    check_typed_flags,
+    report_moved_goal,
+)
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
 
 __getattr__ = older_names(__name__)
@@ -124,6 +129,8 @@ def _train(
         suggest_profile(task, cfg.profile, device)
         if rank.is_first:
             report_untuned_learner(task, cfg.profile, cfg.learner_name)
+    if rank.is_first:
+        report_moved_goal(task, cfg)
     with fail_together():
         prepare_teacher(task, cfg.agent, checkpoint)
     with _run_folder(cfg, rank, output) as folder:

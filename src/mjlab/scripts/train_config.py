@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.rl.config import RslRlBaseRunnerCfg
+from mjlab.rl.config import EvaluationCfg, RslRlBaseRunnerCfg
+from mjlab.rl.evaluation import required_return
 from mjlab.rl.learners import Learner, learner_of
 from mjlab.scripts.flags import is_given
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import BadCallError, UserError, check_count
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.logging import print_notice
+from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, process_rank
 from mjlab.utils.random import process_seed
 from mjlab.utils.wandb import check_wandb_login
@@ -32,6 +34,16 @@ _ALGORITHM_COUNTS = (
     "policy_delay",
     "noise_hold",
     "gradient_length",
+)
+# Fields of an environment config that enter the return of an episode: terms, and number and scale
+# of the rewards. Curricula may change the weights of rewards.
+_OF_RETURNS = (
+    "rewards",
+    "curriculum",
+    "terminations",
+    "decimation",
+    "episode_length_s",
+    "scale_rewards_by_dt",
 )
 
 
@@ -168,6 +180,50 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
             f"--agent.class-name: {name!r} is ignored; use runner_cls of register_mjlab_task for a "
             "runner, or --learner."
         )
+
+
+def report_moved_goal(task: str, cfg: TrainConfig) -> None:
+    """Print a notice if the goal of the task is a return, and `cfg` changes what enters returns."""
+    registered = TrainConfig.from_task(task, cfg.profile, cfg.learner)
+    goal = goal_return(cfg.agent.evaluation)
+    changes = return_differences(registered.env, cfg.env)
+    # Other goals are the user's.
+    if changes and goal is not None and goal == goal_return(registered.agent.evaluation):
+        others = f" and {len(changes) - 3} others" if len(changes) > 3 else ""
+        print_notice(
+            f"The goal of return {goal:g} was set for the registered rewards; {', '.join(changes[:3])}"
+            f"{others} may change what a return is. Set --agent.evaluation.solved-return to match."
+        )
+
+
+def goal_return(evaluation: EvaluationCfg) -> float | None:
+    """Return the return that decides whether the task is solved, None if the return does not."""
+    if evaluation.solved_return is not None:
+        return evaluation.solved_return
+    by_rate = "success_rate" in {**evaluation.solved_above, **evaluation.solved_below}
+    return required_return(evaluation) if by_rate else None
+
+
+def return_differences(env: ManagerBasedRlEnvCfg, other: ManagerBasedRlEnvCfg) -> list[str]:
+    """Return the names of fields that differ and enter the return, such as `rewards.alive.weight`."""
+    pairs = {name: (getattr(env, name), getattr(other, name)) for name in _OF_RETURNS}
+    pairs["sim.mujoco.timestep"] = env.sim.mujoco.timestep, other.sim.mujoco.timestep
+    return [
+        difference
+        for name, (one, two) in pairs.items()
+        for difference in _differences(to_plain(one), to_plain(two), name)
+    ]
+
+
+def _differences(one: Any, two: Any, name: str) -> list[str]:
+    """Return the dotted names of values that differ; a term that is off in one is one name."""
+    if not (isinstance(one, dict) and isinstance(two, dict)):
+        return [] if one == two else [name]
+    return [
+        difference
+        for key in {**one, **two}
+        for difference in _differences(one.get(key), two.get(key), f"{name}.{key}")
+    ]
 
 
 def _check_numbers(cfg: TrainConfig) -> None:
