@@ -423,6 +423,24 @@ def test_a_task_may_be_solved_by_its_metrics(make_runner):
     assert waiting.last_evaluation is None
 
 
+def test_a_trigger_evaluates_without_a_goal(make_runner, tmp_path: Path):
+    from mjlab.rl.plot import read_scalars
+
+    cfg = {"num_episodes": 4, "min_interval": 1}
+    plain = make_runner(evaluation=asdict(EvaluationCfg(**cfg)))
+    plain.learn(2)
+    assert plain.last_evaluation is None
+    triggered = make_runner(
+        tmp_path / "run", evaluation=asdict(EvaluationCfg(trigger_return=-1e9, **cfg))
+    )
+    triggered.learn(2)
+    assert triggered.stop_reason == "finished"
+    assert triggered.last_evaluation.num_episodes == 4
+    steps, seconds = read_scalars(tmp_path / "run", "Perf/evaluation_time")
+    assert steps.tolist() == [0, 1]
+    assert (seconds > 0.0).all()
+
+
 def shorten_episodes(env_cfg) -> None:
     env_cfg.episode_steps = 1
 

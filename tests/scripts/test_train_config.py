@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from commands import SMALL, TASK
 
+from mjlab.scripts.train import parse_train_flags
+from mjlab.scripts.train_config import report_moved_goal
 from mjlab.tasks import registry
 
 
@@ -50,6 +52,42 @@ def test_no_iterations_train_nothing(run, tmp_path):
     outcome = run("train", TASK, *SMALL, *argv)
     assert outcome.status == 0, outcome.err
     assert not list(tmp_path.glob("cartpole/*/model_*.pt"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["--env.rewards.smooth-reward.weight", "9"], "rewards.smooth_reward.weight"),
+        (["--env.rewards.smooth-reward", "None"], "rewards.smooth_reward"),
+        (["--env.decimation", "2"], "decimation"),
+        ([], None),
+        (["--agent.algorithm.gamma", "0.5"], None),
+        # A goal of the user's.
+        (
+            ["--env.rewards.smooth-reward.weight=9", "--agent.evaluation.solved-return=8100"],
+            None,
+        ),
+    ],
+)
+def test_weights_are_named_beside_the_goal(capsys, flags, named):
+    report_moved_goal(TASK, parse_train_flags(TASK, flags, "train"))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == (named is not None)
+    assert all("goal of return 900" in line and str(named) in line for line in lines)
+
+
+def test_goals_in_metrics_do_not_move(capsys):
+    flags = ["--profile", "cpu", "--env.rewards.action-rate-l2.weight", "-9"]
+    task = "Mjlab-Velocity-Flat-Unitree-Go1"
+    report_moved_goal(task, parse_train_flags(task, flags, "train"))
+    assert not capsys.readouterr().err
+
+
+def test_train_reports_a_moved_goal_once(run, tmp_path):
+    argv = ["--log-root", str(tmp_path), "--agent.max-iterations", "1"]
+    outcome = run("train", TASK, *SMALL, *argv, "--env.rewards.smooth-reward.weight", "9")
+    assert outcome.status == 0, outcome.err
+    assert outcome.err.count("goal of return 900") == 1
 
 
 @pytest.mark.parametrize("flag", ["--agent.seed", "--agent.run-name"])

@@ -111,7 +111,8 @@ COMMANDS = (
         "    --jobs N                runs side by side (default: one per GPU, else one per CPU core)\n"
         "    --folder DIR            folder of the sweep (default: logs/sweeps/<task and flags>)\n"
         "    --storage URL           database shared by machines (default: SQLite file in the folder)\n"
-        "    --objective TAG         TensorBoard tag to compare (default: last evaluation, else return)\n"
+        "    --objective TAG         TensorBoard tag to compare (default: last evaluation, else return;\n"
+        "                            if settings change rewards: success rate or metrics)\n"
         "    --minimize              prefer low values of the objective\n"
         "    --device D              cpu, cuda:0, ... (default: GPUs if available)\n"
         "    --gpu-ids IDS           GPUs to use, one run each, such as [0,2] (default: all)",

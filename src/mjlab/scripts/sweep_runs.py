@@ -236,7 +236,8 @@ class Runs:
             for trial in self._study.trials
         )
         left = (self._sweep.num_settings - elsewhere) * self._sweep.seeds - self._num_ended
-        done = [(run.iteration / run.total, run) for run in self._running]
+        # After the last iteration, the last evaluation is left.
+        done = [(min(run.iteration, run.total - 1) / run.total, run) for run in self._running]
         spent = self._spent + sum(time.monotonic() - run.begin for run in self._running)
         trained = self._trained + sum(part - run.first / run.total for part, run in done)
         text = f"{counted(left, 'run')} left"
