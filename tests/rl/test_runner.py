@@ -6,16 +6,19 @@ import contextlib
 import os
 import signal
 import sys
+import time
 import types
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import torch
+from rl_fake_env import FakeEnv
 
 from mjlab.rl.checkpoint import CheckpointError, RunFolderError, load_checkpoint
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
+from mjlab.utils.random import preserved_rng
 
 
 class Recorder(TrainingObserver):
@@ -191,17 +194,70 @@ def test_a_signal_ends_training_with_a_checkpoint_that_resumes(make_runner, tmp_
     assert_same_bits(everything(resumed), expected)
 
 
-def test_a_second_signal_is_not_held_back(make_runner, tmp_path: Path):
-    class InterruptTwice(TrainingObserver):
-        def on_iteration(self, stats):
-            os.kill(os.getpid(), signal.SIGINT)
-            os.kill(os.getpid(), signal.SIGINT)
+def interrupt_once_due(runner, place: str, times: int) -> None:
+    """Raise SIGINT `times` times in the fourth iteration: in its second step, or in its update."""
+    owner, name = (runner.env, "step") if place == "step" else (runner.alg, "update")
+    function, calls = getattr(owner, name), []
 
+    def interrupted(*args):
+        result = function(*args)
+        if runner.current_learning_iteration == 3:
+            calls.append(None)
+            if len(calls) == (2 if place == "step" else 1):
+                for _ in range(times):
+                    signal.raise_signal(signal.SIGINT)
+                time.sleep(1.0 if runner.grace is not None else 0.0)
+        return result
+
+    setattr(owner, name, interrupted)
+
+
+@pytest.mark.parametrize(("place", "grace"), [("step", None), ("update", None), ("step", 0.01)])
+def test_a_second_signal_gives_the_iteration_up(make_runner, tmp_path: Path, place, grace):
+    straight, recorder = make_runner(), Recorder()
+    straight.observers.append(recorder)
+    straight.learn(6)
+    expected = everything(straight)
+    runner, observer = make_runner(tmp_path / "run", save_interval=100), Recorder()
+    runner.observers.append(observer)
+    runner.grace = grace
+    interrupt_once_due(runner, place, times=2 if grace is None else 1)
+    runner.learn(6)
+    assert (runner.stop_reason, runner.stop_signal) == ("interrupted", signal.SIGINT)
+    assert observer.events[-1] == ("end", "interrupted")
+    assert runner.current_learning_iteration == 3
+    with preserved_rng():
+        resumed = make_runner(tmp_path / "resumed")
+        resumed.load(str(tmp_path / "run" / "model_2.pt"))
+        resumed.learn(6)
+        assert_same_bits(everything(resumed), expected)
+    # In its process it goes on in the same way.
+    runner.learn(6)
+    assert_same_bits(everything(runner), expected)
+    for one, other in zip(recorder.stats, observer.stats, strict=True):
+        assert one.mean_reward == other.mean_reward
+        assert one.environment == other.environment
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_only_a_third_signal_ends_a_save(make_runner, tmp_path: Path, times):
+    before = signal.getsignal(signal.SIGINT)
     runner = make_runner(tmp_path / "run")
-    runner.observers.append(InterruptTwice())
-    with pytest.raises(KeyboardInterrupt):
-        runner.learn(5)
-    assert runner.stop_reason == "failed"
+    save = runner.save
+
+    def interrupted(path):
+        for _ in range(times if runner.current_learning_iteration == 3 else 0):
+            signal.raise_signal(signal.SIGINT)
+        save(path)
+
+    runner.save = interrupted
+    with pytest.raises(KeyboardInterrupt) if times == 3 else contextlib.nullcontext():
+        runner.learn(6)
+    assert runner.stop_reason == "interrupted"
+    assert signal.getsignal(signal.SIGINT) is before
+    last = 2 if times == 2 else 0
+    names = [path.name for path in (tmp_path / "run").glob("model_*")]
+    assert max(names) == f"model_{last}.pt"
 
 
 def test_two_hangups_of_a_closed_terminal_save(make_runner, tmp_path: Path):
@@ -380,6 +436,114 @@ def test_training_stops_when_solved_and_evaluation_leaves_no_trace(make_runner, 
     assert runner.last_evaluation.num_episodes == 4
     assert runner.last_evaluation.mean_length <= 12
     assert_same_bits(everything(runner), expected)
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("evaluation", [1, 2])
+@pytest.mark.parametrize("how", ["SIGTERM", "twice", "killed"])
+def test_an_interrupted_evaluation_is_made_up_for(
+    make_runner, tmp_path: Path, monkeypatch, evaluation, how
+):
+    """The first evaluation, or the second one that confirms it."""
+    solved = solved_at(0.01) | {"min_interval": 2}
+    straight = make_runner(tmp_path / "straight", evaluation=solved)
+    straight.learn(50)
+    expected = everything(straight)
+    built, step, steps = [], FakeEnv.step, []
+
+    def built_env(env, *args, **kwargs):
+        init(env, *args, **kwargs)
+        built.append(env)
+
+    def interrupted(env, action):
+        if len(built) > evaluation and env is built[evaluation]:
+            steps.append(None)
+            if len(steps) == 3:
+                assert load_checkpoint(tmp_path / "run" / "model_1.pt")["owes_evaluation"]
+                if how == "killed":
+                    raise Killed
+                for _ in range(2 if how == "twice" else 1):
+                    signal.raise_signal(signal.SIGINT if how == "twice" else signal.Signals[how])
+        return step(env, action)
+
+    init = FakeEnv.__init__
+    with monkeypatch.context() as patch:
+        patch.setattr(FakeEnv, "__init__", built_env)
+        patch.setattr(FakeEnv, "step", interrupted)
+        runner = make_runner(tmp_path / "run", evaluation=solved)
+        with pytest.raises(Killed) if how == "killed" else contextlib.nullcontext():
+            runner.learn(50)
+        if how != "killed":
+            assert runner.stop_reason == "interrupted"
+            assert len(steps) == 3
+            # A resumed run is interrupted while it makes up for the evaluation.
+            steps.clear()
+            with preserved_rng():
+                again = make_runner(tmp_path / "again", evaluation=solved)
+                built[:] = built[:1]
+                again.load(str(tmp_path / "run" / "model_1.pt"))
+                again.learn(50)
+            assert (again.stop_reason, len(steps)) == ("interrupted", 3)
+    with preserved_rng():
+        resumed, recorder = make_runner(tmp_path / "resumed", evaluation=solved), Recorder()
+        resumed.observers.append(recorder)
+        resumed.load(str(tmp_path / ("run" if how == "killed" else "again") / "model_1.pt"))
+        resumed.learn(50)
+        assert resumed.stop_reason == "solved"
+        assert ("evaluation", 2, True) in recorder.events
+        assert resumed.last_evaluation.returns == straight.last_evaluation.returns
+        assert_same_bits(everything(resumed), expected)
+    last = load_checkpoint(tmp_path / "resumed" / "model_1.pt")
+    assert (last["last_evaluated"], last["owes_evaluation"]) == (2, False)
+    if how != "killed":
+        # In its process it goes on in the same way.
+        runner.learn(50)
+        assert_same_bits(everything(runner), expected)
+        assert not load_checkpoint(tmp_path / "run" / "model_1.pt")["owes_evaluation"]
+
+
+def test_each_checkpoint_is_written_once_and_knows_its_evaluation(make_runner, tmp_path: Path):
+    runner = make_runner(
+        tmp_path / "run", evaluation=solved_at(13.0, trigger_fraction=0.0) | {"min_interval": 2}
+    )
+    written, save = [], runner.save
+    runner.save = lambda path: (written.append(Path(path).name), save(path))
+    runner.learn(6)
+    assert written == [
+        "model_0.pt",
+        "model_1.pt",
+        "model_2.pt",
+        "model_3.pt",
+        "model_4.pt",
+        "model_5.pt",
+    ]
+    for iteration, evaluated in ((1, 0), (2, 2), (3, 2), (4, 4), (5, 4), (6, 6)):
+        content = load_checkpoint(tmp_path / "run" / f"model_{iteration - 1}.pt")
+        assert (content["last_evaluated"], content["owes_evaluation"]) == (evaluated, False)
+
+
+@pytest.mark.parametrize("remaining", [0, 3])
+def test_an_evaluation_owed_by_the_last_iteration_is_made(make_runner, tmp_path: Path, remaining):
+    evaluated = solved_at(13.0, trigger_fraction=0.0) | {"min_interval": 3}
+
+    class Stop(TrainingObserver):
+        def on_iteration(self, stats):
+            if stats.iteration == 3:
+                signal.raise_signal(signal.SIGINT)
+
+    first = make_runner(tmp_path / "first", evaluation=evaluated)
+    first.observers.append(Stop())
+    first.learn(3 + remaining)
+    assert first.last_evaluation is None
+    second, recorder = make_runner(tmp_path / "second", evaluation=evaluated), Recorder()
+    second.observers.append(recorder)
+    second.load(str(tmp_path / "first" / "model_2.pt"))
+    second.learn(3)
+    assert recorder.events == [("start", 3, 3), ("evaluation", 3, False), ("end", "finished")]
+    assert not load_checkpoint(tmp_path / "second" / "model_2.pt")["owes_evaluation"]
 
 
 def test_no_evaluation_is_made_before_the_first_iteration_that_may_have_one(make_runner):

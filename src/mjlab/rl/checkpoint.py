@@ -240,7 +240,7 @@ class RunRescue:
     """
 
     learned: dict[str, Any] | None = None
-    """Entries of a checkpoint that resumes in new episodes. None: nothing to save."""
+    """Entries of a checkpoint, saved without its episodes. None: nothing to save."""
 
     def __init__(self, folder: str | os.PathLike[str] | None) -> None:
         """Store the run folder. None: this process writes no files."""
@@ -286,8 +286,10 @@ class RunRescue:
         # NaN weights may be the reason of the failure, and could not be loaded.
         if os.path.exists(path) or not_finite(self.learned):
             return
+        # In the same episodes, the failure may come again.
+        state = lasting_state(self.learned["training_state"])
         try:
-            save_checkpoint(self.learned, path)
+            save_checkpoint({**self.learned, "training_state": state}, path)
         except CheckpointError as failure:
             # The first error is the one that the user needs to see.
             logger.warning("%s", failure)
@@ -542,7 +544,8 @@ def capture_training_state(
 ) -> dict[str, Any]:
     """Return the state between two iterations; `observations` are those of the next action."""
     unwrapped: Any = getattr(env, "unwrapped", env)
-    hidden = [model.get_hidden_state() for model in _models(algorithm)]
+    # Resets write to hidden states.
+    hidden = [copy.deepcopy(model.get_hidden_state()) for model in _models(algorithm)]
     state: dict[str, Any] = {
         "version": VERSION,
         "num_envs": env.num_envs,
@@ -564,13 +567,12 @@ def capture_training_state(
     return state
 
 
-def capture_lasting_state(env: VecEnv, logger_state: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of the training state that new episodes continue: curricula and totals."""
-    unwrapped: Any = getattr(env, "unwrapped", env)
-    state: dict[str, Any] = {"version": VERSION, "num_envs": env.num_envs, "logger": logger_state}
-    if hasattr(unwrapped, "curriculum_state"):
-        state["env"] = {"curriculum": unwrapped.curriculum_state()}
-    return state
+def lasting_state(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the part of a training state that new episodes continue: curricula and totals."""
+    lasting = {name: state[name] for name in ("version", "num_envs", "logger")}
+    if (curricula := curricula_of({"training_state": state})) is not None:
+        lasting["env"] = {"curriculum": curricula}
+    return lasting
 
 
 def curricula_of(content: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -641,9 +643,8 @@ def restore_training_state(
                 unwrapped.load_state_dict(_to(state["env"], env.device))
         load_logger(state["logger"])
         for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
-            if hidden is not None:
-                hidden = _to(hidden, device)
-                model.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
+            hidden = _to(hidden, device)
+            model.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
         if hasattr(algorithm, "last_hidden_states"):
             # rsl_rl's distillation starts an update with the hidden states before the iteration.
             algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)

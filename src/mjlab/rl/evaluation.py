@@ -67,6 +67,7 @@ def evaluate_policy(
     metrics: Mapping[str, PerEnv] | None = None,
     seed: int | None = None,
     progress: Progress | None = None,
+    is_stopped: Callable[[], bool] | None = None,
 ) -> EvaluationResult:
     """Play episodes and score them.
 
@@ -97,8 +98,10 @@ def evaluate_policy(
             environments in the same state give the same episodes.
         progress: Function called every few steps with the number of finished episodes, and with the
             fraction of the evaluation that is done.
+        is_stopped: Function called before every step; True stops the evaluation.
 
     Raises:
+        EvaluationStopped: `is_stopped` returned True.
         ValueError: `num_episodes` is not positive, or episodes are too long.
     """
     num_episodes = env.num_envs if num_episodes is None else num_episodes
@@ -133,7 +136,9 @@ def evaluate_policy(
                     progress(done, (done + running * step / max_steps) / num_episodes)
 
             rounds.append(
-                _play_round(env, policy, count, max_steps, success_func, metrics or {}, report)
+                _play_round(
+                    env, policy, count, max_steps, success_func, metrics or {}, report, is_stopped
+                )
             )
     episodes = functools.reduce(operator.add, rounds)
     successes = episodes.succeeded if success_func is not None else None
@@ -144,6 +149,10 @@ def evaluate_policy(
     if successes is not None:
         successes = successes & episodes.finished
     return summarize(episodes, successes, time.perf_counter() - start)
+
+
+class EvaluationStopped(Exception):
+    """Evaluation that was stopped before its end; the evaluated environments are as before."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -378,29 +387,39 @@ class SolvedCheck:
         """True if training ends when the task is solved."""
         return bool(self._cfg.get("stop_when_solved", True))
 
-    def evaluate(self) -> EvaluationResult:
+    def evaluate(self, is_stopped: Callable[[], bool] = bool) -> EvaluationResult:
         """Score the policy in separate environments, built at the first call.
 
         The episodes are the same at each call.
+
+        Raises:
+            EvaluationStopped: `is_stopped`, called before every step, returned True.
         """
         if self._eval_env is None:
-            self._eval_env = make_evaluation_env(
-                self._env, self._num_episodes, evaluation_seed(self._seed), self._prepare_env
-            )
-        return self._score(self._eval_env, evaluation_seed(self._seed))
+            self._eval_env = self._make_env(evaluation_seed(self._seed), is_stopped)
+        return self._score(self._eval_env, evaluation_seed(self._seed), is_stopped)
 
-    def confirm(self, iteration: int) -> EvaluationResult:
+    def confirm(self, iteration: int, is_stopped: Callable[[], bool] = bool) -> EvaluationResult:
         """Score the policy after `iteration` iterations in new environments, on unused episodes.
 
         The episodes depend on the seed and the iteration only, so that a resumed run has the same
         episodes.
+
+        Raises:
+            EvaluationStopped: `is_stopped`, called before every step, returned True.
         """
         seed = evaluation_seed(self._seed, iteration)
-        env = make_evaluation_env(self._env, self._num_episodes, seed, self._prepare_env)
+        env = self._make_env(seed, is_stopped)
         with closing(env):
-            return self._score(env, seed)
+            return self._score(env, seed, is_stopped)
 
-    def _score(self, env: Any, seed: int) -> EvaluationResult:
+    def _make_env(self, seed: int, is_stopped: Callable[[], bool]) -> RslRlVecEnvWrapper:
+        # Building cannot be stopped, and may take long.
+        if is_stopped():
+            raise EvaluationStopped
+        return make_evaluation_env(self._env, self._num_episodes, seed, self._prepare_env)
+
+    def _score(self, env: Any, seed: int, is_stopped: Callable[[], bool]) -> EvaluationResult:
         # Curricula count the steps of training.
         counter = getattr(self._env.unwrapped, "common_step_counter", None)
         if counter is not None:
@@ -421,6 +440,7 @@ class SolvedCheck:
                     success_is_survival=bool(self._cfg.get("success_is_survival")),
                     metrics=self._cfg.get("metrics"),
                     seed=seed,
+                    is_stopped=is_stopped,
                 )
         finally:
             self._algorithm.train_mode()
@@ -550,6 +570,7 @@ def _play_round(
     success_func: PerEnv | None,
     metrics: Mapping[str, PerEnv],
     report: Callable[[int, int], None],
+    is_stopped: Callable[[], bool] | None,
 ) -> Episodes:
     """Play the first episode of each of the first `count` environments.
 
@@ -572,6 +593,8 @@ def _play_round(
     if reset_policy is not None:
         reset_policy()
     for step in range(max_steps):
+        if is_stopped is not None and is_stopped():
+            raise EvaluationStopped
         if success_func is not None:
             succeeded = torch.where(running, success_func(unwrapped).bool(), succeeded)
         for name, func in metrics.items():

@@ -403,8 +403,16 @@ class RunLogger(Logger):
                 return
             self.erewbuffer.extend(state["extrinsic_rewards"])
             self.irewbuffer.extend(state["intrinsic_rewards"])
-        self.rewbuffer.extend(state["rewards"])
-        self.lenbuffer.extend(state["lengths"])
+        for buffer, name in ((self.rewbuffer, "rewards"), (self.lenbuffer, "lengths")):
+            buffer.clear()
+            buffer.extend(state[name])
+
+    def drop_iteration(self) -> None:
+        """Forget the steps since the last `finish_iteration`."""
+        self._finished.clear()
+        self._step_rewards.clear()
+        self._failures.clear()
+        self.ep_extras.clear()
 
     def _collect_rewards(self) -> tuple[float, float]:
         """Read the step data: add the finished episodes.

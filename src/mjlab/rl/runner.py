@@ -13,6 +13,7 @@ import io
 import logging
 import os
 import secrets
+import signal
 import time
 from collections.abc import Generator, Mapping
 from pathlib import Path
@@ -22,12 +23,12 @@ import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.storage import RolloutStorage
 from rsl_rl.utils import check_nan
 from tensordict import TensorDict
 
 from mjlab.rl.checkpoint import (
     RunRescue,
-    capture_lasting_state,
     capture_training_state,
     check_fits,
     load_algorithm,
@@ -41,7 +42,13 @@ from mjlab.rl.checkpoint import (
 )
 from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
-from mjlab.rl.evaluation import EvaluationResult, SolvedCheck, reward_unit, time_limit
+from mjlab.rl.evaluation import (
+    EvaluationResult,
+    EvaluationStopped,
+    SolvedCheck,
+    reward_unit,
+    time_limit,
+)
 from mjlab.rl.exporter_utils import export_to_onnx, export_with_metadata, get_base_metadata
 from mjlab.rl.networks import (
     check_mini_batches,
@@ -55,13 +62,10 @@ from mjlab.rl.run_logger import RunLogger, TrainingObserver
 from mjlab.utils.errors import UserError
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import process_seed, seed_rng, session_seed
-from mjlab.utils.signals import StopRequest
+from mjlab.utils.signals import Interrupted, StopRequest
 from mjlab.utils.torch import torch_threads, using_torch_threads
 
 logger = logging.getLogger(__name__)
-
-# Reasons to leave the loop, in order of increasing priority between processes.
-_REASONS = ("", "solved", "interrupted")
 
 
 class MjlabOnPolicyRunner(OnPolicyRunner):
@@ -72,10 +76,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     of iterations finished. Progress goes to `observers` instead of the console; in a notebook, it is
     shown in one output.
 
-    After `learn`, `stop_reason` is `finished`, `solved`, `interrupted` (SIGINT or SIGTERM) or
-    `failed`, and `last_evaluation` is the result of the last evaluation, if any. In a solved run,
+    After `learn`, `stop_reason` is `finished`, `solved`, `interrupted` (by the signal `stop_signal`)
+    or `failed`, and `last_evaluation` is the result of the last evaluation, if any. In a solved run,
     that is the confirming evaluation.
     """
+
+    grace: float | None = None
+    """Time after the first stop signal (s): the running iteration is given up if it takes longer. None:
+    unlimited."""
 
     # Any: environments have attributes that rsl_rl's `VecEnv` lacks (`unwrapped`).
     env: Any
@@ -118,6 +126,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         )
         self.observers: list[TrainingObserver] = []
         self.stop_reason: str | None = None
+        self.stop_signal: signal.Signals | None = None
         self.last_evaluation: EvaluationResult | None = None
         self._observations: TensorDict | None = None
         # Part of the identity of checkpoints: which states are of the same training.
@@ -125,8 +134,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._state_to_resume: dict[str, Any] | None = None
         # Seed of the numbers drawn after a resume. None: the generators are restored.
         self._new_seed: int | None = None
-        # True if an evaluation was due after the last iteration but skipped to stop sooner.
+        # True if an evaluation is due after the last iteration, and not finished.
         self._owes_evaluation = False
+        # Path and content of the checkpoint written last.
+        self._written: tuple[str, dict[str, Any]] | None = None
         self._solved_check = SolvedCheck(
             env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
         )
@@ -142,9 +153,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Train until `num_learning_iterations` iterations are finished IN TOTAL.
 
         Iterations before a `load` count. SIGINT, SIGTERM and SIGHUP end training after the current
-        iteration; a second signal ends the process. After one signal, as at the end, a checkpoint
-        for exact resume is written and the policy exported. After an error, weights and optimizer of
-        the last finished iteration are in a checkpoint that resumes in new episodes.
+        iteration; a second signal, or the end of `grace`, gives that iteration up; a third has its
+        usual effect. Evaluations end within a step, and a resumed run makes up for them. In all
+        cases, as at the end and before evaluations, a checkpoint for exact resume is written and the
+        policy exported. After an error, weights and optimizer of the last finished iteration are in
+        a checkpoint that resumes in new episodes.
 
         Args:
             num_learning_iterations: Total number of iterations.
@@ -156,6 +169,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 deleted or moved, and the run was saved next to it.
             CheckpointError: a checkpoint could not be written.
             DivergedError: the physics diverged in most environments, or training failed because of it.
+            Interrupted: with several processes, the running iteration was given up.
             BrokenTermError: a reward or a termination stayed NaN in every environment.
             ValueError: the environment returned NaN, Weights & Biases did not start a run, a student
                 has no teacher, or mini-batches outnumber samples.
@@ -176,36 +190,44 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         with self._session() as stop, RunRescue(self._run_folder) as rescue:
             observations = self._initial_observations(init_at_random_ep_len)
             self._notify("on_start", first, total)
-            if first < total:
-                owed, self._owes_evaluation = self._owes_evaluation, False
-                reason = self._agree_to_stop(owed and self._evaluate_solved(first))
+            owed = self._owes_evaluation
+            if first > 0:
+                reason = self._agree_to_stop(owed and self._evaluate_solved(first, stop), stop)
             while not reason and (iteration := self.current_learning_iteration) < total:
                 begin = time.perf_counter()
+                last = self._snapshot() if self._is_main_process else {}
                 if self._run_folder is not None and iteration > first:
-                    rescue.learned = {**copy.deepcopy(self.alg.save()), **self._progress()}
-                    rescue.learned["training_state"] = capture_lasting_state(
-                        self.env, self.logger.state_dict()
-                    )
-                with self._watch.explaining(self.alg.get_policy()):
-                    with torch.inference_mode():
-                        with using_torch_threads(self._num_collecting_threads):
-                            self._watch.start()
-                            for _ in range(num_steps):
-                                actions = self.alg.act(observations).to(self.env.device)
-                                observations, rewards, dones, extras = self.env.step(actions)
-                                self._watch.update()
-                                if check_every_step:
-                                    check_nan(observations, rewards, dones)
-                                observations = observations.to(self.device)
-                                rewards, dones = rewards.to(self.device), dones.to(self.device)
-                                credited, infos = self._bootstrapped(observations, rewards, extras)
-                                self.alg.process_env_step(observations, credited, dones, infos)
-                                intrinsic = self.alg.intrinsic_rewards if uses_rnd else None
-                                self.logger.process_env_step(rewards, dones, extras, intrinsic)
-                            self._watch.check(num_steps)
-                        collected = time.perf_counter()
-                        self.alg.compute_returns(observations)
-                    losses = self._update()
+                    rescue.learned = last
+                try:
+                    with (
+                        stop.interruptible(self._is_main_process),
+                        self._watch.explaining(self.alg.get_policy()),
+                    ):
+                        with torch.inference_mode():
+                            with using_torch_threads(self._num_collecting_threads):
+                                self._watch.start()
+                                for _ in range(num_steps):
+                                    actions = self.alg.act(observations).to(self.env.device)
+                                    observations, rewards, dones, extras = self.env.step(actions)
+                                    self._watch.update()
+                                    if check_every_step:
+                                        check_nan(observations, rewards, dones)
+                                    observations = observations.to(self.device)
+                                    rewards, dones = rewards.to(self.device), dones.to(self.device)
+                                    credited, infos = self._bootstrapped(
+                                        observations, rewards, extras
+                                    )
+                                    self.alg.process_env_step(observations, credited, dones, infos)
+                                    intrinsic = self.alg.intrinsic_rewards if uses_rnd else None
+                                    self.logger.process_env_step(rewards, dones, extras, intrinsic)
+                                self._watch.check(num_steps)
+                            collected = time.perf_counter()
+                            self.alg.compute_returns(observations)
+                        losses = self._update()
+                except Interrupted as stopped:
+                    self._give_up(last, stopped)
+                    reason = "interrupted"
+                    break
                 learned = time.perf_counter()
                 self._observations = observations
                 self.current_learning_iteration = iteration + 1
@@ -222,21 +244,23 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 )
                 self._notify("on_iteration", stats)
                 self.logger.report_broken_losses(stats)
+                done = iteration + 1
+                check, step_reward = self._solved_check, stats.mean_step_reward
+                self._owes_evaluation = check.should_evaluate(done, step_reward)
                 rescue.check_folder(self.save, f"model_{iteration}.pt")
-                is_due = self._solved_check.should_evaluate(iteration + 1, stats.mean_step_reward)
-                # Skip the evaluation, until the run is resumed, if a stop was requested.
-                interrupted = stop.requested
-                self._owes_evaluation = is_due and interrupted
-                is_solved = is_due and not interrupted and self._evaluate_solved(iteration + 1)
-                reason = self._agree_to_stop(is_solved, interrupted)
-                is_saving = self._run_folder is not None and not reason and iteration + 1 < total
-                if is_saving and iteration % self.cfg["save_interval"] == 0:
+                # Before the evaluation, which may take longer than there is time for.
+                is_saving = self._owes_evaluation or stop.requested or done == total
+                if is_saving or iteration % self.cfg["save_interval"] == 0:
                     self._save_checkpoint()
+                    rescue.learned = None
+                is_solved = self._owes_evaluation and self._evaluate_solved(done, stop)
+                reason = self._agree_to_stop(is_solved, stop)
             rescue.learned = None
-            # A resumed run that is solved before its first iteration also writes a checkpoint.
-            if self.current_learning_iteration > first or reason == "solved":
+            # Without further iterations, too: the evaluation that a resumed run made up for.
+            has_news = self.current_learning_iteration > first or owed or bool(reason)
+            if has_news and self.current_learning_iteration > 0 and not self._is_written:
                 self._save_checkpoint()
-            elif total <= first:
+            if total <= first and not owed:
                 logger.warning(
                     "Nothing to train: the checkpoint has finished %d iterations, and max_iterations "
                     "(in total) is %d.", first, total,
@@ -247,13 +271,18 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _session(self) -> Generator[StopRequest]:
         """Prepare training within the block: log files, signal handlers, threads."""
         self.logger.init_logging_writer()
-        self.stop_reason = "failed"
+        self.stop_reason, self.stop_signal = "failed", None
         try:
             with (
                 using_torch_threads(self._num_threads),
-                StopRequest(lambda name: self._notify("on_stop_requested", name)) as stop,
+                StopRequest(
+                    lambda name: self._notify("on_stop_requested", name), self.grace
+                ) as stop,
             ):
                 yield stop
+        except KeyboardInterrupt:
+            self.stop_reason = "interrupted"
+            raise
         finally:
             self.logger.stop_logging_writer()
             self._solved_check.close()
@@ -364,15 +393,48 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         algorithm.last_hidden_states = (algorithm.last_hidden_states[0], None)
         return losses
 
-    def _agree_to_stop(self, is_solved: bool, interrupted: bool = False) -> str:
+    def _snapshot(self) -> dict[str, Any]:
+        """Return the entries of a checkpoint; further training does not change them."""
+        entries = {**copy.deepcopy(self.alg.save()), **self._progress()}
+        return {**entries, "training_state": self._training_state()}
+
+    def _give_up(self, last: dict[str, Any], stopped: Interrupted) -> None:
+        """End the running iteration early, back in the state `last` before it.
+
+        Raises:
+            Interrupted: other processes still run the iteration. The state is saved.
+        """
+        self.stop_signal = stopped.number
+        logger.warning(
+            "%s: iteration %d is given up.",
+            stopped.number.name,
+            self.current_learning_iteration + 1,
+        )
+        self.alg.load(last, None, True)
+        if isinstance(self.alg.storage, RolloutStorage):
+            self.alg.storage.clear()
+            self.alg.transition.clear()
+        self.logger.drop_iteration()
+        self._observations = restore_training_state(
+            last["training_state"], self.env, self.alg, self.logger.load_state_dict, self.device
+        )
+        if self.is_distributed:
+            if self.current_learning_iteration > 0 and not self._is_written:
+                self._save_checkpoint()
+            raise stopped
+
+    def _agree_to_stop(self, is_solved: bool, stop: StopRequest) -> str:
         """Return the reason to stop with the highest priority among all processes, or ""."""
-        code = 2 if interrupted else int(is_solved)
+        code = int(is_solved) if stop.number is None else 1 + stop.number
         if self.is_distributed:
             # All processes must leave the loop at the same iteration.
             shared = torch.tensor(code, device=self.device)
             torch.distributed.all_reduce(shared, op=torch.distributed.ReduceOp.MAX)
             code = int(shared.item())
-        return _REASONS[code]
+        if code > 1:
+            self.stop_signal = signal.Signals(code - 1)
+            return "interrupted"
+        return "solved" if code else ""
 
     # Evaluation.
 
@@ -381,25 +443,33 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation = self._solved_check.evaluate()
         return self.last_evaluation
 
-    def _evaluate_solved(self, iteration: int) -> bool:
+    def _evaluate_solved(self, iteration: int, stop: StopRequest) -> bool:
         """Evaluate the policy after `iteration` iterations; return True to stop training.
 
-        Evaluates only in the first process; False in others.
+        Evaluates only in the first process; False in others, and if a signal stops the evaluation.
         """
         if not self._is_main_process:
             return False
-        check = self._solved_check
-        check.last_iteration = iteration
-        result = self.evaluate()
-        is_good = check.is_solved_by(result)
-        self._notify("on_evaluation", iteration, result, is_good)
-        self.logger.write_evaluation(result, iteration - 1)
-        if not (is_good and check.stops_training):
+        check, solved = self._solved_check, False
+        try:
+            with stop.interruptible():
+                result = check.evaluate(lambda: stop.requested)
+            self.last_evaluation = result
+            is_good = check.is_solved_by(result)
+            self._notify("on_evaluation", iteration, result, is_good)
+            self.logger.write_evaluation(result, iteration - 1)
+            if is_good and check.stops_training:
+                with stop.interruptible():
+                    result = check.confirm(iteration, lambda: stop.requested)
+                self.last_evaluation, solved = result, check.is_solved_by(result)
+                self._notify("on_confirmation", iteration, result, solved)
+                self.logger.write_evaluation(result, iteration - 1, "Confirmation")
+        except (EvaluationStopped, Interrupted):
             return False
-        self.last_evaluation = result = check.confirm(iteration)
-        solved = check.is_solved_by(result)
-        self._notify("on_confirmation", iteration, result, solved)
-        self.logger.write_evaluation(result, iteration - 1, "Confirmation")
+        check.last_iteration, self._owes_evaluation = iteration, False
+        if self._is_written and self._written is not None:
+            path, content = self._written
+            save_checkpoint({**content, **self._evaluation_entries()}, path)
         return solved
 
     # Checkpoints.
@@ -416,19 +486,15 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """
         if not self._is_main_process:
             return
-        observations = self._observations
-        if observations is None:
-            observations = self.env.get_observations()
         checkpoint = {**self.alg.save(), **self._progress(infos)}
-        checkpoint["training_state"] = capture_training_state(
-            self.env, self.alg, self.logger.state_dict(), observations
-        )
+        checkpoint["training_state"] = self._training_state()
         saves_replay = self.cfg["algorithm"].get("save_replay", False)
         if saves_replay:
             # First, so that the newest checkpoint has a replay even if writing is interrupted.
             storage: Any = self.alg.storage
             ReplayFiles(path).write(storage, str(checkpoint["identity"]))
         save_checkpoint(checkpoint, path)
+        self._written = str(path), checkpoint
         if saves_replay:
             ReplayFiles(path).remove_others()
         if self.cfg.get("upload_model", True):
@@ -496,7 +562,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
         if replay is not None:
             storage.load_state_dict(replay)
-        self._observations = None
+        self._observations = self._written = None
         self._new_seed = None
         self._token = secrets.token_hex(4)
         return infos
@@ -551,11 +617,22 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         check_fits(algorithm._raw_teacher, policy, name="teacher", path=str(path))
         algorithm.load({"actor_state_dict": policy}, {"teacher": True}, strict=True)
 
+    @property
+    def _checkpoint_path(self) -> str:
+        """Path of the checkpoint of this iteration in the run folder."""
+        name = f"model_{self.current_learning_iteration - 1}.pt"
+        return os.path.join(self._run_folder or "", name)
+
+    @property
+    def _is_written(self) -> bool:
+        """True if the checkpoint of this iteration is in the run folder."""
+        return self._written is not None and self._written[0] == self._checkpoint_path
+
     def _save_checkpoint(self) -> None:
         """Write a checkpoint and the policy as ONNX into the run folder."""
         if self._run_folder is None:
             return
-        path = os.path.join(self._run_folder, f"model_{self.current_learning_iteration - 1}.pt")
+        path = self._checkpoint_path
         self.save(path)
         if not self.exports_on_save:
             self.export_policy(str(self._get_export_paths(path)[2]))
@@ -570,11 +647,25 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             "iter": max(done - 1, 0),
             "iterations_finished": done,
             "infos": {**(infos or {}), "env_state": {"common_step_counter": int(counter)}},
-            "last_evaluated": self._solved_check.last_iteration,
-            "owes_evaluation": self._owes_evaluation,
+            **self._evaluation_entries(),
             # Of the state, not of the file: the same if it is saved again before the next iteration.
             "identity": f"{self._token}-{done}",
         }
+
+    def _evaluation_entries(self) -> dict[str, Any]:
+        """Return the checkpoint entries that an evaluation changes."""
+        return {
+            "last_evaluated": self._solved_check.last_iteration,
+            "owes_evaluation": self._owes_evaluation,
+        }
+
+    def _training_state(self) -> dict[str, Any]:
+        """Return the checkpoint entry that exact resume needs."""
+        observations = self._observations
+        if observations is None:
+            observations = self.env.get_observations()
+        state = self.logger.state_dict()
+        return capture_training_state(self.env, self.alg, state, observations)
 
     # Export.
 

@@ -1,11 +1,14 @@
 """Scoped signal handlers: stop requests, the first Ctrl+C, signals for child processes.
 
+A command that a signal ended exits with 128 + its number, as in a shell: 130 for SIGINT, 143 for SIGTERM.
+
 SIGHUP (closed terminal) does not exist on Windows. There, Ctrl-Break (SIGBREAK) takes the place of SIGINT
 for processes of another group, which Ctrl-C does not reach.
 """
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import signal
 import subprocess
@@ -31,6 +34,29 @@ SIGINT and SIGTERM."""
 NEW_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 """`creationflags` of a process that Ctrl-C in the terminal does not reach, on Windows; elsewhere
 `start_new_session=True` does that."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """Stop signal that ended what was asked for. Commands exit with `exit_status`, without a message."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = signal.Signals(number)
+        """Signal."""
+
+    @property
+    def exit_status(self) -> int:
+        """128 + the number of the signal."""
+        return 128 + self.number
+
+
+def interrupting_signal(status: int) -> signal.Signals | None:
+    """Return the stop signal that ended a process with exit status `status`; None if it was not one.
+
+    A negative status is the signal whose default action ended the process, as `subprocess` has it.
+    """
+    number = -status if status < 0 else status - 128
+    return signal.Signals(number) if number in FORWARDED else None
 
 
 def start_in_background(
@@ -84,24 +110,49 @@ def not_ignored(numbers: Iterable[int]) -> list[int]:
 
 
 class StopRequest:
-    """Context manager: SIGINT, SIGTERM and SIGHUP set `signal_name` instead of ending the process.
+    """Context manager: stop signals are requests, in two stages, instead of ending the process.
 
-    The first signal and the end of the context restore the previous handlers, so a second signal has
-    its usual effect. A second SIGHUP is ignored until the end of the context, because a terminal and
-    its shell both send SIGHUP. A process that ignores SIGHUP, such as under `nohup`, keeps ignoring
-    it. No effect outside the main thread, because only the main thread can handle signals.
+    The first SIGINT, SIGTERM or SIGHUP sets `number`: finish what is running, then save. The second
+    signal, or the end of `grace`, raises `Interrupted` in blocks of `interruptible`: save what was
+    finished before. A third has its usual effect. SIGHUP is ignored after the first signal, because
+    a terminal and its shell both send it. A process that ignores SIGHUP, such as under `nohup`,
+    keeps ignoring it. The end of the context restores the previous handlers. No effect outside the
+    main thread, because only the main thread can handle signals.
     """
 
-    def __init__(self, on_request: Callable[[str], None] | None = None) -> None:
-        """Store `on_request`, a callback that receives the signal name."""
-        self.signal_name: str | None = None
+    def __init__(
+        self, on_request: Callable[[str], None] | None = None, grace: float | None = None
+    ) -> None:
+        """Set up.
+
+        Args:
+            on_request: Function that receives the name of the first signal.
+            grace: Time from the first signal to the second stage (s). None: unlimited.
+        """
+        self.number: signal.Signals | None = None
+        """First signal. None: no signal has arrived."""
         self._on_request = on_request
+        self._grace = grace
         self._previous: dict[int, Any] = {}
+        self._timer: threading.Timer | None = None
+        self._is_urgent = False
+        self._is_interruptible = False
 
     @property
     def requested(self) -> bool:
         """True if a signal has arrived."""
-        return self.signal_name is not None
+        return self.number is not None
+
+    @contextlib.contextmanager
+    def interruptible(self, enabled: bool = True) -> Generator[None]:
+        """Let the second stage raise `Interrupted` within the block; at once if it has begun."""
+        self._is_interruptible = enabled
+        try:
+            if enabled and self.number is not None and self._is_urgent:
+                raise Interrupted(self.number)
+            yield
+        finally:
+            self._is_interruptible = False
 
     def __enter__(self) -> StopRequest:
         hangup = [] if _HANGUP is None else not_ignored([_HANGUP])
@@ -110,18 +161,38 @@ class StopRequest:
         return self
 
     def __exit__(self, *exception: object) -> None:
+        self._is_interruptible = False
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer.join()
         restore_handlers(self._previous)
 
+    def _end_grace(self) -> None:
+        # The main thread handles it as SIGTERM, without a signal to the process.
+        if not self._is_urgent:
+            _thread.interrupt_main(signal.SIGTERM)
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.signal_name = signal.Signals(number).name
-        until_exit = {}
-        if _HANGUP in self._previous:
-            until_exit[_HANGUP] = self._previous.pop(_HANGUP)
-            signal.signal(_HANGUP, signal.SIG_IGN)
-        restore_handlers(self._previous)
-        self._previous = until_exit
-        if self._on_request is not None:
-            self._on_request(self.signal_name)
+        if self.number is None:
+            self.number = signal.Signals(number)
+            if _HANGUP in self._previous:
+                signal.signal(_HANGUP, signal.SIG_IGN)
+            if self._grace is not None:
+                self._timer = threading.Timer(self._grace, self._end_grace)
+                self._timer.daemon = True
+                self._timer.start()
+            if self._on_request is not None:
+                self._on_request(self.number.name)
+            return
+        self._is_urgent = True
+        if self._timer is not None:
+            self._timer.cancel()
+        # The handler of SIGHUP follows at the end of the context.
+        hangup = {n: old for n, old in self._previous.items() if n == _HANGUP}
+        restore_handlers({n: old for n, old in self._previous.items() if n not in hangup})
+        self._previous = hangup
+        if self._is_interruptible:
+            raise Interrupted(self.number)
 
 
 @contextlib.contextmanager
