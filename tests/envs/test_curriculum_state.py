@@ -218,13 +218,72 @@ def test_terms_that_are_gone_are_named(make):
     assert "Curriculum/hardens" not in other.extras["log"]
 
 
+def eases(env: Any, env_ids: Any) -> None:
+    """Reduce pushes and noise, and the range that `stages` sets."""
+    env.event_manager.get_term_cfg("drift").params["size"] = 0.5
+    env.command_manager.get_term("target").scale = 0.1
+    ranges = env.command_manager.get_term_cfg("target").ranges
+    ranges.x = (ranges.x[0] / 2.0, ranges.x[1] / 2.0)
+
+
+def stages(env: Any, env_ids: Any) -> None:
+    far = env.common_step_counter >= 10
+    env.command_manager.get_term_cfg("target").ranges.x = (0.0, 3.0 if far else 2.0)
+
+
+def grows(env: Any, env_ids: Any) -> None:
+    env.reward_manager.get_term_cfg("smooth_reward").weight += 1.0
+
+
+def test_edits_of_a_term_that_is_gone_are_undone(make):
+    terms = {"stages": stages, "grows": grows}
+
+    def edit(cfg: Any, **more: Any) -> None:
+        every = {**terms, **more}
+        cfg.curriculum = {name: CurriculumTermCfg(func=func) for name, func in every.items()}
+
+    env = trained(make, 4, edit=lambda cfg: edit(cfg, eases=eases))
+    command: Any = env.command_manager.get_term("target")
+    assert (command.cfg.ranges.x, command.scale) == ((0.0, 1.5), 0.1)
+    other = make(6, edit)
+    assert other.load_curriculum_state(env.curriculum_state()) == ["curriculum_manager.eases"]
+    command = other.command_manager.get_term("target")
+    # The range as of the stage, the weight as of its curriculum, the rest as configured.
+    assert (command.cfg.ranges.x, command.scale) == ((0.0, 3.0), 0.5)
+    assert other.event_manager.get_term_cfg("drift").params["size"] == 0.0
+    weight = env.reward_manager.get_term_cfg("smooth_reward").weight
+    assert weight > 4.0
+    assert other.reward_manager.get_term_cfg("smooth_reward").weight == weight
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_values_set_by_the_new_config_are_kept(make, exact):
+    env = trained(make, 4)
+
+    def edit(cfg: Any) -> None:
+        cfg.rewards["smooth_reward"].weight = 40.0
+        cfg.commands["target"].ranges.x = (-7.0, 7.0)
+
+    other = make(4 if exact else 6, edit)
+    state = env.state_dict()
+    if exact:
+        other.load_state_dict(state)
+    else:
+        left_out = other.load_curriculum_state(state["curriculum"])
+        assert "reward_manager.smooth_reward.weight" in left_out
+    assert other.reward_manager.get_term_cfg("smooth_reward").weight == 40.0
+    assert other.command_manager.get_term_cfg("target").ranges.x == (-7.0, 7.0)
+    size = env.event_manager.get_term_cfg("drift").params["size"]
+    assert other.event_manager.get_term_cfg("drift").params["size"] == size
+
+
 def test_parameters_of_another_function_are_named(make):
     def limited(env: Any, radius: float) -> torch.Tensor:
         return torch.zeros(env.num_envs, dtype=torch.bool)
 
     def edit(cfg: Any) -> None:
         cfg.terminations["too_far"] = TerminationTermCfg(func=limited, params={"radius": 1.0})
-        cfg.curriculum = {}
+        cfg.curriculum = {"hardens": CurriculumTermCfg(func=count_in_env)}
 
     other = make(6, edit)
     left_out = other.load_curriculum_state(trained(make, 4).curriculum_state())

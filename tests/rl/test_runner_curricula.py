@@ -83,12 +83,14 @@ def test_curricula_continue_with_other_observations(make, tmp_path, caplog):
 def test_new_episodes_begin_under_the_restored_curricula(make, tmp_path):
     def edit(cfg: Any) -> None:
         def far(env: Any, env_ids: Any) -> None:
-            env.event_manager.get_term_cfg("reset_slider").params["position_range"] = (1.0, 1.1)
+            if env.common_step_counter > 0:
+                params = env.event_manager.get_term_cfg("reset_slider").params
+                params["position_range"] = (1.0, 1.1)
 
         cfg.curriculum["far"] = CurriculumTermCfg(func=far)
 
     make(tmp_path / "first", 4, edit).learn(1)
-    second = make(tmp_path / "second", 6)
+    second = make(tmp_path / "second", 6, edit)
     state = load_checkpoint(tmp_path / "first" / "model_0.pt")["training_state"]
     assert restore_curricula(state, second.env) == []
     assert weight(second) == 4.0

@@ -25,6 +25,7 @@ METRICS = {
     "failure_interval": (0.0, 0.5),
     "metrics": {},
     "units": {},
+    "curricula": {},
     "notes": [],
 }
 

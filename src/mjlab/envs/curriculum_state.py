@@ -8,15 +8,18 @@ config apply.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import inspect
+import math
 from collections import deque
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from mjlab.managers.manager_base import NullManager
+from mjlab.managers.manager_base import NullManager, plain_values, write_changes
 from mjlab.utils.state import (
     CLASS_KEY,
     SKIP,
@@ -27,11 +30,12 @@ from mjlab.utils.state import (
     restore_state,
     restored,
 )
+from mjlab.utils.torch import to_device
 
 if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
 
-COUNTERS = ("common_step_counter", "_sim_step_counter")
+COUNTERS = ("common_step_counter", "_sim_step_counter", "_stepped_to")
 MANAGERS = (
     "event_manager",
     "command_manager",
@@ -57,7 +61,8 @@ _OWN_ATTRIBUTES = frozenset(
             "_holds_common_steps",
         ),
         *("_looks_ahead", "_may_not_start", "_nan_resets", "_pending_reset", "_renderer"),
-        *("_renderer_is_open", "_sim_step_counter", "_steps_as_one", "common_step_counter"),
+        *("_renderer_is_open", "_sim_step_counter", "_stepped_to", "_steps_as_one", "_term_edits"),
+        *("common_step_counter",),
         *("diverged", "episode_length_buf", "extras", "manager_visualizers", "metadata", "obs_buf"),
         *("observes_ends", "observes_failures", "physics_dt", "render_mode", "reset_buf"),
         *("reset_terminated", "reset_time_outs", "reward_buf"),
@@ -72,16 +77,39 @@ def managers_of(env: ManagerBasedRlEnv) -> dict[str, Any]:
     return {name: one for name, one in managers.items() if not isinstance(one, NullManager)}
 
 
+def begin(env: ManagerBasedRlEnv) -> None:
+    """Record the state before the first reset of `env`, and what each curriculum term edits in it.
+
+    Evaluations leave out terms that only ease training, and with them their edits.
+    """
+    env._built_state = lasting_state(env)
+    before = {"config": _configs(env), **env._built_state}
+
+    def record(name: str) -> None:
+        nonlocal before
+        now = {"config": _configs(env), **lasting_state(env)}
+        edits = changed_part(before, now)
+        env._term_edits[name] = {} if edits is SKIP else edits
+        before = now
+
+    env.curriculum_manager.after_term = record
+
+
 def curriculum_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
     """Return the curriculum state of `env`, as plain data."""
-    changed = _changed(env._built_state or {}, lasting_state(env))
     terrain = env.scene.terrain
     levels = None if terrain is None else terrain.terrain_levels
+    configs = {name: one.config_changes() for name, one in managers_of(env).items()}
+    changed = changed_part(env._built_state or {}, lasting_state(env))
     return {
         "num_envs": env.num_envs,
         "counters": {name: getattr(env, name) for name in COUNTERS},
-        "config_edits": {name: one.config_edits() for name, one in managers_of(env).items()},
+        # Edits of term configs, and the values that they replaced.
+        "config_edits": {name: edits for name, (edits, _) in configs.items()},
+        "config_built": {name: replaced for name, (_, replaced) in configs.items()},
+        # Attributes and settings.
         "changed": {} if changed is SKIP else changed,
+        "term_edits": env._term_edits,
         "terrain_levels": None if levels is None else levels.clone(),
         "num_terrain_levels": 0 if terrain is None else terrain.max_terrain_level,
     }
@@ -90,20 +118,34 @@ def curriculum_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
 def load_curriculum_state(env: ManagerBasedRlEnv, state: dict[str, Any]) -> list[str]:
     """Restore a `curriculum_state` of any number of environments; return the names of parts left out.
 
-    Rows of environments are spread evenly and in order: environment i of M gets row i N div M.
+    - Rows of environments are spread evenly and in order: environment i of M gets row i N div M.
+    - What a curriculum term edits that `env` lacks has the value of the config, and of other terms.
+    - Edits of values that the config of `env` sets differently are left out.
     """
-    fit = _Fit(state["num_envs"], env.num_envs)
-    for name, value in state["counters"].items():
-        setattr(env, name, value)
-    for name, manager in managers_of(env).items():
-        edits = state["config_edits"].get(name, {})
-        manager.apply_config_edits(fit.edits(edits, manager._live_cfgs, name))
-        undo = _Fit(env.num_envs, env.num_envs), env._built_state or {}
-        for one, part in (undo, (fit, state["changed"])):
-            saved = part.get("managers", {}).get(name, {})
-            spreads = name in _WITH_ROWS
-            restore_state(manager, one.entries(saved, vars(manager), name, spreads, depth=0))
-    load_attributes(env, state, fit)
+    state = to_device(state, env.device)
+    fit = Fit(state["num_envs"], env.num_envs)
+    load_counters(env, state)
+    changed, edits, own = state["changed"], state["config_edits"], {}
+    known = env.curriculum_manager.active_terms
+    gone = {name: one for name, one in state["term_edits"].items() if name not in known}
+    fit.left_out += [f"curriculum_manager.{name}" for name in gone]
+    missing = list(gone.values())
+    for one in missing:
+        edits = _outside(edits, None if one is None else one.get("config", {}))
+        changed = _outside(changed, one)
+    if known and missing:
+        # Other terms may edit the same values, as a function of the step.
+        _undo(env)
+        with nullcontext() if env.scene.terrain is None else env.scene.terrain.levels_held():
+            env.curriculum_manager.compute(torch.arange(env.num_envs, device=env.device))
+        after = {name: one.config_edits() for name, one in managers_of(env).items()}
+        for one in missing:
+            own = _merged(own, _inside(after, (one or {}).get("config", {})))
+    # Resets of `env` may have changed what the saved run had not changed.
+    _undo(env)
+    load_config_edits(env, {**state, "config_edits": edits}, fit, own)
+    _load_terms(env, changed, fit)
+    load_attributes(env, changed, fit)
     levels, terrain = state["terrain_levels"], env.scene.terrain
     if levels is not None:
         if terrain is None or state["num_terrain_levels"] != terrain.max_terrain_level:
@@ -111,23 +153,139 @@ def load_curriculum_state(env: ManagerBasedRlEnv, state: dict[str, Any]) -> list
         else:
             current = terrain.terrain_levels
             terrain.set_levels(fit.tensor(levels, current, "terrain levels", spreads=True))
-    return fit.left_out
+    return list(dict.fromkeys(fit.left_out))
 
 
-def load_attributes(env: ManagerBasedRlEnv, state: dict[str, Any], fit: _Fit | None = None) -> None:
-    """Restore attributes and settings of `env` from a `curriculum_state`.
+def load_counters(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
+    """Restore the step counters in the state of an environment."""
+    for name in COUNTERS:
+        # States of earlier versions lack the last one.
+        setattr(env, name, state["counters"].get(name, state["counters"][COUNTERS[0]]))
 
-    Attributes that the saved run had not changed get their values before the first reset, because
-    resets of `env` may have changed them.
-    """
+
+def load_config_edits(
+    env: ManagerBasedRlEnv,
+    state: dict[str, Any],
+    fit: Fit | None = None,
+    own: dict[str, Any] | None = None,
+) -> None:
+    """Restore the edits of term configs in a `curriculum_state`, and `own`, edits of `env` itself."""
+    fit = fit or Fit(state["num_envs"], env.num_envs)
+    for name, manager in managers_of(env).items():
+        edits = state["config_edits"].get(name, {})
+        fitting = fit.edits(edits, state["config_built"].get(name, {}), manager, name)
+        manager.apply_config_edits(_merged(fitting, (own or {}).get(name, {})))
+
+
+def load_attributes(env: ManagerBasedRlEnv, changed: dict[str, Any], fit: Fit) -> None:
+    """Restore the attributes and settings of `env` in the changes of a `curriculum_state`."""
     attributes = vars(env)
-    undo = _Fit(env.num_envs, env.num_envs), env._built_state or {}
-    redo = fit or _Fit(state["num_envs"], env.num_envs), state["changed"]
-    for one, part in (undo, redo):
-        fitted = one.entries(part.get("attributes", {}), attributes, "env", spreads=True)
-        attributes |= {name: restored(attributes.get(name), v) for name, v in fitted.items()}
-    for name, value in state["changed"].get("settings", {}).items():
+    fitted = fit.entries(changed.get("attributes", {}), attributes, "env", spreads=True)
+    attributes |= {name: restored(attributes.get(name), value) for name, value in fitted.items()}
+    for name, value in changed.get("settings", {}).items():
         setattr(env.cfg, name, value)
+
+
+def _load_terms(env: ManagerBasedRlEnv, changed: dict[str, Any], fit: Fit) -> None:
+    """Restore the attributes of terms in the changes of a `curriculum_state`."""
+    managers = managers_of(env)
+    for name, saved in changed.get("managers", {}).items():
+        if name in managers:
+            spreads = name in _WITH_ROWS
+            fitted = fit.entries(saved, vars(managers[name]), name, spreads, depth=0)
+            restore_state(managers[name], fitted)
+
+
+def _undo(env: ManagerBasedRlEnv) -> None:
+    """Restore configs, attributes and settings as they were before the first reset."""
+    for manager in managers_of(env).values():
+        manager.apply_config_edits({})
+    fit, built = Fit(env.num_envs, env.num_envs), env._built_state or {}
+    _load_terms(env, built, fit)
+    load_attributes(env, built, fit)
+
+
+def _configs(env: ManagerBasedRlEnv) -> dict[str, Any]:
+    return {
+        name: {label: plain_values(cfg) for label, cfg in manager._live_cfgs.items()}
+        for name, manager in managers_of(env).items()
+    }
+
+
+def config_as_built(env: ManagerBasedRlEnv) -> Any:
+    """Return a copy of the config of `env`, without the edits of commands and settings by curricula."""
+    cfg = copy.deepcopy(env.cfg)
+    for section, manager in (
+        (cfg.commands, env.command_manager),
+        (cfg.actions, env.action_manager),
+    ):
+        for label, values in manager.config_changes()[1].items():
+            # Configs of commands and actions are those of the environment, or copies of them.
+            write_changes(section[label], copy.deepcopy(values))
+    for name, value in (env._built_state or {}).get("settings", {}).items():
+        setattr(cfg, name, value)
+    return cfg
+
+
+def curricula_in_use(env: ManagerBasedRlEnv) -> dict[str, Any]:
+    """Return the state of the curricula of `env`: what differs from its config, by path.
+
+    Edits of term configs, numbers in public attributes of terms and of the environment, settings, and
+    numbers that curriculum terms log (`Curriculum/<term>`), unless they repeat one of these.
+    """
+    shown: dict[str, Any] = {}
+    if not env.curriculum_manager.active_terms:
+        return shown
+    state = changed_part(env._built_state or {}, lasting_state(env))
+    changed = {} if state is SKIP else state
+    for name, manager in managers_of(env).items():
+        section = f"{name.removesuffix('_manager')}s"
+        for label, edit in manager.config_edits().items():
+            shown |= _numbers(edit, f"{section}.{label.replace('/', '.')}")
+        if manager is env.curriculum_manager:
+            continue
+        by_term = changed.get("managers", {}).get(name, {})
+        for label, attributes in (
+            by_term.get("_class_terms") or by_term.get("_terms") or {}
+        ).items():
+            shown |= _public_numbers(attributes, f"{section}.{label}")
+    shown |= _public_numbers(changed.get("attributes", {}), "env")
+    shown |= changed.get("settings", {})
+    known = [
+        one for value in shown.values() for one in (value if isinstance(value, list) else [value])
+    ]
+    for label, values in env.curriculum_manager.get_active_iterable_terms(0):
+        if len(values) == 1 and not any(math.isclose(values[0], x, rel_tol=1e-5) for x in known):
+            shown[f"Curriculum/{label}"] = values[0]
+    return shown
+
+
+def _public_numbers(attributes: Any, path: str) -> dict[str, Any]:
+    """Return the numbers in `attributes` whose names have no leading underscore."""
+    public = attributes.items() if isinstance(attributes, dict) else ()
+    return {
+        f"{path}.{key}": value.item() if isinstance(value, torch.Tensor) else value
+        for key, value in public
+        if not key.startswith("_")
+        and (
+            isinstance(value, (int, float)) or (isinstance(value, torch.Tensor) and value.ndim == 0)
+        )
+    }
+
+
+def _numbers(values: Any, path: str) -> dict[str, Any]:
+    """Return numbers, and up to eight numbers in a sequence, in nested dicts, by path."""
+    if isinstance(values, dict):
+        parts = [_numbers(value, f"{path}.{key}") for key, value in values.items()]
+        return {name: number for part in parts for name, number in part.items()}
+    if isinstance(values, torch.Tensor):
+        values = values.tolist()
+    if isinstance(values, (int, float)):
+        return {path: values}
+    is_short = isinstance(values, (list, tuple)) and 0 < len(values) <= 8
+    if is_short and all(isinstance(value, (int, float)) for value in values):
+        return {path: list(values)}
+    return {}
 
 
 def lasting_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
@@ -155,7 +313,7 @@ def lasting_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
     }
 
 
-class _Fit:
+class Fit:
     """Values of a state of `num_saved` environments that fit one of `num_envs`.
 
     `left_out` has the names of values that do not.
@@ -166,23 +324,48 @@ class _Fit:
         self._num_saved, self._num_envs = num_saved, num_envs
 
     def edits(
-        self, edits: dict[str, Any], live: dict[str, Any], path: str
+        self, edits: dict[str, Any], was: dict[str, Any], manager: Any, path: str
     ) -> dict[str, dict[str, Any]]:
-        """Return the edits of term configs that the configs `live`, by label, can take."""
+        """Return the edits of term configs that fit `manager`.
+
+        Args:
+            edits: Edits of the saved run, by label.
+            was: Values that they replaced.
+            manager: Manager with configs of these labels, or some of them.
+            path: Name of the manager.
+        """
         fitting: dict[str, dict[str, Any]] = {}
         for label, edit in edits.items():
-            if label not in live:
-                self.left_out.append(f"{path}.{label}")
+            where = f"{path}.{label}"
+            if label not in manager._live_cfgs:
+                self.left_out.append(where)
                 continue
-            cfg, where = live[label], f"{path}.{label}"
+            cfg, built = manager._live_cfgs[label], manager._built_values[label]
+            edit = self._as_built(edit, was.get(label, {}), built, where)
             fields = {key: getattr(cfg, key) for key in edit if hasattr(cfg, key)}
             self.left_out += [f"{where}.{key}" for key in edit if key not in fields]
-            fitting[label] = self.entries({key: edit[key] for key in fields}, fields, where, True)
+            edit = {key: edit[key] for key in fields}
+            fitting[label] = self.entries(edit, fields, where, spreads=True)
             params = fitting[label].get("params", {})
             for key in [key for key in params if not _takes(cfg, key)]:
                 self.left_out.append(f"{where}.params.{key}")
                 del params[key]
         return fitting
+
+    def _as_built(
+        self, edit: dict[str, Any], was: dict[str, Any], built: dict[str, Any], path: str
+    ) -> dict[str, Any]:
+        """Return the part of `edit` whose values were built alike: others were set on purpose."""
+        kept = {}
+        for key, value in edit.items():
+            before, now = was.get(key), built.get(key)
+            if isinstance(value, dict) and isinstance(before, dict) and isinstance(now, dict):
+                kept[key] = self._as_built(value, before, now, f"{path}.{key}")
+            elif key in was and key in built and changed_part(before, now) is not SKIP:
+                self.left_out.append(f"{path}.{key}")
+            else:
+                kept[key] = value
+        return kept
 
     def entries(
         self,
@@ -279,19 +462,54 @@ def _takes(cfg: Any, key: str) -> bool:
     return any(one.name == key or one.kind is one.VAR_KEYWORD for one in parameters)
 
 
-def _changed(before: Any, now: Any) -> Any:
+# Nested dicts.
+
+
+def changed_part(before: Any, now: Any) -> Any:
     """Return the part of the captured state `now` that differs from `before`; SKIP if none does."""
     if isinstance(before, torch.Tensor) and isinstance(now, torch.Tensor):
         return SKIP if torch.equal(before, now) else now
     if isinstance(before, dict) and isinstance(now, dict):
-        parts = {key: _changed(before.get(key, SKIP), value) for key, value in now.items()}
+        parts = {key: changed_part(before.get(key, SKIP), value) for key, value in now.items()}
         parts = {key: value for key, value in parts.items() if value is not SKIP}
         if parts and CLASS_KEY in now:
             parts[CLASS_KEY] = now[CLASS_KEY]
         return parts or SKIP
-    if isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+    if type(before) is not type(now):
+        return now
+    if isinstance(now, (list, tuple)) and len(before) == len(now):
         pairs = zip(before, now, strict=True)
-        return SKIP if all(_changed(old, new) is SKIP for old, new in pairs) else now
-    if type(before) is type(now) and not isinstance(now, (torch.Tensor, dict, list)):
-        return SKIP if before == now else now
-    return now
+        return SKIP if all(changed_part(old, new) is SKIP for old, new in pairs) else now
+    return SKIP if not isinstance(now, (list, tuple)) and before == now else now
+
+
+def _outside(part: dict[str, Any], mask: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the entries of `part` that `mask` lacks; none if `mask` is unknown."""
+    kept = {}
+    for key, value in part.items() if mask is not None else ():
+        if mask is None or key not in mask or key == CLASS_KEY:
+            kept[key] = value
+        elif isinstance(value, dict) and isinstance(mask[key], dict):
+            kept[key] = _outside(value, mask[key])
+    return kept
+
+
+def _inside(part: dict[str, Any], mask: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of `part` that `mask` has."""
+    return {
+        key: _inside(value, mask[key])
+        if isinstance(value, dict) and isinstance(mask[key], dict)
+        else value
+        for key, value in part.items()
+        if key in mask
+    }
+
+
+def _merged(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
+    """Return the entries of both; those of `second` take precedence."""
+    both = dict(first)
+    for key, value in second.items():
+        old = both.get(key)
+        is_nested = isinstance(value, dict) and isinstance(old, dict)
+        both[key] = _merged(old, value) if is_nested else value
+    return both

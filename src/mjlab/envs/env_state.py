@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.envs.curriculum_state import COUNTERS, curriculum_state, load_attributes, managers_of
+from mjlab.envs.curriculum_state import (
+    COUNTERS,
+    Fit,
+    curriculum_state,
+    load_attributes,
+    load_config_edits,
+    load_counters,
+    managers_of,
+)
 from mjlab.utils.state import capture_state, restore_state, shape_differences
 from mjlab.utils.string import counted
 
@@ -30,8 +38,6 @@ def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
         "sim": env.sim.state_dict(),
         "scene": capture_state(env.scene),
         "managers": {name: capture_state(one) for name, one in managers_of(env).items()},
-        # Edits of term configs by curricula: weights, parameters, command ranges.
-        "config_edits": {name: one.config_edits() for name, one in managers_of(env).items()},
         "curriculum": curriculum_state(env),
     }
 
@@ -43,19 +49,30 @@ def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         ValueError: the state belongs to a different task, size or engine; `env` is unchanged.
     """
     _check_fits(env, state)
-    for name, value in state["counters"].items():
-        setattr(env, name, value)
+    load_counters(env, state)
     for name, value in state["buffers"].items():
         getattr(env, name).copy_(value)
     for name, manager in managers_of(env).items():
         restore_state(manager, state["managers"][name])
-        manager.apply_config_edits(state["config_edits"][name])
-    if "curriculum" in state:
-        load_attributes(env, state["curriculum"])
+    curricula = curricula_in(state)
+    load_config_edits(env, curricula)
+    load_attributes(env, curricula["changed"], Fit(env.num_envs, env.num_envs))
     restore_state(env.scene, state["scene"])
     # Physics comes last, because some entity buffers are views of simulation fields.
     env.sim.load_state_dict(state["sim"])
     env.obs_buf = _cloned(state["observations"])
+
+
+def curricula_in(state: dict[str, Any]) -> dict[str, Any]:
+    """Return the `curriculum_state` in a `state_dict`, also of earlier versions."""
+    if "curriculum" in state:
+        return state["curriculum"]
+    # Earlier versions did not tell changed attributes of terms, and what each term edits.
+    return {
+        **{name: state[name] for name in ("num_envs", "counters", "config_edits")},
+        **{"config_built": {}, "changed": {}, "terrain_levels": None, "num_terrain_levels": 0},
+        "term_edits": dict.fromkeys(state["terms"].get("curriculum_manager", ())),
+    }
 
 
 def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:

@@ -177,8 +177,11 @@ class ManagerBasedRlEnv(Tabular):
         self.observes_ends = self.observes_failures = False
         self.common_step_counter = 0
         self._holds_common_steps = False
-        # State before the first reset, which curricula may change.
+        # Value of the counter after the last step or load; it differs if the user has set the counter.
+        self._stepped_to = 0
+        # State before the first reset, and its edits by curriculum term.
         self._built_state: dict[str, Any] | None = None
+        self._term_edits: dict[str, Any] = {}
         self._sim_step_counter = 0
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._pending_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
@@ -360,7 +363,7 @@ class ManagerBasedRlEnv(Tabular):
         if seed is not None:
             self.seed(seed)
         if self._built_state is None:
-            self._built_state = curriculum_state.lasting_state(self)
+            curriculum_state.begin(self)
         with self._checking_terms(resets=True):
             self._clear_extras()
             stepped = env_ids[self.episode_length_buf[env_ids] > 0]
@@ -368,6 +371,7 @@ class ManagerBasedRlEnv(Tabular):
                 self.recorder_manager.record_pre_reset(stepped)
             moved = self.scene.take_moved_envs()
             self._reset_idx(env_ids)
+            self.curriculum_manager.after_term = None
             self.scene.write_data_to_sim(env_ids)
             self._forward(env_ids, moved)
             self.command_manager.compute(dt=0.0, env_ids=env_ids)
@@ -441,6 +445,7 @@ class ManagerBasedRlEnv(Tabular):
             self.episode_length_buf += 1
             if not self._holds_common_steps:
                 self.common_step_counter += 1
+                self._stepped_to = self.common_step_counter
             self._evaluate_step()
 
             # Events.
@@ -501,6 +506,21 @@ class ManagerBasedRlEnv(Tabular):
             yield
         finally:
             self._holds_common_steps = held
+
+    @contextlib.contextmanager
+    def curricula_held(self) -> Generator[None]:
+        """Hold step counter, curriculum terms and terrain levels within this context.
+
+        If the counter was set since the last step, curriculum terms are called once, to follow it.
+        """
+        with contextlib.ExitStack() as stack:
+            if self.scene.terrain is not None:
+                stack.enter_context(self.scene.terrain.levels_held())
+            if self.common_step_counter != self._stepped_to:
+                self.curriculum_manager.compute(as_ids(None, self.num_envs, self.device))
+            stack.enter_context(self.curriculum_manager.held())
+            stack.enter_context(self.common_steps_held())
+            yield
 
     def get_observations(self) -> VecEnvObs:
         """Return the observations of the last step or reset."""
@@ -742,6 +762,14 @@ class ManagerBasedRlEnv(Tabular):
         are those of before: `reset` starts new ones, within `curriculum_manager.held()`.
         """
         return curriculum_state.load_curriculum_state(self, state)
+
+    def curricula_in_use(self) -> dict[str, Any]:
+        """Return what curricula have changed, by path in the config: numbers, and lists of numbers.
+
+        Attributes of terms and of the environment follow the same naming (`env.<name>`); numbers that
+        curriculum terms log, and nothing else shows, are `Curriculum/<term>`.
+        """
+        return curriculum_state.curricula_in_use(self)
 
     def close(self) -> None:
         """Close the renderer, the recorders and the simulation."""

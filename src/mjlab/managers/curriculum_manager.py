@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -32,12 +32,14 @@ class CurriculumManager(TermListManager):
     _title = "curriculum"
     _cfg_type = CurriculumTermCfg
     _leading = ("env", "env_ids")
-    _transient = {"_is_held"}
+    _transient = {"_is_held", "after_term"}
 
     def __init__(self, cfg: Mapping[str, CurriculumTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         self._state: dict[str, Any] = dict.fromkeys(self._term_names)
         self._is_held = False
+        self.after_term: Callable[[str], None] | None = None
+        """Function called with the name of each term after its call. Default None."""
 
     @contextmanager
     def held(self) -> Generator[None]:
@@ -68,6 +70,8 @@ class CurriculumManager(TermListManager):
                         "dict of numbers."
                     )
             self._state[name] = state
+            if self.after_term is not None:
+                self.after_term(name)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, float]:
         """Return `Curriculum/<term>` or `Curriculum/<term>/<key>`, and reset the terms."""

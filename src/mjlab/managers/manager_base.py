@@ -150,11 +150,16 @@ class ManagerBase(Tabular, ABC):
         nested dicts of numbers, strings, tensors and sequences of those. Unchanged values are left
         out, because a resumed run may override them on purpose.
         """
-        edits = {
-            label: changes(self._built_values[label], plain_values(cfg))
-            for label, cfg in self._live_cfgs.items()
-        }
-        return {label: edit for label, edit in edits.items() if edit}
+        return self.config_changes()[0]
+
+    def config_changes(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return `config_edits`, and the values at build time that they replaced."""
+        edits, replaced = {}, {}
+        for label, cfg in self._live_cfgs.items():
+            built, now = self._built_values[label], plain_values(cfg)
+            if edit := changes(built, now):
+                edits[label], replaced[label] = edit, changes(now, built)
+        return edits, replaced
 
     def apply_config_edits(self, edits: Mapping[str, Any]) -> None:
         """Restore configs to their state when `config_edits` returned `edits`.

@@ -28,10 +28,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from mjlab.envs.env_state import curricula_in
 from mjlab.rl.learners import Learner
 from mjlab.utils.errors import MjlabError, UserError, check_count, check_positive
 from mjlab.utils.os import replacing
 from mjlab.utils.random import rng_state, set_rng_state
+from mjlab.utils.torch import to_device
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
@@ -578,13 +580,8 @@ def lasting_state(state: Mapping[str, Any]) -> dict[str, Any]:
 def curricula_of(content: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the curriculum state in the content of a checkpoint, None if it has none."""
     env = (content.get("training_state") or {}).get("env")
-    if not isinstance(env, dict):
-        return None
-    if "curriculum" in env or "config_edits" not in env:
-        return env.get("curriculum")
-    # A state of an earlier version: attributes of terms cannot be told from settings.
-    parts = {name: env[name] for name in ("num_envs", "counters", "config_edits")}
-    return {**parts, "changed": {}, "terrain_levels": None, "num_terrain_levels": 0}
+    is_ours = isinstance(env, dict) and ("curriculum" in env or "config_edits" in env)
+    return curricula_in(env) if is_ours else None
 
 
 def restore_curricula(state: dict[str, Any], env: VecEnv) -> list[str]:
@@ -604,7 +601,7 @@ def restore_curricula(state: dict[str, Any], env: VecEnv) -> list[str]:
     try:
         # Tensors created in the rollout can only be written to in inference mode.
         with torch.inference_mode():
-            left_out = unwrapped.load_curriculum_state(_to(curricula, env.device))
+            left_out = unwrapped.load_curriculum_state(curricula)
             with unwrapped.curriculum_manager.held():
                 env.reset()  # ty: ignore[missing-attribute]
         return left_out
@@ -640,10 +637,10 @@ def restore_training_state(
         if "env" in state and hasattr(unwrapped, "load_state_dict"):
             # Tensors created in the rollout can only be written to in inference mode.
             with torch.inference_mode():
-                unwrapped.load_state_dict(_to(state["env"], env.device))
+                unwrapped.load_state_dict(to_device(state["env"], env.device))
         load_logger(state["logger"])
         for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
-            hidden = _to(hidden, device)
+            hidden = to_device(hidden, device)
             model.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
         if hasattr(algorithm, "last_hidden_states"):
             # rsl_rl's distillation starts an update with the hidden states before the iteration.
@@ -652,7 +649,7 @@ def restore_training_state(
         if rnd is not None and state["rnd"] is not None:
             rnd.update_counter = state["rnd"]["update_counter"]
             if (average := getattr(rnd.reward_normalizer, "disc_avg", None)) is not None:
-                average.avg = _to(state["rnd"]["discounted_average"], device)
+                average.avg = to_device(state["rnd"]["discounted_average"], device)
         observations = observations.to(device)
         # Last, because restoring may draw random numbers.
         set_rng_state(state["rng"])
@@ -684,7 +681,7 @@ def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
         )
     observations = state.get("observations")
     if observations is None:
-        raise ValueError("The run ended within an iteration, so the checkpoint has no episodes.")
+        raise ValueError("The run failed within an iteration, so the checkpoint has no episodes.")
     found, expected = (
         {key: tuple(value.shape) for key, value in one.items()}
         for one in (observations, env.get_observations().flatten_keys("\n"))
@@ -697,17 +694,6 @@ def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
 def _models(algorithm: Any) -> list[Any]:
     names = ("actor", "critic", "student", "teacher")
     return [getattr(algorithm, name) for name in names if hasattr(algorithm, name)]
-
-
-def _to(value: Any, device: Any) -> Any:
-    """Move all tensors in dicts and lists to `device`."""
-    if isinstance(value, torch.Tensor):
-        return value.to(device)
-    if isinstance(value, dict):
-        return {key: _to(item, device) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return type(value)(_to(item, device) for item in value)
-    return value
 
 
 # Legacy layouts.

@@ -241,7 +241,8 @@ class EvaluationCfg:
     together with another success condition."""
     prepare_env: Callable[[Any], None] | None = None
     """Function that edits, in place, a copy of the training environments' config for evaluation, if
-    training makes the task easier. None: same config. Evaluations in training apply it to the config
+    training makes the task easier. None: same config. Curriculum terms that the function removes are
+    off, and so are their edits; others are in their present state. Evaluations in training apply it to the config
     of the run; `evaluate` applies it before flags and `TaskOptions`, which take precedence."""
 
 

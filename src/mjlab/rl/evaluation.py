@@ -19,11 +19,12 @@ import operator
 import re
 import time
 from collections.abc import Callable, Generator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.envs.curriculum_state import config_as_built
 from mjlab.utils.errors import check_positive
 from mjlab.utils.random import evaluation_seed, preserved_rng
 from mjlab.utils.string import suggest
@@ -73,10 +74,10 @@ def evaluate_policy(
 
     Each environment is scored once per round, on its first episode after a reset, so that short
     episodes do not count more often than long ones. If `num_episodes` exceeds the number of
-    environments, several rounds are played. All rounds and evaluations are equally hard: steps do
-    not count as training steps (`common_step_counter` is constant), curricula do not move
-    environments to harder terrain, and the state of the environments is restored. On the CPU, the
-    number of torch threads depends on the size of the policy.
+    environments, several rounds are played. All rounds and evaluations are equally hard: curricula
+    stay in their state (steps do not count as training steps, `common_step_counter`), environments
+    on a generated terrain are distributed evenly over all its levels, and the state of the
+    environments is restored. On the CPU, the number of torch threads depends on the size of the policy.
 
     Episodes truncated by `max_steps` are never successes.
 
@@ -117,14 +118,20 @@ def evaluate_policy(
     if seed is not None:
         env.seed(seed)
     start = time.perf_counter()
-    rounds = []
+    rounds, levels = [], set()
+    terrain = getattr(getattr(env.unwrapped, "scene", None), "terrain", None)
     with (
         threads_for_policy(policy, env.num_envs, env.device),
         torch.inference_mode(),
         _preserved_state(env),
     ):
+        show: Any = getattr(env.unwrapped, "curricula_in_use", dict)
+        curricula = show()
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
+            if terrain is not None and terrain.terrain_levels is not None:
+                terrain.spread_levels(first)
+                levels |= set(terrain.terrain_levels[:count].tolist())
             # Commands that take turns, such as motions, continue their order over all rounds.
             manager: Any = getattr(env.unwrapped, "command_manager", None)
             for name in manager.active_terms if manager is not None else ():
@@ -148,7 +155,10 @@ def evaluate_policy(
         successes = episodes.returns >= success_return
     if successes is not None:
         successes = successes & episodes.finished
-    return summarize(episodes, successes, time.perf_counter() - start)
+    if levels:
+        curricula["terrain_levels"] = [min(levels), max(levels)]
+    result = summarize(episodes, successes, time.perf_counter() - start)
+    return dataclasses.replace(result, curricula=curricula)
 
 
 class EvaluationStopped(Exception):
@@ -190,6 +200,10 @@ class EvaluationResult:
     """Fraction of episodes with the termination true in the last step, by name."""
     metrics: dict[str, MeanAndInterval] = dataclasses.field(default_factory=dict)
     """Metrics of the task, averaged over the steps of an episode and then over episodes."""
+    curricula: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """State of the curricula, which stands still in an evaluation: numbers that differ from the task's
+    config, by path (`commands.twist.ranges.lin_vel_x`), and lowest and highest terrain level. Episodes
+    are distributed evenly over the levels."""
     num_unfinished: int = 0
     """Number of episodes truncated by `max_steps` before the task's time limit."""
     duration: float = 0.0
@@ -420,10 +434,11 @@ class SolvedCheck:
         return make_evaluation_env(self._env, self._num_episodes, seed, self._prepare_env)
 
     def _score(self, env: Any, seed: int, is_stopped: Callable[[], bool]) -> EvaluationResult:
-        # Curricula count the steps of training.
-        counter = getattr(self._env.unwrapped, "common_step_counter", None)
-        if counter is not None:
-            env.unwrapped.common_step_counter = counter
+        training: Any = self._env.unwrapped
+        if hasattr(training, "curriculum_state"):
+            load_curricula(env, training.curriculum_state())
+        elif hasattr(training, "common_step_counter"):
+            env.unwrapped.common_step_counter = training.common_step_counter
         policy = self._algorithm.get_policy()
         hidden_state = policy.get_hidden_state()
         success_return = self._cfg.get("success_return")
@@ -464,6 +479,16 @@ def trigger_return(cfg: Mapping[str, Any]) -> float | None:
     return None if trigger == -math.inf else trigger
 
 
+def curricula_text(curricula: Mapping[str, Any]) -> str:
+    """Return `EvaluationResult.curricula` in words, empty if it is."""
+    words = []
+    for name, value in curricula.items():
+        numbers = [f"{one:.4g}" for one in (value if isinstance(value, (list, tuple)) else [value])]
+        joint = " to " if len(numbers) == 2 else ", "
+        words.append(f"{name.replace('terrain_levels', 'terrain levels')} {joint.join(numbers)}")
+    return "; ".join(words)
+
+
 def success_definition(cfg: EvaluationCfg) -> str | None:
     """Return a description of the success criterion, None if the task does not define success.
 
@@ -500,7 +525,7 @@ def make_evaluation_env(
 ) -> RslRlVecEnvWrapper:
     """Build separate environments with the config of `env`, to evaluate during training.
 
-    `prepare` edits a copy of the config in place first.
+    `prepare` edits a copy of the config in place first. Curricula are at their beginning.
 
     The state of the random number generators is preserved, so that evaluation does not change the
     course of a run.
@@ -508,7 +533,8 @@ def make_evaluation_env(
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
 
     unwrapped = env.unwrapped
-    cfg = copy.deepcopy(unwrapped.cfg)
+    has_curricula = hasattr(unwrapped, "curriculum_state")
+    cfg = config_as_built(unwrapped) if has_curricula else copy.deepcopy(unwrapped.cfg)
     cfg.seed = seed
     cfg.scene = dataclasses.replace(cfg.scene, num_envs=num_envs)
     if prepare is not None:
@@ -516,6 +542,20 @@ def make_evaluation_env(
     with preserved_rng():
         eval_env = type(unwrapped)(cfg=cfg, device=unwrapped.device)
         return RslRlVecEnvWrapper(eval_env, clip_actions=env.clip_actions)
+
+
+def load_curricula(env: RslRlVecEnvWrapper, state: dict[str, Any]) -> None:
+    """Restore the curricula of `env` from a `curriculum_state` of the training environments.
+
+    Edits of curriculum terms that `env` lacks, because they ease training, are left out. Random
+    number generators are not affected.
+    """
+    # Tensors created in evaluations can only be written to in inference mode.
+    with torch.inference_mode(), preserved_rng():
+        left_out = env.unwrapped.load_curriculum_state(state)
+    logger.debug("Curricula left out in the evaluation: %s", left_out)
+    # Curricula may change the length of episodes.
+    env.max_episode_length = env.unwrapped.max_episode_length
 
 
 def reward_unit(env: Any) -> float:
@@ -536,20 +576,16 @@ def time_limit(env: Any) -> int | None:
 
 @contextmanager
 def _preserved_state(env: RslRlVecEnvWrapper) -> Generator[None]:
-    """Hold step and terrain curricula within the block; restore the environments' state after it.
+    """Hold the curricula within the block; restore the environments' state after it.
 
     State that outlives a reset, such as counters of terms, would make evaluations depend on earlier
     ones.
     """
     unwrapped: Any = env.unwrapped
-    terrain = getattr(getattr(unwrapped, "scene", None), "terrain", None)
     state = unwrapped.state_dict() if hasattr(unwrapped, "state_dict") else None
+    held: Any = getattr(unwrapped, "curricula_held", nullcontext)
     try:
-        with ExitStack() as stack:
-            if terrain is not None:
-                stack.enter_context(terrain.levels_held())
-            if hasattr(unwrapped, "common_steps_held"):
-                stack.enter_context(unwrapped.common_steps_held())
+        with held():
             yield
     finally:
         if state is not None:

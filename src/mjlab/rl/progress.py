@@ -21,7 +21,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from mjlab.rl.evaluation import Bound, EvaluationResult, trigger_return
+from mjlab.rl.evaluation import Bound, EvaluationResult, curricula_text, trigger_return
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.utils.string import clock, counted, duration, number
 
@@ -205,7 +205,10 @@ class TrainingProgress(TrainingObserver):
                 )
                 values.append((bound.name, f"{observed.removesuffix(f' {bound.unit}')}({note})"))
         if self._evaluations:
-            values.append(("evaluated_at", str(self._evaluations[-1][0])))
+            iteration, result = self._evaluations[-1]
+            values.append(("evaluated_at", str(iteration)))
+            if state := curricula_text(result.curricula):
+                values.append(("evaluated_under", state))
         values.append(("steps/s", f"{stats.steps_per_second:.0f}"))
         if (usual := self.usual_end) is not None:
             when = "" if usual[1] is None else f"(in {clock(usual[1])})"
@@ -260,7 +263,9 @@ class TrainingProgress(TrainingObserver):
             parts.append(text)
         scores = "; ".join(parts)
         when = "" if iteration == self.iteration else f" at iteration {iteration}"
-        return f"{scores[:1].upper()}{scores[1:]}; {counted(result.num_episodes, 'episode')}{when}."
+        state = curricula_text(result.curricula)
+        episodes = counted(result.num_episodes, "episode") + (f" at {state}" if state else "")
+        return f"{scores[:1].upper()}{scores[1:]}; {episodes}{when}."
 
     # Panel.
 
@@ -329,6 +334,8 @@ class TrainingProgress(TrainingObserver):
             return "none yet"
         iteration, result = self._evaluations[-1]
         when = f"iteration {iteration}, {counted(result.num_episodes, 'episode')}"
+        if state := curricula_text(result.curricula):
+            when += f" at {state}"
         table = Table.grid(padding=(0, 2))
         for _ in range(4):
             table.add_column()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rich.console import Console
 from rich.live import Live
 
-from mjlab.rl.evaluation import Bound, EvaluationResult
+from mjlab.rl.evaluation import Bound, EvaluationResult, curricula_text
 from mjlab.rl.progress import (
     NotebookProgress,
     ProgressCfg,
@@ -114,6 +114,8 @@ class TrainingDisplay(TrainingProgress):
             if result.failure_rate and result.failure_interval is not None:
                 low, high = result.failure_interval
                 metrics.append(f"{result.failure_rate:.1%} failed ({low:.1%} to {high:.1%})")
+            if state := curricula_text(result.curricula):
+                metrics.append(f"at {state}")
             verdict = "solved" if solved else "not confirmed, so training goes on"
             self._print(
                 f"Evaluation after {iteration} iterations: {', '.join(metrics)}, {verdict}."

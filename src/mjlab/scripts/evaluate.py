@@ -6,11 +6,13 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from mjlab.rl.checkpoint import curricula_of, load_checkpoint
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.environments import make_env
@@ -19,6 +21,7 @@ from mjlab.scripts.policy import (
     PolicyFlags,
     env_cfg_of,
     find_checkpoint,
+    has_foreign_runner,
     make_policy,
     parse_policy_flags,
     policy_env_cfg,
@@ -81,6 +84,8 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, profile=cfg.profile)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
+        if checkpoint is not None:
+            _load_curricula(task, env, checkpoint)
         with EvaluationProgress(cfg.num_episodes) as progress:
             result = evaluate_policy(
                 env,
@@ -111,6 +116,26 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     }
     print(json.dumps(metrics, indent=2) if cfg.json else _table(metrics, failures))
     return metrics
+
+
+def _load_curricula(task: str, env: Any, checkpoint: Path) -> None:
+    """Restore the curricula of the policy's run; print a line if their state is unknown."""
+    from mjlab.rl.evaluation import load_curricula
+
+    unwrapped = env.unwrapped
+    if not unwrapped.curriculum_manager.active_terms:
+        return
+    is_ours = checkpoint.suffix == ".pt" and not has_foreign_runner(task)
+    state = curricula_of(load_checkpoint(checkpoint)) if is_ours else None
+    if state is not None:
+        load_curricula(env, state)
+        return
+    # Loading a checkpoint sets the counter.
+    steps = unwrapped.common_step_counter
+    print_notice(
+        f"{checkpoint.name} does not hold the state of the task's curricula: they are at their "
+        + (f"state after {counted(steps, 'step')}." if steps else "beginning.")
+    )
 
 
 class EvaluationProgress:
@@ -161,6 +186,8 @@ def _failure_terms(env: Any) -> list[str]:
 
 def _table(metrics: dict[str, Any], failures: list[str]) -> str:
     """Format the metrics; `failures` are the terminations that count as failures."""
+    from mjlab.rl.evaluation import curricula_text
+
     lines = [
         f"Task         {metrics['task']}",
         f"Policy       {metrics['policy']}",
@@ -191,6 +218,8 @@ def _table(metrics: dict[str, Any], failures: list[str]) -> str:
     for name, value in metrics["metrics"].items():
         mean = f"{value['mean']:.4g} {metrics['units'].get(name, '')}".rstrip()
         lines.append(f"{name:<12} {mean}   {_interval(value['interval'], '.4g')}")
+    if state := curricula_text(metrics["curricula"]):
+        lines.append(f"Curricula    {state}")
     lines += [f"Note         {note}" for note in metrics["notes"]]
     return "\n".join(lines)
 

@@ -286,6 +286,24 @@ class TerrainEntity(Entity):
         """Move all environments to `levels` (N,) of their columns. Does nothing on a plane."""
         self._go_to_levels(torch.arange(self.cfg.num_envs, device=self._device), levels)
 
+    def spread_levels(self, first: int = 0) -> None:
+        """Distribute the environments evenly over all levels, whatever `max_init_terrain_level` is.
+
+        Consecutive environments have different levels, so that each column is even too. Does nothing
+        on a plane.
+
+        Args:
+            first: Number of environments distributed before, in earlier rounds.
+        """
+        num = self.max_terrain_level
+        if num == 0:
+            return
+        # Coprime with the number of levels, and near the golden section: any few environments in
+        # succession cover the levels.
+        stride = next(k for k in range(round(0.618 * num), num + 1) if math.gcd(k, num) == 1)
+        index = torch.arange(first, first + self.cfg.num_envs, device=self._device)
+        self.set_levels(index * stride % num)
+
     def randomize_env_origins(self, env_ids: torch.Tensor) -> None:
         """Move environments to uniformly sampled cells. Does nothing on a plane."""
         if self.terrain_origins is None or self.terrain_types is None:

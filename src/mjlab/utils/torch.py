@@ -115,3 +115,14 @@ def torch_threads(num_parameters: int, batch_size: int) -> int:
         # torchrun always sets OMP_NUM_THREADS for its workers; cores are divided here instead.
         limit = _MOST_THREADS
     return max(1, min(cores_per_process(), limit))
+
+
+def to_device(value: Any, device: Any) -> Any:
+    """Return `value` with all tensors in its dicts, lists and tuples on `device`."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if isinstance(value, dict):
+        return {key: to_device(item, device) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(to_device(item, device) for item in value)
+    return value
