@@ -3,8 +3,9 @@
 Training of Go1 on flat ground runs once. A client that receives the data of a browser, without
 drawing, connects and disconnects repeatedly, so that both kinds of iterations are
 spread over the same minutes. `python benchmarks/live_view.py [MINUTES]` prints one line of JSON:
-steps per second of both kinds, the median of their ratio over neighboring blocks, and the processor
-time of the view, in cores.
+steps per second of both kinds, the median of their ratio over neighboring blocks, the processor
+time of the view, in cores, and the time from the end of the first iteration until the page shows the
+robots under a trained policy.
 
 The machine must be idle otherwise: the expected effect is 2 %.
 """
@@ -15,6 +16,7 @@ import contextlib
 import json
 import multiprocessing
 import os
+import re
 import signal
 import sys
 import tempfile
@@ -25,6 +27,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import viser
+import zstandard
 from measure import Row, output_of
 from websockets.sync.client import connect
 
@@ -37,7 +40,10 @@ from mjlab.tasks.registry import load_runner_cls
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 BLOCK_S = 20.0
+PORT = 8790
 _LIMIT = 0.02
+# Progress of a finished iteration, sent together with the poses of the robots.
+_SHOWN = re.compile(rb"Iteration:</strong> [1-9]")
 
 # A browser counts as connected once it has said where its camera is.
 _CAMERA = {
@@ -47,51 +53,55 @@ _CAMERA = {
 }  # fmt: skip
 
 
-def watch(url: str, block: Any) -> None:
-    """Watch the page for `BLOCK_S`, look away for as long, and so on; `block` counts both."""
+def watch(block: Any, shown: Any) -> None:
+    """Watch the page until it shows a trained policy, at the time `shown`.
+
+    Then look away and watch in turns, for `BLOCK_S` each; `block` counts both.
+    """
     protocol: Any = f"viser-v{viser.__version__}"
+    address, options = f"ws://localhost:{PORT}", {"max_size": None, "compression": None}
     while True:
-        time.sleep(BLOCK_S)
-        address = url.replace("http", "ws")
-        with connect(address, subprotocols=[protocol], max_size=None, compression=None) as page:
+        try:
+            page = connect(address, subprotocols=[protocol], **options)
+        except OSError:
+            # Not served yet.
+            time.sleep(0.02)
+            continue
+        with page:
             page.send(msgspec.msgpack.encode(_CAMERA))
             block.value += 1
             end = time.monotonic() + BLOCK_S
             while time.monotonic() < end:
                 with contextlib.suppress(TimeoutError):
-                    page.recv(timeout=0.5)
+                    message = page.recv(timeout=0.5)
+                    if shown.value == 0.0 and _SHOWN.search(decoded(message)):
+                        shown.value = time.monotonic()
         block.value += 1
+        time.sleep(BLOCK_S)
+
+
+def decoded(message: Any) -> bytes:
+    """Return the text of a message of viser, after its two sizes."""
+    size = int.from_bytes(message[8:16], "little")
+    return zstandard.ZstdDecompressor().decompress(message[16 : 16 + size])
 
 
 class Recorder(TrainingObserver):
     """Notes the speed of every iteration and the processor time of the view."""
 
-    def __init__(self, view: LiveView, minutes: float) -> None:
+    def __init__(self, view: LiveView, block: Any, minutes: float) -> None:
         self._view = view
         self._end = time.monotonic() + 60.0 * minutes
+        self._block = block
         self.rows: list[tuple[int, float, float, float]] = []
-        # The page is watched in blocks of an odd number.
-        spawn = multiprocessing.get_context("spawn")
-        self._block = spawn.Value("i", 0)
-        # The client is a separate process: its work must not count for the measured one.
-        url = view._exchange.url
-        self._client = spawn.Process(target=_watch_when_there, args=(url, self._block), daemon=True)
-        self._client.start()
 
     def on_iteration(self, stats: IterationStats) -> None:
         """Note one iteration; end training when the time is up."""
-        process = self._view._process
-        assert process is not None
         now = time.monotonic()
-        self.rows.append((self._block.value, stats.steps_per_second, now, _cpu_time(process.pid)))
+        cpu_time = _cpu_time(self._view._process.pid)
+        self.rows.append((self._block.value, stats.steps_per_second, now, cpu_time))
         if now > self._end:
             os.kill(os.getpid(), signal.SIGINT)
-
-
-def _watch_when_there(url: Path, block: Any) -> None:
-    while not url.exists():
-        time.sleep(0.1)
-    watch(url.read_text(), block)
 
 
 def _cpu_time(pid: int) -> float:
@@ -101,23 +111,30 @@ def _cpu_time(pid: int) -> float:
 
 def measure_costs(minutes: float) -> dict[str, float]:
     """Train for `minutes`; return the results."""
+    spawn = multiprocessing.get_context("spawn")
+    # The page is watched in blocks of an odd number.
+    block, shown = spawn.Value("i", 0), spawn.Value("d", 0.0)
+    # The client is a separate process: its work must not count for the measured one.
+    spawn.Process(target=watch, args=(block, shown), daemon=True).start()
     recorders: list[Recorder] = []
     base: Any = load_runner_cls(TASK)
 
     class Runner(base):
         def learn(self, *args: Any, **kwargs: Any) -> None:
-            recorders.append(Recorder(self.observers[0], minutes))
+            (view,) = (item for item in self.observers if isinstance(item, LiveView))
+            recorders.append(Recorder(view, block, minutes))
             self.observers.append(recorders[0])
             super().learn(*args, **kwargs)
 
     environments.load_runner_cls = lambda _: Runner  # ty: ignore[invalid-assignment]
     with tempfile.TemporaryDirectory() as folder:
         cfg = TrainConfig.from_task(TASK, "cpu")
-        cfg.live, cfg.live_port, cfg.device, cfg.log_root = True, 8790, "cpu", folder
+        cfg.live, cfg.live_port, cfg.device, cfg.log_root = True, PORT, "cpu", folder
         cfg.agent.max_iterations = 1_000_000
         cfg.agent.evaluation = EvaluationCfg()
         launch_training(TASK, cfg)
-    return summary(recorders[0].rows)
+    rows = recorders[0].rows
+    return {**summary(rows), "seconds_until_shown": shown.value - rows[0][2]}
 
 
 def summary(rows: list[tuple[int, float, float, float]]) -> dict[str, float]:
@@ -155,7 +172,8 @@ def measure(minutes: float = 10.0) -> list[Row]:
         Row(
             "Go1 flat, `train --live`: speed of training that a browser costs",
             f"{cost:.1%} ± {error:.1%} ({seen['watched_steps_per_s']:,.0f} env-steps/s watched; the view "
-            f"takes {seen['view_cores_watched']:.1%} of a core)",
+            f"takes {seen['view_cores_watched']:.1%} of a core; a trained policy is shown "
+            f"{seen['seconds_until_shown']:.1f} s after the first iteration)",
             f"not watched, in turns of {BLOCK_S:.0f} s: "
             f"{seen['unwatched_steps_per_s']:,.0f} env-steps/s",
             "under 2 % (empty: the error leaves it open)",

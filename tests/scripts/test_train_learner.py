@@ -260,8 +260,8 @@ def test_the_live_view_shows_it(tmp_path, monkeypatch):
     try:
         job = LiveJob(TASK, _view_env_cfg(cfg), cfg.agent, MjlabOnPolicyRunner)
         exchange = Exchange(tmp_path)
-        viewer = make_viewer(job, exchange, server)
-        network = viewer._take_stats.__self__._network
+        viewer = make_viewer(job, exchange, server, exchange.ready.touch)
+        network = viewer._take_progress.__self__._network
         state = {name: value.clone() + 1 for name, value in network.state_dict().items()}
         exchange.write_weights(SimpleNamespace(state_dict=lambda: state), 5, None)
         viewer.run(num_steps=2)

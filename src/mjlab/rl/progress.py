@@ -33,6 +33,8 @@ _SECONDS_BETWEEN_OUTPUTS = 0.5
 _NOTEBOOK_WIDTH = 90
 _BARS, _ASCII_BARS = "▁▂▃▄▅▆▇█", "_.-=+*%#"
 _READINGS, _MOST_READINGS = 24, 480
+# Units of exploring episodes, and of endless ones.
+_UNITS = ("return", "reward per step")
 _ENDS = {"solved": "Finished", "finished": "Finished", "interrupted": "Interrupted"}
 
 
@@ -145,6 +147,11 @@ class TrainingProgress(TrainingObserver):
             return None
         share = (usual - self.iteration) / (self._total - self.iteration)
         return usual, None if left is None else share * left
+
+    @property
+    def goal(self) -> float | None:
+        """Return of evaluations that solves the task, None if other values decide."""
+        return next((b.limit for b in self._bounds if b.name == "mean_return"), None)
 
     @staticmethod
     def _exploring(stats: IterationStats) -> float:
@@ -267,6 +274,23 @@ class TrainingProgress(TrainingObserver):
         episodes = counted(result.num_episodes, "episode") + (f" at {state}" if state else "")
         return f"{scores[:1].upper()}{scores[1:]}; {episodes}{when}."
 
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the values of the panel as (name, text)."""
+        rows = [("time", self._time_left())]
+        stats = self.stats
+        if stats is None:
+            return rows
+        solves = "" if self.goal is None else f"; {number(self.goal)} solves"
+        unit = _UNITS[stats.exploring_return is None]
+        rows.append((unit, f"{number(self._exploring(stats))}, exploring{solves}"))
+        rows.append(("episodes", self._episodes(stats)))
+        if self._bounds:
+            last = self._scores() if self._evaluations else "none yet"
+            rows += [("last eval", last), ("next eval", self._next_evaluation() or "")]
+        share = stats.learning_time / max(stats.collection_time + stats.learning_time, 1e-9)
+        speed = f"{stats.steps_per_second:,.0f} steps/s (learning takes {share:.0%})"
+        return [*rows, ("speed", speed)]
+
     # Panel.
 
     def __rich_console__(
@@ -288,29 +312,16 @@ class TrainingProgress(TrainingObserver):
         done = ProgressBar(total=max(self._total, 1), completed=self.iteration, width=24)
         bar.add_row(str(self.iteration), done, str(self._total))
         rows.add_row(" iteration", bar)
-        rows.add_row("", self._time_left())
-        if self.stats is not None:
-            self._add_values(rows, self.stats, options.ascii_only)
+        for name, text in self.rows():
+            if name == "last eval" and self._evaluations:
+                rows.add_row(f" {name}", self._judged())
+            else:
+                rows.add_row("" if name == "time" else f" {name}", text)
+            if name in _UNITS and len(self._returns) > 1:
+                bars = _ASCII_BARS if options.ascii_only else _BARS
+                rows.add_row("", sparkline(self._returns, bars))
         rows.add_row("", Text("Ctrl-C saves, then stops.", style="dim"))
         yield rows
-
-    def _add_values(self, rows: Table, stats: IterationStats, ascii_only: bool) -> None:
-        unit = "reward per step" if stats.exploring_return is None else "return"
-        name, value = f" {unit}", f"{number(self._exploring(stats))}, exploring"
-        by_return = [b for b in self._bounds if b.name == "mean_return"]
-        if by_return:
-            value += f"; {limit(by_return[0])} solves"
-        rows.add_row(name, value)
-        if len(self._returns) > 1:
-            rows.add_row("", sparkline(self._returns, _ASCII_BARS if ascii_only else _BARS))
-        rows.add_row(" episodes", self._episodes(stats))
-        if self._bounds:
-            rows.add_row(" last eval", self._judged())
-            rows.add_row(" next eval", self._next_evaluation())
-        share = stats.learning_time / max(stats.collection_time + stats.learning_time, 1e-9)
-        rows.add_row(
-            " speed", f"{stats.steps_per_second:,.0f} steps/s (learning takes {share:.0%})"
-        )
 
     def _time_left(self) -> str:
         left, usual = self.left_at_most, self.usual_end
@@ -330,8 +341,6 @@ class TrainingProgress(TrainingObserver):
         return f"{of_seconds}, {noise}"
 
     def _judged(self) -> RenderableType:
-        if not self._evaluations:
-            return "none yet"
         iteration, result = self._evaluations[-1]
         when = f"iteration {iteration}, {counted(result.num_episodes, 'episode')}"
         if state := curricula_text(result.curricula):

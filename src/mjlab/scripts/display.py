@@ -29,6 +29,7 @@ from mjlab.utils.logging import print_notice
 from mjlab.utils.string import counted, number
 
 if TYPE_CHECKING:
+    from mjlab.scripts.live import LiveView
     from mjlab.scripts.run_folder import NewRunFolder
     from mjlab.scripts.train_config import TrainConfig
 
@@ -37,8 +38,10 @@ _SECONDS_BETWEEN_LINES = 5.0
 _UPDATES_PER_SECOND = 4
 
 
-def show_training(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder) -> None:
-    """Add observers to `runner` that show training in the terminal, and with `--live` in the browser.
+def show_training(
+    task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder, view: LiveView | None
+) -> None:
+    """Add observers to `runner` that show training in the terminal, and in the browser by `view`.
 
     Training that starts keeps `folder`. Runners of other packages, without observers, print by
     themselves.
@@ -48,14 +51,11 @@ def show_training(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder
         if cfg.live:
             print_notice("--live: not shown, because the runner of this task has no observers.")
         return
-    if cfg.live:
-        from mjlab.scripts.live import LiveView
-
-        # Before the display, which owns the terminal once started.
-        runner.observers.insert(0, LiveView(task, cfg, runner))
     progress = ProgressCfg.of_runner(runner, task, usual_iteration(task, cfg))
     display = NotebookProgress(progress) if in_notebook() else TrainingDisplay(progress)
     runner.observers += [KeepRunFolder(folder), display]
+    if view is not None:
+        view.follow(runner, display)
 
 
 class _PipeSafeConsole(Console):

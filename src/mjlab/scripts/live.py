@@ -1,8 +1,7 @@
 """`train --live`: view of the policy during training, served asynchronously by a separate process.
 
-Training writes the newest weights to a file at the end of an iteration, only while a browser is
-connected. The page, a separate environment and the policy run in the view process
-(`mjlab.scripts.live_view`) at low priority.
+The view process (`mjlab.scripts.live_view`) builds its environments while training builds its own. At the
+end of an iteration, training writes the newest weights and the learning curve to a file for it.
 """
 
 from __future__ import annotations
@@ -17,16 +16,20 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Generator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjlab import rl
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.scripts.live_view import Exchange, LiveJob
+from mjlab.tasks.registry import load_runner_cls
 from mjlab.utils.errors import UserError
 from mjlab.utils.os import create_locked, remove_abandoned
 
 if TYPE_CHECKING:
-    from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.rl.evaluation import EvaluationResult
+    from mjlab.rl.progress import TrainingProgress
     from mjlab.scripts.train_config import TrainConfig
 
 logger = logging.getLogger(__name__)
@@ -40,72 +43,38 @@ _PREFIX = "mjlab-live-"
 # Held by training; the folder of a killed training process has an unheld lock.
 _LOCK = "lock"
 _NUM_ENVS = 4
-_SECONDS_TO_START = 20.0
+_MOST_POINTS = 400
+_SECONDS_TO_START = 10.0
 _SECONDS_TO_END = 3.0
 # Variables of `torchrun` that would make the view process a training process.
 _DISTRIBUTED = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "TORCHELASTIC_RUN_ID")
 
 
-class LiveView(TrainingObserver):
-    """Observer that starts the view process and writes weights. Failures do not stop training."""
+@contextlib.contextmanager
+def live_view(task: str, cfg: TrainConfig) -> Generator[LiveView]:
+    """Serve the page of a run within the block, and print its URL.
 
-    def __init__(self, task: str, cfg: TrainConfig, runner: MjlabOnPolicyRunner) -> None:
-        """Start the process.
+    Args:
+        task: Name of the task.
+        cfg: Configuration of the run, complete; not modified.
 
-        Args:
-            task: Name of the task.
-            cfg: Configuration of the run; not modified.
-            runner: Runner of the shown policy.
-
-        Raises:
-            UserError: the configuration cannot be pickled.
-        """
-        self._runner = runner
-        job = _pickled(LiveJob(task, _view_env_cfg(cfg), cfg.agent, type(runner)))
-        _remove_abandoned_folders()
-        self._folder = tempfile.TemporaryDirectory(prefix=_PREFIX)
-        self._lock = create_locked(Path(self._folder.name) / _LOCK)
-        self._exchange = Exchange(Path(self._folder.name))
-        self._next_weights = 0.0
-        self._process: subprocess.Popen | None = _start(
-            self._exchange, cfg.live_host, cfg.live_port
-        )
-        assert self._process.stdin is not None
+    Raises:
+        UserError: the configuration cannot be pickled.
+    """
+    _remove_abandoned_folders()
+    with (
+        tempfile.TemporaryDirectory(prefix=_PREFIX) as folder,
+        create_locked(Path(folder) / _LOCK),
+    ):
+        exchange = Exchange(Path(folder))
+        # Before pickling, which imports the learner: the process starts meanwhile.
+        process = _start(exchange, cfg.live_host, cfg.live_port)
         try:
-            self._process.stdin.write(len(job).to_bytes(8, "little") + job)
-            self._process.stdin.flush()
-        except OSError:
-            self._give_up_if_ended()
-
-    def on_start(self, first_iteration: int, total_iterations: int) -> None:
-        """Print the URL of the page; write the initial weights."""
-        self._write_weights(None)
-        limit = time.perf_counter() + _SECONDS_TO_START
-        while time.perf_counter() < limit and not self._give_up_if_ended():
-            if self._exchange.url.exists():
-                url = self._exchange.url.read_text(encoding="utf-8")
-                print(f"Live:    {url} (open it in a browser)", flush=True)
-                return
-            time.sleep(0.02)
-
-    def on_iteration(self, stats: IterationStats) -> None:
-        """Write the newest weights if a browser is connected."""
-        begin = time.perf_counter()
-        if begin < self._next_weights or self._give_up_if_ended():
-            return
-        if not self._exchange.watched.exists():
-            return
-        try:
-            self._write_weights(stats)
-        except OSError as error:
-            logger.warning("Live view: writing weights failed: %s", error)
-        end = time.perf_counter()
-        self._next_weights = end + max(_SECONDS_BETWEEN_WEIGHTS, (end - begin) / _MAX_TIME_SHARE)
-
-    def on_end(self, reason: str) -> None:
-        """End the process."""
-        process, self._process = self._process, None
-        if process is not None:
+            view = LiveView(exchange, process)
+            view.send(_pickled_job(task, cfg))
+            view.print_url()
+            yield view
+        finally:
             assert process.stdin is not None
             # The process ends when its standard input is closed.
             with contextlib.suppress(OSError):
@@ -115,24 +84,118 @@ class LiveView(TrainingObserver):
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        self._lock.close()
-        self._folder.cleanup()
 
-    def _write_weights(self, stats: IterationStats | None) -> None:
+
+class LiveView(TrainingObserver):
+    """Observer that hands weights and progress to a view process, whose failure is one warning."""
+
+    def __init__(self, exchange: Exchange, process: subprocess.Popen) -> None:
+        """Prepare the view of `process`, a view process that reads its job from standard input."""
+        self._exchange = exchange
+        self._process = process
+        self._is_over = False
+        self._runner: Any = None
+        self._progress: TrainingProgress | None = None
+        self._total = 0
+        self._unit = "return"
+        self._curve: dict[int, float] = {}
+        self._evaluations: dict[int, float] = {}
+        self._next_weights = 0.0
+
+    def send(self, job: bytes) -> None:
+        """Send the pickled job."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(len(job).to_bytes(8, "little") + job)
+            self._process.stdin.flush()
+        except OSError:
+            self._has_ended()
+
+    def print_url(self) -> None:
+        """Print the URL of the page, once it is served."""
+        if self._wait_for(self._exchange.url):
+            url = self._exchange.url.read_text(encoding="utf-8")
+            print(f"Live:    {url} (open it in a browser)", flush=True)
+
+    def follow(self, runner: Any, progress: TrainingProgress) -> None:
+        """Observe `runner` after `progress`, whose values are shown; wait until the page is filled.
+
+        With all cores busy with training, filling would take several times as long.
+        """
+        self._runner, self._progress = runner, progress
+        runner.observers.append(self)
+        self._wait_for(self._exchange.ready)
+
+    def on_start(self, first_iteration: int, total_iterations: int) -> None:
+        """Write the initial weights."""
+        self._total = total_iterations
+        self._write()
+
+    def on_iteration(self, stats: IterationStats) -> None:
+        """Add a point to the learning curve; write the newest weights if it is time."""
+        self._unit, value = "return", stats.exploring_return
+        if value is None:
+            self._unit, value = "reward per step", stats.mean_step_reward
+        self._curve[stats.iteration] = value
+        self._total = stats.total_iterations
+        if time.perf_counter() >= self._next_weights:
+            self._write()
+
+    def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Add a point to the evaluations."""
+        self._evaluations[iteration] = result.mean_return
+        self._write()
+
+    def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Replace the point of the evaluation that it confirms or not."""
+        self.on_evaluation(iteration, result, solved)
+
+    def _write(self) -> None:
+        if self._has_ended():
+            return
+        begin = time.perf_counter()
         num_steps = int(getattr(self._runner.env.unwrapped, "common_step_counter", 0))
-        self._exchange.write_weights(self._runner.alg.get_policy(), num_steps, stats)
+        try:
+            self._exchange.write_weights(self._runner.alg.get_policy(), num_steps, self._shown())
+        except OSError as error:
+            self._is_over = True
+            logger.warning("Live view: training continues without it; writing failed: %s", error)
+        end = time.perf_counter()
+        self._next_weights = end + max(_SECONDS_BETWEEN_WEIGHTS, (end - begin) / _MAX_TIME_SHARE)
 
-    def _give_up_if_ended(self) -> bool:
+    def _shown(self) -> dict[str, Any]:
+        """Return the progress as `LiveViewer` takes it."""
+        assert self._progress is not None
+        stride = len(self._curve) // _MOST_POINTS + 1
+        return {
+            "iteration": self._progress.iteration,
+            "total_iterations": self._total,
+            "rows": self._progress.rows(),
+            "unit": self._unit,
+            "curve": {
+                i: v for i, v in self._curve.items() if i % stride == 0 or i in self._evaluations
+            },
+            # Returns: they do not compare with a reward per step.
+            "evaluations": self._evaluations if self._unit == "return" else {},
+            "goal": self._progress.goal if self._unit == "return" else None,
+            "time": time.time(),
+        }
+
+    def _wait_for(self, file: Path) -> bool:
+        limit = time.perf_counter() + _SECONDS_TO_START
+        while time.perf_counter() < limit and not self._has_ended():
+            if file.exists():
+                return True
+            time.sleep(0.02)
+        return False
+
+    def _has_ended(self) -> bool:
         """Return True if the process has ended; log it the first time."""
-        if self._process is None:
-            return True
-        if self._process.poll() is None:
-            return False
-        self._process = None
-        reason = (
-            self._exchange.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            or [""]
-        )[-1]
+        if self._is_over or self._process.poll() is None:
+            return self._is_over
+        self._is_over = True
+        output = self._exchange.log.read_text(encoding="utf-8", errors="replace")
+        reason = (output.strip().splitlines() or [""])[-1]
         logger.warning("Live view: process ended; training continues. %s", reason)
         return True
 
@@ -160,7 +223,9 @@ def _view_env_cfg(cfg: TrainConfig) -> Any:
     return env
 
 
-def _pickled(job: LiveJob) -> bytes:
+def _pickled_job(task: str, cfg: TrainConfig) -> bytes:
+    runner_cls = load_runner_cls(task) or rl.MjlabOnPolicyRunner
+    job = LiveJob(task, _view_env_cfg(cfg), cfg.agent, runner_cls)
     # Only cloudpickle pickles lambdas and classes of `__main__`.
     import cloudpickle
 

@@ -1,9 +1,8 @@
 """View process of `train --live`: page of a policy that another process trains.
 
 Started by `mjlab.scripts.live`; reads a pickled `LiveJob` from standard input, and ends when standard
-input is closed, even if training was killed. The environment is built when the first browser connects,
-and stepped at the lowest priority only while a browser is connected. Heavy modules are not imported
-before.
+input is closed, even if training was killed. The environment is built while training builds its own, and
+stepped at the lowest priority, only while a browser is connected.
 """
 
 from __future__ import annotations
@@ -12,11 +11,12 @@ import contextlib
 import io
 import os
 import pickle
+import queue
 import signal
 import sys
 import threading
-import time
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,9 +26,6 @@ from mjlab.viewer.page_server import page_url, serve_page
 if TYPE_CHECKING:
     import viser
 
-    from mjlab.rl.run_logger import IterationStats
-
-_POLL_PERIOD = 0.25
 _LOWEST_PRIORITY = 19
 
 
@@ -36,12 +33,9 @@ def main() -> None:
     """Show the job from standard input. Arguments: exchange folder, address, port."""
     # Training handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    size = int.from_bytes(sys.stdin.buffer.read(8), "little")
-    pickled = sys.stdin.buffer.read(size)
-    if size == 0 or len(pickled) < size:
-        return
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    show(pickled, Exchange(Path(sys.argv[1])), sys.argv[2], int(sys.argv[3]))
+    jobs: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_read_until_end, args=(jobs,), daemon=True).start()
+    show(jobs, Exchange(Path(sys.argv[1])), sys.argv[2], int(sys.argv[3]))
 
 
 def lower_priority() -> None:
@@ -54,37 +48,28 @@ def lower_priority() -> None:
         os.nice(_LOWEST_PRIORITY)
 
 
-def show(pickled: bytes, exchange: Exchange, host: str, port: int) -> None:
-    """Serve the page of a pickled `LiveJob`; build its environment when the first browser connects.
-
-    Neither torch nor the task is imported before.
-    """
+def show(jobs: queue.SimpleQueue[bytes], exchange: Exchange, host: str, port: int) -> None:
+    """Serve the page of the pickled `LiveJob` in `jobs`."""
     server = serve_page(host, port)
     with replacing(exchange.url) as file:
         file.write(page_url(server).encode())
-    # Shown at once to a browser that connects: building takes seconds while training uses the cores.
     note = server.gui.add_markdown("Building the view …")
-    notes: list[Any] = []
-    is_built = False
+    # Imported before the job arrives: training imports and pickles meanwhile.
+    import mjlab.rl.runner
+    import mjlab.viewer.viser.live  # noqa: F401
 
-    @server.on_client_connect
-    def _(client: Any) -> None:
-        if not is_built:
-            notes.append(client.add_notification("Building the view", "", loading=True))
+    def on_ready() -> None:
+        note.remove()
+        # After building: at low priority, building would take minutes with all cores busy.
+        lower_priority()
+        exchange.ready.touch()
 
-    while not server.get_clients():
-        time.sleep(_POLL_PERIOD)
-    exchange.watched.touch()
-    viewer = make_viewer(pickle.loads(pickled), exchange, server)
-    # After building: at low priority, building would take minutes with all cores busy.
-    lower_priority()
-    is_built = True
-    for shown in (note, *notes):
-        shown.remove()
-    viewer.run(catch_sigint=False)
+    make_viewer(pickle.loads(jobs.get()), exchange, server, on_ready).run(catch_sigint=False)
 
 
-def make_viewer(job: LiveJob, exchange: Exchange, server: viser.ViserServer) -> Any:
+def make_viewer(
+    job: LiveJob, exchange: Exchange, server: viser.ViserServer, on_ready: Callable[[], None]
+) -> Any:
     """Return the viewer of a job, with a new environment and network."""
     import torch
 
@@ -93,25 +78,13 @@ def make_viewer(job: LiveJob, exchange: Exchange, server: viser.ViserServer) -> 
     from mjlab.rl.learners import acting_cfg
     from mjlab.viewer.viser.live import LiveViewer
 
-    def set_watched(watched: bool) -> None:
-        if watched:
-            exchange.watched.touch()
-        else:
-            exchange.watched.unlink(missing_ok=True)
-
     torch.set_num_threads(1)
     env = ManagerBasedRlEnv(job.env, device="cpu")
     wrapped = RslRlVecEnvWrapper(env, clip_actions=job.agent.clip_actions)
     runner = job.runner_cls(wrapped, acting_cfg(job.agent), None, "cpu")
-    network = runner.alg.get_policy()
-    weights = NewestWeights(exchange, network, env)
+    weights = NewestWeights(exchange, runner.alg.get_policy(), env)
     return LiveViewer(
-        wrapped,
-        runner.get_inference_policy(device="cpu"),
-        title=job.task,
-        take_stats=weights.take,
-        set_watched=set_watched,
-        viser_server=server,
+        wrapped, runner.get_inference_policy(device="cpu"), server, job.task, weights.take, on_ready
     )
 
 
@@ -136,27 +109,26 @@ class Exchange:
         self.folder = folder
         self.url = folder / "url"
         """URL of the page, written once the page is served."""
-        self.watched = folder / "watched"
-        """Exists while a browser is connected."""
+        self.ready = folder / "ready"
+        """Exists once the page shows the robots."""
         self.weights = folder / "weights.pt"
-        """Newest policy and statistics of its iteration, replaced atomically."""
+        """Newest policy and the progress of training, replaced atomically."""
         self.log = folder / "log.txt"
         """Output of the view process."""
 
-    def write_weights(self, policy: Any, num_steps: int, stats: IterationStats | None) -> None:
+    def write_weights(self, policy: Any, num_steps: int, progress: Mapping[str, Any]) -> None:
         """Write the state of a policy.
 
         Args:
             policy: Policy network.
             num_steps: Steps per environment, the input of curricula.
-            stats: Statistics of the policy's iteration; None before the first iteration.
+            progress: Progress of training, as `LiveViewer` takes it.
         """
         import torch
 
         content = io.BytesIO()
-        stats_dict = None if stats is None else asdict(stats)
-        policy_state = policy.state_dict()
-        torch.save({"policy": policy_state, "num_steps": num_steps, "stats": stats_dict}, content)
+        state = {"policy": policy.state_dict(), "num_steps": num_steps, "progress": progress}
+        torch.save(state, content)
         with replacing(self.weights) as file:
             file.write(content.getbuffer())
 
@@ -171,7 +143,7 @@ class NewestWeights:
         self._seen: tuple[int, int] | None = None
 
     def take(self) -> dict[str, Any] | None:
-        """Load the newest weights; return the statistics of their iteration, or None if unchanged."""
+        """Load the newest weights; return the progress of training, or None if unchanged."""
         import torch
 
         try:
@@ -186,12 +158,14 @@ class NewestWeights:
         self._network.load_state_dict(content["policy"])
         # Curricula must match those of training.
         self._env.common_step_counter = content["num_steps"]
-        return content["stats"]
+        return content["progress"]
 
 
-def _end_with_parent() -> None:
-    """End this process as soon as its standard input is closed."""
+def _read_until_end(jobs: queue.SimpleQueue[bytes]) -> None:
+    """Pass on the job from standard input; end this process when the input is closed."""
     with contextlib.suppress(OSError):
+        size = int.from_bytes(sys.stdin.buffer.read(8), "little")
+        jobs.put(sys.stdin.buffer.read(size))
         sys.stdin.buffer.read()
     os._exit(0)
 

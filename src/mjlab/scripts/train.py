@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjlab.compat import older_names
 from mjlab.rl.distributed import (
@@ -52,6 +52,9 @@ from mjlab.scripts.train_config import (
     report_moved_goal,
 )
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
+
+if TYPE_CHECKING:
+    from mjlab.scripts.live import LiveView
 
 __getattr__ = older_names(__name__)
 
@@ -133,10 +136,15 @@ def _train(
         report_moved_goal(task, cfg)
     with fail_together():
         prepare_teacher(task, cfg.agent, checkpoint)
-    with _run_folder(cfg, rank, output) as folder:
+    with _run_folder(cfg, rank, output) as folder, contextlib.ExitStack() as stack:
         with fail_together():
             fetched_from = None if checkpoint is None else cfg.wandb_run_path
             prepare_env_cfg(task, cfg, cfg.env, checkpoint, fetched_from)
+            view = None
+            if cfg.live and rank.is_first and not has_foreign_runner(task):
+                from mjlab.scripts.live import live_view
+
+                view = stack.enter_context(live_view(task, cfg))
             env = training_env(cfg, device, folder.path, rank)
         try:
             print_heading(task, cfg, env, rank)
@@ -160,7 +168,7 @@ def _train(
                     write_resumed(folder.path, checkpoint)
                 write_params(folder.path, cfg.env, cfg.agent)
             try:
-                ended = _learn(task, cfg, runner, folder)
+                ended = _learn(task, cfg, runner, folder, view)
             finally:
                 if rank.is_first:
                     report_divergence(env.unwrapped)
@@ -185,13 +193,19 @@ def _run_folder(
         yield new if rank.is_first else SharedRunFolder(path)
 
 
-def _learn(task: str, cfg: TrainConfig, runner: Any, folder: NewRunFolder | SharedRunFolder) -> str:
+def _learn(
+    task: str,
+    cfg: TrainConfig,
+    runner: Any,
+    folder: NewRunFolder | SharedRunFolder,
+    view: LiveView | None,
+) -> str:
     """Train; return the stop reason."""
     is_shared = isinstance(folder, SharedRunFolder)
     if not is_shared:
         from mjlab.scripts.display import show_training
 
-        show_training(task, cfg, runner, folder)
+        show_training(task, cfg, runner, folder, view)
     ended = "failed"
     try:
         runner.learn(num_learning_iterations=cfg.agent.max_iterations, init_at_random_ep_len=True)

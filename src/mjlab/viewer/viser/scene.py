@@ -25,7 +25,7 @@ from mjlab.compat import offers_older_static_methods
 from mjlab.viewer.camera import CameraView, first_moving_body, whole_model_view
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import copy_state, host_model, sync_model_fields, to_numpy
-from mjlab.viewer.viser.look import set_look
+from mjlab.viewer.viser.look import set_look, set_plain_look, without_metal
 from mjlab.viewer.viser.visualizer import ViserDebugVisualizer
 
 log = logging.getLogger(__name__)
@@ -110,6 +110,13 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         """Typical size of a body (m), or `meansize_override`."""
         override = self.meansize_override
         return float(self.mj_model.stat.meansize) if override is None else override
+
+    def set_plain_look(self) -> None:
+        """Draw without reflections and shadows, which are slow in browsers without a GPU."""
+        groups = (self._fixed_geom_handles, self._fixed_site_handles, self.site_handles_by_group)
+        handles = [handle for group in groups for handle in group.values()]
+        set_plain_look(self.server, [*handles, *(group.handle for group in self._mesh_groups)])
+        self._variants.is_plain = True
 
     def get_env_indices(self, num_envs: int) -> Iterable[int]:
         """Return the environments to draw debug items for, among the visible ones."""
@@ -397,6 +404,7 @@ class GeomVariants:
         self._taken_over: set[tuple[int, int]] = set()
         self._seen: dict[str, np.ndarray] = {}
         self._next_check = 0.0
+        self.is_plain = False
 
     def update(
         self, body_xpos: np.ndarray, body_xmat: np.ndarray, env_idx: int, offset: np.ndarray
@@ -466,6 +474,8 @@ class GeomVariants:
                             lod="off",
                             visible=False,
                         )
+                        if self.is_plain:
+                            handle.glb_data = without_metal(handle.glb_data)
                         self._shapes[key] = _Shape(handle, group)
                     self._shapes[key].envs.append(env_idx)
                     self._shapes[key].bodies.append(body)
