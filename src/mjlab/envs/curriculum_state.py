@@ -56,6 +56,7 @@ _OWN_ATTRIBUTES = frozenset(
         *(
             "_acts_between_substeps",
             "_built_state",
+            "_built_settings",
             "_command_dts",
             "_device",
             "_holds_common_steps",

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import copy
+import os
+import re
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,12 +19,19 @@ from mjlab.envs.curriculum_state import (
     load_counters,
     managers_of,
 )
+from mjlab.utils.os import to_plain
 from mjlab.utils.state import capture_state, restore_state, shape_differences
 from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
-    from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv
+    from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
+# Settings of the machine and of output; `num_envs` and the engine are compared by themselves.
+_OF_THE_MACHINE = (
+    *("seed", "viewer", "recorders", "scene.num_envs", "sim.engine", "sim.num_threads"),
+    *("sim.nan_guard", "sim.nconmax", "sim.njmax"),
+)
+_PATH = "<path>"
 _BUFFERS = ("episode_length_buf", "_pending_reset", "_nan_resets")
 
 
@@ -31,6 +41,7 @@ def state_dict(env: ManagerBasedRlEnv) -> dict[str, Any]:
         "num_envs": env.num_envs,
         # Copies of lists of names, or of dicts of such lists.
         "terms": {name: copy.copy(one.active_terms) for name, one in managers_of(env).items()},
+        "settings": env._built_settings,
         "terrain": _terrain_fingerprint(env),
         "counters": {name: getattr(env, name) for name in COUNTERS},
         "buffers": {name: getattr(env, name).clone() for name in _BUFFERS},
@@ -75,6 +86,32 @@ def curricula_in(state: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def settings_of(cfg: ManagerBasedRlEnvCfg) -> dict[str, str]:
+    """Return the settings that the state of an environment depends on, as text by dotted path.
+
+    Terms and entities compute attributes from settings (scales, gains, thresholds), which are part of
+    the state: a state restored under other settings would undo them.
+    """
+    return {
+        path: text
+        for path, text in _leaves(to_plain(cfg), "")
+        if not any(path == own or path.startswith(f"{own}.") for own in _OF_THE_MACHINE)
+    }
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, str]]:
+    holds_more = isinstance(value, list) and any(isinstance(item, dict) for item in value)
+    if holds_more or (isinstance(value, dict) and value):
+        for name, item in enumerate(value) if holds_more else value.items():
+            yield from _leaves(item, f"{path}.{name}" if path else str(name))
+    elif isinstance(value, str) and any(os.path.exists(one) for one in value.split(",")):
+        # A resumed run reads the copies in the run folder.
+        yield path, _PATH
+    else:
+        # Memory addresses differ between runs.
+        yield path, re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
 def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
     if state["num_envs"] != env.num_envs:
         raise ValueError(
@@ -99,6 +136,14 @@ def _check_fits(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         if state["terms"].get(manager) != current["terms"].get(manager)
     ]
     differences += shape_differences(state, current)
+    if not differences and (settings := state.get("settings")) is not None:
+        now = env._built_settings
+        differences = [
+            f"{path} {now.get(path, 'absent')}, was {settings.get(path, 'absent')}"
+            for path in dict.fromkeys((*now, *settings))
+            if now.get(path) != settings.get(path)
+            and _PATH not in (now.get(path), settings.get(path))
+        ]
     if differences:
         more = f"; and {len(differences) - 5} more" if len(differences) > 5 else ""
         raise ValueError(

@@ -150,6 +150,7 @@ class ManagerBasedRlEnv(Tabular):
         # Checked before the scene creates tensors on a device that the engine does not support.
         Simulation.check(cfg.scene.num_envs, cfg.sim, device)
         self.cfg = cfg
+        self._built_settings = env_state.settings_of(cfg)
         cfg.seed = self.seed(-1 if cfg.seed is None else cfg.seed)
         self.render_mode = render_mode
         self.metadata: dict[str, Any] = {"render_modes": [None, "rgb_array"]}
