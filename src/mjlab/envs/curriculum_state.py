@@ -47,8 +47,9 @@ MANAGERS = (
     "metrics_manager",
 )
 # Attributes of managers by term. Others are buffers of a step or an episode.
-_BY_TERM = ("_class_terms", "_terms", "_timers", "_state")
-# Managers whose terms may hold rows that outlive episodes, such as a difficulty per environment.
+_BY_TERM = ("_class_terms", "_terms", "_state")
+# Managers whose terms, in other packages, may hold rows that outlive episodes: a difficulty per
+# environment.
 _WITH_ROWS = ("command_manager", "curriculum_manager")
 # Attributes of an environment with plain data that are no memory of curricula.
 _OWN_ATTRIBUTES = frozenset(
@@ -232,11 +233,10 @@ def curricula_in_use(env: ManagerBasedRlEnv) -> dict[str, Any]:
     """Return the state of the curricula of `env`: what differs from its config, by path.
 
     Edits of term configs, numbers in public attributes of terms and of the environment, settings, and
-    numbers that curriculum terms log (`Curriculum/<term>`), unless they repeat one of these.
+    numbers that curriculum terms log (`Curriculum/<term>`), unless they repeat one of these or the
+    first one.
     """
     shown: dict[str, Any] = {}
-    if not env.curriculum_manager.active_terms:
-        return shown
     state = changed_part(env._built_state or {}, lasting_state(env))
     changed = {} if state is SKIP else state
     for name, manager in managers_of(env).items():
@@ -251,12 +251,17 @@ def curricula_in_use(env: ManagerBasedRlEnv) -> dict[str, Any]:
         ).items():
             shown |= _public_numbers(attributes, f"{section}.{label}")
     shown |= _public_numbers(changed.get("attributes", {}), "env")
-    shown |= changed.get("settings", {})
+    settings = changed.get("settings", {}).items()
+    shown |= {name: value for name, value in settings if isinstance(value, (int, float))}
     known = [
         one for value in shown.values() for one in (value if isinstance(value, list) else [value])
     ]
     for label, values in env.curriculum_manager.get_active_iterable_terms(0):
-        if len(values) == 1 and not any(math.isclose(values[0], x, rel_tol=1e-5) for x in known):
+        logged = env._term_edits.get(label, {}).get("managers", {}).get("curriculum_manager", {})
+        first = _numbers(logged.get("_state", {}).get(label), label).values()
+        if len(values) == 1 and not any(
+            math.isclose(values[0], number, rel_tol=1e-5) for number in (*known, *first)
+        ):
             shown[f"Curriculum/{label}"] = values[0]
     return shown
 
@@ -424,6 +429,8 @@ class Fit:
                 return saved
         elif CLASS_KEY in saved:
             if is_stateful(live) and saved[CLASS_KEY] == type(live).__name__:
+                # Rows in terms of this package are of episodes.
+                spreads = spreads and not type(live).__module__.startswith("mjlab.")
                 return self.entries(saved, vars(live), path, spreads)
         elif live is _MISSING or live is None:
             return saved

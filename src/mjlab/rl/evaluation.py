@@ -544,18 +544,19 @@ def make_evaluation_env(
         return RslRlVecEnvWrapper(eval_env, clip_actions=env.clip_actions)
 
 
-def load_curricula(env: RslRlVecEnvWrapper, state: dict[str, Any]) -> None:
+def load_curricula(env: RslRlVecEnvWrapper, state: dict[str, Any]) -> list[str]:
     """Restore the curricula of `env` from a `curriculum_state` of the training environments.
 
     Edits of curriculum terms that `env` lacks, because they ease training, are left out. Random
-    number generators are not affected.
+    number generators are not affected. Returns the names of other parts that were left out.
     """
     # Tensors created in evaluations can only be written to in inference mode.
     with torch.inference_mode(), preserved_rng():
         left_out = env.unwrapped.load_curriculum_state(state)
-    logger.debug("Curricula left out in the evaluation: %s", left_out)
     # Curricula may change the length of episodes.
     env.max_episode_length = env.unwrapped.max_episode_length
+    eased = {f"curriculum_manager.{name}" for name in state["term_edits"]}
+    return [name for name in left_out if name not in eased]
 
 
 def reward_unit(env: Any) -> float:

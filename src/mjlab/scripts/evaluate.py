@@ -122,20 +122,21 @@ def _load_curricula(task: str, env: Any, checkpoint: Path) -> None:
     """Restore the curricula of the policy's run; print a line if their state is unknown."""
     from mjlab.rl.evaluation import load_curricula
 
+    is_ours = checkpoint.suffix == ".pt" and not has_foreign_runner(task)
+    state = curricula_of(load_checkpoint(checkpoint)) if is_ours else None
+    left_out = [] if state is None else load_curricula(env, state)
     unwrapped = env.unwrapped
     if not unwrapped.curriculum_manager.active_terms:
         return
-    is_ours = checkpoint.suffix == ".pt" and not has_foreign_runner(task)
-    state = curricula_of(load_checkpoint(checkpoint)) if is_ours else None
-    if state is not None:
-        load_curricula(env, state)
-        return
-    # Loading a checkpoint sets the counter.
-    steps = unwrapped.common_step_counter
-    print_notice(
-        f"{checkpoint.name} does not hold the state of the task's curricula: they are at their "
-        + (f"state after {counted(steps, 'step')}." if steps else "beginning.")
-    )
+    if state is None:
+        # Loading a checkpoint sets the counter.
+        steps = unwrapped.common_step_counter
+        print_notice(
+            f"{checkpoint.name} does not hold the state of the task's curricula: they are at their "
+            + (f"state after {counted(steps, 'step')}." if steps else "beginning.")
+        )
+    elif left_out:
+        print_notice(f"Curricula of {checkpoint.name} not restored: {', '.join(left_out)}.")
 
 
 class EvaluationProgress:

@@ -333,6 +333,12 @@ class GrowingDifficulty(Easing):
                 setattr(noise, name, _scaled(size, part))
         return d
 
+    def reset(self, env_ids: torch.Tensor | slice | None) -> None:
+        """Start to count steps, also in resets that hold the curriculum."""
+        self._episode_start[slice(None) if env_ids is None else env_ids] = (
+            self._env.common_step_counter
+        )
+
     def _count(self, env_ids: torch.Tensor | slice, reward_name: str, survival_s: float) -> None:
         """Count the episodes that end. Resets around an evaluation have no steps and count nothing."""
         env = self._env
@@ -345,7 +351,6 @@ class GrowingDifficulty(Easing):
         self._tally += torch.stack(
             [part.sum().double() for part in (survived, fell, reward, steps)]
         )
-        self._episode_start[env_ids] = env.common_step_counter
 
     def _is_successful(self, reward_name: str, survival: float, tracking: float) -> bool:
         """Return True for a successful interval, and clear its totals."""
