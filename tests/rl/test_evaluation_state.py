@@ -233,3 +233,25 @@ def test_rough_terrain_of_a_robot_is_evaluated_on_all_levels():
         "commands.twist.ranges.ang_vel_z": [-0.7, 0.7],
         "terrain_levels": [0, 9],
     }
+
+
+@pytest.mark.parametrize(
+    ("task", "eased"),
+    [
+        ("Mjlab-Velocity-Flat-Unitree-Go1", {"event_manager", "reward_manager"}),
+        ("Mjlab-Velocity-Flat-Unitree-G1", {"event_manager", "command_manager"}),
+        ("Mjlab-Tracking-Flat-Unitree-G1", {"event_manager", "reward_manager"}),
+    ],
+)
+def test_profiles_ease_training_only(task, eased):
+    cfg: Any = load_env_cfg(task, profile="cpu")
+    cfg.scene.num_envs, cfg.seed, cfg.sim.engine = 2, 1, "native"
+    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
+    prepare = load_rl_cfg(task, profile="cpu").evaluation.prepare_env
+    evaluated = make_evaluation_env(env, 3, 1, prepare)
+    state = env.unwrapped.curriculum_state()
+    load_curricula(evaluated, state)
+    assert {name for name, edits in state["config_edits"].items() if edits} == eased
+    assert evaluated.unwrapped.curricula_in_use() == {}
+    env.close()
+    evaluated.close()

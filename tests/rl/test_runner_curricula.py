@@ -13,7 +13,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import CurriculumTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-from mjlab.rl.checkpoint import load_checkpoint, restore_curricula
+from mjlab.rl.checkpoint import load_checkpoint, restore_lasting_state
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -92,7 +92,7 @@ def test_new_episodes_begin_under_the_restored_curricula(make, tmp_path):
     make(tmp_path / "first", 4, edit).learn(1)
     second = make(tmp_path / "second", 6, edit)
     state = load_checkpoint(tmp_path / "first" / "model_0.pt")["training_state"]
-    assert restore_curricula(state, second.env) == []
+    assert restore_lasting_state(state, second.env) == []
     assert weight(second) == 4.0
     positions = second.env.unwrapped.scene["cartpole"].data.joint_pos[:, 0]
     assert (positions >= 1.0).all()

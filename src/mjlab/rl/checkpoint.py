@@ -571,7 +571,7 @@ def capture_training_state(
 
 def lasting_state(state: Mapping[str, Any]) -> dict[str, Any]:
     """Return the part of a training state that new episodes continue: curricula and totals."""
-    lasting = {name: state[name] for name in ("version", "num_envs", "logger")}
+    lasting = {name: state[name] for name in ("version", "num_envs", "logger", "rnd")}
     if (curricula := curricula_of({"training_state": state})) is not None:
         lasting["env"] = {"curriculum": curricula}
     return lasting
@@ -584,14 +584,18 @@ def curricula_of(content: Mapping[str, Any]) -> dict[str, Any] | None:
     return curricula_in(env) if is_ours else None
 
 
-def restore_curricula(state: dict[str, Any], env: VecEnv) -> list[str]:
-    """Restore the curricula in a training state, and start new episodes under them.
+def restore_lasting_state(state: dict[str, Any], env: VecEnv, algorithm: Any = None) -> list[str]:
+    """Restore what outlives episodes in a training state, mainly curricula, and start new episodes.
 
     Returns the names of parts left out.
 
     Raises:
         CheckpointError: the state is malformed.
     """
+    rnd = getattr(algorithm, "rnd", None)
+    if rnd is not None and state.get("rnd") is not None:
+        # Its weight follows a schedule.
+        rnd.update_counter = state["rnd"]["update_counter"]
     curricula = curricula_of({"training_state": state})
     unwrapped: Any = getattr(env, "unwrapped", env)
     if not hasattr(unwrapped, "load_curriculum_state"):

@@ -35,7 +35,7 @@ from mjlab.rl.checkpoint import (
     load_checkpoint,
     migrate,
     override_algorithm,
-    restore_curricula,
+    restore_lasting_state,
     restore_training_state,
     save_checkpoint,
     set_deviation,
@@ -339,7 +339,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 reason = f"the saved state does not fit. {error}"
         # Otherwise every session would repeat the random numbers of the first.
         seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
-        left_out = restore_curricula(state, self.env)
+        left_out = restore_lasting_state(state, self.env, self.alg)
         self.logger.load_totals(state["logger"])
         logger.warning(
             "Weights, optimizer, iteration and curricula are resumed, but episodes and random numbers "
