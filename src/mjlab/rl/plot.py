@@ -36,6 +36,8 @@ LABELS = {
 
 # Written in every iteration, so the first value is the first iteration of a session.
 _EVERY_ITERATION = "Perf/collection_time"
+# Widths in characters, of a legend and of a handle in it.
+_LEGEND_WIDTH, _LEGEND_HANDLE = 80, 6
 # Small axes side by side.
 _IN_A_ROW = 3
 # Instead of the default: endless episodes have no return, and runs of other packages lack both.
@@ -214,15 +216,6 @@ def plot_run(
         if axes.dataLim.y0 >= 0.0:
             axes.set_ylim(bottom=0.0)
     _add_environment_steps(top, curves)
-    handles = {
-        text: handle
-        for axes in (top, *below)
-        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    if len(handles) > 1:
-        figure.legend(
-            handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False
-        )
     title = folder.resolve().name if title is None else title
     return _save(figure, folder / "learning_curve.png" if output is None else output, title)
 
@@ -349,11 +342,10 @@ def plot_curves(
             begin, end = (x[0], x[-1]) if len(x) else (np.inf, np.inf)
             for part in (one[0] <= begin, one[0] >= end):
                 if part.sum() > 1:
-                    axes.plot(one[0][part], one[1][part], lw=0.8, alpha=0.6, color=color)
+                    style = {"lw": 0.8, "alpha": 0.6, "color": color, "label": "single seeds"}
+                    axes.plot(one[0][part], one[1][part], **style)
     if draw is not None:
         draw(axes)
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend()
     axes.set(xlabel=xlabel, ylabel=ylabel)
     return _save(figure, output, title)
 
@@ -385,6 +377,16 @@ def _save(figure: Figure, output: str | Path, title: str) -> Path:
             axes.set_title(f"{beyond} beyond the axis", loc="right", fontsize="small")
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
+    # By text: several lines may have the same.
+    handles: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(text, handle)
+    if handles:
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", frameon=False,
+            ncols=max(1, min(4, _LEGEND_WIDTH // (_LEGEND_HANDLE + max(map(len, handles))))),
+        )  # fmt: skip
     figure.suptitle(title)
     output = Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
