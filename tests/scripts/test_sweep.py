@@ -47,7 +47,8 @@ class Machine:
         self.interrupts_after = 99
         self.fails: tuple[str, ...] = ()
         self.writes = True
-        self.status_of_interrupted = 0
+        self.status_of_interrupted = 130
+        self.stopped_alone = ""
         self.results = lambda flags: {"mean_return": 1e4 * float(flags[f"--{RATE}"])}
         self._alive = 0
 
@@ -69,6 +70,8 @@ class Machine:
                 signal.raise_signal(signal.SIGINT)
                 return None
             ended = "interrupted"
+        elif flags["--agent.seed"] == self.stopped_alone:
+            self.stopped_alone, ended = "", "interrupted"
         else:
             ended = "failed" if flags.get(f"--{RATE}") in self.fails else "finished"
         self._alive -= 1
@@ -193,7 +196,7 @@ def test_ctrl_c_stops_all_runs_and_the_same_command_resumes_them(sweep, machine,
     assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
 
 
-@pytest.mark.parametrize("status", [0, 130, 143])
+@pytest.mark.parametrize("status", [0, 129, 130, 143, -15])
 def test_interrupted_runs_are_not_failed(sweep, machine, folder, status):
     machine.interrupts_after, machine.status_of_interrupted = 3, status
     outcome = sweep(*LEARNING, "--folder", str(folder), "--seeds", "2")
@@ -201,8 +204,24 @@ def test_interrupted_runs_are_not_failed(sweep, machine, folder, status):
     assert "Failed" not in outcome.out
     assert outcome.out.count("Saved  ") >= 1
     assert {row["state"] for row in rows_of(folder)} <= {"finished", "interrupted"}
+    left = re.search(r"Interrupted; (\d) runs? left", outcome.out)
+    assert left is not None
+    assert int(left[1]) == 4 - sum(int(row["seeds"] or 0) for row in rows_of(folder))
     machine.interrupts_after = 99
     assert sweep(*LEARNING, "--folder", str(folder), "--seeds", "2").status == 0
+    assert [row["state"] for row in rows_of(folder)] == ["finished", "finished"]
+
+
+def test_a_run_stopped_alone_is_resumed(sweep, machine, folder):
+    argv = (*LEARNING, "--folder", str(folder), "--seeds", "2")
+    machine.stopped_alone, machine.status_of_interrupted = "1", 143
+    outcome = sweep(*argv)
+    assert outcome.status in (130, 143)
+    assert "Failed" not in outcome.out
+    assert [row["state"] for row in rows_of(folder)] == ["interrupted", "waiting"]
+    assert sweep(*argv).status == 0
+    resumed = [flags_of(c) for c in machine.commands if "--agent.resume" in flags_of(c)]
+    assert [flags["--agent.seed"] for flags in resumed] == ["1"]
     assert [row["state"] for row in rows_of(folder)] == ["finished", "finished"]
 
 
@@ -244,6 +263,16 @@ def test_a_return_does_not_rank_reward_weights(sweep, machine, folder):
     assert "not ranked" in outcome.out
     assert "leave out --objective to compare success_rate" in outcome.out
     assert not {"Best", "Highest", "Next"} & set(re.findall(r"^\w+", outcome.out, re.MULTILINE))
+
+
+def test_weights_of_a_range_are_sampled_and_compared_by_success(sweep, machine, folder):
+    machine.results = by_weight
+    argv = ("--over", f"{LIFT_WEIGHT}=1..10", "--trials", "3", "--folder", str(folder))
+    outcome = sweep(*argv, task=LIFT)
+    assert outcome.status == 0, outcome.err
+    weights = [float(row["weight"]) for row in rows_of(folder)]
+    assert weights == sorted(weights)
+    assert "compared by success_rate" in outcome.out
 
 
 def test_goals_in_returns_neither_rank_nor_stop(sweep, machine, folder):
@@ -380,10 +409,20 @@ def test_success_by_a_return_counts_as_the_return(evaluation, tag, is_low):
         assert (objective.tag, objective.minimize) == (tag, is_low)
     else:
         assert "metrics" in objective.reason or "Evaluation/speed" in objective.reason
-        # The user knows better than the names.
+        # Users may choose.
         assert choose_objective(TASK, cfgs, "Train/mean_episode_length").is_ranked
         assert not choose_objective(TASK, cfgs, "Evaluation/success_rate").is_ranked
         assert not choose_objective(TASK, cfgs, "Train/exploring_return").is_ranked
+
+
+def test_endless_episodes_are_not_ranked():
+    cfgs = [weighted(TASK, 1.0), weighted(TASK, 10.0)]
+    for cfg in cfgs:
+        cfg.env.episode_length_s = 1e9
+        cfg.agent.evaluation = EvaluationCfg(success_func=len)
+    objective = choose_objective(TASK, cfgs)
+    assert not objective.is_ranked
+    assert "episode_length_s" in objective.reason
 
 
 def test_failures_rank_tasks_that_can_fail():

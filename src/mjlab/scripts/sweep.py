@@ -42,6 +42,7 @@ from mjlab.scripts.train_config import (
 )
 from mjlab.scripts.train_seeds import read_count
 from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.signals import Interrupted
 from mjlab.utils.string import counted
 
 ROOT = Path("logs/sweeps")
@@ -77,9 +78,9 @@ def command(argv: list[str], prog: str) -> None:
         Comparison(sweep, study).report()
     words = ["uv", "run", *prog.split(), *argv]
     line = subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
-    if runs.interrupted:
-        print(f"Interrupted; finished runs are kept. To continue:\n    {line}")
-        raise KeyboardInterrupt
+    if runs.stopped_by is not None:
+        print(f"Interrupted; {runs.what_is_left()}. To continue:\n    {line}")
+        raise Interrupted(runs.stopped_by)
     if runs.failed:
         logs = ", ".join(map(str, runs.failed[:3]))
         raise UserError(
@@ -132,12 +133,14 @@ def parse_sweep(argv: list[str], prog: str) -> Sweep:
         storage=args.storage,
     )
     cfgs = check_settings(sweep)
-    report_moved_goal(task, cfgs[0])
+    objective = choose_objective(task, cfgs, args.objective, args.minimize)
+    if objective.past_goal is None:
+        report_moved_goal(task, cfgs[0])
     return dataclasses.replace(
         sweep,
         axes=tuple(_with_type(axis, cfgs[0]) for axis in axes),
         folder=Path(args.folder or ROOT / _name(sweep)),
-        objective=choose_objective(task, cfgs, args.objective, args.minimize),
+        objective=objective,
     )
 
 

@@ -86,20 +86,25 @@ def choose_objective(
     common = [name for name in found[0] if all(name in measures for measures in found)]
     metrics = [*first.agent.evaluation.metrics]
     if tag is None and common:
-        name, *others = common
+        name, *others = dict.fromkeys([*common, *metrics])
         is_low = minimize or found[0][name]
         reason = f"compared by {name}{', lowest first' if is_low else ''}, {why}"
         return Objective(f"Evaluation/{name}", is_low, True, reason, goal, tuple(others))
     name = (tag or EVALUATED).removeprefix("Evaluation/")
     if name in common or name in metrics or not _contains_return(tag or EVALUATED):
         return Objective(tag or EVALUATED, minimize, past_goal=goal)
-    if common:
+    others: tuple[str, ...] = ()
+    if first.env.episode_length_s >= _LONGEST_EPISODE_S:
+        use = "set env.episode_length_s, because endless episodes are not evaluated"
+    elif common:
         use = f"leave out --objective to compare {common[0]}"
     elif metrics:
         use = f"use --objective Evaluation/{metrics[0]}, with --minimize if low values are good"
+        tag, others = tag or f"Evaluation/{metrics[0]}", tuple(metrics[1:])
     else:
         use = "define success_func or metrics in the task's EvaluationCfg"
-    return Objective(tag or _default_tag(first), minimize, False, f"not ranked, {why}; {use}", goal)
+    reason = f"not ranked, {why}; {use}"
+    return Objective(tag or _default_tag(first), minimize, False, reason, goal, others)
 
 
 def _measures(task: str, cfg: TrainConfig, changes: Iterable[str]) -> dict[str, bool]:

@@ -78,8 +78,10 @@ class Comparison:
         self._sweep = sweep
         rows: dict[tuple[str, ...], _Row] = {}
         for trial in study.trials:
-            if trial.state.name not in ("WAITING", "PRUNED"):
-                setting = setting_of(trial)
+            setting, state = setting_of(trial), trial.state.name
+            if state == "WAITING":
+                rows.setdefault(tuple(setting.values()), _Row(setting, [], [], "waiting", None))
+            elif state != "PRUNED":
                 # A retry comes after the failed trial of the same setting.
                 rows[tuple(setting.values())] = self._row(setting, trial, study.is_own(trial))
         self._rows = [*rows.values()]

@@ -22,7 +22,13 @@ from mjlab.scripts.sweep_study import Study, TrainedRun, setting_of, trained_run
 from mjlab.scripts.train_seeds import train_command
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.processes import CORES_VARIABLE, PARENT_VARIABLE, available_cores
-from mjlab.utils.signals import FORWARDED, handled_signals, send_signal, start_in_background
+from mjlab.utils.signals import (
+    FORWARDED,
+    handled_signals,
+    interrupting_signal,
+    send_signal,
+    start_in_background,
+)
 from mjlab.utils.string import clock, counted
 
 if TYPE_CHECKING:
@@ -33,8 +39,6 @@ _EVALUATIONS = 10
 """Number of evaluations of a run."""
 _FIRST_REPORT_S = 60.0
 """Time until what is left is printed, while no run ends (s); the times in between double."""
-# Exit statuses of a run stopped by SIGHUP, SIGINT or SIGTERM, from a shell and from the system.
-_STOPPED = (129, 130, 143, -1, -2, -15)
 # Number of finished iterations in the output of a run: `[12/100]`.
 _ITERATION = re.compile(rb"^\[(\d+)/\d+\]", re.MULTILINE)
 
@@ -74,15 +78,13 @@ class Runs:
     def __init__(self, sweep: Sweep, study: Study) -> None:
         self._sweep = sweep
         self._study = study
-        self.interrupted = False
-        """True if a run was interrupted."""
+        self.stopped_by: signal.Signals | None = None
+        """Signal that stopped the sweep or one of its runs."""
         self.failed: list[Path] = []
         """Output of failed runs."""
         self._slots = machine_slots(sweep)
         self._signals: list[signal.Signals] = []
         self._queue: deque[tuple[FrozenTrial, int]] = deque()
-        # Unfinished seeds by trial.
-        self._left: dict[int, int] = {}
         self._running: list[_Run] = []
         self._num_jobs = len(self._slots)
         self._num_ended = 0
@@ -96,12 +98,12 @@ class Runs:
     def train(self) -> None:
         """Train the runs that are not finished, until none is left or a signal arrives.
 
-        SIGINT, SIGTERM and SIGHUP are forwarded to all runs, which save a checkpoint; a second signal
-        stops them without saving. After an error, such as a lost database, runs are saved too.
+        SIGINT, SIGTERM and SIGHUP are forwarded to all runs, which save a checkpoint; at a second signal
+        without the running iteration. After an error, such as a lost database, runs are saved too.
         """
         _print_summary(self._sweep, self._slots)
-        forward = self._signals
-        with handled_signals(lambda number, _: forward.append(FORWARDED[number]), FORWARDED):
+        received = self._signals
+        with handled_signals(lambda number, _: received.append(signal.Signals(number)), FORWARDED):
             try:
                 own = self._study.own()
                 for trial in own:
@@ -114,10 +116,10 @@ class Runs:
                     self._update()
                     if time.monotonic() > self._next_report:
                         self._next_report += time.monotonic() - self._begin
-                        print(f"Running  {self._left_over()}", flush=True)
+                        print(f"Running  {self.what_is_left()}", flush=True)
             finally:
                 # A second signal would stop runs that are saving.
-                if self._running and not self.interrupted:
+                if self._running and self.stopped_by is None:
                     self._stop(signal.SIGINT)
                 while any(run.process.poll() is None for run in self._running):
                     time.sleep(_SECONDS_BETWEEN_LOOKS)
@@ -137,9 +139,9 @@ class Runs:
             self._stop(self._signals.pop(0))
 
     def _stop(self, number: signal.Signals) -> None:
-        self.interrupted = True
+        self.stopped_by = self.stopped_by or number
         for run in self._running:
-            send_signal(run.process, number)
+            send_signal(run.process, FORWARDED[number])
         # A terminal that was closed takes no output.
         with contextlib.suppress(OSError):
             print(f"\nSaving {counted(len(self._running), 'run')} ...", flush=True)
@@ -151,7 +153,6 @@ class Runs:
             for seed in range(1, self._sweep.seeds + 1)
             if self._sweep.finished_run(setting_of(trial), seed) is None
         ]
-        self._left[trial.number] = len(seeds)
         self._num_ended += self._sweep.seeds - len(seeds)
         self._queue.extend((trial, seed) for seed in seeds)
         if not seeds:
@@ -159,7 +160,7 @@ class Runs:
 
     def _fill(self) -> None:
         """Start runs on the free slots."""
-        while self._slots and not self.interrupted and not self._signals:
+        while self._slots and self.stopped_by is None and not self._signals:
             while not self._queue and (trial := self._study.next()) is not None:
                 self._add(trial)
             if not self._queue:
@@ -199,27 +200,31 @@ class Runs:
         sweep, setting = self._sweep, setting_of(run.trial)
         newest = next(iter(sweep.sessions(setting, run.seed)), None)
         info = {} if newest is None else read_run_info(newest)
-        self._left[run.trial.number] -= 1
-        status = run.process.returncode
+        stopped = interrupting_signal(run.process.returncode)
+        if run.process.returncode == 0 and info.get("ended") == "interrupted":
+            stopped = signal.SIGINT
         if (trained := trained_run(sweep, setting, run.seed)) is not None:
             self._count(run, trained)
             value = f"{sweep.objective.label} {trained.value:.4g}"
-            print(f"Finished {run.name}: {value}; {self._left_over()}", flush=True)
-        elif status in _STOPPED or (status == 0 and info.get("ended") == "interrupted"):
-            self.interrupted = True
+            print(f"Finished {run.name}: {value}; {self.what_is_left()}", flush=True)
+        elif stopped or self.stopped_by:
+            self.stopped_by = self.stopped_by or stopped
+            is_saved = stopped and info.get("ended") == "interrupted"
             saved = f"Saved    {run.name}, iteration {info.get('iterations', 0)}"
-            is_saved = info.get("ended") == "interrupted"
             print(saved if is_saved else f"Stopped  {run.name} without saving", flush=True)
-            return
-        elif self.interrupted:
-            print(f"Stopped  {run.name} without saving", flush=True)
             return
         else:
             self._num_ended += 1
             self.failed.append(sweep.log_file(setting, run.seed))
             print(f"Failed   {run.name}: {_last_error(self.failed[-1])}", flush=True)
-        if self._left[run.trial.number] == 0:
+        pending = [*(trial for trial, _ in self._queue), *(one.trial for one in self._running)]
+        if any(trial.number == run.trial.number for trial in pending):
+            return
+        logs = {sweep.log_file(setting, seed) for seed in range(1, sweep.seeds + 1)}
+        if logs.isdisjoint(self.failed):
             self._study.finish(run.trial)
+        else:
+            self._study.fail(run.trial)
 
     def _count(self, run: _Run, trained: TrainedRun) -> None:
         """Add a finished run to what the time left is estimated from."""
@@ -229,7 +234,7 @@ class Runs:
         self._training += trained.training_seconds
         self._evaluating += trained.evaluation_seconds
 
-    def _left_over(self) -> str:
+    def what_is_left(self) -> str:
         """Return the number of runs left here, the time they take, and the share of evaluations."""
         elsewhere = sum(
             trial.state.name in ("RUNNING", "COMPLETE") and not self._study.is_own(trial)

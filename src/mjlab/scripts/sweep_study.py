@@ -113,15 +113,20 @@ class Study:
         return None
 
     def finish(self, trial: FrozenTrial) -> None:
-        """Store the value of a trial, if it has no value yet: mean over seeds; failed if not finite."""
+        """Store the value of a trial, if it has no value yet: mean over seeds; failed if not finite.
+
+        Does nothing for a trial with unfinished runs.
+        """
         setting = setting_of(trial)
         seeds = range(1, self._sweep.seeds + 1)
         runs = [trained_run(self._sweep, setting, seed) for seed in seeds]
-        found = [run.value for run in runs if run is not None and math.isfinite(run.value)]
-        if len(found) < len(runs):
+        values = [run.value for run in runs if run is not None]
+        if len(values) < len(runs):
+            return
+        if not all(map(math.isfinite, values)):
             self.fail(trial)
             return
-        self._study.tell(trial.number, statistics.fmean(found), skip_if_finished=True)
+        self._study.tell(trial.number, statistics.fmean(values), skip_if_finished=True)
 
     def fail(self, trial: FrozenTrial) -> None:
         """Mark a trial as failed; the next command retries it."""
