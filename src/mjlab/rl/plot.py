@@ -342,7 +342,12 @@ def plot_curves(
             begin, end = (x[0], x[-1]) if len(x) else (np.inf, np.inf)
             for part in (one[0] <= begin, one[0] >= end):
                 if part.sum() > 1:
-                    style = {"lw": 0.8, "alpha": 0.6, "color": color, "label": "single seeds"}
+                    style: dict[str, Any] = {
+                        "lw": 0.8,
+                        "alpha": 0.6,
+                        "color": color,
+                        "label": "single seeds",
+                    }
                     axes.plot(one[0][part], one[1][part], **style)
     if draw is not None:
         draw(axes)
