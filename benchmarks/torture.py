@@ -28,7 +28,9 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 from torture_parts.commands import preload  # noqa: E402 - found by the line above.
 from torture_parts.trials import Verdict, run_trials  # noqa: E402
 
-PARTS = ("kills", "damage", "limits", "command_lines", "config_files", "physics", "page")
+PARTS = (
+    *("kills", "resumes", "damage", "limits", "command_lines", "config_files", "physics", "page"),
+)
 MINUTES = 15.0
 """Wall-clock minutes of all parts on two cores with the default numbers of trials."""
 

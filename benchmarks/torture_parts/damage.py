@@ -22,13 +22,19 @@ TRIALS = 280
 LIMIT = 90.0
 
 _ITERATIONS = 2
+_SAC = (
+    "--learner", "sac", "--agent.algorithm.batch-size", "64", "--agent.algorithm.num-updates", "1",
+    "--agent.algorithm.learning-starts", "2", "--agent.algorithm.replay-steps", "40",
+)  # fmt: skip
 _DEEP = 100_000
 
 
 def prepare(folder: Path) -> dict[str, Any]:
     """Make one good file of each kind, with the result of its reader."""
     run = trained(folder / "logs", _ITERATIONS)
+    of_sac = trained(folder / "sac", _ITERATIONS, *_SAC)
     files = {
+        "replay": of_sac / "replay_model_1.pt",
         "checkpoint": next(run.glob("model_1.pt")),
         "onnx": next(run.glob("*.onnx")),
         "events": next(run.glob("events.out.*")),
@@ -39,8 +45,12 @@ def prepare(folder: Path) -> dict[str, Any]:
         "dump": _make_dump(folder / "dumps"),
     }
     files["model of a dump"] = next((folder / "dumps").glob("model_2*.mjb"))
-    shutil.rmtree(run / "git", ignore_errors=True)
-    return {"run": str(run), "files": {kind: str(path) for kind, path in files.items()}}
+    for one in (run, of_sac):
+        shutil.rmtree(one / "git", ignore_errors=True)
+    return {
+        "runs": [str(run), str(of_sac)],
+        "files": {kind: str(path) for kind, path in files.items()},
+    }
 
 
 # Readers return content that can be compared, and raise `Rejected` with the message of an error.
@@ -56,6 +66,24 @@ def _read_checkpoint(path: Path) -> Any:
     try:
         return load_checkpoint(path)
     except CheckpointError as error:
+        raise Rejected(str(error)) from error
+
+
+def _read_replay(path: Path) -> Any:
+    from mjlab.rl.checkpoint import CheckpointError, load_checkpoint
+    from mjlab.rl.replay import ReplayFiles
+
+    checkpoint = path.with_name(path.name.removeprefix("replay_"))
+
+    class AnySize:
+        def check_fits(self, state: Any) -> None: ...
+
+    storage: Any = AnySize()
+    try:
+        return ReplayFiles(checkpoint).read(storage, load_checkpoint(checkpoint)["identity"])
+    except CheckpointError as error:
+        if str(path) not in str(error) or "delete this file" not in str(error):
+            raise Broken(f"says neither file nor cure: {error}") from error
         raise Rejected(str(error)) from error
 
 
@@ -159,6 +187,7 @@ def _read_by_page(path: Path) -> Any:
 
 _READERS: dict[str, tuple[Callable[[Path], Any], ...]] = {
     "checkpoint": (*[_read_checkpoint] * 8, _read_by_evaluate, _read_by_resume),
+    "replay": (*[_read_replay] * 4, _read_by_resume),
     "onnx": (_read_by_evaluate,),
     "events": (_read_events, _read_events, _read_by_plot),
     "run.json": (_read_by_evaluate, _read_by_resume),
@@ -170,7 +199,7 @@ _READERS: dict[str, tuple[Callable[[Path], Any], ...]] = {
 }
 # One turn of trials: kinds with their frequencies.
 _KINDS = (
-    *["checkpoint"] * 8, *["onnx"] * 3, "events", "run.json", "agent.yaml", "env.yaml",
+    *["checkpoint"] * 8, *["replay"] * 4, *["onnx"] * 3, "events", "run.json", "agent.yaml", "env.yaml",
     *["motion"] * 3, *["dump"] * 2, "model of a dump",
 )  # fmt: skip
 
@@ -268,6 +297,17 @@ def _misfit(data: bytes, rng: random.Random) -> tuple[bytes, str]:
     return buffer.getvalue(), f"{'/'.join(map(str, way))} replaced by {choice}"
 
 
+def _of_another(data: bytes, rng: random.Random) -> tuple[bytes, str]:
+    """Give a replay the identity of another checkpoint, or none."""
+    import torch
+
+    content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    content["identity"] = rng.choice((None, "00000000-1", content["identity"].replace("-2", "-1")))
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue(), f"identity {content['identity']}"
+
+
 _DAMAGES = (_flip, _flip, _flip, _flip, _cut, _cut, _zeros, _hole, _empty, _garbage, _absurd)
 
 
@@ -277,15 +317,17 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
     kind = _KINDS[trial.number % len(_KINDS)]
     reader = rng.choice(_READERS[kind])
     good = Path(prepared["files"][kind])
-    path = _copied(good, Path(prepared["run"]))
+    path = _copied(good, prepared["runs"])
     damage = rng.choice(_DAMAGES)
-    if kind == "checkpoint" and rng.random() < 0.25:
+    if kind == "replay":
+        damage = rng.choice((damage, _misfit, _misfit, _of_another))
+    elif kind == "checkpoint" and rng.random() < 0.25:
         damage, reader = _misfit, rng.choice((_read_by_resume, _read_by_resume, _read_by_evaluate))
     damaged, how = damage(good.read_bytes(), rng)
     trial.trying(f"{kind}, {how}, {name_of(reader)}")
     # Read the undamaged file first, from a separate copy.
     expected = reader(path)
-    path = _copied(good, Path(prepared["run"]))
+    path = _copied(good, prepared["runs"])
     path.write_bytes(damaged)
     try:
         found = reader(path)
@@ -301,13 +343,14 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
     raise Broken("read as something else, in silence")
 
 
-def _copied(good: Path, run: Path) -> Path:
+def _copied(good: Path, runs: list[str]) -> Path:
     """Return a new copy of `good`, with the neighboring files of its reader."""
     here = Path("files").resolve()
     shutil.rmtree(here, ignore_errors=True)
-    if good.is_relative_to(run):
-        shutil.copytree(run, here / "logs/cartpole" / run.name)
-        return here / "logs/cartpole" / run.name / good.relative_to(run)
+    for run in map(Path, runs):
+        if good.is_relative_to(run):
+            shutil.copytree(run, here / "logs/cartpole" / run.name)
+            return here / "logs/cartpole" / run.name / good.relative_to(run)
     shutil.copytree(
         good.parent, here, symlinks=True
     ) if good.parent.name == "dumps" else here.mkdir()

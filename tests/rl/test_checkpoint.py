@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import errno
+import math
 import os
 import pickle
 import random
@@ -248,6 +249,15 @@ def test_a_checkpoint_of_rsl_rl_continues_at_the_next_iteration(make_runner, tmp
     assert runner.env.unwrapped.common_step_counter == 17
     torch.save({**runner.alg.save(), "iter": 4, "infos": None}, tmp_path / "model_4.pt")
     assert runner.load(str(tmp_path / "model_4.pt")) == {}
+
+
+@pytest.mark.parametrize("value", [math.nan, "no", None])
+def test_a_malformed_switch_is_an_error(make_runner, tmp_path: Path, value):
+    runner = make_runner()
+    runner.save(str(tmp_path / "model_0.pt"))
+    content = {**load_checkpoint(tmp_path / "model_0.pt"), "owes_evaluation": value}
+    with pytest.raises(CheckpointError, match="owes_evaluation"):
+        runner.load_content(content, tmp_path / "model_0.pt")
 
 
 def test_a_checkpoint_is_read_once(make_runner, tmp_path: Path):

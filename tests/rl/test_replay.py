@@ -186,6 +186,7 @@ DAMAGES: dict[str, tuple[str, Damage]] = {
     "infinite": ("rewards", set_tensor("rewards", lambda x: x.fill_(math.inf))),
     "NaN in an end": ("ends/actor", set_tensor("ends/actor", lambda x: x.fill_(math.nan))),
     "fewer rows": ("actions", set_tensor("actions", lambda x: x[:-1])),
+    "wider ends": ("ends/actor", set_tensor("ends/actor", lambda x: x.repeat(1, 2))),
     "one dimension": ("rewards", set_tensor("rewards", torch.Tensor.flatten)),
     "nothing": ("rewards", set_tensor("rewards", lambda x: x[:, :0])),
 }

@@ -725,6 +725,8 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
                 raise ValueError(f"{name}: expected a dict, got a {type(value).__name__}.")
         for name, value in counts.items():
             check_count(name, value, _COUNT_ENTRIES.get(name, 0))
+        if not isinstance(owes := checkpoint.get("owes_evaluation", False), bool):
+            raise ValueError(f"owes_evaluation: expected True or False, got {owes!r}.")
     except ValueError as error:
         raise CheckpointError(
             f"Checkpoint {path!r} is malformed: {error} Use another checkpoint. Nothing was changed."

@@ -280,6 +280,13 @@ def check_contents(state: Mapping[str, Any]) -> None:
                 f"Replay {name}: expected {tuple(shape)} as first sizes, as rewards, got "
                 f"{tuple(tensors[name].shape)}."
             )
+    for group in groups:
+        ends, stored = (tensors[f"{part}/{group}"].shape for part in ("ends", "observations"))
+        if ends[1:] != stored[2:] or ends[:1] == (0,):
+            raise ValueError(
+                f"Replay ends/{group}: expected shape (ends, *{tuple(stored[2:])}), as observations, got "
+                f"{tuple(ends)}."
+            )
     for name in ("row", "num_filled", "num_ends_stored"):
         if type(state.get(name)) is not int:
             raise ValueError(f"Replay {name}: expected an integer, got {state.get(name)!r}.")
