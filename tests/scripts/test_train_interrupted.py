@@ -16,6 +16,7 @@ import torch
 from commands import SMALL, TASK
 
 from mjlab.rl.checkpoint import load_checkpoint
+from mjlab.rl.plot import read_scalars
 from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 
 PATIENCE = 60.0
@@ -26,11 +27,11 @@ def endless_run(log_root: Path) -> list[str]:
     return [*command, "--log-root", str(log_root), "--agent.max-iterations", "1000000"]
 
 
-def start_endless_run(log_root: Path) -> subprocess.Popen[str]:
+def start_endless_run(log_root: Path, *flags: str) -> subprocess.Popen[str]:
     # One thread, as in the runs that these are compared with.
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
-        endless_run(log_root),
+        [*endless_run(log_root), *flags],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -46,18 +47,21 @@ def wait_for_checkpoint(log_root: Path, process: subprocess.Popen[str], name: st
         time.sleep(0.01)
 
 
-def assert_resumes_exactly(train, log_root: Path, run_dir: Path, tmp_path: Path) -> None:
+def assert_resumes_exactly(
+    train, log_root: Path, run_dir: Path, tmp_path: Path, *flags: str
+) -> Path:
     """Resume what is in `run_dir`, and compare with a run that was never ended."""
     last = checkpoints_in(run_dir)[-1]
     iterations = load_checkpoint(last)["iterations_finished"] + 2
-    resumed = train(log_root, iterations, "--agent.resume", "True")
-    straight = train(tmp_path / "straight", iterations)
+    resumed = train(log_root, iterations, "--agent.resume", "True", *flags)
+    straight = train(tmp_path / "straight", iterations, *flags)
     name = f"model_{iterations - 1}.pt"
     for model in ("actor_state_dict", "critic_state_dict"):
         one = load_checkpoint(resumed / name)[model]
         other = load_checkpoint(straight / name)[model]
         assert one.keys() == other.keys()
         assert [key for key in one if not torch.equal(one[key], other[key])] == []
+    return resumed
 
 
 def test_a_run_that_is_killed_resumes_from_its_last_checkpoint_bit_for_bit(train, tmp_path):
@@ -71,13 +75,13 @@ def test_a_run_that_is_killed_resumes_from_its_last_checkpoint_bit_for_bit(train
     assert_resumes_exactly(train, log_root, run_dir, tmp_path)
 
 
-def test_sigterm_saves_exports_and_ends_with_status_0(train, tmp_path):
+def test_sigterm_saves_exports_and_ends_with_its_status(train, tmp_path):
     log_root = tmp_path / "logs"
     process = start_endless_run(log_root)
     wait_for_checkpoint(log_root, process, "model_0.pt")
     process.terminate()
     out = process.communicate(timeout=PATIENCE)[0]
-    assert process.returncode == 0, out
+    assert process.returncode == 143, out
     assert "SIGTERM: finishing this iteration, then saving" in out
     assert "Interrupted at" in out
     (run_dir,) = (log_root / "cartpole").iterdir()
@@ -86,6 +90,45 @@ def test_sigterm_saves_exports_and_ends_with_status_0(train, tmp_path):
     assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
     assert list(run_dir.glob("*.onnx"))
     assert_resumes_exactly(train, log_root, run_dir, tmp_path)
+
+
+def test_an_evaluation_ends_at_a_signal_and_is_made_up_for(train, tmp_path):
+    log_root = tmp_path / "logs"
+    flags = ("--agent.evaluation.trigger-return=-1e9", "--agent.evaluation.min-interval", "1")
+    flags += ("--agent.evaluation.num-episodes", "256")
+    process = start_endless_run(log_root, *flags)
+    wait_for_checkpoint(log_root, process, "model_0.pt")
+    process.terminate()
+    out = process.communicate(timeout=PATIENCE)[0]
+    assert process.returncode == 143, out
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    assert [path.name for path in checkpoints_in(run_dir)] == ["model_0.pt"]
+    assert load_checkpoint(run_dir / "model_0.pt")["owes_evaluation"]
+    flags = (*flags[:-1], "4")
+    resumed = assert_resumes_exactly(train, log_root, run_dir, tmp_path, *flags)
+    assert list(read_scalars(resumed, "Evaluation/mean_return")[0]) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("flags", [(), ("--grace", "0")])
+def test_a_long_iteration_is_given_up(tmp_path, flags):
+    """By a second signal, or after the grace: what was finished before is saved."""
+    log_root, steps = tmp_path / "logs", ("--agent.num-steps-per-env", "1000")
+    process = start_endless_run(log_root, *steps, *flags, "--agent.save-interval", "1000")
+    wait_for_checkpoint(log_root, process, "model_0.pt")
+    time.sleep(1.0)
+    for _ in range(1 if flags else 2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.05)
+    out = process.communicate(timeout=PATIENCE)[0]
+    assert process.returncode == 130, out
+    assert "is given up" in out
+    assert "Failed" not in out
+    (run_dir,) = (log_root / "cartpole").iterdir()
+    info = read_run_info(run_dir)
+    assert info["ended"] == "interrupted"
+    last = load_checkpoint(checkpoints_in(run_dir)[-1])
+    assert last["iterations_finished"] == info["iterations"]
+    assert "observations" in last["training_state"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
@@ -107,7 +150,7 @@ def test_a_terminal_that_is_closed_leaves_a_checkpoint(tmp_path):
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     (run_dir,) = (log_root / "cartpole").iterdir()
     info = read_run_info(run_dir)
-    assert (status, info["ended"]) == (0, "interrupted")
+    assert (status, info["ended"]) == (129, "interrupted")
     assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
 
 
@@ -155,7 +198,7 @@ def test_a_signal_that_ends_the_reader_of_a_pipe_first_leaves_a_checkpoint(tmp_p
     # As `train | tee log`, when Ctrl-C ends `tee`.
     process.stdout.close()
     process.send_signal(signal.SIGINT)
-    process.wait(PATIENCE)
+    assert process.wait(PATIENCE) == 130
     (run_dir,) = (log_root / "cartpole").iterdir()
     info = read_run_info(run_dir)
     assert info["ended"] == "interrupted"

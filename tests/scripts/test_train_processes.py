@@ -164,7 +164,7 @@ def test_a_signal_to_one_stops_all_after_the_same_iteration_and_saves_once(tmp_p
         time.sleep(0.01)
     run.send(1, signal.SIGINT)
     ended = run.end()
-    assert [process.status for process in ended] == [0, 0], ended
+    assert [process.status for process in ended] == [130, 130], ended
     assert "Interrupted at" in ended[0].out
     (run_dir,) = run.runs()
     iterations = read_run_info(run_dir)["iterations"]

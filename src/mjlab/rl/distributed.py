@@ -36,7 +36,14 @@ from mjlab.utils.processes import (
     cores_per_process,
     process_rank,
 )
-from mjlab.utils.signals import FORWARDED, handled_signals, send_signal, start_in_background
+from mjlab.utils.signals import (
+    FORWARDED,
+    Interrupted,
+    handled_signals,
+    interrupting_signal,
+    send_signal,
+    start_in_background,
+)
 
 T = TypeVar("T")
 
@@ -73,7 +80,7 @@ def launch_workers(
 
     Raises:
         UserError: a process failed; the message has its rank and exit status.
-        KeyboardInterrupt: a signal stopped the processes before they could handle it.
+        Interrupted: a signal stopped the processes.
     """
     # The launcher owns the store of the process group, so that no other program can take its port in
     # the meantime.
@@ -83,22 +90,22 @@ def launch_workers(
     shared |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
     workers: list[subprocess.Popen[bytes]] = []
-    received: list[signal.Signals] = []
+    received: list[int] = []
     killed: set[subprocess.Popen[bytes]] = set()
 
     def forward(number: int, frame: FrameType | None) -> None:
-        received.append(FORWARDED[number])
+        received.append(number)
         for worker in workers:
             send_signal(worker, FORWARDED[number])
 
     with handled_signals(forward, FORWARDED):
         for rank in range(count):
             own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
-            # A terminal sends Ctrl-C to all of its processes, and a second signal stops training
-            # immediately.
+            # A terminal sends Ctrl-C to all of its processes, and a second signal gives up the running
+            # iteration.
             workers.append(start_in_background(command, own))
             for number in received:
-                send_signal(workers[-1], number)
+                send_signal(workers[-1], FORWARDED[number])
         try:
             while None in (codes := [worker.poll() for worker in workers]) and not any(codes):
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
@@ -117,11 +124,14 @@ def launch_workers(
     # The process that failed first, not one that failed because of it or was killed here.
     later = [rank for rank in range(count) if workers[rank] not in killed]
     others = (0, OtherProcessError.exit_status)
-    candidates = (rank for rank in (*failed, *later) if workers[rank].returncode not in others)
-    rank = next(candidates, failed[0])
+    ended = [rank for rank in (*failed, *later) if workers[rank].returncode not in others]
+    stopped = {rank: interrupting_signal(workers[rank].returncode) for rank in ended}
+    rank = next((rank for rank in ended if stopped[rank] is None), next(iter(ended), failed[0]))
+    if received and (stopped.get(rank) is not None or workers[rank] in killed):
+        raise Interrupted(received[0])
     code = workers[rank].returncode
-    if received and code in (130, -signal.SIGINT):
-        raise KeyboardInterrupt
+    if code > 0 and (number := stopped.get(rank)) is not None:
+        raise Interrupted(number)
     how = f"failed with status {code}; see its output above"
     if code < 0:
         how = f"was ended by {signal.Signals(-code).name}"

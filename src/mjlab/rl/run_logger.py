@@ -109,7 +109,7 @@ class TrainingObserver:
         """Handle a written checkpoint."""
 
     def on_stop_requested(self, signal_name: str) -> None:
-        """Handle SIGINT, SIGTERM or SIGHUP; the current iteration still finishes."""
+        """Handle the first SIGINT, SIGTERM or SIGHUP. An evaluation ends; an iteration still finishes."""
 
     def on_end(self, reason: str) -> None:
         """Handle the end of training: `finished`, `solved`, `interrupted` or `failed`."""

@@ -192,7 +192,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             self._notify("on_start", first, total)
             owed = self._owes_evaluation
             if first > 0:
-                reason = self._agree_to_stop(owed and self._evaluate_solved(first, stop), stop)
+                is_solved = owed and self._evaluate_solved(first, stop)
+                reason = self._agree_to_stop(is_solved, stop, is_last=first >= total)
             while not reason and (iteration := self.current_learning_iteration) < total:
                 begin = time.perf_counter()
                 last = self._snapshot() if self._is_main_process else {}
@@ -254,7 +255,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                     self._save_checkpoint()
                     rescue.learned = None
                 is_solved = self._owes_evaluation and self._evaluate_solved(done, stop)
-                reason = self._agree_to_stop(is_solved, stop)
+                reason = self._agree_to_stop(is_solved, stop, is_last=done >= total)
             rescue.learned = None
             # Without further iterations, too: the evaluation that a resumed run made up for.
             has_news = self.current_learning_iteration > first or owed or bool(reason)
@@ -423,9 +424,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 self._save_checkpoint()
             raise stopped
 
-    def _agree_to_stop(self, is_solved: bool, stop: StopRequest) -> str:
-        """Return the reason to stop with the highest priority among all processes, or ""."""
-        code = int(is_solved) if stop.number is None else 1 + stop.number
+    def _agree_to_stop(self, is_solved: bool, stop: StopRequest, is_last: bool) -> str:
+        """Return the reason to stop with the highest priority among all processes, or "".
+
+        After the last iteration, a signal interrupts nothing but the evaluation that is owed.
+        """
+        code, is_owed = int(is_solved), self._is_main_process and self._owes_evaluation
+        if stop.number is not None and (is_owed or not is_last):
+            code = 1 + stop.number
         if self.is_distributed:
             # All processes must leave the loop at the same iteration.
             shared = torch.tensor(code, device=self.device)
@@ -442,6 +448,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Score the policy in separate environments; the run is not affected."""
         self.last_evaluation = self._solved_check.evaluate()
         return self.last_evaluation
+
+    @property
+    def owes_evaluation(self) -> bool:
+        """True if an evaluation is due after the last iteration, and was not finished."""
+        return self._owes_evaluation
 
     def _evaluate_solved(self, iteration: int, stop: StopRequest) -> bool:
         """Evaluate the policy after `iteration` iterations; return True to stop training.

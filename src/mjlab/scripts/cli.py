@@ -20,6 +20,7 @@ from mjlab.scripts import prepare_threads
 from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
+from mjlab.utils.signals import Interrupted
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
@@ -477,7 +478,8 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     """Run `command` with the command line's arguments; return if it succeeds, else exit.
 
     Errors that a user can fix (`MjlabError`, `ValueError`, `OSError`) are printed as one message;
-    the exit status is `MjlabError.exit_status`, else 1. Other errors keep their traceback.
+    the exit status is `MjlabError.exit_status`, else 1. Other errors keep their traceback. A command
+    that a signal ended exits with 128 + its number.
     """
     prepare_threads()
     # Plain library messages.
@@ -493,6 +495,8 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         command(sys.argv[1:])
+    except Interrupted as stopped:
+        sys.exit(stopped.exit_status)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:

@@ -50,6 +50,8 @@ def show_training(
         folder.keep()
         if cfg.live:
             print_notice("--live: not shown, because the runner of this task has no observers.")
+        if cfg.grace is not None:
+            print_notice("--grace: ignored, because the runner of this task stops by itself.")
         return
     progress = ProgressCfg.of_runner(runner, task, usual_iteration(task, cfg))
     display = NotebookProgress(progress) if in_notebook() else TrainingDisplay(progress)
@@ -127,7 +129,7 @@ class TrainingDisplay(TrainingProgress):
             # `isatty` is False for a closed terminal, which remains a character device.
             _redirect_to_devnull(lambda file: stat.S_ISCHR(file.st_mode))
         self._print(
-            f"{signal_name}: finishing this iteration, then saving. Once more to stop at once."
+            f"{signal_name}: finishing this iteration, then saving. Once more: without finishing it."
         )
 
     def on_end(self, reason: str) -> None:

@@ -194,9 +194,9 @@ def choose_seed(checkpoint: Path | None) -> int:
 
 
 def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path) -> bool:
-    """Return True, and print a message, if the loaded run has finished all iterations."""
+    """Return True, and print a message, if the loaded run has finished all iterations and evaluations."""
     done, total = runner.current_learning_iteration, cfg.agent.max_iterations
-    if done < total:
+    if done < total or runner.owes_evaluation:
         return False
     print(
         f"Nothing to train: {checkpoint} has finished {done} iterations, and --agent.max-iterations "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
 from collections.abc import Generator
 from pathlib import Path
@@ -52,6 +53,7 @@ from mjlab.scripts.train_config import (
     report_moved_goal,
 )
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
+from mjlab.utils.signals import Interrupted
 
 if TYPE_CHECKING:
     from mjlab.scripts.live import LiveView
@@ -66,7 +68,8 @@ def command(argv: list[str], prog: str) -> None:
     check_typed_flags(cfg, flags)
     gpus = gpus_to_share(cfg)
     if not gpus:
-        launch_training(task, cfg)
+        if (stopped := train_until_stopped(task, cfg)[1]) is not None:
+            raise Interrupted(stopped)
         return
     check_flags(cfg)
     # CUDA_VISIBLE_DEVICES restricts the workers to the selected GPUs.
@@ -92,13 +95,21 @@ def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
 def launch_training(task: str, cfg: TrainConfig) -> Path:
     """Train `task` with the flags `cfg`; return the run folder.
 
-    If the run to resume has finished all iterations, return its folder without training. A run that
+    Signals that interrupt training, as in `MjlabOnPolicyRunner.learn`, do not end the caller. If the run to resume has finished all iterations, return its folder without training. A run that
     fails before its first iteration leaves no folder.
 
     Raises:
         UserError, ValueError, OSError, CheckpointError, EngineUnavailableError: the request cannot be
             fulfilled; raised before training starts if possible.
     """
+    return train_until_stopped(task, cfg)[0]
+
+
+run_train = launch_training
+
+
+def train_until_stopped(task: str, cfg: TrainConfig) -> tuple[Path, signal.Signals | None]:
+    """Train as `launch_training`; return the run folder, and the signal that interrupted training."""
     end_with_launcher()
     rank = process_rank()
     # Only the first process prints the device. All report the processes they wait for.
@@ -110,12 +121,9 @@ def launch_training(task: str, cfg: TrainConfig) -> Path:
         return _train(task, cfg, device, rank, output)
 
 
-run_train = launch_training
-
-
 def _train(
     task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
-) -> Path:
+) -> tuple[Path, signal.Signals | None]:
     # Imports rsl_rl, which takes seconds; flags are checked before.
     from mjlab.scripts.results import print_heading, report_divergence, write_results
 
@@ -157,7 +165,7 @@ def _train(
             if checkpoint is not None:
                 # Foreign runners train `max_iterations` more iterations.
                 if not has_foreign_runner(task) and is_finished(cfg, runner, checkpoint):
-                    return checkpoint.parent
+                    return checkpoint.parent, None
                 iteration = getattr(runner, "current_learning_iteration", "unknown")
                 print(f"Resumed: {checkpoint}, iteration {iteration}")
             print(f"Run:     {folder.path}", flush=True)
@@ -174,9 +182,11 @@ def _train(
                     report_divergence(env.unwrapped)
         finally:
             env.close()
-    if rank.is_first:
-        write_results(task, cfg, folder.path, device, ended)
-    return folder.path
+    # The launcher takes processes that outlive an interrupted one for stuck.
+    with fail_together():
+        if rank.is_first:
+            write_results(task, cfg, folder.path, device, ended)
+    return folder.path, getattr(runner, "stop_signal", None)
 
 
 @contextlib.contextmanager
@@ -207,6 +217,7 @@ def _learn(
 
         show_training(task, cfg, runner, folder, view)
     ended = "failed"
+    runner.grace = cfg.grace
     try:
         runner.learn(num_learning_iterations=cfg.agent.max_iterations, init_at_random_ep_len=True)
         # A custom runner may have a custom loop that does not call `on_start`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from mjlab.rl.evaluation import required_return
 from mjlab.rl.learners import Learner, learner_of
 from mjlab.scripts.flags import is_given
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
-from mjlab.utils.errors import BadCallError, UserError, check_count
+from mjlab.utils.errors import BadCallError, UserError, check_count, check_in_range
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.logging import print_notice
 from mjlab.utils.os import to_plain
@@ -87,6 +88,10 @@ class TrainConfig:
     """Weights & Biases run to resume, as entity/project/run. Requires --agent.resume True."""
     wandb_checkpoint_name: str | None = None
     """Checkpoint of the Weights & Biases run. None: newest."""
+    grace: float | None = field(default=None, kw_only=True)
+    """Seconds after Ctrl-C or SIGTERM in which the running iteration may finish; after them, or at a second
+    signal, training stops with the one before. None: as long as it takes. For job queues that kill what
+    still runs some time after a signal."""
     live: bool = False
     """Serve a page in the browser that shows the policy during training."""
     live_port: int = 8080
@@ -236,6 +241,8 @@ def _check_numbers(cfg: TrainConfig) -> None:
     if cfg.video:
         counts["--video-interval"] = cfg.video_interval
     check_count("--agent.max-iterations", agent.max_iterations, minimum=0)
+    if cfg.grace is not None:
+        check_in_range("--grace", cfg.grace, 0.0, threading.TIMEOUT_MAX)
     for flag, value in counts.items():
         check_count(flag.replace("_", "-"), value)
     steps = agent.num_steps_per_env * algorithm.get("num_learning_epochs", 1)

@@ -13,12 +13,18 @@ from types import FrameType
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import NO_GPU
 from mjlab.scripts.flags import is_given
-from mjlab.scripts.run_folder import read_run_info, runs_named
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.logging import print_notice
 from mjlab.utils.processes import PARENT_VARIABLE
-from mjlab.utils.signals import FORWARDED, handled_signals, send_signal, start_in_background
+from mjlab.utils.signals import (
+    FORWARDED,
+    Interrupted,
+    handled_signals,
+    interrupting_signal,
+    send_signal,
+    start_in_background,
+)
 
 _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, sequentially (default: 5)."
 
@@ -33,14 +39,11 @@ def command(argv: list[str], prog: str) -> None:
         to_the_end = ["--agent.evaluation.stop-when-solved", "False"]
         arguments = train_command(argv[0], [*to_the_end, *flags], seed)
         arguments += ["--agent.run-name", f"seed_{seed}"]
-        before = runs_named(experiment, f"seed_{seed}")
-        status, stopped = run_forwarding_signals(arguments)
-        # A training process interrupted by a signal also exits with 0.
-        new = [run for run in runs_named(experiment, f"seed_{seed}") if run not in before]
-        interrupted = any(read_run_info(run).get("ended") == "interrupted" for run in new)
-        if stopped or (status == 0 and interrupted):
+        status, received = run_forwarding_signals(arguments)
+        # Others may have stopped the training process.
+        if (stopped := received or interrupting_signal(status)) is not None:
             print(f"Stopped during seed {seed} of {count}; no other seed is trained.")
-            return
+            raise Interrupted(stopped)
         if status != 0:
             raise UserError(f"Training with seed {seed} ended with status {status}.")
 
@@ -92,37 +95,35 @@ def train_command(task: str, flags: list[str], seed: int) -> list[str]:
     return [*command, *flags, "--agent.seed", str(seed)]
 
 
-def run_forwarding_signals(command: list[str], seconds: float | None = None) -> tuple[int, bool]:
-    """Run `command`; return its exit status, and True if this process received a stop signal.
+def run_forwarding_signals(
+    command: list[str], seconds: float | None = None
+) -> tuple[int, signal.Signals | None]:
+    """Run `command`; return its exit status, and the first stop signal that this process received.
 
     SIGINT, SIGTERM and SIGHUP do not end this process: each is forwarded to `command` once, and this
     process waits until `command` has ended, e.g. saved. After `seconds`, `command` receives SIGINT.
     """
     child: subprocess.Popen[bytes] | None = None
-    early: list[int] = []
-    stopped = False
+    received: list[signal.Signals] = []
 
     def forward(number: int, frame: FrameType | None = None) -> None:
-        nonlocal stopped
-        stopped = True
-        if child is None:
-            early.append(number)
-        else:
+        received.append(signal.Signals(number))
+        if child is not None:
             send_signal(child, FORWARDED[number])
 
     with handled_signals(forward, FORWARDED):
-        # A terminal sends Ctrl-C to all of its processes, and a second signal would stop training
-        # without saving.
+        # A terminal sends Ctrl-C to all of its processes, and a second signal would give up the
+        # running iteration.
         child = start_in_background(command, {**os.environ, PARENT_VARIABLE: str(os.getpid())})
-        for number in early:
-            forward(number)
+        for number in tuple(received):
+            send_signal(child, FORWARDED[number])
         try:
-            return child.wait(seconds), stopped
+            status = child.wait(seconds)
         except subprocess.TimeoutExpired:
-            # A second signal would end the child without saving.
-            if not stopped:
+            if not received:
                 send_signal(child, signal.SIGINT)
-            return child.wait(), stopped
+            status = child.wait()
+    return status, received[0] if received else None
 
 
 def plot_command(argv: list[str], prog: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ from mjlab.scripts.reference import (
 from mjlab.scripts.resume import resume_flags
 from mjlab.scripts.run_folder import read_run_info, runs_named, sessions_of
 from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.signals import Interrupted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -201,23 +203,28 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
 
 
 def command(argv: list[str], prog: str) -> None:
-    """Run `verify`: exits 0 if the curve is within the band, 1 if not, 2 for invalid arguments."""
+    """Run `verify`: exits 0 if the curve is within the band, 1 if not, 2 for invalid arguments.
+
+    Raises:
+        Interrupted: training was interrupted.
+    """
     task, *flags = argv
     try:
         cfg, reference, train_cfg, run_dir = _prepare(task, flags, prog)
     except (UserError, ValueError, OSError) as error:
         raise BadCallError(str(error)) from error
+    stopped = None
     if run_dir is None:
-        from mjlab.scripts.train import launch_training
+        from mjlab.scripts.train import train_until_stopped
 
-        run_dir = launch_training(task, train_cfg)
+        run_dir, stopped = train_until_stopped(task, train_cfg)
     try:
         run = read_run(run_dir)
     except NotEvaluatedError:
         if end_of(run_dir) in ENDED:
             raise
         print("So far     no evaluation: the same command with --resume goes on.")
-        raise KeyboardInterrupt from None
+        raise Interrupted(stopped or signal.SIGINT) from None
     runs = [seed.run for seed in reference.seeds]
     comparison = compare(runs, run, reference.standard_error)
     print(f"\n{report(reference, run, comparison)}")
@@ -227,7 +234,7 @@ def command(argv: list[str], prog: str) -> None:
         print(
             f"So far     {part}. Training was {run.ended}: the same command with --resume goes on."
         )
-        raise KeyboardInterrupt
+        raise Interrupted(stopped or signal.SIGINT)
     end = "its end" if comparison.limit is None else "the samples until it is solved"
     where = f"{part}, {end} {'within' if comparison.ends_within else 'outside'}"
     if comparison.is_within:
