@@ -162,6 +162,13 @@ def test_a_task_without_curricula_shows_none(make):
     assert EvaluationResult.from_dict(result.to_dict()).curricula == {}
 
 
+def test_many_curricula_are_counted():
+    curricula = {**{f"rewards.r{i}.weight": float(i) for i in range(9)}, "terrain_levels": [0, 9]}
+    text = curricula_text(curricula)
+    assert text.startswith("rewards.r0.weight 0; ")
+    assert text.endswith("rewards.r4.weight 4; 4 more; terrain levels 0 to 9")
+
+
 def climbs(env: Any, env_ids: Any) -> float:
     terrain = env.scene.terrain
     terrain.terrain_levels[env_ids] = (terrain.terrain_levels[env_ids] + 1) % 5

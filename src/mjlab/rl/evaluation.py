@@ -49,6 +49,8 @@ _STEPS_BETWEEN_CHECKS = 16
 _LONGEST_EPISODE = 1_000_000
 # Fewer episodes say little about failures in one of a hundred.
 _MANY_EPISODES = 200
+# Entries of the state of curricula in a line of text.
+_MOST_CURRICULA = 6
 # Two-sided 95 % quantile of the normal distribution.
 _Z95 = 1.959964
 # Parts of a success function's docstring that describe the tensor.
@@ -480,12 +482,15 @@ def trigger_return(cfg: Mapping[str, Any]) -> float | None:
 
 
 def curricula_text(curricula: Mapping[str, Any]) -> str:
-    """Return `EvaluationResult.curricula` in words, empty if it is."""
+    """Return `EvaluationResult.curricula` in words: the first entries, and how many follow."""
     words = []
     for name, value in curricula.items():
         numbers = [f"{one:.4g}" for one in (value if isinstance(value, (list, tuple)) else [value])]
         joint = " to " if len(numbers) == 2 else ", "
         words.append(f"{name.replace('terrain_levels', 'terrain levels')} {joint.join(numbers)}")
+    # The last entry is that of terrain levels.
+    if (more := len(words) - _MOST_CURRICULA) > 0:
+        words[_MOST_CURRICULA - 1 : -1] = [f"{more} more"]
     return "; ".join(words)
 
 
