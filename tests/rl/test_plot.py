@@ -212,6 +212,12 @@ def test_the_learning_curve_has_goal_evaluations_and_units(tmp_path: Path, figur
     assert above.get_xlim() == pytest.approx((2000.0 * low, 2000.0 * high))
 
 
+@pytest.mark.parametrize("goal", [1e9, float("inf"), float("nan")])
+def test_a_goal_that_nothing_reaches_does_not_flatten_the_curve(tmp_path: Path, figures, goal):
+    plot_run(write_run(tmp_path, {0: 1.0, 1: 2.0}), evaluation={"solved_return": goal})
+    assert figures[0].axes[0].get_ylim()[1] < 3.0
+
+
 def test_goals_besides_the_return_have_their_own_axes(tmp_path: Path, figures):
     others = {
         "Evaluation/mean_return": {1: 3000.0},

@@ -38,6 +38,8 @@ LABELS = {
 _EVERY_ITERATION = "Perf/collection_time"
 # Widths in characters, of a legend and of a handle in it.
 _LEGEND_WIDTH, _LEGEND_HANDLE = 80, 6
+# Goals so many times as high as the curve are not drawn.
+_FAR = 1000.0
 # Small axes side by side.
 _IN_A_ROW = 3
 # Instead of the default: endless episodes have no return, and runs of other packages lack both.
@@ -234,7 +236,13 @@ def _draw_evaluations(
         if (curve := curves.get(f"{group}/{name}")) is not None:
             axes.plot(curve[0] + 1, scale * curve[1], label=group.lower(), **style)
     if goal is not None:
-        axes.axhline(scale * goal.limit, ls="--", lw=1, color="dimgray", zorder=1, label="goal")
+        _draw_goal(axes, scale * goal.limit)
+
+
+def _draw_goal(axes: Axes, goal: float) -> None:
+    # A goal that nothing reaches, to train to the end, would flatten the curve.
+    if abs(goal) <= _FAR * max(1.0, abs(axes.dataLim.y0), abs(axes.dataLim.y1)):
+        axes.axhline(goal, ls="--", lw=1, color="dimgray", zorder=1, label="goal")
 
 
 def _add_environment_steps(axes: Axes, curves: Mapping[str, Curve]) -> None:
@@ -302,7 +310,7 @@ def plot_seeds(
 
     def draw(axes: Axes) -> None:
         if goal is not None:
-            axes.axhline(goal, ls="--", lw=1, color="dimgray", zorder=1, label="goal")
+            _draw_goal(axes, goal)
 
     return plot_curves(drawn, output, title=title, ylabel=LABELS.get(tag, tag), draw=draw)
 
