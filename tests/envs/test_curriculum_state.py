@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -254,6 +255,25 @@ def test_edits_of_a_term_that_is_gone_are_undone(make):
     weight = env.reward_manager.get_term_cfg("smooth_reward").weight
     assert weight > 4.0
     assert other.reward_manager.get_term_cfg("smooth_reward").weight == weight
+
+
+def replaces(env: Any, env_ids: Any) -> None:
+    command: Any = env.command_manager.get_term("target")
+    x = command.cfg.ranges.x[1] + 1.0
+    command.cfg = dataclasses.replace(command.cfg, ranges=Ranges(x=(0.0, x)))
+
+
+def test_replaced_configs_continue(make):
+    def edit(cfg: Any) -> None:
+        cfg.curriculum = {"replaces": CurriculumTermCfg(func=replaces)}
+
+    env, same, other = trained(make, 4, edit=edit), make(4, edit), make(6, edit)
+    x = env.command_manager.get_term_cfg("target").ranges.x
+    assert x[1] > 3.0
+    same.load_state_dict(env.state_dict())
+    assert other.load_curriculum_state(env.curriculum_state()) == []
+    for one in (same, other):
+        assert one.command_manager.get_term_cfg("target").ranges.x == x
 
 
 @pytest.mark.parametrize("same_number", [True, False])

@@ -209,7 +209,7 @@ def _undo(env: ManagerBasedRlEnv) -> None:
 
 def _configs(env: ManagerBasedRlEnv) -> dict[str, Any]:
     return {
-        name: {label: plain_values(cfg) for label, cfg in manager._live_cfgs.items()}
+        name: {label: plain_values(cfg) for label, cfg in manager.live_cfgs().items()}
         for name, manager in managers_of(env).items()
     }
 
@@ -341,12 +341,13 @@ class Fit:
             path: Name of the manager.
         """
         fitting: dict[str, dict[str, Any]] = {}
+        live = manager.live_cfgs()
         for label, edit in edits.items():
             where = f"{path}.{label}"
-            if label not in manager._live_cfgs:
+            if label not in live:
                 self.left_out.append(where)
                 continue
-            cfg, built = manager._live_cfgs[label], manager._built_values[label]
+            cfg, built = live[label], manager._built_values[label]
             edit = self._as_built(edit, was.get(label, {}), built, where)
             fields = {key: getattr(cfg, key) for key in edit if hasattr(cfg, key)}
             self.left_out += [f"{where}.{key}" for key in edit if key not in fields]

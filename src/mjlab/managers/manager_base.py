@@ -143,6 +143,10 @@ class ManagerBase(Tabular, ABC):
         """Return the name and the current values of each term in one environment."""
         return []
 
+    def live_cfgs(self) -> dict[str, Any]:
+        """Return the config that each term reads, by label."""
+        return self._live_cfgs
+
     def config_edits(self) -> dict[str, Any]:
         """Return the changes of term configs since the terms were built.
 
@@ -155,7 +159,7 @@ class ManagerBase(Tabular, ABC):
     def config_changes(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return `config_edits`, and the values at build time that they replaced."""
         edits, replaced = {}, {}
-        for label, cfg in self._live_cfgs.items():
+        for label, cfg in self.live_cfgs().items():
             built, now = self._built_values[label], plain_values(cfg)
             if edit := changes(built, now):
                 edits[label], replaced[label] = edit, changes(now, built)
@@ -167,7 +171,7 @@ class ManagerBase(Tabular, ABC):
         Values not in `edits` are restored to their values at build time, because later edits (e.g.
         by a first reset) may have changed them. Edits of terms that no longer exist are skipped.
         """
-        for label, cfg in self._live_cfgs.items():
+        for label, cfg in self.live_cfgs().items():
             undone = changes(plain_values(cfg), self._built_values[label])
             write_changes(cfg, copy.deepcopy(undone))
             write_changes(cfg, edits.get(label, {}))
@@ -378,6 +382,12 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
     def active_terms(self) -> list[str]:
         """Names of the terms, in order."""
         return list(self._terms)
+
+    def live_cfgs(self) -> dict[str, Any]:
+        """Return the config that each term reads, by name. Curricula may replace `term.cfg`."""
+        return {
+            name: getattr(self._terms[name], "cfg", cfg) for name, cfg in self._live_cfgs.items()
+        }
 
     def get_term(self, name: str) -> TermT:
         """Return the term `name`. Raises `KeyError`, listing the valid names, if unknown."""
