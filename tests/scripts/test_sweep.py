@@ -196,7 +196,7 @@ def test_ctrl_c_stops_all_runs_and_the_same_command_resumes_them(sweep, machine,
     assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
 
 
-@pytest.mark.parametrize("status", [0, 129, 130, 143, -15])
+@pytest.mark.parametrize("status", [129, 130, 143, -15])
 def test_interrupted_runs_are_not_failed(sweep, machine, folder, status):
     machine.interrupts_after, machine.status_of_interrupted = 3, status
     outcome = sweep(*LEARNING, "--folder", str(folder), "--seeds", "2")
@@ -216,7 +216,7 @@ def test_a_run_stopped_alone_is_resumed(sweep, machine, folder):
     argv = (*LEARNING, "--folder", str(folder), "--seeds", "2")
     machine.stopped_alone, machine.status_of_interrupted = "1", 143
     outcome = sweep(*argv)
-    assert outcome.status in (130, 143)
+    assert outcome.status == 143
     assert "Failed" not in outcome.out
     assert [row["state"] for row in rows_of(folder)] == ["interrupted", "waiting"]
     assert sweep(*argv).status == 0

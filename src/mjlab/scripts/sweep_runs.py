@@ -201,8 +201,6 @@ class Runs:
         newest = next(iter(sweep.sessions(setting, run.seed)), None)
         info = {} if newest is None else read_run_info(newest)
         stopped = interrupting_signal(run.process.returncode)
-        if run.process.returncode == 0 and info.get("ended") == "interrupted":
-            stopped = signal.SIGINT
         if (trained := trained_run(sweep, setting, run.seed)) is not None:
             self._count(run, trained)
             value = f"{sweep.objective.label} {trained.value:.4g}"
