@@ -35,22 +35,21 @@ from learning import EVALUATION_SEED  # noqa: E402
 from measure import output_of, processor  # noqa: E402
 
 from mjlab.rl.plot import LABELS, plot_curves  # noqa: E402
+from mjlab.runs import Run  # noqa: E402
+from mjlab.runs.run import DONE  # noqa: E402
 from mjlab.scripts.devices import resolve_device  # noqa: E402
 from mjlab.scripts.reference import (  # noqa: E402
     DATA,
-    ENDED,
     METRIC,
     Kind,
     Reference,
     SeedRecord,
-    end_of,
     read_run,
     reference_path,
     thinned,
     trained_seconds,
 )
 from mjlab.scripts.resume import resume_flags  # noqa: E402
-from mjlab.scripts.run_folder import checkpoints_in  # noqa: E402
 from mjlab.scripts.train_seeds import run_forwarding_signals, train_command  # noqa: E402
 from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, require_task  # noqa: E402
 from mjlab.utils.errors import UserError  # noqa: E402
@@ -157,7 +156,7 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
     _clear_unless_same(folder, {"commit": commit, "flags": reference.train_flags})
     run = _newest_run(folder)
     left = 60.0 * options.minutes - (trained_seconds(run) if run else 0.0)
-    if left > 0 and (run is None or end_of(run) not in ENDED):
+    if left > 0 and (run is None or Run(run).state not in DONE):
         command = train_command(reference.task, reference.train_flags, seed)
         command += ["--device", options.device, "--log-root", str(folder)]
         if run is not None:
@@ -165,16 +164,16 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
         begin = time.monotonic()
         status, stopped = run_forwarding_signals(command, left)
         run = _newest_run(folder)
-        ended = None if run is None else end_of(run)
+        ended = None if run is None else Run(run).state
         # A signal sent to the training process alone ends it with 0 as well.
         if stopped or (ended == "interrupted" and time.monotonic() - begin < left):
             return None
         # The status does not count: the time limit may have passed after training.
-        if ended not in (*ENDED, "interrupted"):
+        if ended not in (*DONE, "interrupted"):
             raise RuntimeError(f"Training of seed {seed} ended with status {status}.")
     assert run is not None
     record = read_run(run)
-    if record.ended not in ENDED:
+    if record.ended not in DONE:
         record = dataclasses.replace(record, ended="minutes")
     return SeedRecord(
         seed=seed,
@@ -199,14 +198,14 @@ def _clear_unless_same(folder: Path, settings: dict[str, Any]) -> None:
 
 def _newest_run(folder: Path) -> Path | None:
     """Return the newest run with a checkpoint, in any experiment."""
-    runs = (path for path in folder.glob("*/*/") if checkpoints_in(path))
+    runs = (path for path in folder.glob("*/*/") if Run(path).checkpoints)
     return max(runs, key=lambda path: path.name, default=None)
 
 
 def _score(reference: Reference, run: Path, seed: int, options: Options) -> dict[str, Any]:
     """Return the output of `evaluate` for the last policy of a run."""
     command = [sys.executable, "-m", "mjlab.scripts.evaluate", reference.task]
-    command += ["--checkpoint-file", str(checkpoints_in(run)[-1]), "--device", options.device]
+    command += ["--checkpoint-file", str(Run(run).newest), "--device", options.device]
     command += ["--num-episodes", str(options.episodes), "--seed", str(seed), "--json", "True"]
     # Flags of the environment apply to the evaluation too.
     flags = reference.flags

@@ -20,9 +20,10 @@ import tyro
 from PIL import Image
 
 from mjlab.rl.checkpoint import latest_checkpoint
+from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.demo import DEMOS
 from mjlab.scripts.environments import make_env
-from mjlab.scripts.policy import make_policy, policy_env_cfg
+from mjlab.scripts.policy import make_policy
 from mjlab.terrains import (
     BoxInvertedPyramidStairsTerrainCfg,
     SubTerrainCfg,
@@ -168,7 +169,7 @@ def save(frames: list[np.ndarray], path: Path) -> None:
 
 def record(clip: Clip, policy: Path, seed: int) -> list[np.ndarray]:
     """Return the frames of a clip, each (height, width, 3), uint8."""
-    cfg = policy_env_cfg(clip.task, clip.profile, purpose="play")
+    cfg = registered_env_cfg(clip.task, clip.profile, "play")
     cfg.scene.env_spacing = clip.spacing
     cfg.scene.spec_fn = light_studio
     # The robot starts at the center of its environment, and walks at one velocity.

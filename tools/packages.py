@@ -225,7 +225,7 @@ class _Worker:
         import torch
 
         from mjlab.envs import ManagerBasedRlEnv
-        from mjlab.scripts.run_folder import checkpoints_in
+        from mjlab.runs import Run
         from mjlab.scripts.train import TrainConfig, launch_training
         from mjlab.tasks.registry import load_env_cfg
 
@@ -248,7 +248,7 @@ class _Worker:
         cfg.agent.num_steps_per_env = NUM_STEPS
         cfg.agent.max_iterations = ITERATIONS
         cfg.agent.logger = "tensorboard"
-        checkpoints = checkpoints_in(launch_training(task, cfg))
+        checkpoints = Run(launch_training(task, cfg)).checkpoints
         if not checkpoints:
             raise FileNotFoundError("training left no checkpoint")
         yield "train"

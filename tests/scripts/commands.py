@@ -20,8 +20,8 @@ import pytest
 import torch
 
 from mjlab.rl.run_logger import IterationStats
+from mjlab.runs import Run
 from mjlab.scripts import cli, display
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 
 TASK = "Mjlab-Cartpole-Swingup"
 SMALL = [
@@ -100,7 +100,7 @@ def stopped_after(iterations: int) -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(display.KeepRunFolder, "on_iteration", stop)
+        patch.setattr(display.RunRecorder, "on_iteration", stop)
         yield
 
 
@@ -128,7 +128,9 @@ def interrupt_training(command: list[str], log_root: Path, patience: float = 60.
     assert process.returncode == 130, out
     assert out.count("SIGINT: finishing this iteration, then saving") == 1
     (run_dir,) = (log_root / "cartpole").iterdir()
-    info = read_run_info(run_dir)
+    info = Run(run_dir).info
     assert info["ended"] == "interrupted"
-    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    assert [c.path for c in Run(run_dir).checkpoints][
+        -1
+    ].name == f"model_{info['iterations'] - 1}.pt"
     return out

@@ -11,10 +11,12 @@ import pytest
 import yaml
 from commands import TASK
 
+from mjlab.runs import Run
+from mjlab.runs.folder import write_info
+from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.flags import suggest_profile
-from mjlab.scripts.policy import env_cfg_of, parse_policy_flags, policy_env_cfg
-from mjlab.scripts.run_folder import read_run_info, write_run_info
+from mjlab.scripts.policy import env_cfg_of, parse_policy_flags
 from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
 from mjlab.tasks.cpu_profile import cpu_profile
@@ -78,7 +80,7 @@ def test_a_profile_sets_what_flags_start_from_and_flags_win():
 
 
 def test_the_run_says_its_profile_and_holds_its_settings(profiled):
-    assert read_run_info(profiled)["profile"] == "cpu"
+    assert Run(profiled).info["profile"] == "cpu"
     assert params(profiled, "agent")["actor"]["hidden_dims"] == [8]
     assert params(profiled, "env")["decimation"] == 3
 
@@ -102,9 +104,9 @@ def test_policies_are_shown_as_evaluations_have_it_and_not_as_the_profile_trains
     assert (
         parse_train_flags("Test-Easier", ["--profile", "cpu"], "train").env.episode_length_s == 5.0
     )
-    assert policy_env_cfg("Test-Easier", "cpu", purpose="evaluate").episode_length_s == 0.1
-    assert policy_env_cfg("Test-Easier", "cpu", purpose="play").episode_length_s == 0.1
-    assert policy_env_cfg("Test-Easier", "cpu", purpose="train").episode_length_s == 5.0
+    assert registered_env_cfg("Test-Easier", "cpu", "evaluate").episode_length_s == 0.1
+    assert registered_env_cfg("Test-Easier", "cpu", "play").episode_length_s == 0.1
+    assert registered_env_cfg("Test-Easier", "cpu", "train").episode_length_s == 5.0
     flags = ["--profile", "cpu", "--env.episode-length-s", "0.3"]
     cfg = parse_policy_flags(EvaluateConfig, flags, "Test-Easier", "evaluate", purpose="evaluate")
     assert env_cfg_of("Test-Easier", cfg, None, purpose="evaluate").episode_length_s == 0.3
@@ -128,7 +130,7 @@ def test_resuming_keeps_the_profile(run, profiled):
     assert "Resuming with the profile 'cpu'" in outcome.err
     assert "random numbers restart" not in outcome.err
     (resumed,) = set(profiled.parent.iterdir()) - {profiled}
-    assert read_run_info(resumed)["profile"] == "cpu"
+    assert Run(resumed).info["profile"] == "cpu"
     assert params(resumed, "env")["decimation"] == 3
     assert params(resumed, "env")["scene"]["num_envs"] == 6
     # Without the profile the networks differ, and loading the checkpoint raises.
@@ -179,7 +181,7 @@ def test_play_without_the_profile_refuses_the_policy(run, profiled):
 
 
 def test_a_profile_that_the_task_no_longer_has_is_told(run, profiled):
-    write_run_info(profiled, profile="gone")
+    write_info(profiled, profile="gone")
     flags = ("--log-root", str(profiled.parents[1]), "--device", "cpu")
     outcome = run("play", PROFILED, "--viewer", "none", "--num-steps", "2", *flags)
     assert outcome.status == 1

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 import pytest
 
+from mjlab.runs import Checkpoint
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.flags import options_of, prepare_env_cfg, with_task_options
 from mjlab.scripts.play import PlayConfig
@@ -88,11 +89,11 @@ def test_flags_of_a_task_are_in_its_help(capsys):
 
 
 def test_a_task_prepares_a_copy_of_its_config_before_it_is_built(tmp_path):
-    checkpoint = tmp_path / "model_3.pt"
+    checkpoint = Checkpoint(tmp_path / "model_3.pt")
     flags = ["--agent", "zero", "--pole-colour", "blue", "--wandb-run-path", "org/p/run"]
     cfg = parse_policy_flags(PlayConfig, flags, TASK, "play", purpose="play")
     env_cfg = env_cfg_of(TASK, cfg, checkpoint, purpose="play")
-    assert env_cfg.prepared == ("blue", PolicyOrigin(TASK, checkpoint, "org/p/run"))
+    assert env_cfg.prepared == ("blue", PolicyOrigin(TASK, checkpoint.path, "org/p/run"))
     assert not hasattr(cfg.env, "prepared")
     # A file on disk is of no run at Weights & Biases.
     cfg.checkpoint_file = str(checkpoint)

@@ -8,11 +8,11 @@ import sys
 
 import pytest
 
+from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.flags import parse_flags, with_task_options
 from mjlab.scripts.help import MISSING, SCREENS, lookup, requested_topic, screen_text
 from mjlab.scripts.play import PlayConfig
-from mjlab.scripts.policy import policy_env_cfg
 from mjlab.scripts.profile_env import ProfileConfig
 from mjlab.scripts.train_config import TrainConfig
 from mjlab.tasks.registry import list_tasks
@@ -32,7 +32,7 @@ def flags_in(text: str) -> set[str]:
 
 def config(command: str, task: str):
     if command in POLICY_FLAGS:
-        env = policy_env_cfg(task, None, purpose="play" if command == "play" else "train")
+        env = registered_env_cfg(task, None, "play" if command == "play" else "train")
         return with_task_options(POLICY_FLAGS[command](env=env), task)
     return with_task_options(TrainConfig.from_task(task), task)
 

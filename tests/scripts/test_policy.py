@@ -11,7 +11,9 @@ import yaml
 from rsl_rl.utils import resolve_callable
 
 from mjlab.rl.learners import acting_cfg
-from mjlab.scripts.policy import _agent_cfg, constant_policy
+from mjlab.runs import Run
+from mjlab.runs.folder import write_info
+from mjlab.scripts.policy import constant_policy
 from mjlab.tasks.registry import load_rl_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -20,14 +22,14 @@ TASK = "Mjlab-Cartpole-Swingup"
 def agent_cfg_beside(folder, params):
     (folder / "params").mkdir()
     (folder / "params" / "agent.yaml").write_text(yaml.safe_dump(params))
-    return _agent_cfg(TASK, folder / "model_1.pt")
+    return acting_cfg(Run(folder, TASK).cfg().agent)
 
 
 def test_sizes_of_the_run_replace_those_of_the_task(tmp_path):
     cfg = agent_cfg_beside(
         tmp_path, {"actor": {"hidden_dims": [8, 4], "activation": "relu", "rnn_num_layers": 2}}
     )
-    assert cfg["actor"]["hidden_dims"] == [8, 4]
+    assert cfg["actor"]["hidden_dims"] == (8, 4)
     assert cfg["actor"]["activation"] == "relu"
     assert cfg["actor"]["rnn_num_layers"] == 2
     assert cfg["critic"] == agent_cfg_of_task()["critic"]
@@ -95,10 +97,8 @@ def test_runs_of_tracking_are_evaluated_and_played_with_the_class_they_had(
 def test_settings_that_no_network_has_are_said_to_be_the_runs(run, trained, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
-    params = folder / "params" / "agent.yaml"
-    saved = yaml.safe_load(params.read_text())
-    saved["actor"]["activation"] = "nonsense"
-    params.write_text(yaml.safe_dump(saved))
+    settings = Run(folder).settings
+    write_info(folder, settings={**settings, "agent.actor.activation": "nonsense"})
     checkpoint = str(next(folder.glob("model_*.pt")))
     outcome = run("evaluate", TASK, "--device", "cpu", "--checkpoint-file", checkpoint)
     assert outcome.status == 1
@@ -130,7 +130,7 @@ def test_nothing_else_in_a_run_folder_reaches_the_networks(tmp_path, actor):
 
 
 def test_a_run_folder_that_says_nothing_leaves_the_task_as_it_is(tmp_path):
-    assert _agent_cfg(TASK, tmp_path / "model_1.pt") == agent_cfg_of_task()
+    assert acting_cfg(Run(tmp_path, TASK).cfg().agent) == agent_cfg_of_task()
 
 
 def test_constant_policies_have_the_shape_of_the_actions():

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjlab.rl.plot import read_scalars
+from mjlab.runs import Run
 from mjlab.scripts.reference import (
     FALSE_ALARMS,
     Reference,
@@ -26,7 +27,6 @@ from mjlab.scripts.reference import (
     samples_limit,
     thinned,
 )
-from mjlab.scripts.run_folder import read_run_info, sessions_of
 from mjlab.utils.errors import UserError
 
 # An evaluation after every iteration, of short episodes.
@@ -290,8 +290,8 @@ def test_a_resumed_run_has_the_curve_of_an_uninterrupted_one(
         (first / "model_2.pt").unlink()
     second = train(tmp_path, 3, *EVALUATED, "--agent.resume", "True")
     third = train(tmp_path, 4, *EVALUATED, "--agent.resume", "True")
-    assert read_run_info(third)["resumed"] == f"{second.name}/model_2.pt"
-    assert sessions_of(third) == [first, second, third]
+    assert Run(third).info["resumed"] == f"{second.name}/model_2.pt"
+    assert [run.folder for run in Run(third).joined] == [first, second, third]
     resumed, whole = read_run(third), read_run(uninterrupted)
     assert times_dropped(resumed) == times_dropped(whole)
     assert resumed.seconds > read_run(first).seconds_at[1]
@@ -314,7 +314,7 @@ def test_a_run_that_is_solved_as_it_is_resumed_has_its_last_evaluation(train, tm
     with stopped_after(2):
         first = train(tmp_path, 4, *solved)
     second = train(tmp_path, 4, *solved, "--agent.resume", "True")
-    assert read_run_info(first)["ended"] == "interrupted"
+    assert Run(first).info["ended"] == "interrupted"
     run = read_run(second)
     assert (run.ended, run.iterations, run.samples_at) == ("solved", 2, [256])
 

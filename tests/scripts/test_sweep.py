@@ -20,9 +20,10 @@ from commands import TASK
 
 from mjlab.managers import CurriculumTermCfg, TerminationTermCfg
 from mjlab.rl.config import EvaluationCfg
+from mjlab.runs import Run
+from mjlab.runs.folder import write_info, write_params
 from mjlab.scripts import cli
 from mjlab.scripts.reference import read_scalars_of_sessions
-from mjlab.scripts.run_folder import read_run_info, write_params, write_run_info
 from mjlab.scripts.sweep_objective import choose_objective
 from mjlab.scripts.sweep_settings import Axis, Sweep
 from mjlab.scripts.train_config import TrainConfig, return_differences
@@ -99,7 +100,7 @@ def write_run(run_dir: Path, ended: str, results: dict[str, float]) -> None:
     run_dir.mkdir(parents=True)
     agent = TrainConfig.from_task(TASK).agent
     write_params(run_dir, agent, agent)
-    write_run_info(run_dir, task=TASK, learner="ppo", ended=ended, iterations=3)
+    write_info(run_dir, task=TASK, learner="ppo", ended=ended, iterations=3)
     (run_dir / "model_2.pt").touch()
     with SummaryWriter(str(run_dir)) as writer:
         for i in range(3):
@@ -618,7 +619,7 @@ def test_a_run_is_resumed_from_the_last_checkpoint_with_iterations_left(monkeypa
             checkpoint = sweep.runs_folder({"x": "1"}) / name / f"model_{number}.pt"
             checkpoint.parent.mkdir(parents=True, exist_ok=True)
             checkpoint.touch()
-        write_run_info(checkpoint.parent, ended="interrupted", iterations=3)
+        write_info(checkpoint.parent, ended="interrupted", iterations=3)
     assert sweep.finished_run({"x": "1"}, 1) is None
     found = sweep.last_checkpoint({"x": "1"}, 1)
     assert found is not None
@@ -648,7 +649,7 @@ def test_a_sweep_that_trains_is_interrupted_and_continued(tmp_path):
     for setting in ("1e-4", "1e-3"):
         for seed in (1, 2):
             *_, last = sorted((folder / "runs" / f"learning-rate={setting}").glob(f"*seed_{seed}"))
-            assert read_run_info(last)["iterations"] == 2
+            assert Run(last).info["iterations"] == 2
             # Exactly the last iteration was evaluated, and no iteration is missing.
             scalars = read_scalars_of_sessions(last)
             assert sorted(scalars["Perf/collection_time"]) == [0, 1]

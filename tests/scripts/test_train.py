@@ -12,8 +12,8 @@ from commands import SMALL
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mjlab.rl.checkpoint import load_checkpoint
+from mjlab.runs import Run
 from mjlab.scripts.flags import parse_flags
-from mjlab.scripts.run_folder import read_run_info
 from mjlab.scripts.train import TrainConfig, launch_training, run_train
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -106,9 +106,9 @@ def test_a_run_leaves_all_its_files(trained):
     assert {path.name for path in trained.glob("model_*.pt")} == {"model_0.pt", "model_1.pt"}
     agent = yaml.safe_load((trained / "params" / "agent.yaml").read_text())
     assert (agent["seed"], agent["max_iterations"]) == (7, 2)
-    assert read_run_info(trained)["ended"] == "finished"
-    assert read_run_info(trained)["iterations"] == 2
-    assert read_run_info(trained)["task"] == TASK
+    assert Run(trained).info["ended"] == "finished"
+    assert Run(trained).info["iterations"] == 2
+    assert Run(trained).info["task"] == TASK
     assert (trained / f"{trained.name}.onnx").stat().st_size > 1000
     assert (trained / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     assert list(trained.glob("events.out.tfevents.*"))
@@ -131,14 +131,14 @@ def test_the_start_says_what_runs_where(run, tmp_path):
 def test_two_runs_begun_at_once_have_folders_of_their_own(train, tmp_path, monkeypatch):
     import datetime
 
-    from mjlab.scripts import run_folder
+    from mjlab.runs import folder
 
     class Stopped(datetime.datetime):
         @classmethod
         def now(cls, tz=None):
             return cls(2026, 1, 2, 3, 4, 5)
 
-    monkeypatch.setattr(run_folder, "datetime", Stopped)
+    monkeypatch.setattr(folder, "datetime", Stopped)
     names = [train(tmp_path, 1).name for _ in range(2)]
     assert names == ["2026-01-02_03-04-05", "2026-01-02_03-04-05-2"]
 
@@ -232,8 +232,8 @@ def test_training_stops_by_itself_once_solved(train, tmp_path):
         tmp_path, 6, "--agent.evaluation.solved-return", "-1", "--agent.evaluation.num-episodes",
         "4", "--env.episode-length-s", "0.5", "--agent.evaluation.min-interval", "1",
     )  # fmt: skip
-    assert read_run_info(run_dir)["ended"] == "solved"
-    assert read_run_info(run_dir)["iterations"] < 6
+    assert Run(run_dir).info["ended"] == "solved"
+    assert Run(run_dir).info["iterations"] < 6
 
 
 def test_the_names_of_the_parts_are_those_of_the_interface():

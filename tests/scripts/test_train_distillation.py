@@ -6,7 +6,7 @@ import pytest
 import yaml
 from commands import SMALL, TASK
 
-from mjlab.scripts.run_folder import checkpoints_in
+from mjlab.runs import Run
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 STUDENT = ("--learner", "distillation")
@@ -17,7 +17,7 @@ def student(run, train, tmp_path_factory):
     """Return the runs of a teacher of another size than the task's, and of its student."""
     logs = tmp_path_factory.mktemp("distillation") / "logs"
     teacher = train(logs, 2, "--agent.actor.hidden-dims", "16,24")
-    checkpoint = str(checkpoints_in(teacher)[-1])
+    checkpoint = str([c.path for c in Run(teacher).checkpoints][-1])
     return teacher, train(logs, 2, *STUDENT, "--agent.teacher-checkpoint", checkpoint)
 
 
@@ -32,7 +32,7 @@ def test_a_student_is_resumed_evaluated_and_played_from_both_files(run, train, s
     argv = ["--log-root", str(logs), "--device", "cpu"]
     resumed = train(logs, 3, "--agent.resume", "True", "--agent.load-run", student[1].name)
     outputs = []
-    for path in (checkpoints_in(resumed)[-1], next(resumed.glob("*.onnx"))):
+    for path in ([c.path for c in Run(resumed).checkpoints][-1], next(resumed.glob("*.onnx"))):
         flags = ["--checkpoint-file", str(path), "--num-episodes", "4", "--seed", "3"]
         outcome = run("evaluate", TASK, *argv, *flags, "--env.episode-length-s", "2")
         assert outcome.status == 0, outcome.err
@@ -42,13 +42,13 @@ def test_a_student_is_resumed_evaluated_and_played_from_both_files(run, train, s
 
 def test_a_teacher_that_ppo_did_not_train_is_refused(run, student, tmp_path):
     argv = [TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT, "--agent.teacher-checkpoint"]
-    outcome = run("train", *argv, str(checkpoints_in(student[1])[-1]))
+    outcome = run("train", *argv, str([c.path for c in Run(student[1]).checkpoints][-1]))
     assert outcome.status == 1
     assert "expected a checkpoint of the learner 'ppo'" in outcome.message
 
 
 def test_flags_that_would_teach_nothing_are_refused(run, student, tmp_path):
-    teacher = str(checkpoints_in(student[0])[-1])
+    teacher = str([c.path for c in Run(student[0]).checkpoints][-1])
     argv = [TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT]
     outcome = run("train", *argv, "--agent.algorithm.gradient-length", "9")
     assert "gradient-length: expected at most 8" in outcome.message
@@ -72,7 +72,7 @@ def test_a_blind_student_follows_a_teacher_with_a_scan(run, tmp_path):
     ):
         outcome = run("train", *argv, *flags)
         assert outcome.status == 0, outcome.err
-    checkpoint = checkpoints_in(max((tmp_path / "go1_velocity").iterdir()))[-1]
+    checkpoint = Run(max((tmp_path / "go1_velocity").iterdir())).newest.path
     for path in (checkpoint, next(checkpoint.parent.glob("*.onnx"))):
         flags = ["--checkpoint-file", str(path), "--num-episodes", "2", "--device", "cpu"]
         outcome = run("evaluate", task, *flags, "--env.episode-length-s", "1", "--seed", "1")

@@ -11,7 +11,7 @@ from commands import SMALL, TASK
 
 from mjlab.rl import MjlabOnPolicyRunner
 from mjlab.rl.divergence import RolloutWatch
-from mjlab.scripts.run_folder import NewRunFolder
+from mjlab.runs.folder import NewRunFolder
 from mjlab.utils.os import create_locked, temporary_path
 
 
@@ -124,7 +124,7 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
         # Event files are written every ten seconds.
         "    time.time = lambda: now() + 1000.0 * stats.iteration\n"
         "    time.sleep(0.02)\n"
-        "display.KeepRunFolder.on_iteration = limit\n"
+        "display.RunRecorder.on_iteration = limit\n"
         "from mjlab.scripts.train import main\n"
         "main()\n"
     )

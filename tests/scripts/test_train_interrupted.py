@@ -17,7 +17,7 @@ from commands import SMALL, TASK
 
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.rl.plot import read_scalars
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info
+from mjlab.runs import Run
 
 PATIENCE = 60.0
 
@@ -51,7 +51,7 @@ def assert_resumes_exactly(
     train, log_root: Path, run_dir: Path, tmp_path: Path, *flags: str
 ) -> Path:
     """Resume what is in `run_dir`, and compare with a run that was never ended."""
-    last = checkpoints_in(run_dir)[-1]
+    last = [c.path for c in Run(run_dir).checkpoints][-1]
     iterations = load_checkpoint(last)["iterations_finished"] + 2
     resumed = train(log_root, iterations, "--agent.resume", "True", *flags)
     straight = train(tmp_path / "straight", iterations, *flags)
@@ -85,9 +85,11 @@ def test_sigterm_saves_exports_and_ends_with_its_status(train, tmp_path):
     assert "SIGTERM: finishing this iteration, then saving" in out
     assert "Interrupted at" in out
     (run_dir,) = (log_root / "cartpole").iterdir()
-    info = read_run_info(run_dir)
+    info = Run(run_dir).info
     assert info["ended"] == "interrupted"
-    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    assert [c.path for c in Run(run_dir).checkpoints][
+        -1
+    ].name == f"model_{info['iterations'] - 1}.pt"
     assert list(run_dir.glob("*.onnx"))
     assert_resumes_exactly(train, log_root, run_dir, tmp_path)
 
@@ -102,7 +104,7 @@ def test_an_evaluation_ends_at_a_signal_and_is_made_up_for(train, tmp_path):
     out = process.communicate(timeout=PATIENCE)[0]
     assert process.returncode == 143, out
     (run_dir,) = (log_root / "cartpole").iterdir()
-    assert [path.name for path in checkpoints_in(run_dir)] == ["model_0.pt"]
+    assert [c.path.name for c in Run(run_dir).checkpoints] == ["model_0.pt"]
     assert load_checkpoint(run_dir / "model_0.pt")["owes_evaluation"]
     flags = (*flags[:-1], "4")
     resumed = assert_resumes_exactly(train, log_root, run_dir, tmp_path, *flags)
@@ -124,9 +126,9 @@ def test_a_long_iteration_is_given_up(tmp_path, flags):
     assert "is given up" in out
     assert "Failed" not in out
     (run_dir,) = (log_root / "cartpole").iterdir()
-    info = read_run_info(run_dir)
+    info = Run(run_dir).info
     assert info["ended"] == "interrupted"
-    last = load_checkpoint(checkpoints_in(run_dir)[-1])
+    last = Run(run_dir).newest.content
     assert last["iterations_finished"] == info["iterations"]
     assert "observations" in last["training_state"]
 
@@ -149,9 +151,9 @@ def test_a_terminal_that_is_closed_leaves_a_checkpoint(tmp_path):
     os.close(terminal)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     (run_dir,) = (log_root / "cartpole").iterdir()
-    info = read_run_info(run_dir)
+    info = Run(run_dir).info
     assert (status, info["ended"]) == (129, "interrupted")
-    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    assert Run(run_dir).newest.path.name == f"model_{info['iterations'] - 1}.pt"
 
 
 def read_until_closed(terminal: int) -> None:
@@ -200,6 +202,8 @@ def test_a_signal_that_ends_the_reader_of_a_pipe_first_leaves_a_checkpoint(tmp_p
     process.send_signal(signal.SIGINT)
     assert process.wait(PATIENCE) == 130
     (run_dir,) = (log_root / "cartpole").iterdir()
-    info = read_run_info(run_dir)
+    info = Run(run_dir).info
     assert info["ended"] == "interrupted"
-    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    assert [c.path for c in Run(run_dir).checkpoints][
+        -1
+    ].name == f"model_{info['iterations'] - 1}.pt"

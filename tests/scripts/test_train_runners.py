@@ -12,8 +12,8 @@ from rsl_rl.models import MLPModel
 from rsl_rl.runners import OnPolicyRunner
 
 from mjlab.rl import MjlabOnPolicyRunner
+from mjlab.runs import Run
 from mjlab.scripts import train
-from mjlab.scripts.run_folder import read_run_info
 from mjlab.tasks import registry
 
 OWN = "Test-Own"
@@ -124,7 +124,7 @@ def test_a_runner_needs_no_attributes(run, own_task, tmp_path):
     assert outcome.status == 0, outcome.err
     assert SEEN["learned"] == 2
     assert "no observers" in outcome.err
-    info = read_run_info(folder)
+    info = Run(folder).info
     assert (info["ended"], info["iterations"]) == ("finished", 2)
     assert "use_mixed_precision" not in SEEN["cfg"]["algorithm"]
     assert SEEN["cfg"]["actor"]["cnn_cfg"] is None
@@ -164,7 +164,7 @@ def test_a_failed_runner_keeps_its_folder(run, own_task, tmp_path):
     with pytest.raises(RuntimeError, match="on fire"):
         trains(run, tmp_path)
     (folder,) = (tmp_path / "cartpole").iterdir()
-    assert read_run_info(folder)["ended"] == "failed"
+    assert Run(folder).info["ended"] == "failed"
     assert (folder / "model_2.pt").exists()
 
 
@@ -172,7 +172,7 @@ def test_a_runner_of_rsl_rl_trains_and_resumes(run, own_task, tmp_path):
     own_task(RslRunner)
     outcome, folder = trains(run, tmp_path)
     assert outcome.status == 0, outcome.err
-    assert read_run_info(folder)["iterations"] == 1
+    assert Run(folder).info["iterations"] == 1
     outcome, folder = trains(run, tmp_path, "--agent.resume", "True")
     assert outcome.status == 0, outcome.err
     assert sorted(path.name for path in folder.glob("model_*.pt"))[-1] == "model_2.pt"

@@ -12,7 +12,7 @@ from commands import SMALL, interrupt_training
 
 from mjlab.rl import EvaluationCfg
 from mjlab.rl.plot import read_scalars
-from mjlab.scripts.run_folder import read_run_info
+from mjlab.runs import Run
 from mjlab.tasks import registry
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -81,7 +81,7 @@ def test_a_solved_seed_goes_on_to_its_last_iteration_and_is_evaluated(
     outcome = run("train_seeds", easy, *SMALL[:-4], *flags, "--env.episode-length-s", "0.2")
     assert outcome.status == 0, outcome.err
     (run_dir,) = (tmp_path / "cartpole").iterdir()
-    info = read_run_info(run_dir)
+    info = Run(run_dir).info
     assert (info["ended"], info["iterations"]) == ("finished", 3)
     iterations, _ = read_scalars(run_dir, "Evaluation/mean_return")
     assert list(iterations) == [0, 1, 2]
@@ -188,7 +188,7 @@ def test_an_interrupted_seed_ends_the_series(run, monkeypatch, child, received, 
         return (child, received) if len(trained) == 2 else (0, None)
 
     monkeypatch.setattr("mjlab.scripts.train_seeds.run_forwarding_signals", pretend)
-    outcome = run("train_seeds", TASK, "--seeds", "3")
+    outcome = run("train_seeds", TASK, "--seeds", "3", "--device", "cpu")
     assert (outcome.status, outcome.err) == (status, "")
     assert len(trained) == 2
     assert "Stopped during seed 2 of 3" in outcome.out

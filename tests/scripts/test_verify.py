@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from commands import run_script, stopped_after
 
+from mjlab.runs import Run
 from mjlab.scripts.reference import DATA, Reference, read_run, reference_path
-from mjlab.scripts.run_folder import read_run_info
 from mjlab.scripts.train_seeds import run_forwarding_signals
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -157,7 +157,7 @@ def test_training_ends_where_the_shortest_run_of_the_reference_did(verify, tmp_p
 
     assert verify(edit=shorten).status == 0
     (run_dir,) = (tmp_path / "logs" / "cartpole").iterdir()
-    assert read_run_info(run_dir)["iterations"] == 2
+    assert Run(run_dir).info["iterations"] == 2
 
 
 def test_where_all_seeds_were_solved_one_that_is_not_in_time_is_outside(verify, tmp_path):
@@ -170,7 +170,7 @@ def test_where_all_seeds_were_solved_one_that_is_not_in_time_is_outside(verify, 
     assert "Solved     not; reference after 128 to 128, a healthy seed within" in outcome.out
     assert "the samples until it is solved outside" in outcome.out
     (run_dir,) = (tmp_path / "logs" / "cartpole").iterdir()
-    assert ITERATIONS < read_run_info(run_dir)["iterations"] <= 4 * ITERATIONS
+    assert ITERATIONS < Run(run_dir).info["iterations"] <= 4 * ITERATIONS
 
 
 def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):

@@ -205,7 +205,10 @@ def wandb_files(monkeypatch):
     """The files of the only run of a made-up server; without it, asking the server fails."""
     names = ["model_50.pt", "model_400.pt", "model_x.pt", "config.yaml"]
     files = {name: FakeWandbFile(name) for name in names}
-    run = types.SimpleNamespace(files=lambda: list(files.values()), file=files.__getitem__)
+    config = {"env_cfg": {"decimation": 2}, "train_cfg": {"seed": 7}, "note": "..."}
+    run = types.SimpleNamespace(
+        files=lambda: list(files.values()), file=files.__getitem__, config=config
+    )
     api = types.SimpleNamespace(run={"me/project/abc": run}.__getitem__)
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(Api=lambda: api))
@@ -231,6 +234,8 @@ def test_the_highest_wandb_checkpoint_is_downloaded_once(tmp_path, wandb_files):
     assert (path, was_cached) == (tmp_path / "wandb_checkpoints" / "abc" / "model_400.pt", False)
     assert path.read_text() == "model_400.pt"
     assert get_wandb_checkpoint_path(tmp_path, Path("me/project/abc")) == (path, True)
+    params = {p.name: p.read_text() for p in (path.parent / "params").iterdir()}
+    assert params == {"env.yaml": "decimation: 2\n", "agent.yaml": "seed: 7\n"}
     # Asked for by name, a cached file needs no server.
     wandb_files.clear()
     assert get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"), path.name) == (path, True)
@@ -247,7 +252,7 @@ def test_a_broken_download_is_not_cached(tmp_path, wandb_files):
     wandb_files["model_400.pt"].fails = True
     with pytest.raises(ConnectionError):
         get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
-    assert list((tmp_path / "wandb_checkpoints" / "abc").iterdir()) == []
+    assert list((tmp_path / "wandb_checkpoints" / "abc").glob("*.pt")) == []
 
 
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])

@@ -21,7 +21,7 @@ import tempfile
 import warnings
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,9 +29,8 @@ import numpy as np
 import torch
 
 from mjlab.envs.env_state import curricula_in
-from mjlab.rl.learners import Learner
 from mjlab.utils.errors import MjlabError, UserError, check_count, check_positive
-from mjlab.utils.os import replacing
+from mjlab.utils.os import checkpoint_names, replacing
 from mjlab.utils.random import rng_state, set_rng_state
 from mjlab.utils.torch import to_device
 
@@ -194,24 +193,8 @@ def latest_checkpoint(folder: Path) -> Path | None:
     """Return the `model_<number>.pt` with the highest number in `folder`, or None."""
     if not folder.is_dir():
         return None
-    numbered = {
-        int(match.group(1)): path
-        for path in folder.iterdir()
-        if (match := re.fullmatch(r"model_(\d+)\.pt", path.name))
-    }
-    return numbered[max(numbered)] if numbered else None
-
-
-def learner_of_checkpoint(path: str | os.PathLike[str]) -> Learner:
-    """Return the learner that wrote a checkpoint.
-
-    Raises:
-        CheckpointError: see `load_checkpoint`.
-    """
-    checkpoint = load_checkpoint(path)
-    if "student_state_dict" in checkpoint:
-        return "distillation"
-    return "sac" if _SAC_KEY in checkpoint else "ppo"
+    names = checkpoint_names(path.name for path in folder.iterdir())
+    return folder / names[-1] if names else None
 
 
 def ensure_writable_folder(folder: str | os.PathLike[str]) -> Path:
@@ -536,6 +519,70 @@ def not_finite(value: Any, name: str = "") -> list[str]:
         return []
     prefix = f"{name}." if name else ""
     return [found for key, item in items for found in not_finite(item, f"{prefix}{key}")]
+
+
+# Terms of observations and actions.
+
+
+def term_shapes(env: Any) -> dict[str, Any]:
+    """Return names and shapes of observation terms by group, and of action terms, in their order.
+
+    Empty for environments without managers.
+    """
+    env = getattr(env, "unwrapped", env)
+    observations = getattr(env, "observation_manager", None)
+    actions = getattr(env, "action_manager", None)
+    if observations is None or actions is None:
+        return {}
+    return {
+        "observations": {
+            group: {
+                name: list(shape)
+                for name, shape in zip(names, observations.group_obs_term_dim[group], strict=True)
+            }
+            for group, names in observations.active_terms.items()
+        },
+        "actions": {name: [actions.get_term(name).action_dim] for name in actions.active_terms},
+    }
+
+
+def check_terms(saved: Any, env: Any, groups: Iterable[str], path: str) -> None:
+    """Check that the terms of `groups` and the actions of `env` are those in a checkpoint.
+
+    Networks of equal sizes would otherwise read other terms than those they were trained with.
+
+    Args:
+        saved: Result of `term_shapes`, from the checkpoint; empty if unknown.
+        env: Environments.
+        groups: Observation groups of the networks to load.
+        path: Checkpoint file, for messages.
+
+    Raises:
+        CheckpointError: names, order or shapes differ.
+    """
+    now = term_shapes(env)
+    if not saved or not now:
+        return
+    pairs = {
+        f"observations.{group}": (saved["observations"].get(group), now["observations"].get(group))
+        for group in groups
+    }
+    pairs["actions"] = saved["actions"], now["actions"]
+    lines = [
+        f"  {name}: trained with {_listed(trained)}, got {_listed(found)}"
+        for name, (trained, found) in pairs.items()
+        if None not in (trained, found) and list(trained.items()) != list(found.items())
+    ]
+    if lines:
+        raise CheckpointError(
+            f"Checkpoint {path!r} was trained with other terms, or in another order:\n"
+            + "\n".join(lines)
+            + "\nUse the task as it was trained, or train again."
+        )
+
+
+def _listed(terms: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {tuple(shape)}" for name, shape in terms.items()) or "nothing"
 
 
 # Exact resume.

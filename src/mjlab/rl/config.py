@@ -274,8 +274,8 @@ class RslRlBaseRunnerCfg:
     """Weights & Biases project."""
     wandb_tags: tuple[str, ...] = ()
     """Weights & Biases tags of the run."""
-    resume: bool = False
-    """Resume from a checkpoint."""
+    resume: bool | Literal["auto"] = False
+    """Resume from a checkpoint. `auto`: if there is one, else start a new run, as job scripts need."""
     load_run: str = ".*"
     """Run folder to resume from: regular expression; the newest match is used."""
     load_checkpoint: str = "model_.*.pt"

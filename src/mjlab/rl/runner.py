@@ -31,6 +31,7 @@ from mjlab.rl.checkpoint import (
     RunRescue,
     capture_training_state,
     check_fits,
+    check_terms,
     load_algorithm,
     load_checkpoint,
     migrate,
@@ -39,6 +40,7 @@ from mjlab.rl.checkpoint import (
     restore_training_state,
     save_checkpoint,
     set_deviation,
+    term_shapes,
 )
 from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
@@ -124,6 +126,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             reward_unit=reward_unit(self.env),
             episode_steps=time_limit(self.env),
         )
+        self.task: str | None = None
+        """Name of the task, recorded in checkpoints."""
         self.observers: list[TrainingObserver] = []
         self.stop_reason: str | None = None
         self.stop_signal: signal.Signals | None = None
@@ -556,6 +560,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """
         # torch's optimizers keep the loaded tensors, and write to them.
         checkpoint = migrate(copy.deepcopy(content), str(path))
+        groups = {
+            group
+            for network, names in (self.cfg.get("obs_groups") or {}).items()
+            for group in names
+            if load_cfg is None or load_cfg.get(network)
+        }
+        check_terms(checkpoint.get("sizes"), self.env, sorted(groups), str(path))
         storage: Any = getattr(self.alg, "storage", None)
         replay = None
         if load_cfg is None and isinstance(storage, ReplayStorage):
@@ -661,6 +672,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             **self._evaluation_entries(),
             # Of the state, not of the file: the same if it is saved again before the next iteration.
             "identity": f"{self._token}-{done}",
+            "task": self.task,
+            "sizes": term_shapes(self.env),
         }
 
     def _evaluation_entries(self) -> dict[str, Any]:

@@ -187,6 +187,16 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         ),
     ),
     Command(
+        "runs",
+        "watch",
+        "your runs of a task, their settings and scores",
+        "mjlab.scripts.runs:command",
+        "TASK",
+        "List the runs of a task, the last started first: state, finished iterations, mean return of the last\n"
+        "evaluation, size on disk, and settings that differ from the task.",
+        ("mjlab runs Mjlab-Cartpole-Swingup", "mjlab runs Mjlab-Cartpole-Swingup --json"),
+    ),
+    Command(
         "list-envs",
         "build",
         "tasks and their profiles",

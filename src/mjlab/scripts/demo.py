@@ -35,11 +35,11 @@ DEMOS = {
 
 def demo_cfg(demo: Demo) -> PlayConfig:
     """Return the default flags of `demo`: one robot, on the CPU, in the browser."""
+    from mjlab.runs.run import registered_env_cfg
     from mjlab.scripts.play import PlayConfig
-    from mjlab.scripts.policy import policy_env_cfg
     from mjlab.sensor import RayCastSensorCfg
 
-    env = policy_env_cfg(demo.task, demo.profile, purpose="play")
+    env = registered_env_cfg(demo.task, demo.profile, "play")
     for sensor in env.scene.sensors:
         # Rays would distract from the robot.
         if isinstance(sensor, RayCastSensorCfg):

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.flags import (
     parse_flags,
     parse_known_flags,
     prepare_env_cfg,
     with_task_options,
 )
-from mjlab.scripts.policy import policy_env_cfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.string import counted
@@ -94,7 +94,7 @@ def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:
 
 def _env_cfg(task: str, choice: ConfigChoice) -> ManagerBasedRlEnvCfg:
     if choice.play:
-        return policy_env_cfg(task, choice.profile, purpose="play")
+        return registered_env_cfg(task, choice.profile, "play")
     return load_env_cfg(task, profile=choice.profile)
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rich.console import Console
 from rich.live import Live
 
-from mjlab.rl.evaluation import Bound, EvaluationResult, curricula_text
+from mjlab.rl.evaluation import RESULT_FIELDS, Bound, EvaluationResult, curricula_text
 from mjlab.rl.progress import (
     NotebookProgress,
     ProgressCfg,
@@ -23,14 +23,15 @@ from mjlab.rl.progress import (
     label,
 )
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
+from mjlab.runs.folder import write_info
 from mjlab.scripts.reference import DATA, Kind, Reference, reference_path, referenced_tasks
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.logging import print_notice
 from mjlab.utils.string import counted, number
 
 if TYPE_CHECKING:
+    from mjlab.runs.folder import NewRunFolder
     from mjlab.scripts.live import LiveView
-    from mjlab.scripts.run_folder import NewRunFolder
     from mjlab.scripts.train_config import TrainConfig
 
 # Period of plain lines, for log files.
@@ -55,7 +56,7 @@ def show_training(
         return
     progress = ProgressCfg.of_runner(runner, task, usual_iteration(task, cfg))
     display = NotebookProgress(progress) if in_notebook() else TrainingDisplay(progress)
-    runner.observers += [KeepRunFolder(folder), display]
+    runner.observers += [RunRecorder(folder), display]
     if view is not None:
         view.follow(runner, display)
 
@@ -192,12 +193,28 @@ def _redirect_to_devnull(is_gone: Callable[[os.stat_result], bool]) -> None:
             os.dup2(nowhere.fileno(), number)
 
 
-class KeepRunFolder(TrainingObserver):
-    """Observer that keeps the run folder once training has started."""
+class RunRecorder(TrainingObserver):
+    """Observer that keeps the run folder once training has started, and records evaluations in it."""
 
     def __init__(self, folder: NewRunFolder) -> None:
         self._folder = folder
+        self._evaluations: list[dict[str, Any]] = []
 
     def on_start(self, first_iteration: int, total_iterations: int) -> None:
         """Keep the folder."""
         self._folder.keep()
+
+    def on_evaluation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Record the result."""
+        values = result.to_dict()
+        entry = {name: values[name] for name in RESULT_FIELDS if values[name] is not None}
+        entry |= {"metrics": {name: value.mean for name, value in result.metrics.items()}}
+        self._evaluations.append({"iteration": iteration, "solved": solved, **entry})
+        # On a full disk, the next checkpoint raises a clear error.
+        with contextlib.suppress(OSError):
+            write_info(self._folder.path, evaluations=self._evaluations)
+
+    def on_confirmation(self, iteration: int, result: EvaluationResult, solved: bool) -> None:
+        """Replace the result of the evaluation that it confirms or not."""
+        self._evaluations.pop()
+        self.on_evaluation(iteration, result, solved)

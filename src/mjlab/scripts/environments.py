@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mjlab import rl
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.rl.learners import learner_of, train_dict
+from mjlab.runs.settings import Settings, apply_settings
 from mjlab.scripts.flags import options_of
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls, task_source
 from mjlab.utils.config_fields import check_fields_exist
@@ -20,6 +21,7 @@ from mjlab.utils.torch import prepare_torch
 from mjlab.utils.wandb import add_wandb_tags
 
 if TYPE_CHECKING:
+    from mjlab.rl.config import RslRlBaseRunnerCfg
     from mjlab.scripts.train_config import TrainConfig
 
 
@@ -32,11 +34,11 @@ def make_env(
     *,
     seed: int | None = None,
     render_mode: str | None = None,
-    profile: str | None = None,
+    agent: RslRlBaseRunnerCfg | None = None,
 ) -> Any:
     """Return the wrapped environment of `cfg`; arguments that are None keep the value in `cfg`.
 
-    Actions are clipped to `clip_actions` of the learner config of the task under `profile`.
+    Actions are clipped to `clip_actions` of the learner config `agent`. None: that of the task.
     """
     prepare_torch(device)
     cfg = copy.deepcopy(cfg)
@@ -46,7 +48,7 @@ def make_env(
     if engine is not None:
         cfg.sim.engine = engine
     env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
-    clip_actions = load_rl_cfg(task, profile=profile).clip_actions
+    clip_actions = (agent or load_rl_cfg(task)).clip_actions
     return rl.RslRlVecEnvWrapper(env, clip_actions=clip_actions)
 
 
@@ -90,9 +92,11 @@ def _reserve_learner_core(cfg: TrainConfig, device: str, rank: ProcessRank) -> G
 
 
 def training_runner(
-    task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str
+    task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str, settings: Settings
 ) -> rl.MjlabOnPolicyRunner:
     """Return the runner of `task`, with newly initialized networks.
+
+    Evaluations have the `settings` of the run, also where the profile eases the task for training.
 
     Raises:
         ValueError: the agent config does not fit the environments.
@@ -105,7 +109,17 @@ def training_runner(
     # to build the environment.
     seed_rng(cfg.agent.seed)
     runner_kwargs = options_of(task, cfg).runner_kwargs()
-    runner = runner_cls(env, train_dict(cfg.agent), str(run_dir), device, **runner_kwargs)
+    train_cfg = train_dict(cfg.agent)
+    if (prepare := cfg.agent.evaluation.prepare_env) is not None:
+
+        def prepare_with_settings(env_cfg: ManagerBasedRlEnvCfg) -> None:
+            prepare(env_cfg)
+            vars(env_cfg).update(vars(apply_settings(env_cfg, settings, "env")[0]))
+
+        train_cfg["evaluation"]["prepare_env"] = prepare_with_settings
+    runner = runner_cls(env, train_cfg, str(run_dir), device, **runner_kwargs)
+    if isinstance(runner, rl.MjlabOnPolicyRunner):
+        runner.task = task
     if (source := task_source(task)) is not None and hasattr(runner, "add_git_repo_to_log"):
         runner.add_git_repo_to_log(source)
     return runner

@@ -6,27 +6,28 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mjlab.rl.checkpoint import curricula_of, load_checkpoint
+from mjlab.rl.checkpoint import curricula_of
+from mjlab.runs import Checkpoint
+from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.environments import make_env
 from mjlab.scripts.flags import is_given
 from mjlab.scripts.policy import (
     PolicyFlags,
+    agent_cfg_of,
     env_cfg_of,
     find_checkpoint,
     has_foreign_runner,
     make_policy,
     parse_policy_flags,
-    policy_env_cfg,
+    report_policy,
 )
-from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import check_count
 from mjlab.utils.logging import print_notice
 from mjlab.utils.string import counted
@@ -77,11 +78,13 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
-    default = policy_env_cfg(task, cfg.profile, purpose="evaluate").scene.num_envs
+    report_policy(task, checkpoint, cfg, env_cfg, "evaluate")
+    default = registered_env_cfg(task, cfg.profile, "evaluate").scene.num_envs
     is_chosen = keep_num_envs or env_cfg.scene.num_envs != default
     num_envs = cfg.num_envs or (None if is_chosen else cfg.num_episodes)
-    solved = load_rl_cfg(task, profile=cfg.profile).evaluation
-    env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, profile=cfg.profile)
+    agent = agent_cfg_of(task, checkpoint, cfg.profile)
+    solved = agent.evaluation
+    env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, agent=agent)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         if checkpoint is not None:
@@ -118,12 +121,12 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     return metrics
 
 
-def _load_curricula(task: str, env: Any, checkpoint: Path) -> None:
+def _load_curricula(task: str, env: Any, checkpoint: Checkpoint) -> None:
     """Restore the curricula of the policy's run; print a line if their state is unknown."""
     from mjlab.rl.evaluation import load_curricula
 
-    is_ours = checkpoint.suffix == ".pt" and not has_foreign_runner(task)
-    state = curricula_of(load_checkpoint(checkpoint)) if is_ours else None
+    is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
+    state = curricula_of(checkpoint.content) if is_ours else None
     left_out = [] if state is None else load_curricula(env, state)
     unwrapped = env.unwrapped
     if not unwrapped.curriculum_manager.active_terms:
@@ -132,11 +135,11 @@ def _load_curricula(task: str, env: Any, checkpoint: Path) -> None:
         # Loading a checkpoint sets the counter.
         steps = unwrapped.common_step_counter
         print_notice(
-            f"{checkpoint.name} does not hold the state of the task's curricula: they are at their "
+            f"{checkpoint.path.name} does not hold the state of the task's curricula: they are at their "
             + (f"state after {counted(steps, 'step')}." if steps else "beginning.")
         )
     elif left_out:
-        print_notice(f"Curricula of {checkpoint.name} not restored: {', '.join(left_out)}.")
+        print_notice(f"Curricula of {checkpoint.path.name} not restored: {', '.join(left_out)}.")
 
 
 class EvaluationProgress:

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 import tyro
 
 import mjlab
+from mjlab.runs.settings import apply_settings
 from mjlab.scripts.flag_values import flag_rules
 from mjlab.scripts.help import TERM_DICTS, print_help, requested_topic
-from mjlab.scripts.run_folder import read_run_info
 from mjlab.tasks.registry import (
     PolicyOrigin,
     TaskOptions,
@@ -35,6 +35,7 @@ from mjlab.utils.logging import print_notice
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
+    from mjlab.runs import Run
 
 C = TypeVar("C")
 
@@ -94,19 +95,18 @@ def is_given(flag: str, flags: list[str]) -> bool:
 # Profile and learner.
 
 
-def parse_with_choices(
+def parse_for_run(
     make_default: Callable[..., C],
-    recorded: Callable[[C, Mapping[str, str | None]], Mapping[str, str | None]],
+    select: Callable[[C], Run | None],
     flags: list[str],
     prog: str,
 ) -> C:
-    """Return the defaults under the requested profile and learner, updated by `flags`.
+    """Return the defaults for the selected run, profile and learner, updated by `flags`.
 
     Args:
-        make_default: Returns the defaults for choices passed as keywords; missing choices are those of
-            the task.
-        recorded: Returns the choices of the selected run that differ from the task's. Its arguments
-            are the defaults updated by the flags, and the choices in the flags, which it can skip.
+        make_default: Function of the keywords `run`, and `profile` and `learner` if in `flags`, that
+            returns the defaults: with the settings of the run, or those of the task without a run.
+        select: Function that returns the run selected by the flags; None without a run.
         flags: Command line.
         prog: Name of the command, for messages.
 
@@ -115,15 +115,15 @@ def parse_with_choices(
         ValueError: unknown learner.
     """
     requested = requested_choices(flags)
-    default = make_default(**requested)
-    if len(requested) == len(_CHOICES) or requested_topic(flags) is not None:
+    default = make_default(run=None, **requested)
+    if requested_topic(flags) is not None:
         return parse_flags(type(default), default, flags, prog)
     # The learner of the selected run may have flags that the task's learner lacks.
     cfg, unknown = parse_known_flags(type(default), default, flags, prog)
-    choices = {**recorded(cfg, requested), **requested}
-    if choices == requested and not unknown:
+    run = select(cfg)
+    if run is None and not unknown:
         return cfg
-    default = make_default(**choices)
+    default = make_default(run=run, **requested)
     return parse_flags(type(default), default, flags, prog)
 
 
@@ -140,20 +140,6 @@ def requested_choices(flags: list[str]) -> dict[str, str | None]:
             value = flags[position + 1] if position + 1 < len(flags) else "None"
         choices[name] = None if value == "None" else value
     return choices
-
-
-def profile_of_run(task: str, run_dir: Path) -> str | None:
-    """Return the profile of `task` that the run in `run_dir` used, or None."""
-    profile = read_run_info(run_dir).get("profile")
-    if not isinstance(profile, str):
-        return None
-    if profile not in list_profiles(task):
-        print_notice(
-            f"The run in {run_dir} used the profile {profile!r}, unknown to {task}; using the default "
-            "settings of the task."
-        )
-        return None
-    return profile
 
 
 def suggest_profile(task: str, profile: str | None, device: str) -> None:
@@ -180,12 +166,13 @@ def report_untuned_learner(task: str, profile: str | None, learner: str) -> None
 # Task flags.
 
 
-def with_task_options(cfg: C, task: str) -> C:
+def with_task_options(cfg: C, task: str, run: Run | None = None) -> C:
     """Return the flags of a command extended by the options of the task.
 
     Args:
         cfg: Dataclass of flags with their defaults.
         task: Name of the task.
+        run: Run with the options to use as defaults.
 
     Raises:
         UnknownTaskError, TaskImportError: unknown task, or its options cannot be imported.
@@ -202,11 +189,14 @@ def with_task_options(cfg: C, task: str) -> C:
             f"Options {options.__name__} of task {task!r}: expected names other than the flags of the "
             f"command, got {taken}; rename these fields."
         )
+    default = options()
+    if run is not None:
+        default, _ = apply_settings(default, run.settings, "options")
     # No prefix: options look like flags of the command.
     annotation: Any = Annotated[options, tyro.conf.arg(name="")]  # ty: ignore[invalid-type-form]
     kind: Any = dataclasses.make_dataclass(
         type(cfg).__name__,
-        [(_FIELD, annotation, dataclasses.field(default_factory=options))],
+        [(_FIELD, annotation, dataclasses.field(default_factory=lambda: default))],
         bases=(type(cfg),),
         namespace={"__doc__": type(cfg).__doc__, "__module__": type(cfg).__module__},
     )

@@ -7,19 +7,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mjlab.compat import older_names
+from mjlab.runs import Checkpoint
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.environments import make_env
 from mjlab.scripts.policy import (
     PolicyFlags,
+    agent_cfg_of,
     env_cfg_of,
     find_checkpoint,
     load_policy,
     make_policy,
     parse_policy_flags,
+    report_policy,
+    run_of,
 )
 from mjlab.scripts.record import VideoCfg, record_policy
-from mjlab.scripts.run_folder import is_run_folder
 from mjlab.utils.errors import UserError, check_count
 from mjlab.utils.logging import print_notice
 from mjlab.utils.torch import threads_for_policy
@@ -92,12 +95,13 @@ def run_play(task: str, cfg: PlayConfig) -> None:
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="play")
+    report_policy(task, checkpoint, cfg, env_cfg, "play")
     if cfg.no_terminations:
         env_cfg.terminations = {}
     if cfg.video:
         folder = Path("videos")
-        if checkpoint is not None and is_run_folder(checkpoint.parent):
-            folder = checkpoint.parent / "videos" / "play"
+        if checkpoint is not None and run_of(checkpoint, task).exists:
+            folder = checkpoint.path.parent / "videos" / "play"
         video = VideoCfg(
             length=cfg.num_steps or max(cfg.video_length, 1),
             suffix=cfg.video_format,
@@ -111,7 +115,8 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         )
         record_policy(task, env_cfg, checkpoint, folder, device, video)
         return
-    env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, profile=cfg.profile)
+    agent = agent_cfg_of(task, checkpoint, cfg.profile)
+    env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, agent=agent)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
@@ -127,7 +132,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
 
 
 def _make_viewer(
-    task: str, cfg: PlayConfig, env: Any, policy: Any, checkpoint: Path | None, device: str
+    task: str, cfg: PlayConfig, env: Any, policy: Any, checkpoint: Checkpoint | None, device: str
 ) -> Any:
     if cfg.viewer == "native":
         from mjlab.viewer import NativeMujocoViewer
@@ -137,11 +142,11 @@ def _make_viewer(
     from mjlab.viewer.viser.viewer import local_checkpoints
 
     manager = None
-    if checkpoint is not None and any(checkpoint.parent.glob("*.pt")):
+    if checkpoint is not None and any(checkpoint.path.parent.glob("*.pt")):
         manager = local_checkpoints(
-            checkpoint.parent,
+            checkpoint.path.parent,
             lambda path: load_policy(task, env, path, device, cfg.profile),
-            current=checkpoint.name,
+            current=checkpoint.path.name,
         )
     viewer = ViserPlayViewer(env, policy, checkpoint_manager=manager, host=cfg.host, port=cfg.port)
     print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)

@@ -17,6 +17,7 @@ from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.environments import make_env
 from mjlab.scripts.policy import (
     PolicyFlags,
+    agent_cfg_of,
     env_cfg_of,
     find_checkpoint,
     make_policy,
@@ -105,7 +106,7 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
         cfg.num_envs,
         cfg.engine,
         seed=cfg.seed,
-        profile=cfg.profile,
+        agent=agent_cfg_of(task, checkpoint, cfg.profile),
     )
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)

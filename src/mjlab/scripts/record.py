@@ -10,8 +10,9 @@ from typing import Any, Literal
 import torch
 
 from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.runs import Checkpoint
 from mjlab.scripts.environments import make_env
-from mjlab.scripts.policy import make_policy
+from mjlab.scripts.policy import agent_cfg_of, make_policy
 from mjlab.utils.wrappers.video_recorder import ClipWriter
 from mjlab.viewer.base import done_mask, reset_policy
 
@@ -43,7 +44,7 @@ class VideoCfg:
 def record_policy(
     task: str,
     env_cfg: ManagerBasedRlEnvCfg,
-    checkpoint: Path | None,
+    checkpoint: Checkpoint | None,
     folder: Path,
     device: str,
     video: VideoCfg | None = None,
@@ -64,11 +65,11 @@ def record_policy(
         video.num_envs,
         video.engine,
         render_mode="rgb_array",
-        profile=video.profile,
+        agent=agent_cfg_of(task, checkpoint, video.profile),
     )
     try:
         policy = make_policy(task, env, video.agent, checkpoint, device, video.profile)
-        name = video.agent if checkpoint is None else checkpoint.stem
+        name = video.agent if checkpoint is None else checkpoint.path.stem
         writer = ClipWriter(
             folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
         )

@@ -15,7 +15,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjlab.scripts.run_folder import read_params, read_run_info, sessions_of
+from mjlab.runs import Run
+from mjlab.runs.run import DONE
 from mjlab.utils.errors import UserError
 from mjlab.utils.os import replacing
 
@@ -34,8 +35,6 @@ FALSE_ALARMS = 0.05
 """Upper bound on the probability that a healthy seed is classified as outside."""
 # Probability `a` of the bounds below. 3 a bounds the false alarms.
 _TAIL = FALSE_ALARMS / 3
-ENDED = ("solved", "finished")
-"""Stop reasons of completed training."""
 # Tag written once per iteration.
 _EVERY_ITERATION = "Perf/collection_time"
 # Points per stored curve: tens of kilobytes per task.
@@ -202,7 +201,7 @@ def read_run(run_dir: Path) -> RunRecord:
             f"{run_dir}: expected a run with evaluations, got none; train longer, or set "
             "--agent.evaluation.solved-return and --agent.evaluation.trigger-return."
         )
-    agent, env = read_params(run_dir, "agent"), read_params(run_dir, "env")
+    agent, env = Run(run_dir).params["agent"], Run(run_dir).params["env"]
     per_iteration = agent["num_steps_per_env"] * env["scene"]["num_envs"]
     # Metrics common to all evaluations; custom runners may add others.
     names = set.intersection(*(set(metrics) for metrics in evaluations.values()))
@@ -212,7 +211,7 @@ def read_run(run_dir: Path) -> RunRecord:
     )
     last = max(seconds)
     return RunRecord(
-        ended=str(end_of(run_dir)),
+        ended=Run(run_dir).state,
         iterations=last + 1,
         samples=(last + 1) * per_iteration,
         seconds=elapsed[last],
@@ -221,18 +220,6 @@ def read_run(run_dir: Path) -> RunRecord:
         figures={name: [evaluations[i][name] for i in evaluated] for name in sorted(names)},
         num_episodes=agent["evaluation"]["num_episodes"],
     )
-
-
-def end_of(run_dir: Path) -> str | None:
-    """Return the stop reason of a run; None if unknown. Ctrl-C in the last iteration is `finished`."""
-    info = read_run_info(run_dir)
-    ended = info.get("ended")
-    if (
-        ended == "interrupted"
-        and info["iterations"] >= read_params(run_dir, "agent")["max_iterations"]
-    ):
-        return "finished"
-    return ended
 
 
 def trained_seconds(run_dir: Path) -> float:
@@ -269,7 +256,9 @@ def read_scalars_of_sessions(run_dir: Path) -> dict[str, dict[int, float]]:
     # Steps of the other tags are seconds.
     return {
         tag: dict(zip(iterations.tolist(), values.tolist(), strict=True))
-        for tag, (iterations, values) in read_all_scalars(sessions_of(run_dir)).items()
+        for tag, (iterations, values) in read_all_scalars(
+            [run.folder for run in Run(run_dir).joined]
+        ).items()
         if not tag.endswith("/time")
     }
 
@@ -389,7 +378,7 @@ def compare(runs: Sequence[RunRecord], run: RunRecord, standard_error: float) ->
     curves, curve = [one.curve() for one in runs], run.curve()
     begin = max(samples[0] for samples, _ in (*curves, curve))
     end = min(samples[-1] for samples, _ in curves)
-    if run.ended not in ENDED:
+    if run.ended not in DONE:
         end = min(end, curve[0][-1])
     samples = np.linspace(begin, max(begin, end), _GRID)
     mean, half = band(curves, samples, standard_error)

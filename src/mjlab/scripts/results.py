@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mjlab
+from mjlab.runs import Run
 from mjlab.scripts.flags import prepare_env_cfg
-from mjlab.scripts.policy import policy_env_cfg
 from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.sim.warning_log import mujoco_warnings
 from mjlab.tasks.registry import load_rl_cfg
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from mjlab.utils.processes import ProcessRank
 
 _LOG_ROOT = "logs/rsl_rl"
-# Flags that change the inputs and outputs of the policy, so `play` and `evaluate` need them as well.
-_POLICY_FLAGS = ("--env.observations.", "--env.actions.")
 # Flags that select the run to resume.
 _RESUME_FLAGS = ("--agent.resume", "--agent.load-run", "--agent.load-checkpoint")
 
@@ -60,18 +58,18 @@ def write_results(
 
     The last lines are commands for the next step, which depend on the stop reason `ended`.
     """
-    from mjlab.rl.checkpoint import latest_checkpoint
     from mjlab.rl.plot import plot_run
 
     # A run solved at resume has no iterations.
     with contextlib.suppress(ValueError):
         plot_run(run_dir, title=task, evaluation=vars(cfg.agent.evaluation))
-    checkpoint = latest_checkpoint(run_dir)
+    run = Run(run_dir, task)
+    checkpoint = run.newest
     if cfg.result_video and checkpoint is not None:
         from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
-        env_cfg = policy_env_cfg(task, cfg.profile, purpose="play")
-        prepare_env_cfg(task, None, env_cfg, checkpoint)
+        env_cfg = run.cfg("play").env
+        prepare_env_cfg(task, cfg, env_cfg, checkpoint.path)
         try:
             video = VideoCfg(profile=cfg.profile)
             record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
@@ -89,19 +87,17 @@ def write_results(
 
 def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None) -> list[str]:
     """Return the commands that watch, score and, if interrupted, resume the run in `run_dir`."""
-    from mjlab.rl.checkpoint import latest_checkpoint
-
     flags = [] if cfg.log_root == _LOG_ROOT else ["--log-root", cfg.log_root]
     typed = [*flags]
     # The commands look for the newest policy in the experiment of the task.
     if cfg.agent.experiment_name != load_rl_cfg(task).experiment_name:
         typed = [*flags, "--agent.experiment-name", cfg.agent.experiment_name]
-        flags = ["--checkpoint-file", str(_short(latest_checkpoint(run_dir) or run_dir))]
+        newest = Run(run_dir).newest
+        flags = ["--checkpoint-file", str(_short(run_dir if newest is None else newest.path))]
     words = sys.argv
     # Not the flags of other commands that train, such as `verify`.
     if task in words and Path(words[words.index(task) - 1]).stem == "train":
         typed = words[words.index(task) + 1 :]
-        flags += _picked(typed, lambda name: name.startswith(_POLICY_FLAGS))
         typed = _picked(typed, lambda name: name not in _RESUME_FLAGS)
     commands = [["play", task, *flags], ["evaluate", task, *flags]]
     if ended == "interrupted":

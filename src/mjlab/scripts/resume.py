@@ -1,24 +1,20 @@
-"""Resume: selection of the run, and its profile, learner, number of environments and seed."""
+"""Resume: selection of the run, and its settings, number of environments and seed."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mjlab.rl.checkpoint import CheckpointError, learner_of_checkpoint, load_checkpoint
-from mjlab.rl.distributed import STORE_VARIABLE
+from mjlab.rl.checkpoint import CheckpointError
 from mjlab.rl.learners import learner_of
-from mjlab.scripts.flags import profile_of_run
-from mjlab.scripts.run_folder import read_params, read_run_info, run_folders
-from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.runs import Checkpoint, Run, resolve_checkpoint, runs_in
+from mjlab.runs.settings import apply_to_unchanged
+from mjlab.scripts.policy import has_foreign_runner
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.os import get_checkpoint_path, get_wandb_checkpoint_path
-from mjlab.utils.processes import process_rank
 from mjlab.utils.random import draw_seed
 
 if TYPE_CHECKING:
@@ -26,25 +22,27 @@ if TYPE_CHECKING:
     from mjlab.scripts.train_config import TrainConfig
 
 
-def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
+def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Checkpoint | None:
     """Return the checkpoint to resume, or None for a new run.
 
-    The checkpoint is the one with the highest number in the most recently changed run of `task` and the
-    learner of `cfg` that matches the patterns. Runs without a recorded task match any task; runs
-    without a recorded learner match any learner.
+    The checkpoint is the one with the highest number that matches the pattern, in the last started run
+    of `task` and the learner of `cfg` that matches the pattern. Runs without a recorded task match any
+    task; runs without a recorded learner match any learner.
 
     Raises:
-        UserError: the matching runs are of other tasks or learners, or a pattern is not a regular
-            expression.
-        ValueError: run or checkpoint not found; the message lists the available ones.
+        UserError: the matching runs are of other tasks or learners, or still running; or a pattern is
+            not a regular expression.
+        ValueError: run or checkpoint not found, and resume is not `auto`; the message lists the
+            available ones.
     """
     if not cfg.agent.resume:
         return None
-    agent = cfg.agent
-    experiment = cfg.experiment_folder
+    agent, experiment = cfg.agent, cfg.experiment_folder
     if cfg.wandb_run_path is not None:
         run_path = Path(cfg.wandb_run_path)
-        return get_wandb_checkpoint_path(experiment, run_path, cfg.wandb_checkpoint_name)[0]
+        return Checkpoint(
+            get_wandb_checkpoint_path(experiment, run_path, cfg.wandb_checkpoint_name)[0]
+        )
     for flag, pattern in (("run", agent.load_run), ("checkpoint", agent.load_checkpoint)):
         try:
             re.compile(pattern)
@@ -54,14 +52,24 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Path | None:
             ) from error
     runs = _runs_to_resume(task, cfg)
     for run in runs:
-        with contextlib.suppress(ValueError):
-            return get_checkpoint_path(experiment, re.escape(run.name), agent.load_checkpoint)
-    own = "|".join(re.escape(run.name) for run in runs)
+        found = [c for c in run.folder.iterdir() if re.fullmatch(agent.load_checkpoint, c.name)]
+        if any(path.is_file() for path in found):
+            if run.state == "running":
+                raise UserError(
+                    f"{run.folder} is still running; stop it, or name another run by --agent.load-run."
+                )
+            path = get_checkpoint_path(
+                experiment, re.escape(run.folder.name), agent.load_checkpoint
+            )
+            return Checkpoint(path)
+    if agent.resume == "auto":
+        return None
+    own = "|".join(re.escape(run.folder.name) for run in runs)
     # Raises an error that lists the runs and checkpoints.
-    return get_checkpoint_path(experiment, own or agent.load_run, agent.load_checkpoint)
+    return Checkpoint(get_checkpoint_path(experiment, own or agent.load_run, agent.load_checkpoint))
 
 
-def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Path]:
+def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Run]:
     """Return the runs that match the pattern, the task and the learner, newest first.
 
     Raises:
@@ -69,12 +77,16 @@ def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Path]:
     """
     experiment, pattern, learner = cfg.experiment_folder, cfg.agent.load_run, cfg.learner
     # Matching rule of `get_checkpoint_path`.
-    runs = run_folders(experiment)
-    matching = [run for run in runs if re.fullmatch(pattern, run.name)]
-    matching = matching or [run for run in runs if re.match(pattern, run.name)]
-    others = {run: why for run in matching if (why := _mismatch(run, task, learner))}
-    if others and len(others) == len(matching):
-        listed = [f"{run.name} is {why}" for run, why in others.items()]
+    runs = runs_in(experiment)
+    matching = [run for run in runs if re.fullmatch(pattern, run.folder.name)]
+    matching = matching or [run for run in runs if re.match(pattern, run.folder.name)]
+    others = [run for run in matching if not run.is_of(task, learner)]
+    if others and len(others) == len(matching) and cfg.agent.resume != "auto":
+        listed = [
+            f"{run.folder.name} is of "
+            + (f"the learner {run.learner!r}" if run.is_of(task, None) else str(run.task))
+            for run in others
+        ]
         listed[3:] = [f"and {len(listed) - 3} more"] if len(listed) > 3 else []
         by = "" if learner is None else f" by the learner {learner!r}"
         raise UserError(
@@ -84,14 +96,43 @@ def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Path]:
     return [run for run in matching if run not in others]
 
 
-def _mismatch(run_dir: Path, task: str, learner: str | None) -> str | None:
-    """Describe why a run is not of `task` and `learner`; None if it is, or if not recorded."""
-    info = read_run_info(run_dir)
-    if (found := info.get("task", task)) != task:
-        return f"of {found}"
-    if learner is not None and (found := info.get("learner", learner)) != learner:
-        return f"of the learner {found!r}"
-    return None
+def run_to_continue(task: str, cfg: TrainConfig) -> Run | None:
+    """Return the run whose settings are the defaults of `cfg`: the resumed one, or that of `--like`.
+
+    Errors in the selection of the resumed run are reported when training starts, after other errors
+    in the flags.
+
+    Raises:
+        UserError: the run of `--like` was not found, or a run is to be resumed as well.
+    """
+    if cfg.like is not None:
+        if cfg.agent.resume:
+            raise UserError("--like: expected a new run, got --agent.resume; use one of them.")
+        return Run(resolve_checkpoint(Path(cfg.like), task).path.parent, task)
+    # Runs of Weights & Biases are downloaded once, when training starts.
+    if cfg.as_registered or cfg.wandb_run_path is not None:
+        return None
+    try:
+        checkpoint = checkpoint_to_resume(task, cfg)
+    except (UserError, ValueError, OSError, CheckpointError):
+        return None
+    if checkpoint is None:
+        return None
+    run = Run(checkpoint.path.parent, task)
+    if run.learner is None and not has_foreign_runner(task):
+        with contextlib.suppress(CheckpointError):
+            return Run(run.folder, task, checkpoint.learner)
+    return run
+
+
+def with_settings_of(run: Run, task: str, cfg: TrainConfig) -> None:
+    """Apply the settings of `run` to fields of `cfg` that are as registered, in place.
+
+    For runs that are unknown when flags are parsed: changes of `cfg` count as typed flags.
+    """
+    registered = type(cfg).from_task(task, cfg.profile, cfg.learner)
+    cfg.env = apply_to_unchanged(cfg.env, registered.env, run.settings, "env")
+    cfg.agent = apply_to_unchanged(cfg.agent, registered.agent, run.settings, "agent")
 
 
 def resume_flags(run_dir: Path, checkpoint: Path | None = None) -> list[str]:
@@ -105,49 +146,13 @@ def resume_flags(run_dir: Path, checkpoint: Path | None = None) -> list[str]:
     return flags
 
 
-def choices_to_resume(
-    task: str, cfg: TrainConfig, requested: Mapping[str, str | None]
-) -> dict[str, str | None]:
-    """Return profile and learner of the run to resume, except those in `requested`.
-
-    The profile is omitted if the run had none, and the learner if it is the default of the task. Both
-    are unknown for a Weights & Biases run before the download.
-    """
-    choices: dict[str, str | None] = {}
-    if cfg.wandb_run_path is not None:
-        return choices
-    try:
-        checkpoint = checkpoint_to_resume(task, cfg)
-        if checkpoint is None:
-            return choices
-        learner = learner_of_checkpoint(checkpoint)
-    except (UserError, ValueError, OSError, CheckpointError):
-        # Reported when training starts, after other errors in the flags.
-        return choices
-    # All processes parse the flags; our launcher has printed the messages before starting the others.
-    reports = STORE_VARIABLE not in os.environ and process_rank().is_first
-    if (
-        "profile" not in requested
-        and (profile := profile_of_run(task, checkpoint.parent)) is not None
-    ):
-        choices["profile"] = profile
-        if reports:
-            print_notice(f"Resuming with the profile {profile!r}, as before; --profile overrides.")
-    default = load_rl_cfg(task, profile=choices.get("profile", cfg.profile))
-    if "learner" not in requested and learner != learner_of(default):
-        choices["learner"] = learner
-        if reports:
-            print_notice(f"Resuming with the learner {learner!r}, as before.")
-    return choices
-
-
-def check_learner_resumes(cfg: TrainConfig, checkpoint: Path) -> None:
+def check_learner_resumes(cfg: TrainConfig, checkpoint: Checkpoint) -> None:
     """Raise UserError unless the learner of `cfg` wrote `checkpoint`.
 
     Raises:
         CheckpointError: the checkpoint cannot be read.
     """
-    expected, found = learner_of(cfg.agent), learner_of_checkpoint(checkpoint)
+    expected, found = learner_of(cfg.agent), checkpoint.learner
     if expected != found:
         raise UserError(
             f"--learner: expected {found!r}, which wrote {checkpoint}, got {expected!r}; use "
@@ -155,51 +160,50 @@ def check_learner_resumes(cfg: TrainConfig, checkpoint: Path) -> None:
         )
 
 
-def restore_num_envs(task: str, cfg: TrainConfig, checkpoint: Path) -> None:
-    """Set the number of environments to that of the resumed run, unless set by flags.
+def restore_num_envs(cfg: TrainConfig, checkpoint: Checkpoint) -> None:
+    """Set the number of environments to that of the resumed run.
 
     Fewer environments can ruin a policy of several hours within a few iterations.
     """
-    scene = cfg.env.scene
-    default = load_env_cfg(task, profile=cfg.profile).scene.num_envs
-    if cfg.num_envs is not None or scene.num_envs != default:
-        return
-    # Runs of other tools and runners lack the training state, but may have saved their config.
-    state = None
-    with contextlib.suppress(CheckpointError):
-        state = load_checkpoint(checkpoint).get("training_state")
-    saved: Any = [state, read_params(checkpoint.parent, "env").get("scene")]
-    counts = [holder.get("num_envs") for holder in saved if isinstance(holder, dict)]
-    count = next((n for n in counts if isinstance(n, int) and n >= 1), None)
+    count = Run(checkpoint.path.parent).num_envs
+    if count is None:
+        # Runs of other tools and runners may have checkpoints of any format.
+        with contextlib.suppress(CheckpointError):
+            count = checkpoint.num_envs
     if count is None:
         print_notice(
-            f"{checkpoint} does not record the number of environments; using {scene.num_envs}, the "
-            "default of the task. --num-envs overrides."
+            f"{checkpoint} does not record the number of environments; using {cfg.env.scene.num_envs}, "
+            "the default of the task. --num-envs overrides."
         )
         return
-    scene.num_envs = count
+    cfg.env.scene.num_envs = count
     print(f"Resuming with --num-envs {count}, as before; --num-envs overrides.")
 
 
-def choose_seed(checkpoint: Path | None) -> int:
+def choose_seed(run: Run | None) -> int:
     """Return and print the seed of the resumed run, or a random seed."""
-    if checkpoint is not None:
-        seed: Any = read_params(checkpoint.parent, "agent").get("seed")
-        if isinstance(seed, int) and seed >= 0:
-            print(f"Seed:    {seed}, as before; --agent.seed overrides")
-            return seed
+    if run is not None and run.seed is not None:
+        print(f"Seed:    {run.seed}, as before; --agent.seed overrides")
+        return run.seed
     seed = draw_seed()
     print(f"Seed:    {seed}, drawn; --agent.seed {seed} repeats the run")
     return seed
 
 
-def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Path) -> bool:
-    """Return True, and print a message, if the loaded run has finished all iterations and evaluations."""
+def is_finished(cfg: TrainConfig, runner: MjlabOnPolicyRunner, checkpoint: Checkpoint) -> bool:
+    """Return True, and print a message, if nothing is left to train: all iterations and evaluations are
+    finished, or, with `--agent.resume auto`, the run was solved.
+    """
     done, total = runner.current_learning_iteration, cfg.agent.max_iterations
-    if done < total or runner.owes_evaluation:
+    is_solved = cfg.agent.resume == "auto" and Run(checkpoint.path.parent).state == "solved"
+    if (done < total or runner.owes_evaluation) and not is_solved:
         return False
-    print(
-        f"Nothing to train: {checkpoint} has finished {done} iterations, and --agent.max-iterations "
-        f"is {total}, including these. To continue, use e.g. --agent.max-iterations {done + 100}."
-    )
+    if is_solved:
+        print(f"Nothing to train: the run of {checkpoint} was solved. --agent.resume True goes on.")
+    else:
+        print(
+            f"Nothing to train: {checkpoint} has finished {done} iterations, and "
+            f"--agent.max-iterations is {total}, including these. To continue, use e.g. "
+            f"--agent.max-iterations {done + 100}."
+        )
     return True

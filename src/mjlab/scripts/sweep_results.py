@@ -19,7 +19,7 @@ import torch
 
 from mjlab.rl.evaluation import mean_and_interval, wilson_interval
 from mjlab.rl.plot import LABELS, plot_curves
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info
+from mjlab.runs import Run
 from mjlab.scripts.sweep_settings import train_config
 from mjlab.scripts.sweep_study import Study, TrainedRun, setting_of, trained_run
 from mjlab.utils.os import write_atomically
@@ -132,7 +132,7 @@ class Comparison:
                 _mean([run.last(f"Evaluation/{name}") for run in row.runs]) for name in others
             ]
             cells.append(len(row.runs) or None)
-            cells.append(_mean([read_run_info(run.folder).get("iterations") for run in row.runs]))
+            cells.append(_mean([Run(run.folder).info.get("iterations") for run in row.runs]))
             cells.append(_mean([run.training_seconds / 60.0 for run in row.runs]))
             evaluating = sum(run.evaluation_seconds for run in row.runs)
             total = evaluating + sum(run.training_seconds for run in row.runs)
@@ -212,7 +212,7 @@ class Comparison:
         if first.runs:
             sign = 1.0 if sweep.objective.minimize else -1.0
             run = min(first.runs, key=lambda run: sign * run.value)
-            checkpoint = str(checkpoints_in(run.folder)[-1])
+            checkpoint = str(Run(run.folder).newest)
             commands.append(["play", sweep.task, "--checkpoint-file", checkpoint])
         join = subprocess.list2cmdline if os.name == "nt" else shlex.join
         for words in commands:

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from mjlab.rl.evaluation import Bound
+from mjlab.runs import Run
 from mjlab.scripts.resume import resume_flags
-from mjlab.scripts.run_folder import read_run_info
 from mjlab.scripts.sweep_settings import Setting, Sweep, train_config, train_flags
 from mjlab.scripts.sweep_study import Study, TrainedRun, setting_of, trained_run
 from mjlab.scripts.train_seeds import train_command
@@ -199,7 +199,7 @@ class Runs:
         run.log.close()
         sweep, setting = self._sweep, setting_of(run.trial)
         newest = next(iter(sweep.sessions(setting, run.seed)), None)
-        info = {} if newest is None else read_run_info(newest)
+        info = {} if newest is None else Run(newest).info
         stopped = interrupting_signal(run.process.returncode)
         if (trained := trained_run(sweep, setting, run.seed)) is not None:
             self._count(run, trained)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.reference import ENDED
-from mjlab.scripts.run_folder import checkpoints_in, read_run_info, runs_named
+from mjlab.runs import Run, runs_in
+from mjlab.runs.run import DONE
 from mjlab.scripts.sweep_objective import Objective
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.string import is_number
@@ -152,7 +152,7 @@ class Sweep:
 
     def sessions(self, setting: Setting, seed: int) -> list[Path]:
         """Return the run folders of a seed, the newest first."""
-        return runs_named(self.runs_folder(setting), f"seed_{seed}")
+        return [run.folder for run in runs_in(self.runs_folder(setting), run_name=f"seed_{seed}")]
 
     def finished_run(self, setting: Setting, seed: int) -> Path | None:
         """Return the last session of a run that was trained to its end; None for others.
@@ -160,15 +160,15 @@ class Sweep:
         A run interrupted in its last iteration lacks the last evaluation.
         """
         runs = self.sessions(setting, seed)
-        return next((run for run in runs if read_run_info(run).get("ended") in ENDED), None)
+        return next((run for run in runs if Run(run).info.get("ended") in DONE), None)
 
     def last_checkpoint(self, setting: Setting, seed: int) -> Path | None:
         """Return the checkpoint to resume a run from: the newest with iterations left."""
         total = train_config(self, setting).agent.max_iterations
         for run in self.sessions(setting, seed):
-            for checkpoint in reversed(checkpoints_in(run)):
-                if int(checkpoint.stem.removeprefix("model_")) + 1 < total:
-                    return checkpoint
+            for checkpoint in reversed(Run(run).checkpoints):
+                if checkpoint.number is not None and checkpoint.number + 1 < total:
+                    return checkpoint.path
         return None
 
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import os
 import signal
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.compat import older_names
 from mjlab.rl.distributed import (
+    STORE_VARIABLE,
     ProcessOutput,
     broadcast_from_first,
     fail_together,
@@ -19,11 +23,25 @@ from mjlab.rl.distributed import (
     log_file,
     output_of,
 )
+from mjlab.rl.learners import learner_of
+from mjlab.runs import Checkpoint, Run
+from mjlab.runs.folder import (
+    NewRunFolder,
+    SharedRunFolder,
+    exit_by_signal,
+    resumed_entry,
+    write_info,
+    write_params,
+)
+from mjlab.runs.run import RunCfg
+from mjlab.runs.settings import Settings, differences, is_of_the_session, typed_settings
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import gpus_to_share, training_device
 from mjlab.scripts.environments import training_env, training_runner
 from mjlab.scripts.flags import (
-    parse_with_choices,
+    is_given,
+    options_of,
+    parse_for_run,
     prepare_env_cfg,
     report_untuned_learner,
     suggest_profile,
@@ -33,18 +51,11 @@ from mjlab.scripts.policy import has_foreign_runner, prepare_teacher
 from mjlab.scripts.resume import (
     check_learner_resumes,
     checkpoint_to_resume,
-    choices_to_resume,
     choose_seed,
     is_finished,
     restore_num_envs,
-)
-from mjlab.scripts.run_folder import (
-    NewRunFolder,
-    SharedRunFolder,
-    exit_by_signal,
-    write_params,
-    write_resumed,
-    write_run_info,
+    run_to_continue,
+    with_settings_of,
 )
 from mjlab.scripts.train_config import (
     TrainConfig,
@@ -52,6 +63,9 @@ from mjlab.scripts.train_config import (
     check_typed_flags,
     report_moved_goal,
 )
+from mjlab.tasks.registry import load_rl_cfg
+from mjlab.utils.logging import print_list, print_notice
+from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
 from mjlab.utils.signals import Interrupted
 
@@ -68,7 +82,7 @@ def command(argv: list[str], prog: str) -> None:
     check_typed_flags(cfg, flags)
     gpus = gpus_to_share(cfg)
     if not gpus:
-        if (stopped := train_until_stopped(task, cfg)[1]) is not None:
+        if (stopped := train_until_stopped(task, cfg, flags)[1]) is not None:
             raise Interrupted(stopped)
         return
     check_flags(cfg)
@@ -84,18 +98,36 @@ def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
         UnknownProfileError: unknown profile.
         ValueError: the learner is unknown, or not supported by the task.
     """
-    return parse_with_choices(
-        lambda **choices: with_task_options(TrainConfig.from_task(task, **choices), task),
-        lambda cfg, requested: choices_to_resume(task, cfg, requested),
-        flags,
-        prog,
-    )
+
+    def make_default(run: Run | None, **choices: Any) -> TrainConfig:
+        if run is None:
+            return with_task_options(TrainConfig.from_task(task, **choices), task)
+        # All processes parse the flags; our launcher has printed the messages before.
+        if STORE_VARIABLE not in os.environ and process_rank().is_first:
+            _report_choices(task, run, choices)
+        choices = {"profile": run.profile, "learner": run.learner, **choices}
+        resolved = run.cfg("train", **choices)
+        cfg = TrainConfig(env=resolved.env, agent=resolved.agent, **choices)
+        return with_task_options(cfg, task, run)
+
+    return parse_for_run(make_default, lambda cfg: run_to_continue(task, cfg), flags, prog)
+
+
+def _report_choices(task: str, run: Run, requested: Mapping[str, Any]) -> None:
+    """Print the profile and the learner of a run, unless requested or the default."""
+    if "profile" not in requested and run.profile is not None:
+        print_notice(f"Resuming with the profile {run.profile!r}, as before; --profile overrides.")
+    default = learner_of(load_rl_cfg(task, profile=requested.get("profile", run.profile)))
+    if "learner" not in requested and run.learner not in (None, default):
+        print_notice(f"Resuming with the learner {run.learner!r}, as before.")
 
 
 def launch_training(task: str, cfg: TrainConfig) -> Path:
     """Train `task` with the flags `cfg`; return the run folder.
 
-    Signals that interrupt training, as in `MjlabOnPolicyRunner.learn`, do not end the caller. If the run to resume has finished all iterations, return its folder without training. A run that
+    Differences of `cfg` from the task count as typed flags; a resumed run keeps its other settings.
+    Signals that interrupt training, as in `MjlabOnPolicyRunner.learn`, do not end the caller.
+    If the run to resume has finished all iterations, return its folder without training. A run that
     fails before its first iteration leaves no folder.
 
     Raises:
@@ -108,8 +140,14 @@ def launch_training(task: str, cfg: TrainConfig) -> Path:
 run_train = launch_training
 
 
-def train_until_stopped(task: str, cfg: TrainConfig) -> tuple[Path, signal.Signals | None]:
-    """Train as `launch_training`; return the run folder, and the signal that interrupted training."""
+def train_until_stopped(
+    task: str, cfg: TrainConfig, flags: list[str] | None = None
+) -> tuple[Path, signal.Signals | None]:
+    """Train as `launch_training`; return the run folder, and the signal that interrupted training.
+
+    `flags` is the command line that gave `cfg`, with the settings of a resumed run. None: `cfg` was
+    made in Python.
+    """
     end_with_launcher()
     rank = process_rank()
     # Only the first process prints the device. All report the processes they wait for.
@@ -118,36 +156,57 @@ def train_until_stopped(task: str, cfg: TrainConfig) -> tuple[Path, signal.Signa
     with joined_processes(device), output_of(rank) as output:
         with fail_together():
             check_flags(cfg)
-        return _train(task, cfg, device, rank, output)
+        return _train(task, cfg, flags, device, rank, output)
 
 
 def _train(
-    task: str, cfg: TrainConfig, device: str, rank: ProcessRank, output: ProcessOutput | None
+    task: str,
+    cfg: TrainConfig,
+    flags: list[str] | None,
+    device: str,
+    rank: ProcessRank,
+    output: ProcessOutput | None,
 ) -> tuple[Path, signal.Signals | None]:
     # Imports rsl_rl, which takes seconds; flags are checked before.
     from mjlab.scripts.results import print_heading, report_divergence, write_results
 
     # One process looks up the checkpoint, before the new run folder could be found.
-    checkpoint = broadcast_from_first(lambda: checkpoint_to_resume(task, cfg))
+    path = broadcast_from_first(
+        lambda: None if (found := checkpoint_to_resume(task, cfg)) is None else found.path
+    )
+    checkpoint = None if path is None else Checkpoint(path)
+    run = None if path is None else Run(path.parent, task)
+    like = None if cfg.like is None else run_to_continue(task, cfg)
+    typed = _typed(task, cfg, flags)
+    if run is not None and (flags is None or cfg.wandb_run_path is not None):
+        with_settings_of(run, task, cfg)
+    if run is not None and "agent.seed" not in typed:
+        cfg.agent.seed = run.seed if run.seed is not None else cfg.agent.seed
     if cfg.agent.seed == -1:
-        cfg.agent.seed = broadcast_from_first(lambda: choose_seed(checkpoint))
+        cfg.agent.seed = broadcast_from_first(lambda: choose_seed(run))
     cfg.apply_short_forms(rank)
     if checkpoint is not None:
         if not has_foreign_runner(task):
             check_learner_resumes(cfg, checkpoint)
-        restore_num_envs(task, cfg, checkpoint)
+        if "env.scene.num_envs" not in typed:
+            restore_num_envs(cfg, checkpoint)
     else:
+        if like is not None and like.num_envs and "env.scene.num_envs" not in typed:
+            cfg.env.scene.num_envs = like.num_envs
         suggest_profile(task, cfg.profile, device)
         if rank.is_first:
             report_untuned_learner(task, cfg.profile, cfg.learner_name)
     if rank.is_first:
         report_moved_goal(task, cfg)
     with fail_together():
-        prepare_teacher(task, cfg.agent, checkpoint)
+        prepare_teacher(task, cfg.agent, run)
     with _run_folder(cfg, rank, output) as folder, contextlib.ExitStack() as stack:
         with fail_together():
             fetched_from = None if checkpoint is None else cfg.wandb_run_path
-            prepare_env_cfg(task, cfg, cfg.env, checkpoint, fetched_from)
+            requested = copy.deepcopy(cfg)
+            prepare_env_cfg(task, cfg, cfg.env, path, fetched_from)
+            if run is not None:
+                run.check_terms(cfg.env, cfg.agent.obs_groups)
             view = None
             if cfg.live and rank.is_first and not has_foreign_runner(task):
                 from mjlab.scripts.live import live_view
@@ -156,24 +215,37 @@ def _train(
             env = training_env(cfg, device, folder.path, rank)
         try:
             print_heading(task, cfg, env, rank)
+            if rank.is_first:
+                _report_settings(cfg, run or like)
             with fail_together():
-                runner = training_runner(task, cfg, env, folder.path, device)
-                if checkpoint is not None:
-                    runner.load(str(checkpoint))
+                settings = _settings(task, requested, typed, run)
+                runner = training_runner(task, cfg, env, folder.path, device, settings)
+                if checkpoint is not None and run is not None:
+                    checkpoint.load_into(runner)
+                    _override(runner, typed, run)
                 elif (teacher := getattr(cfg.agent, "teacher_checkpoint", None)) is not None:
                     runner.load_teacher(teacher)
             if checkpoint is not None:
                 # Foreign runners train `max_iterations` more iterations.
                 if not has_foreign_runner(task) and is_finished(cfg, runner, checkpoint):
-                    return checkpoint.parent, None
+                    return checkpoint.path.parent, None
                 iteration = getattr(runner, "current_learning_iteration", "unknown")
                 print(f"Resumed: {checkpoint}, iteration {iteration}")
             print(f"Run:     {folder.path}", flush=True)
             if rank.is_first:
-                info = {"profile": cfg.profile, "learner": cfg.learner_name, "command": sys.argv}
-                write_run_info(folder.path, task=task, **info)
-                if checkpoint is not None:
-                    write_resumed(folder.path, checkpoint)
+                write_info(
+                    folder.path,
+                    task=task,
+                    profile=cfg.profile,
+                    learner=cfg.learner_name,
+                    command=sys.argv,
+                    started=datetime.now().isoformat(),
+                    settings=settings,
+                    prepared=[
+                        one.path for one in differences(cfg.env, to_plain(requested.env), "env")
+                    ],
+                    **({} if path is None else {"resumed": resumed_entry(folder.path, path)}),
+                )
                 write_params(folder.path, cfg.env, cfg.agent)
             try:
                 ended = _learn(task, cfg, runner, folder, view)
@@ -187,6 +259,78 @@ def _train(
         if rank.is_first:
             write_results(task, cfg, folder.path, device, ended)
     return folder.path, getattr(runner, "stop_signal", None)
+
+
+def _typed(task: str, cfg: TrainConfig, flags: list[str] | None) -> Settings:
+    """Return the settings that were typed, number of environments and seed included."""
+    registered = TrainConfig.from_task(task, cfg.profile, cfg.learner)
+    given = {
+        "agent.seed": (cfg.agent.seed, registered.agent.seed),
+        "env.scene.num_envs": (cfg.env.scene.num_envs, registered.env.scene.num_envs),
+    }
+    if flags is None:
+        found = {}
+        for name in ("env", "agent"):
+            recorded = to_plain(getattr(registered, name))
+            found |= {one.path: one.now for one in differences(getattr(cfg, name), recorded, name)}
+        found |= {path: now for path, (now, default) in given.items() if now != default}
+    else:
+        found = typed_settings(cfg.env, "env", flags) | typed_settings(cfg.agent, "agent", flags)
+        found |= typed_settings(options_of(task, cfg), "options", flags)
+        found |= {
+            path: now
+            for path, (now, _) in given.items()
+            if is_given(f"--{path.replace('_', '-')}", flags)
+        }
+    return found | ({} if cfg.num_envs is None else {"env.scene.num_envs": cfg.num_envs})
+
+
+def _settings(task: str, cfg: TrainConfig, typed: Settings, run: Run | None) -> Settings:
+    """Return the settings to record: those of the resumed run, updated by those of `cfg`."""
+    registered = TrainConfig.from_task(task, cfg.profile, cfg.learner)
+    parts = [
+        (cfg.env, registered.env, "env"),
+        (cfg.agent, registered.agent, "agent"),
+        (options_of(task, cfg), options_of(task, None), "options"),
+    ]
+    changed = {
+        one.path: one.now
+        for own, default, name in parts
+        for one in differences(own, to_plain(default), name)
+    }
+    hidden = {f"options.{name}" for name in options_of(task, cfg).unrecorded}
+    typed = {path: value for path, value in typed.items() if not is_of_the_session(path)}
+    before = {} if run is None or cfg.as_registered else run.settings
+    found = {**before, **changed, **typed}
+    return {path: value for path, value in found.items() if path not in hidden}
+
+
+def _report_settings(cfg: TrainConfig, run: Run | None) -> None:
+    """Print how configs with the settings of `run` differ from the registered task."""
+    if run is not None:
+        left_out = {} if cfg.as_registered else run.cfg("train").left_out
+        resolved = RunCfg(env=cfg.env, agent=cfg.agent, left_out=left_out)
+        lines = run.notes("train", resolved, cfg.profile)
+        print_list(f"Settings of {run.folder.name} and of this command:", lines)
+
+
+def _override(runner: Any, typed: Settings, run: Run) -> None:
+    """Let typed flags of the learner replace what the checkpoint restored.
+
+    Flags with the values of `run` change nothing: job scripts type all flags at every restart, and
+    the resumed run is the one that was interrupted.
+    """
+    changed = {}
+    for path, value in typed.items():
+        part, _, name = path.partition(".")
+        recorded: Any = run.params["agent"]
+        for key in name.split("."):
+            recorded = recorded.get(key) if isinstance(recorded, dict) else None
+        if part == "agent" and value != recorded:
+            changed[name] = value
+    # Runners of other packages restore what they restore.
+    if changed and hasattr(runner, "override"):
+        runner.override(changed)
 
 
 @contextlib.contextmanager
@@ -226,11 +370,12 @@ def _learn(
     finally:
         # Runners of other packages may have neither.
         ended = getattr(runner, "stop_reason", None) or ended
-        iterations = getattr(runner, "current_learning_iteration", cfg.agent.max_iterations)
+        total = None if ended == "failed" else cfg.agent.max_iterations
+        iterations = getattr(runner, "current_learning_iteration", total)
         if not is_shared:
             # On a full disk, do not mask the error that names the intact checkpoint.
             with contextlib.suppress(OSError):
-                write_run_info(folder.path, ended=ended, iterations=iterations)
+                write_info(folder.path, ended=ended, iterations=iterations)
     return ended
 
 

@@ -81,6 +81,10 @@ class TrainConfig:
     """Dump the states that led to a NaN."""
     log_root: str = "logs/rsl_rl"
     """Root folder of all runs."""
+    like: str | None = field(default=None, kw_only=True)
+    """Run with the settings to start a new run with: its folder, or a checkpoint in it."""
+    as_registered: bool = field(default=False, kw_only=True)
+    """Resume with the task as registered today, without the settings of the run."""
     torchrunx_log_dir: str | None = None
     """Folder for the output of processes other than the first. None: `torchrunx` in the run folder;
     empty: discard the output. The environment variable TORCHRUNX_LOG_DIR takes precedence."""

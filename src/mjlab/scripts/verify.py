@@ -9,26 +9,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mjlab.runs import Run, runs_in
+from mjlab.runs.run import DONE
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.devices import resolve_device
 from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.reference import (
     DATA,
-    ENDED,
     Comparison,
     Kind,
     NotEvaluatedError,
     Reference,
     RunRecord,
     compare,
-    end_of,
     read_run,
     reference_path,
     referenced_tasks,
     samples_limit,
 )
 from mjlab.scripts.resume import resume_flags
-from mjlab.scripts.run_folder import read_run_info, runs_named, sessions_of
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.signals import Interrupted
 
@@ -111,9 +110,9 @@ def _prepare(
     if cfg.resume:
         run_dir = _newest_run(task, cfg)
         # Raises for a missing session before training instead of after.
-        sessions_of(run_dir)
+        _ = Run(run_dir).joined
         train_flags += resume_flags(run_dir)
-        done = run_dir if end_of(run_dir) in ENDED else None
+        done = run_dir if Run(run_dir).state in DONE else None
     return cfg, reference, parse_train_flags(task, train_flags, f"{prog} {task}"), done
 
 
@@ -130,9 +129,9 @@ def _newest_run(task: str, cfg: VerifyConfig) -> Path:
     from mjlab.tasks.registry import load_rl_cfg
 
     experiment = Path(cfg.log_root).resolve() / load_rl_cfg(task).experiment_name
-    for run_dir in runs_named(experiment, f"verify_seed_{cfg.seed}"):
-        if read_run_info(run_dir).get("task") == task:
-            return run_dir
+    for run in runs_in(experiment, run_name=f"verify_seed_{cfg.seed}"):
+        if run.task == task:
+            return run.folder
     raise UserError(
         f"--resume: expected a run of `verify {task}` with seed {cfg.seed} in {experiment}, got "
         "none; leave out --resume to start a new run."
@@ -221,7 +220,7 @@ def command(argv: list[str], prog: str) -> None:
     try:
         run = read_run(run_dir)
     except NotEvaluatedError:
-        if end_of(run_dir) in ENDED:
+        if Run(run_dir).state in DONE:
             raise
         print("So far     no evaluation: the same command with --resume goes on.")
         raise Interrupted(stopped or signal.SIGINT) from None
@@ -230,7 +229,7 @@ def command(argv: list[str], prog: str) -> None:
     print(f"\n{report(reference, run, comparison)}")
     print(f"Picture    {_draw(reference, run, comparison, run_dir / 'verify.png')}")
     part = f"{comparison.within.mean():.0%} of the way within the band"
-    if run.ended not in ENDED:
+    if run.ended not in DONE:
         print(
             f"So far     {part}. Training was {run.ended}: the same command with --resume goes on."
         )

@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mjlab.compat import older_names
 from mjlab.utils.config_fields import check_fields_exist
@@ -205,7 +205,13 @@ def task_source(task_name: str) -> str | None:
 
 @dataclass
 class TaskOptions:
-    """Base class of task options: a dataclass with a default for each field."""
+    """Base class of task options: a dataclass with a default for each field.
+
+    Runs record their options, and are resumed and played with them.
+    """
+
+    unrecorded: ClassVar[tuple[str, ...]] = ()
+    """Fields that are not recorded, because the run folder holds the data that they select."""
 
     def prepare(self, env_cfg: Any, origin: PolicyOrigin) -> None:
         """Edit the environment config in place, and fetch required data.

@@ -17,6 +17,7 @@ _CODES = {
 }
 
 _LONGEST = 8000
+_MOST_LINES = 24
 
 
 def print_info(message: str, color: str = "green") -> None:
@@ -33,6 +34,14 @@ def print_info(message: str, color: str = "green") -> None:
 def print_notice(message: str) -> None:
     """Print a notice to stderr. Stdout is reserved for a command's results."""
     print(shorten(message), file=sys.stderr, flush=True)
+
+
+def print_list(title: str, lines: list[str]) -> None:
+    """Print a list to stderr, shortened if long; nothing if empty."""
+    if lines:
+        more = len(lines) - _MOST_LINES
+        shown = [*lines[:_MOST_LINES], *([f"and {more} more"] if more > 0 else [])]
+        print_notice("\n    ".join([title, *shown]))
 
 
 def shorten(text: str) -> str:

@@ -14,7 +14,7 @@ import socket
 import stat
 import tempfile
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -35,7 +35,7 @@ _WANDB_CACHE = "wandb_checkpoints"
 _TEMPORARY = re.compile(r"\.(.+)\.\d+-[0-9a-f]{8}\.tmp")
 # Age for removal of files of other machines, because their locks may not be visible here.
 _SECONDS_TO_KEEP = 86400.0
-_WANDB_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
+_CHECKPOINT = re.compile(r"model_(\d+)\.pt")
 
 
 def dump_yaml(filename: Path, data: dict[str, Any], sort_keys: bool = False) -> None:
@@ -109,6 +109,18 @@ def _plain_object(value: Any) -> Any:
     return repr(value)
 
 
+def checkpoint_number(name: str) -> int | None:
+    """Return the number of a checkpoint file `model_<number>.pt`; None for other names."""
+    match = _CHECKPOINT.fullmatch(name)
+    return int(match.group(1)) if match else None
+
+
+def checkpoint_names(names: Iterable[str]) -> list[str]:
+    """Return those of `names` that are checkpoints, in the order of their numbers."""
+    numbered = [(n, name) for name in names if (n := checkpoint_number(name)) is not None]
+    return [name for _, name in sorted(numbered)]
+
+
 def get_checkpoint_path(
     log_path: Path, run_dir: str = ".*", checkpoint: str = ".*", sort_alpha: bool = True
 ) -> Path:
@@ -167,7 +179,7 @@ def get_wandb_checkpoint_path(
     fails.
     """
     cache = Path(log_path) / _WANDB_CACHE / Path(run_path).name
-    if checkpoint_name is not None and _WANDB_CHECKPOINT.fullmatch(checkpoint_name):
+    if checkpoint_name is not None and checkpoint_number(checkpoint_name) is not None:
         cached = cache / checkpoint_name
         if cached.is_file():
             return cached, True
@@ -176,8 +188,7 @@ def get_wandb_checkpoint_path(
 
     with _asking_wandb(run_path):
         run = wandb.Api().run(str(run_path))
-        names = [file.name for file in run.files() if _WANDB_CHECKPOINT.fullmatch(file.name)]
-    names.sort(key=lambda name: int(name[len("model_") : -len(".pt")]))
+        names = checkpoint_names(file.name for file in run.files())
     if not names or (checkpoint_name is not None and checkpoint_name not in names):
         raise ValueError(
             f"Checkpoint {checkpoint_name or 'model_<n>.pt'!r} not found in run {str(run_path)!r}. "
@@ -188,6 +199,11 @@ def get_wandb_checkpoint_path(
     if target.is_file():
         return target, True
     cache.mkdir(parents=True, exist_ok=True)
+    # The configs, as in a run folder.
+    recorded = getattr(run, "config", {})
+    for entry, file in (("env_cfg", "env.yaml"), ("train_cfg", "agent.yaml")):
+        if isinstance(recorded.get(entry), dict):
+            dump_yaml(cache / "params" / file, recorded[entry])
     # Download to a temporary file and rename it, so that a failed download leaves no partial file.
     with tempfile.TemporaryDirectory(dir=cache) as folder, _asking_wandb(run_path):
         run.file(name).download(folder, replace=True)
@@ -269,6 +285,22 @@ def rename_locked(file: IO[bytes], path: Path) -> None:
         file.close()
     os.replace(file.name, path)
     file.close()
+
+
+def is_locked(path: Path) -> bool:
+    """Return True while a process holds a file of `create_locked` open.
+
+    Without locks (Windows), True if the file exists.
+    """
+    try:
+        with open(path, "rb") as file:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            return fcntl is None
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
 
 
 def remove_abandoned(path: Path) -> bool:

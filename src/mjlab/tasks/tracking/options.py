@@ -32,6 +32,8 @@ class MotionOptions(TaskOptions):
     motions recorded by the policy's run, the default of the environment config.
     """
 
+    unrecorded = ("motion_file", "registry_name")
+
     motion_file: str | None = None
     """Motions to imitate: files, folders, or names of bundled motions (e.g. squat), separated by
     commas. None: the motions the policy was trained on, or the task's default."""
@@ -64,13 +66,17 @@ class MotionOptions(TaskOptions):
             return find_motions(self.motion_file)
         if self.registry_name is not None:
             return fetch_artifact(self.registry_name)
+        recorded = None if origin.checkpoint is None else recorded_motions(origin.checkpoint.parent)
         if command.motion_file != motion_cfg(load_env_cfg(origin.task)).motion_file:
-            return None
+            try:
+                return find_motions(command.motion_file)
+            except MotionFileError:
+                # The path is of another machine if the run was copied.
+                return recorded
         if origin.wandb_run_path is not None:
             return fetch_motions_of_run(origin.wandb_run_path)
         if origin.checkpoint is None:
             return None
-        recorded = recorded_motions(origin.checkpoint.parent)
         if not recorded:
             logger.warning(
                 "The run of %s has no recorded motion; using %s. Use --motion-file to select one.",

@@ -1,0 +1,459 @@
+"""Runs: what a folder of training says about itself, and the choice among several.
+
+A folder holds `run.json` (task, profile, learner, settings, evaluations, end), `params/*.yaml` (the
+resolved configs), event files and checkpoints. Folders of other tools and of releases 1.x may lack
+`run.json`; their settings are read from `params`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mjlab.runs.checkpoint import Checkpoint
+from mjlab.runs.settings import Difference, Settings, apply_settings, differences, read_yaml
+from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
+from mjlab.utils.errors import UserError
+from mjlab.utils.logging import print_notice
+from mjlab.utils.os import checkpoint_names, checkpoint_number, is_locked, to_plain
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
+    from mjlab.rl.config import RslRlBaseRunnerCfg
+
+Purpose = Literal["train", "evaluate", "play"]
+State = Literal["running", "finished", "solved", "interrupted", "failed"]
+
+INFO_FILE = "run.json"
+"""File of the metadata of a run."""
+RUNNING_FILE = ".running"
+"""File that the training process locks while it runs."""
+TIME_FORMAT = "%Y-%m-%d_%H-%M-%S"
+"""Format of the start time in the name of a folder."""
+DONE = ("solved", "finished")
+"""States of completed training."""
+
+_TIME = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCfg:
+    """Configs of a run for a purpose."""
+
+    env: ManagerBasedRlEnvCfg
+    """Environment."""
+    agent: RslRlBaseRunnerCfg
+    """Learner."""
+    left_out: dict[str, str]
+    """Settings of the run that do not fit the configs, and the reasons, by path."""
+
+
+class Run:
+    """Training run in a folder. Files are read when first needed; an instance does not follow a
+    training that goes on."""
+
+    def __init__(
+        self, folder: Path | str, task: str | None = None, learner: str | None = None
+    ) -> None:
+        """Set the folder.
+
+        Args:
+            folder: Folder of the run.
+            task: Task of a run that does not record it.
+            learner: Learner of a run that does not record it.
+        """
+        self.folder = Path(folder)
+        """Folder of the run."""
+        self._task = task
+        self._learner = learner
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.folder)!r})"
+
+    # Metadata.
+
+    @property
+    def exists(self) -> bool:
+        """True if training created the folder, which may also just store policies."""
+        return (self.folder / INFO_FILE).is_file() or (self.folder / "params").is_dir()
+
+    @cached_property
+    def info(self) -> dict[str, Any]:
+        """Metadata of the run (`run.json`); empty if missing or unreadable."""
+        try:
+            info = json.loads((self.folder / INFO_FILE).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return info if isinstance(info, dict) else {}
+
+    @cached_property
+    def params(self) -> dict[Literal["env", "agent"], dict[str, Any]]:
+        """Resolved configs as plain data (`params/*.yaml`); empty if missing or unreadable."""
+        folder = self.folder / "params"
+        return {"env": read_yaml(folder / "env.yaml"), "agent": read_yaml(folder / "agent.yaml")}
+
+    @property
+    def task(self) -> str | None:
+        """Task; None if not recorded."""
+        return self._text("task") or self._task
+
+    @property
+    def learner(self) -> str | None:
+        """Learner; None if not recorded."""
+        return self._text("learner") or self._learner
+
+    @cached_property
+    def profile(self) -> str | None:
+        """Profile of the task; None if the run had none, or one that the task no longer has."""
+        profile = self._text("profile")
+        if profile is None or self.task is None or profile in list_profiles(self.task):
+            return profile
+        print_notice(
+            f"The run in {self.folder} used the profile {profile!r}, unknown to {self.task}; using the "
+            "default settings of the task."
+        )
+        return None
+
+    def _text(self, name: str) -> str | None:
+        value = self.info.get(name)
+        return value if isinstance(value, str) else None
+
+    def is_of(self, task: str | None, learner: str | None) -> bool:
+        """Return True unless the run records another task or learner. None: any."""
+        return task in (None, self.task or task) and learner in (None, self.learner or learner)
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments per process; None if not recorded."""
+        scene = self.params["env"].get("scene")
+        count = scene.get("num_envs") if isinstance(scene, dict) else None
+        return count if isinstance(count, int) and count >= 1 else None
+
+    @property
+    def seed(self) -> int | None:
+        """Seed; None if not recorded."""
+        seed = self.params["agent"].get("seed")
+        return seed if isinstance(seed, int) and seed >= 0 else None
+
+    @property
+    def started(self) -> datetime | None:
+        """Start of the run, as recorded or as in the name of the folder."""
+        with contextlib.suppress(ValueError):
+            return datetime.fromisoformat(self._text("started") or "")
+        named = _TIME.match(self.folder.name)
+        with contextlib.suppress(ValueError):
+            return datetime.strptime(named.group(), TIME_FORMAT) if named else None
+        return None
+
+    @property
+    def state(self) -> State:
+        """State. A run that was killed is interrupted."""
+        ended = self.info.get("ended")
+        if ended is None and is_locked(self.folder / RUNNING_FILE):
+            return "running"
+        if ended in (*DONE, "failed"):
+            return ended
+        # A signal in the last iteration.
+        total, done = self.params["agent"].get("max_iterations"), self.info.get("iterations")
+        is_done = isinstance(total, int) and isinstance(done, int) and done >= total
+        return "finished" if is_done else "interrupted"
+
+    @cached_property
+    def evaluations(self) -> list[dict[str, Any]]:
+        """Evaluations during training, in order: `iteration`, `mean_return`, `solved`, ...
+
+        Of runs that do not record them, the values in the event files.
+        """
+        recorded = self.info.get("evaluations")
+        if isinstance(recorded, list):
+            return [entry for entry in recorded if isinstance(entry, dict)]
+        from mjlab.rl.plot import read_all_scalars
+
+        found: dict[int, dict[str, Any]] = {}
+        with contextlib.suppress(ValueError):
+            for tag, (iterations, values) in read_all_scalars(self.folder).items():
+                group, _, name = tag.partition("/")
+                for i, value in (
+                    zip(iterations, values, strict=True) if group == "Evaluation" else ()
+                ):
+                    found.setdefault(int(i) + 1, {})[name] = float(value)
+        return [{"iteration": i, **found[i]} for i in sorted(found)]
+
+    # Checkpoints.
+
+    @property
+    def checkpoints(self) -> list[Checkpoint]:
+        """Checkpoints `model_<number>.pt`, in the order of their numbers."""
+        files = self.folder.iterdir() if self.folder.is_dir() else ()
+        return [Checkpoint(self.folder / name) for name in checkpoint_names(f.name for f in files)]
+
+    @property
+    def newest(self) -> Checkpoint | None:
+        """Last checkpoint; None without checkpoints."""
+        checkpoints = self.checkpoints
+        return checkpoints[-1] if checkpoints else None
+
+    @property
+    def joined(self) -> list[Run]:
+        """Runs that continue one another, from the first session to this one.
+
+        Raises:
+            UserError: folder of an earlier session not found.
+        """
+        sessions = [Run(self.folder.resolve(), self._task)]
+        while (resumed := sessions[0].info.get("resumed")) is not None:
+            # `/` also handles an absolute `resumed`.
+            folder = (sessions[0].folder.parent / str(resumed)).parent
+            if not folder.is_dir() or folder in [run.folder for run in sessions]:
+                raise UserError(
+                    f"{sessions[0].folder / INFO_FILE} resumed: expected the folder of an earlier "
+                    f"session, got {str(resumed)!r}; put that folder back."
+                )
+            sessions.insert(0, Run(folder, self._task))
+        return sessions
+
+    @property
+    def is_evaluated(self) -> bool:
+        """True if this session or one that it continues records an evaluation."""
+        with contextlib.suppress(UserError):
+            return any(run.info.get("evaluations") for run in self.joined)
+        return bool(self.info.get("evaluations"))
+
+    def describe(self, checkpoint: Checkpoint | None = None) -> str:
+        """Return `model_28.pt of 14:03, solved, 960`: checkpoint, start, state, last mean return."""
+        started = self.started
+        day = "%H:%M" if started and started.date() == datetime.now().date() else "%Y-%m-%d %H:%M"
+        of = self.folder.name if started is None else f"{started:{day}}"
+        parts = [f"{checkpoint.path.name} of {of}" if checkpoint else of, self.state]
+        if evaluations := self.info.get("evaluations"):
+            parts.append(f"{evaluations[-1]['mean_return']:.4g}")
+        return ", ".join(parts)
+
+    # Configs.
+
+    @cached_property
+    def settings(self) -> Settings:
+        """Settings that differ from the registered task, by path; those of Python callers included.
+
+        Read from `params` if not recorded.
+        """
+        recorded = self.info.get("settings")
+        if isinstance(recorded, dict) or self.task is None:
+            return recorded or {}
+        env, agent = self._registered("train")
+        changes = [
+            *differences(env, self.params["env"], "env"),
+            *differences(agent, self.params["agent"], "agent"),
+        ]
+        return {one.path: one.recorded for one in changes}
+
+    def cfg(self, purpose: Purpose = "train", **choices: Any) -> RunCfg:
+        """Return the configs of the run: those registered today, with the settings of the run.
+
+        Number of environments, seed, engine, logger and the like are those of the task.
+
+        Args:
+            purpose: Purpose of the environments; see `registered_env_cfg`.
+            **choices: `profile` or `learner` other than those of the run.
+
+        Raises:
+            UserError: the task is unknown.
+        """
+        env, agent = self._registered(purpose, **choices)
+        env, left_out = apply_settings(env, self.settings, "env")
+        agent, of_agent = apply_settings(agent, self.settings, "agent")
+        return RunCfg(env=env, agent=agent, left_out=left_out | of_agent)
+
+    def _registered(self, purpose: Purpose, **choices: Any) -> tuple[Any, Any]:
+        if self.task is None:
+            raise UserError(
+                f"{self.folder}: expected a run of a known task, got none; name the task."
+            )
+        choices = {"profile": self.profile, "learner": self.learner, **choices}
+        env = registered_env_cfg(self.task, choices["profile"], purpose)
+        return env, load_rl_cfg(self.task, **choices)
+
+    @property
+    def changes(self) -> list[Difference]:
+        """Changes of the code since the run: configs with its settings today, and as recorded."""
+        if not isinstance(self.info.get("settings"), dict):
+            return []
+        cfg, prepared = self.cfg("train"), self.info.get("prepared") or []
+        found = [
+            *differences(cfg.env, self.params["env"], "env"),
+            *differences(cfg.agent, self.params["agent"], "agent"),
+        ]
+        return [one for one in found if one.path not in cfg.left_out and one.path not in prepared]
+
+    def notes(self, purpose: Purpose, cfg: RunCfg, profile: str | None) -> list[str]:
+        """Return lines on the configs that a command uses for this run.
+
+        Differences from the registered task, settings of the run that were left out, and changes of
+        the code since the run.
+
+        Args:
+            purpose: Purpose of the environments.
+            cfg: Configs, with the flags of the command; differences of the learner matter to train.
+            profile: Profile of the task.
+        """
+        env, agent = self._registered(purpose, profile=profile)
+        found = [*differences(cfg.env, to_plain(env), "env")]
+        if purpose == "train":
+            found += differences(cfg.agent, to_plain(agent), "agent")
+        lines = [f"{one.path}: {one.now} (registered: {one.recorded})" for one in found]
+        lines += [
+            f"{path}: {self.settings[path]} of the run left out: {reason}"
+            for path, reason in cfg.left_out.items()
+        ]
+        now = {one.path: one.now for one in found}
+        lines += [
+            f"{one.path}: {one.now} today, {one.recorded} when the run was trained"
+            for one in self.changes
+            if one.path not in now
+        ]
+        return lines
+
+    def check_terms(self, env: ManagerBasedRlEnvCfg, networks: Iterable[str]) -> None:
+        """Check that observation and action terms of `env` are those of the run, in the same order.
+
+        Networks of equal sizes would otherwise read other terms than those they were trained with.
+
+        Args:
+            env: Config of environments to run networks of this run in.
+            networks: Networks (`actor`, `critic`, ...) to run.
+
+        Raises:
+            UserError: names or order differ.
+        """
+        recorded, groups = self.params["env"], self.params["agent"].get("obs_groups")
+        read = (
+            [groups.get(network) or () for network in networks] if isinstance(groups, dict) else ()
+        )
+        pairs = {"actions": (env.actions, recorded.get("actions"))}
+        for group in {name for names in read for name in names}:
+            now, then = env.observations.get(group), recorded.get("observations", {}).get(group)
+            if now is not None and isinstance(then, dict):
+                pairs[f"observations.{group}"] = now.terms, then.get("terms")
+        lines = []
+        for name, (now, then) in pairs.items():
+            own = [term for term, cfg in now.items() if cfg is not None]
+            if isinstance(then, dict):
+                trained = [term for term, cfg in then.items() if cfg is not None]
+                if own != trained:
+                    lines.append(
+                        f"  {name}: trained with {', '.join(trained)}; got {', '.join(own)}"
+                    )
+        if lines:
+            raise UserError(
+                f"The policy of {self.folder} was trained with other terms, or in another order:\n"
+                + "\n".join(lines)
+                + "\nUse the task as it was trained, or train again."
+            )
+
+
+def registered_env_cfg(task: str, profile: str | None, purpose: Purpose) -> ManagerBasedRlEnvCfg:
+    """Return the environment config of `task` for a policy trained under `profile`.
+
+    The number of environments is that of the task without the profile, except to train: a number
+    chosen for learning is unrelated to the number to play.
+
+    Args:
+        task: Name of the task.
+        profile: Profile, or None.
+        purpose: `train` for the training config; `evaluate` for that of evaluations in training;
+            `play` for the play config of the task, with simplifications of the profile undone as in
+            evaluations.
+    """
+    play = purpose == "play"
+    cfg = load_env_cfg(task, play=play, profile=profile)
+    if purpose == "train":
+        return cfg
+    if profile is not None:
+        cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
+    if purpose == "evaluate" or profile is not None:
+        prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
+        if prepare is not None:
+            prepare(cfg)
+    return cfg
+
+
+# Choice among runs.
+
+
+def runs_in(
+    experiment: Path,
+    task: str | None = None,
+    learner: str | None = None,
+    run_name: str | None = None,
+) -> list[Run]:
+    """Return the runs of an experiment, the last started first.
+
+    Runs that do not record their task or learner match any.
+
+    Args:
+        experiment: Folder of the runs.
+        task: Task of the runs. None: any.
+        learner: Learner of the runs. None: any.
+        run_name: Name given to the runs by `--agent.run-name`. None: any.
+    """
+    if not experiment.is_dir():
+        return []
+    named = re.compile(".*" if run_name is None else rf".*_{re.escape(run_name)}(-\d+)?")
+    folders = (path for path in experiment.iterdir() if path.is_dir())
+    runs = [Run(path, task) for path in folders if named.fullmatch(path.name)]
+    runs = [run for run in runs if run.is_of(task, learner)]
+    return sorted(
+        runs, key=lambda run: (run.started or datetime.min, run.folder.name), reverse=True
+    )
+
+
+def newest_run(runs: Iterable[Run]) -> Run | None:
+    """Return the run to play or evaluate, of those with checkpoints: the first one that is running,
+    else evaluated, else finished, else the first. `runs` are in the order of `runs_in`.
+    """
+    candidates = [run for run in runs if run.newest is not None]
+    rules = (
+        lambda run: run.state == "running",
+        lambda run: run.is_evaluated,
+        lambda run: run.state in DONE,
+        lambda run: True,
+    )
+    return next((run for rule in rules for run in candidates if rule(run)), None)
+
+
+def resolve_checkpoint(path: Path, task: str) -> Checkpoint:
+    """Return the checkpoint at `path`, or the last one of a run folder.
+
+    The path may omit the run folder: `logs/rsl_rl/cartpole/model_500.pt` refers to that file of the
+    newest run of `task`, or to the last checkpoint of that run if it was solved or finished before
+    iteration 500.
+
+    Raises:
+        UserError: file not found; the message lists the available checkpoints.
+    """
+    if path.is_file():
+        return Checkpoint(path)
+    folder, number = Run(path, task), checkpoint_number(path.name)
+    if folder.newest is not None:
+        return folder.newest
+    newest = newest_run(runs_in(path.parent, task)) if number is not None else None
+    last = newest.newest if newest is not None else None
+    if newest is not None and last is not None and number is not None:
+        if (sibling := newest.folder / path.name).is_file():
+            return Checkpoint(sibling)
+        if newest.state in DONE and number > (last.number or 0):
+            print_notice(
+                f"The newest run was {newest.state} before {path.name}. Its last checkpoint: {last}"
+            )
+            return last
+    runs = [Run(path.parent), *runs_in(path.parent)[:1]]
+    available = [str(checkpoint) for run in runs for checkpoint in run.checkpoints[-3:]]
+    hint = f"Available: {', '.join(available)}." if available else f"Use `train {task}` first."
+    raise UserError(f"Checkpoint {path} not found. {hint}")

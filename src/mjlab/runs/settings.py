@@ -1,0 +1,288 @@
+"""Settings of a run: differences from the registered config, recorded and applied again.
+
+Settings map dotted paths of flags to plain values: `{"env.decimation": 2, "env.rewards.upright": None}`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import enum
+import importlib
+from collections.abc import Iterator, Mapping
+from dataclasses import is_dataclass
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from mjlab.utils.os import to_plain
+
+C = TypeVar("C")
+Settings = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Unread:
+    """Object in a YAML file of releases 1.x that only they can read: a function, or an enum."""
+
+    tag: str
+    """Its tag."""
+
+
+# Flags of the machine, the session and its log, and not of the policy.
+_OF_THE_SESSION = (
+    "env.scene.num_envs", "env.seed", "env.sim.engine", "env.sim.num_threads", "env.sim.nan_guard",
+    "agent.seed", "agent.resume", "agent.load_run", "agent.load_checkpoint", "agent.run_name",
+    "agent.experiment_name", "agent.logger", "agent.wandb_project", "agent.wandb_tags",
+    "agent.neptune_project", "agent.upload_model", "agent.save_git_diff", "agent.upload_git_diff",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """Value of a config that differs from a recorded one. Values are plain; removed terms are None."""
+
+    path: str
+    """Dotted path, such as `env.rewards.upright.weight`."""
+    now: Any
+    """Value of the config."""
+    recorded: Any
+    """Recorded value."""
+
+
+def is_of_the_session(path: str) -> bool:
+    """Return True for flags of the machine, the session and its log, and not of the policy."""
+    return any(path == own or path.startswith(f"{own}.") for own in _OF_THE_SESSION)
+
+
+def differences(cfg: Any, recorded: Any, path: str) -> Iterator[Difference]:
+    """Yield the differences between a config and the plain form of another, in depth.
+
+    Fields that `recorded` lacks are skipped, because earlier versions did not have them.
+
+    Args:
+        cfg: Dataclass, dict, list, tuple or value.
+        recorded: Result of `to_plain`, or read from YAML.
+        path: Path of `cfg`: "env", "agent" or "options".
+    """
+    if is_of_the_session(path):
+        return
+    if is_dataclass(cfg) and isinstance(recorded, Mapping):
+        for field in dataclasses.fields(cfg):
+            if field.name in recorded:
+                inner = f"{path}.{field.name}"
+                yield from differences(getattr(cfg, field.name), recorded[field.name], inner)
+    elif isinstance(cfg, Mapping) and isinstance(recorded, Mapping):
+        own = {to_plain(key): value for key, value in cfg.items()}
+        for key in dict.fromkeys((*own, *recorded)):
+            yield from differences(own.get(key), recorded.get(key), f"{path}.{key}")
+    elif _holds_configs(cfg) and isinstance(recorded, list) and len(cfg) == len(recorded):
+        for number, (one, other) in enumerate(zip(cfg, recorded, strict=True)):
+            yield from differences(one, other, f"{path}.{number}")
+    elif (now := to_plain(cfg)) != recorded and not isinstance(recorded, Unread):
+        yield Difference(path, now, recorded)
+
+
+def _holds_configs(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and any(is_dataclass(item) for item in value)
+
+
+def typed_settings(cfg: Any, path: str, flags: list[str]) -> Settings:
+    """Return the settings that the command line `flags` sets, with their values in the parsed `cfg`.
+
+    A typed value counts even if it is the registered one.
+
+    Args:
+        cfg: Config.
+        path: Path of the config: "env", "agent" or "options".
+        flags: Command line.
+    """
+    names = {word.partition("=")[0].replace("_", "-") for word in flags if word.startswith("--")}
+
+    def is_typed(leaf: str) -> bool:
+        # Options of a task look like flags of the command.
+        flag = f"--{leaf.removeprefix('options.')}".replace("_", "-")
+        return any(flag == name or flag.startswith(f"{name}.") for name in names)
+
+    return {
+        leaf: value
+        for leaf, value in _leaves(cfg, path)
+        if is_typed(leaf) and not is_of_the_session(leaf)
+    }
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield the paths and plain values of a config, in depth."""
+    if is_dataclass(value):
+        items: Any = (
+            (field.name, getattr(value, field.name)) for field in dataclasses.fields(value)
+        )
+    elif isinstance(value, Mapping):
+        items = value.items()
+    elif _holds_configs(value):
+        items = enumerate(value)
+    else:
+        yield path, to_plain(value)
+        return
+    for name, item in items:
+        yield from _leaves(item, f"{path}.{to_plain(name)}")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the plain data of a config in YAML; empty if missing or unreadable.
+
+    Nothing is imported: Python objects in files of releases 1.x are read as lists or `Unread`.
+    """
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        pass
+
+    def construct(loader: Any, tag: str, node: Any) -> Any:
+        return loader.construct_sequence(node, deep=True) if tag == "tuple" else Unread(tag)
+
+    Loader.add_multi_constructor("tag:yaml.org,2002:python/", construct)
+    try:
+        # A subclass of the safe loader.
+        params = yaml.load(path.read_text(encoding="utf-8"), Loader)
+    except (OSError, ValueError, RecursionError, yaml.YAMLError):
+        return {}
+    return params if isinstance(params, dict) else {}
+
+
+# Application.
+
+
+def apply_settings(cfg: C, settings: Mapping[str, Any], path: str) -> tuple[C, dict[str, str]]:
+    """Return a copy of `cfg` with the settings below `path`, and the reasons for those left out.
+
+    Values are converted to the types of the fields. Runs may be of other people: in the config of
+    the learner, which imports names such as `module:function`, only networks of this package are
+    accepted.
+    """
+    left_out: dict[str, str] = {}
+    for name, value in settings.items():
+        first, _, rest = name.partition(".")
+        if first != path or not rest:
+            continue
+        try:
+            if path == "agent" and not (_is_import_free(value) or _is_own_network(name, value)):
+                raise TypeError("code named by a run is not imported; set it by its flag")
+            cfg = _updated(cfg, type(cfg), rest.split("."), value)
+        except (KeyError, IndexError, AttributeError):
+            left_out[name] = "not part of this config"
+        except (TypeError, ValueError) as error:
+            left_out[name] = str(error)
+    return cfg, left_out
+
+
+def apply_to_unchanged(cfg: C, registered: Any, settings: Mapping[str, Any], path: str) -> C:
+    """Return a copy of `cfg` with the settings below `path`, except those that `cfg` changed.
+
+    Args:
+        cfg: Config.
+        registered: Config of the task.
+        settings: Settings.
+        path: Path of the configs: "env" or "agent".
+    """
+    changed = {one.path for one in differences(cfg, to_plain(registered), path)}
+    rest = {name: value for name, value in settings.items() if name not in changed}
+    return apply_settings(cfg, rest, path)[0]
+
+
+def _updated(holder: Any, declared: Any, parts: list[str], value: Any) -> Any:
+    """Return a copy of `holder` with the plain `value` at `parts`."""
+    if not parts:
+        return _typed(value, declared, holder)
+    key, *rest = parts
+    if is_dataclass(holder):
+        new = _updated(getattr(holder, key), _field_types(holder).get(key, Any), rest, value)
+        holder = copy.copy(holder)
+        # Also fields of frozen dataclasses.
+        object.__setattr__(holder, key, new)
+        return holder
+    if isinstance(holder, dict):
+        names = {str(to_plain(name)): name for name in holder}
+        # Keys may contain dots.
+        while key not in names and rest:
+            key, rest = f"{key}.{rest[0]}", rest[1:]
+        if key not in names and isinstance(value, dict):
+            raise KeyError(key)
+        name, inner = names.get(key, key), _type_of_values(declared)
+        if value is None and not rest and is_dataclass(holder[name]):
+            # A term that is switched off.
+            return {**holder, name: None}
+        return {**holder, name: _updated(holder.get(name), inner, rest, value)}
+    if isinstance(holder, (list, tuple)):
+        items = list(holder)
+        items[int(key)] = _updated(items[int(key)], Any, rest, value)
+        return type(holder)(items)
+    raise KeyError(key)
+
+
+def _type_of_values(declared: Any) -> Any:
+    """Return the type of the values of a dict, also if it may be None."""
+    options = (declared, *get_args(declared))
+    return next((get_args(o)[1] for o in options if get_origin(o) is dict), Any)
+
+
+def _field_types(cfg: Any) -> dict[str, Any]:
+    try:
+        return get_type_hints(type(cfg))
+    except NameError:
+        # Annotations imported under TYPE_CHECKING cannot be resolved.
+        return {}
+
+
+def _typed(value: Any, declared: Any, current: Any) -> Any:
+    """Return the plain `value` as the type `declared`, or as that of `current` where any is allowed.
+
+    Raises:
+        TypeError: it has another type.
+    """
+    origin, arguments = get_origin(declared), get_args(declared)
+    if declared is Any:
+        numbers = isinstance(current, int | float) and isinstance(value, int | float)
+        return value if current is None or numbers else _typed(value, type(current), current)
+    if origin in (Union, UnionType):
+        for option in arguments:
+            with contextlib.suppress(TypeError):
+                return _typed(value, option, current)
+    elif value is None and declared is NoneType:
+        return None
+    elif origin is Literal and value in arguments:
+        return value
+    elif (kind := origin or declared) in (tuple, list) and isinstance(value, list):
+        each = arguments[:1] * len(value) if kind is list or ... in arguments else arguments
+        each = each if len(each) == len(value) else (Any,) * len(value)
+        items = zip(value, each, [*(current or ()), *[None] * len(value)], strict=False)
+        return kind(_typed(*item) for item in items)
+    elif isinstance(declared, enum.EnumType) and value in declared.__members__:
+        return declared[value]
+    elif declared is float and type(value) is int:
+        return float(value)
+    elif type(value) is kind:
+        return value
+    raise TypeError(f"expected {getattr(declared, '__name__', declared)}, got {value!r}")
+
+
+def _is_import_free(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(_is_import_free(item) for item in (*value, *value.values()))
+    if isinstance(value, list):
+        return all(_is_import_free(item) for item in value)
+    return not isinstance(value, str) or value.isidentifier()
+
+
+def _is_own_network(path: str, value: Any) -> bool:
+    from torch import nn
+
+    module, _, name = str(value).partition(":")
+    if not path.endswith(".class_name") or not module.startswith("mjlab."):
+        return False
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return False
+    return isinstance(found, type) and issubclass(found, nn.Module)
