@@ -45,7 +45,6 @@ _LOCK = "lock"
 _NUM_ENVS = 4
 _MOST_POINTS = 400
 _SECONDS_TO_START = 10.0
-_SECONDS_TO_END = 3.0
 # Variables of `torchrun` that would make the view process a training process.
 _DISTRIBUTED = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "TORCHELASTIC_RUN_ID")
 
@@ -75,15 +74,9 @@ def live_view(task: str, cfg: TrainConfig) -> Generator[LiveView]:
             view.print_url()
             yield view
         finally:
-            assert process.stdin is not None
-            # The process ends when its standard input is closed.
-            with contextlib.suppress(OSError):
-                process.stdin.close()
-            try:
-                process.wait(_SECONDS_TO_END)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            # It has nothing to save.
+            process.kill()
+            process.wait()
 
 
 class LiveView(TrainingObserver):
@@ -195,7 +188,13 @@ class LiveView(TrainingObserver):
             return self._is_over
         self._is_over = True
         output = self._exchange.log.read_text(encoding="utf-8", errors="replace")
-        reason = (output.strip().splitlines() or [""])[-1]
+        # The last line of an error. Otherwise, output is no reason.
+        has_failed = self._process.returncode > 0 and output.strip()
+        reason = (
+            output.strip().splitlines()[-1]
+            if has_failed
+            else f"Exit status {self._process.returncode}."
+        )
         logger.warning("Live view: process ended; training continues. %s", reason)
         return True
 
