@@ -187,14 +187,11 @@ class LiveView(TrainingObserver):
         if self._is_over or self._process.poll() is None:
             return self._is_over
         self._is_over = True
-        output = self._exchange.log.read_text(encoding="utf-8", errors="replace")
-        # The last line of an error. Otherwise, output is no reason.
-        has_failed = self._process.returncode > 0 and output.strip()
-        reason = (
-            output.strip().splitlines()[-1]
-            if has_failed
-            else f"Exit status {self._process.returncode}."
-        )
+        reason = f"Exit status {self._process.returncode}."
+        output = self._exchange.log.read_text(encoding="utf-8", errors="replace").strip()
+        # The last line of an error. Other output is no reason.
+        if self._process.returncode > 0 and output:
+            reason = output.splitlines()[-1]
         logger.warning("Live view: process ended; training continues. %s", reason)
         return True
 
