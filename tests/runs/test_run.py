@@ -119,7 +119,7 @@ def test_the_newest_run_is_running_evaluated_finished_or_has_a_checkpoint(tmp_pa
         assert newest(tmp_path) == solved.folder
         (new.path / "model_0.pt").write_bytes(b"")
         assert newest(tmp_path) == new.path
-        assert "running" in Run(new.path).describe(Run(new.path).newest)
+        assert "running" in Run(new.path).describe()
 
 
 def test_a_session_is_evaluated_if_an_earlier_one_was(tmp_path):

@@ -226,12 +226,11 @@ class Run:
             return any(run.info.get("evaluations") for run in self.joined)
         return bool(self.info.get("evaluations"))
 
-    def describe(self, checkpoint: Checkpoint | None = None) -> str:
-        """Return `model_28.pt of 14:03, solved, 960`: checkpoint, start, state, last mean return."""
+    def describe(self) -> str:
+        """Return `14:03, solved, 960`: start, state, mean return of the last evaluation."""
         started = self.started
         day = "%H:%M" if started and started.date() == datetime.now().date() else "%Y-%m-%d %H:%M"
-        of = self.folder.name if started is None else f"{started:{day}}"
-        parts = [f"{checkpoint.path.name} of {of}" if checkpoint else of, self.state]
+        parts = [self.folder.name if started is None else f"{started:{day}}", self.state]
         if evaluations := self.info.get("evaluations"):
             parts.append(f"{evaluations[-1]['mean_return']:.4g}")
         return ", ".join(parts)

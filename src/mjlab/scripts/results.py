@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from mjlab.utils.processes import ProcessRank
 
 _LOG_ROOT = "logs/rsl_rl"
-# Flags that select the run to resume.
-_RESUME_FLAGS = ("--agent.resume", "--agent.load-run", "--agent.load-checkpoint")
+# Flags that select a run to continue.
+_RESUME_FLAGS = ("--agent.resume", "--agent.load-run", "--agent.load-checkpoint", "--like")
 
 
 def print_heading(task: str, cfg: TrainConfig, env: Any, rank: ProcessRank) -> None:
