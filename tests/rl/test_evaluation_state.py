@@ -162,6 +162,27 @@ def test_a_task_without_curricula_shows_none(make):
     assert EvaluationResult.from_dict(result.to_dict()).curricula == {}
 
 
+def test_logged_numbers_show_curricula_without_edits(make):
+    """The curriculum's memory and effect are its own: only its logged number tells them."""
+    hidden = {"level": 0.0}
+
+    def climbs_alone(env: Any, env_ids: Any) -> float:
+        hidden["level"] += 1.0
+        return hidden["level"]
+
+    def constant(env: Any, env_ids: Any) -> float:
+        return 7.0
+
+    def edit(cfg: Any) -> None:
+        terms = {"alone": climbs_alone, "constant": constant}
+        cfg.curriculum = {name: CurriculumTermCfg(func=func) for name, func in terms.items()}
+
+    env = make(2, edit)
+    assert env.unwrapped.curricula_in_use() == {}
+    env.reset()
+    assert env.unwrapped.curricula_in_use() == {"Curriculum/alone": 2.0}
+
+
 def test_many_curricula_are_counted():
     curricula = {**{f"rewards.r{i}.weight": float(i) for i in range(9)}, "terrain_levels": [0, 9]}
     text = curricula_text(curricula)

@@ -51,23 +51,18 @@ _BY_TERM = ("_class_terms", "_terms", "_state")
 # Managers whose terms, in other packages, may hold rows that outlive episodes: a difficulty per
 # environment.
 _WITH_ROWS = ("command_manager", "curriculum_manager")
+# Settings that the environment reads at every use.
+_SETTINGS = ("episode_length_s",)
 # Attributes of an environment with plain data that are no memory of curricula.
 _OWN_ATTRIBUTES = frozenset(
     {
-        *(
-            "_acts_between_substeps",
-            "_built_state",
-            "_built_settings",
-            "_command_dts",
-            "_device",
-            "_holds_common_steps",
-        ),
-        *("_looks_ahead", "_may_not_start", "_nan_resets", "_pending_reset", "_renderer"),
-        *("_renderer_is_open", "_sim_step_counter", "_stepped_to", "_steps_as_one", "_term_edits"),
-        *("common_step_counter",),
-        *("diverged", "episode_length_buf", "extras", "manager_visualizers", "metadata", "obs_buf"),
-        *("observes_ends", "observes_failures", "physics_dt", "render_mode", "reset_buf"),
-        *("reset_terminated", "reset_time_outs", "reward_buf"),
+        *("_acts_between_substeps", "_built_settings", "_built_state", "_command_dts", "_device"),
+        *("_holds_common_steps", "_looks_ahead", "_may_not_start", "_nan_resets", "_pending_reset"),
+        *("_renderer", "_renderer_is_open", "_sim_step_counter", "_stepped_to", "_steps_as_one"),
+        *("_term_edits", "common_step_counter", "diverged", "episode_length_buf", "extras"),
+        *("manager_visualizers", "metadata", "obs_buf", "observes_ends", "observes_failures"),
+        *("physics_dt", "render_mode", "reset_buf", "reset_terminated", "reset_time_outs"),
+        *("reward_buf",),
     }
 )
 _MISSING = object()
@@ -240,7 +235,8 @@ def curricula_in_use(env: ManagerBasedRlEnv) -> dict[str, Any]:
     state = changed_part(env._built_state or {}, lasting_state(env))
     changed = {} if state is SKIP else state
     for name, manager in managers_of(env).items():
-        section = f"{name.removesuffix('_manager')}s"
+        kind = name.removesuffix("_manager")
+        section = kind if hasattr(env.cfg, kind) else f"{kind}s"
         for label, edit in manager.config_edits().items():
             shown |= _numbers(edit, f"{section}.{label.replace('/', '.')}")
         if manager is env.curriculum_manager:
@@ -251,8 +247,7 @@ def curricula_in_use(env: ManagerBasedRlEnv) -> dict[str, Any]:
         ).items():
             shown |= _public_numbers(attributes, f"{section}.{label}")
     shown |= _public_numbers(changed.get("attributes", {}), "env")
-    settings = changed.get("settings", {}).items()
-    shown |= {name: value for name, value in settings if isinstance(value, (int, float))}
+    shown |= changed.get("settings", {})
     known = [
         one for value in shown.values() for one in (value if isinstance(value, list) else [value])
     ]
@@ -311,11 +306,11 @@ def lasting_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
         for name, value in vars(env).items()
         if name not in _OWN_ATTRIBUTES and not is_stateful(value)
     }
-    settings = {name: plain_scalar(value) for name, value in vars(env.cfg).items()}
+    settings = {name: plain_scalar(getattr(env.cfg, name)) for name in _SETTINGS}
     return {
         "managers": managers,
         "attributes": capture_values(attributes),
-        "settings": {name: value for name, value in settings.items() if value is not SKIP},
+        "settings": settings,
     }
 
 

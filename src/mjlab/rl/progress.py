@@ -271,8 +271,8 @@ class TrainingProgress(TrainingObserver):
         scores = "; ".join(parts)
         when = "" if iteration == self.iteration else f" at iteration {iteration}"
         state = curricula_text(result.curricula)
-        episodes = counted(result.num_episodes, "episode") + (f" at {state}" if state else "")
-        return f"{scores[:1].upper()}{scores[1:]}; {episodes}{when}."
+        when += f", under {state}" if state else ""
+        return f"{scores[:1].upper()}{scores[1:]}; {counted(result.num_episodes, 'episode')}{when}."
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the values of the panel as (name, text)."""
@@ -344,7 +344,7 @@ class TrainingProgress(TrainingObserver):
         iteration, result = self._evaluations[-1]
         when = f"iteration {iteration}, {counted(result.num_episodes, 'episode')}"
         if state := curricula_text(result.curricula):
-            when += f" at {state}"
+            when += f", under {state}"
         table = Table.grid(padding=(0, 2))
         for _ in range(4):
             table.add_column()

@@ -118,7 +118,7 @@ class TrainingDisplay(TrainingProgress):
                 low, high = result.failure_interval
                 metrics.append(f"{result.failure_rate:.1%} failed ({low:.1%} to {high:.1%})")
             if state := curricula_text(result.curricula):
-                metrics.append(f"at {state}")
+                metrics.append(f"under {state}")
             verdict = "solved" if solved else "not confirmed, so training goes on"
             self._print(
                 f"Evaluation after {iteration} iterations: {', '.join(metrics)}, {verdict}."
