@@ -1,4 +1,4 @@
-"""`train-seeds` and `plot-seeds`: one task over several seeds, and their plot."""
+"""`train-seeds`: one task over several seeds."""
 
 from __future__ import annotations
 
@@ -122,25 +122,6 @@ def test_a_seed_that_fails_ends_the_series_and_is_named(run, commands):
 def test_an_unknown_task_trains_nothing(run, commands):
     assert run("train_seeds", "No-Task").status == 1
     assert not commands
-
-
-def test_the_figure_of_several_runs_is_drawn(run, trained, tmp_path):
-    picture = tmp_path / "figures" / "seeds.png"
-    outcome = run("plot_seeds", str(trained), str(trained), "--output", str(picture))
-    assert outcome.status == 0, outcome.err
-    assert outcome.out.strip() == str(picture)
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-def test_what_is_no_run_is_named(run, trained, tmp_path):
-    outcome = run("plot_seeds", str(trained), str(tmp_path / "nowhere"))
-    assert outcome.status == 1
-    assert str(tmp_path / "nowhere") in outcome.message
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    outcome = run("plot_seeds", str(empty), "--output", str(tmp_path / "x.png"))
-    assert outcome.status == 1
-    assert str(empty) in outcome.message
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])

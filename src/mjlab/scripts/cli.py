@@ -128,7 +128,7 @@ COMMANDS = (
         "plot-seeds",
         "learn",
         "one curve with its spread",
-        "mjlab.scripts.train_seeds:plot_command",
+        "mjlab.scripts.plot_seeds:command",
     ),
     Command(
         "verify",

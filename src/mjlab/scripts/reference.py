@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mjlab.runs import Run
 from mjlab.runs.run import DONE
 from mjlab.utils.errors import UserError
+from mjlab.utils.logging import print_notice
 from mjlab.utils.os import replacing
 
 if TYPE_CHECKING:
@@ -261,6 +262,18 @@ def read_scalars_of_sessions(run_dir: Path) -> dict[str, dict[int, float]]:
         ).items()
         if not tag.endswith("/time")
     }
+
+
+def parts_of(run_dir: Path) -> list[Path]:
+    """Return the folders of a run that was resumed, from its first session to `run_dir`.
+
+    If one was moved or deleted, only `run_dir`, with a notice.
+    """
+    try:
+        return [run.folder for run in Run(run_dir).joined]
+    except UserError as error:
+        print_notice(str(error))
+        return [run_dir]
 
 
 def thinned(run: RunRecord, points: int = _POINTS) -> RunRecord:

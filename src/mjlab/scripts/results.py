@@ -15,6 +15,7 @@ import mjlab
 from mjlab.runs import Run
 from mjlab.scripts.flags import prepare_env_cfg
 from mjlab.scripts.record import VideoCfg, record_policy
+from mjlab.scripts.reference import parts_of
 from mjlab.sim.warning_log import mujoco_warnings
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.string import counted
@@ -62,7 +63,7 @@ def write_results(
 
     # A run solved at resume has no iterations.
     with contextlib.suppress(ValueError):
-        plot_run(run_dir, title=task, evaluation=vars(cfg.agent.evaluation))
+        plot_run(parts_of(run_dir), title=task, evaluation=vars(cfg.agent.evaluation))
     run = Run(run_dir, task)
     checkpoint = run.newest
     if cfg.result_video and checkpoint is not None:

@@ -126,23 +126,6 @@ def run_forwarding_signals(
     return status, received[0] if received else None
 
 
-def plot_command(argv: list[str], prog: str) -> None:
-    """Run `plot-seeds`."""
-    parser = argparse.ArgumentParser(
-        prog=prog,
-        description="Plot the mean over runs, with one sample standard deviation shaded.",
-    )
-    parser.add_argument("runs", nargs="+", type=Path, help="run folders")
-    parser.add_argument("--output", type=Path, default=Path("seeds.png"), help="output PNG")
-    parser.add_argument("--tag", help="TensorBoard tag of the metric to plot")
-    parser.add_argument("--title", help="title of the plot")
-    args = parser.parse_args(argv)
-    from mjlab.rl.plot import plot_seeds
-
-    path = plot_seeds(args.runs, args.output, tag=args.tag, title=args.title)
-    print(path)
-
-
 def main() -> None:
     """Entry point of `train-seeds`."""
     run_alias("train-seeds")
