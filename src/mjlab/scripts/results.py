@@ -7,7 +7,6 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
     from mjlab.utils.processes import ProcessRank
 
 _LOG_ROOT = "logs/rsl_rl"
-# Flags that select a run to continue.
-_RESUME_FLAGS = ("--agent.resume", "--agent.load-run", "--agent.load-checkpoint", "--like")
 
 
 def print_heading(task: str, cfg: TrainConfig, env: Any, rank: ProcessRank) -> None:
@@ -87,22 +84,26 @@ def write_results(
 
 
 def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None) -> list[str]:
-    """Return the commands that watch, score and, if interrupted, resume the run in `run_dir`."""
-    flags = [] if cfg.log_root == _LOG_ROOT else ["--log-root", cfg.log_root]
-    typed = [*flags]
+    """Return the commands that watch, score and, if interrupted, resume the run in `run_dir`.
+
+    The run records its settings, so only flags of the machine are repeated.
+    """
+    root = [] if cfg.log_root == _LOG_ROOT else ["--log-root", cfg.log_root]
+    machine = [
+        word
+        for flag, value in (("--device", cfg.device), ("--engine", cfg.engine))
+        if value is not None
+        for word in (flag, value)
+    ]
+    resume, flags = [*root, *machine], root
     # The commands look for the newest policy in the experiment of the task.
     if cfg.agent.experiment_name != load_rl_cfg(task).experiment_name:
-        typed = [*flags, "--agent.experiment-name", cfg.agent.experiment_name]
+        resume += ["--agent.experiment-name", cfg.agent.experiment_name]
         newest = Run(run_dir).newest
         flags = ["--checkpoint-file", str(_short(run_dir if newest is None else newest.path))]
-    words = sys.argv
-    # Not the flags of other commands that train, such as `verify`.
-    if task in words and Path(words[words.index(task) - 1]).stem == "train":
-        typed = words[words.index(task) + 1 :]
-        typed = _picked(typed, lambda name: name not in _RESUME_FLAGS)
     commands = [["play", task, *flags], ["evaluate", task, *flags]]
     if ended == "interrupted":
-        commands.insert(0, ["train", task, *typed, "--agent.resume", "True"])
+        commands.insert(0, ["train", task, *resume, "--agent.resume", "True"])
     join = subprocess.list2cmdline if os.name == "nt" else shlex.join
     return [join(["uv", "run", *_program(), *command]) for command in commands]
 
@@ -112,18 +113,6 @@ def _program() -> list[str]:
     script = Path(sys.argv[0])
     is_own = script.suffix == ".py" and Path(mjlab.__file__).parent not in script.resolve().parents
     return ["python", sys.argv[0]] if is_own else []
-
-
-def _picked(flags: list[str], picks: Callable[[str], bool]) -> list[str]:
-    """Return the flags of a command line, with their values, whose names `picks` accepts."""
-    picked: list[str] = []
-    is_picked = False
-    for word in flags:
-        if word.startswith("--"):
-            is_picked = picks(word.partition("=")[0].replace("_", "-"))
-        if is_picked:
-            picked.append(word)
-    return picked
 
 
 def _short(path: Path) -> Path:
