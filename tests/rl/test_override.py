@@ -381,3 +381,20 @@ def test_the_same_optimizer_continues(tmp_path, caplog, kind):
 def test_a_standard_deviation_is_set(runs):
     deviation = runs["ppo"].resume({"actor.distribution_cfg.init_std": 0.25}).alg.get_policy()
     assert torch.equal(deviation.distribution.std_param, torch.full((2,), 0.25))
+
+
+def test_the_rate_of_curiosity_is_set(tmp_path):
+    rnd = {
+        "num_outputs": 2,
+        "predictor_hidden_dims": (4,),
+        "target_hidden_dims": (4,),
+        "weight": 0.1,
+        "learning_rate": 1e-3,
+    }
+    groups = {"actor": ("actor",), "critic": ("critic",), "rnd_state": ("actor",)}
+    run = Run("ppo", tmp_path, **{"algorithm.rnd_cfg": rnd, "obs_groups": groups})
+    runner = run.resume({"algorithm.rnd_cfg.learning_rate": 1e-5, "algorithm.rnd_cfg.weight": 0.2})
+    assert [group["lr"] for group in runner.alg.rnd.optimizer.param_groups] == [1e-5]
+    assert rates(runner) != [1e-5]
+    runner.learn(3)
+    assert runner.alg.rnd.weight == pytest.approx(0.2 * runner.env.unwrapped.step_dt)

@@ -169,6 +169,8 @@ def check_typed_flags(cfg: TrainConfig, flags: list[str]) -> None:
             print_notice(f"{flag} is ignored by a new run; use --agent.resume True to resume one.")
     if is_given("--wandb-checkpoint-name", flags) and cfg.wandb_run_path is None:
         print_notice("--wandb-checkpoint-name is ignored without --wandb-run-path.")
+    if is_given("--env.seed", flags):
+        print_notice("--env.seed is ignored: --agent.seed seeds the environments, too.")
     if is_given("--gpu-ids", flags) and cfg.gpu_ids is not None:
         if cfg.device is not None and (
             process_rank().is_alone or not cfg.device.startswith("cuda")
