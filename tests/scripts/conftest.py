@@ -30,12 +30,12 @@ def run_main() -> Callable[..., Outcome]:
 def train(run) -> Callable[..., Path]:
     """Return a function that trains a little and returns the run's folder."""
 
-    def train(log_root: Path, iterations: int, *flags: str) -> Path:
+    def train(log_root: Path, iterations: int, *flags: str, status: int = 0) -> Path:
         experiment = log_root / "cartpole"
         before = set(experiment.iterdir()) if experiment.is_dir() else set()
         argv = [TASK, *SMALL, "--log-root", str(log_root)]
         outcome = run("train", *argv, "--agent.max-iterations", str(iterations), *flags)
-        assert outcome.status == 0, outcome.err
+        assert outcome.status == status, outcome.err
         (run_dir,) = set(experiment.iterdir()) - before
         return run_dir
 

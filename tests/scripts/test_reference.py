@@ -312,7 +312,7 @@ def test_a_run_that_is_solved_as_it_is_resumed_has_its_last_evaluation(train, tm
         "2",
     )
     with stopped_after(2):
-        first = train(tmp_path, 4, *solved)
+        first = train(tmp_path, 4, *solved, status=130)
     second = train(tmp_path, 4, *solved, "--agent.resume", "True")
     assert Run(first).info["ended"] == "interrupted"
     run = read_run(second)
