@@ -29,8 +29,9 @@ from torture_parts.commands import preload  # noqa: E402 - found by the line abo
 from torture_parts.trials import Verdict, run_trials  # noqa: E402
 
 PARTS = (
-    *("kills", "resumes", "damage", "limits", "command_lines", "config_files", "physics", "page"),
-)
+    "kills", "evaluations", "resumes", "damage", "limits", "command_lines", "config_files",
+    "physics", "page",
+)  # fmt: skip
 MINUTES = 15.0
 """Wall-clock minutes of all parts on two cores with the default numbers of trials."""
 

@@ -120,7 +120,7 @@ def _check_interrupted(
     for folder in left:
         if folder.is_dir() and not checkpoints(folder):
             raise Broken(f"{kind.name} left a run folder without a checkpoint")
-    if run and ended.status == 0:
+    if run and ended.status in (0, 128 + kind):
         done = json.loads((run / "run.json").read_text())["iterations"]
         newest = {int(path.stem.removeprefix("model_")) for path in checkpoints(run)}
         if max(newest) != done - 1:

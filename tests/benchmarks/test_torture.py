@@ -15,7 +15,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 BENCHMARKS = ROOT / "benchmarks"
-PARTS = ("kills", "resumes", "damage", "limits", "command_lines", "config_files", "physics", "page")
+PARTS = (
+    "kills",
+    "evaluations",
+    "resumes",
+    "damage",
+    "limits",
+    "command_lines",
+    "config_files",
+    "physics",
+    "page",
+)
 
 # Trials that end in every way there is. Run apart, because processes are forked.
 STUB = """

@@ -41,6 +41,8 @@ _INSTALLERS |= {
     "no-emit-package",
 }
 # TensorBoard, ruff, sphinx-build, and the commands of Isaac Lab.
+# Flags of Slurm.
+_SLURM = {"open-mode", "requeue", "signal", "time"}
 _OTHERS = {
     "logdir",
     "project",
@@ -183,7 +185,15 @@ def _unknown(command: str, text: str) -> set[str]:
 
 def test_flags_are_fields_of_the_commands() -> None:
     unknown = set()
-    elsewhere = _ELSEWHERE | _TORCHRUN | _INSTALLERS | _OTHERS | _flags_of_gpu() | _flags_of_sweep()
+    elsewhere = (
+        _ELSEWHERE
+        | _TORCHRUN
+        | _INSTALLERS
+        | _OTHERS
+        | _SLURM
+        | _flags_of_gpu()
+        | _flags_of_sweep()
+    )
     for page in PAGES:
         code = _code(page.read_text(encoding="utf-8"))
         flags = set.intersection(*(_unknown(command, code) for command in _flags_of()))

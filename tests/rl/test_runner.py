@@ -260,6 +260,18 @@ def test_only_a_third_signal_ends_a_save(make_runner, tmp_path: Path, times):
     assert max(names) == f"model_{last}.pt"
 
 
+def test_a_signal_in_the_last_iteration_interrupts_nothing(make_runner, tmp_path: Path):
+    class Stop(TrainingObserver):
+        def on_iteration(self, stats):
+            if stats.iteration == 3:
+                signal.raise_signal(signal.SIGINT)
+
+    runner = make_runner(tmp_path / "run")
+    runner.observers.append(Stop())
+    runner.learn(3)
+    assert (runner.stop_reason, runner.stop_signal) == ("finished", None)
+
+
 def test_two_hangups_of_a_closed_terminal_save(make_runner, tmp_path: Path):
     class HangUp(TrainingObserver):
         def on_iteration(self, stats):

@@ -7,6 +7,7 @@ import inspect
 import io
 import logging
 import os
+import signal
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -19,6 +20,7 @@ from mjlab.scripts.cli import run_command
 from mjlab.sim.engine import EngineUnavailableError
 from mjlab.tasks.registry import UnknownTaskError
 from mjlab.utils.errors import UserError
+from mjlab.utils.signals import Interrupted
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -104,6 +106,7 @@ def test_an_error_may_have_another_status(failing):
 
 def test_an_interrupt_ends_with_its_customary_status_and_no_message(failing):
     assert failing(KeyboardInterrupt()) == (130, "", "")
+    assert failing(Interrupted(signal.SIGTERM)) == (143, "", "")
 
 
 def test_a_reader_that_has_seen_enough_causes_no_message():

@@ -235,6 +235,7 @@ def test_a_number_of_environments_below_one_is_refused(attempt, count):
         ("--env.episode-length-s", "nan"),
         ("--agent.num-steps-per-env", "0"),
         ("--agent.save-interval", "0"),
+        ("--grace", "-1"),
         ("--agent.algorithm.num-mini-batches", "0"),
         ("--agent.algorithm.num-learning-epochs", "-1"),
     ],
