@@ -623,7 +623,7 @@ def test_a_run_is_resumed_from_the_last_checkpoint_with_iterations_left(monkeypa
     assert sweep.finished_run({"x": "1"}, 1) is None
     found = sweep.last_checkpoint({"x": "1"}, 1)
     assert found is not None
-    assert (found.parent.name, found.name) == ("2026-01-01_a_seed_1", "model_1.pt")
+    assert (found.path.parent.name, found.path.name) == ("2026-01-01_a_seed_1", "model_1.pt")
     assert sweep.last_checkpoint({"x": "2"}, 1) is None
 
 

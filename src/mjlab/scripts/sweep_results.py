@@ -19,7 +19,6 @@ import torch
 
 from mjlab.rl.evaluation import mean_and_interval, wilson_interval
 from mjlab.rl.plot import LABELS, plot_curves
-from mjlab.runs import Run
 from mjlab.scripts.sweep_settings import train_config
 from mjlab.scripts.sweep_study import Study, TrainedRun, setting_of, trained_run
 from mjlab.utils.os import write_atomically
@@ -132,7 +131,7 @@ class Comparison:
                 _mean([run.last(f"Evaluation/{name}") for run in row.runs]) for name in others
             ]
             cells.append(len(row.runs) or None)
-            cells.append(_mean([Run(run.folder).info.get("iterations") for run in row.runs]))
+            cells.append(_mean([run.run.info.get("iterations") for run in row.runs]))
             cells.append(_mean([run.training_seconds / 60.0 for run in row.runs]))
             evaluating = sum(run.evaluation_seconds for run in row.runs)
             total = evaluating + sum(run.training_seconds for run in row.runs)
@@ -212,7 +211,7 @@ class Comparison:
         if first.runs:
             sign = 1.0 if sweep.objective.minimize else -1.0
             run = min(first.runs, key=lambda run: sign * run.value)
-            checkpoint = str(Run(run.folder).newest)
+            checkpoint = str(run.run.newest)
             commands.append(["play", sweep.task, "--checkpoint-file", checkpoint])
         join = subprocess.list2cmdline if os.name == "nt" else shlex.join
         for words in commands:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from mjlab.rl.evaluation import Bound
-from mjlab.runs import Run
 from mjlab.scripts.resume import resume_flags
 from mjlab.scripts.sweep_settings import Setting, Sweep, train_config, train_flags
 from mjlab.scripts.sweep_study import Study, TrainedRun, setting_of, trained_run
@@ -179,7 +178,7 @@ class Runs:
         if sweep.objective.past_goal is not None:
             flags += ["--agent.evaluation.stop-when-solved=False"]
         saved = sweep.last_checkpoint(setting, seed)
-        flags += [] if saved is None else resume_flags(saved.parent, saved)
+        flags += [] if saved is None else resume_flags(saved.path.parent, saved.path)
         command = train_command(sweep.task, flags, seed)
         name = f"{sweep.describe(setting)}, seed {seed}"
         print(f"{'Resumed' if saved else 'Started'}  {name}", flush=True)
@@ -187,7 +186,7 @@ class Runs:
         log = open(sweep.log_file(setting, seed), "ab")  # noqa: SIM115
         environment = {**os.environ, **slot, PARENT_VARIABLE: str(os.getpid())}
         process = start_in_background(command, environment, log)
-        first = 0 if saved is None else int(saved.stem.removeprefix("model_")) + 1
+        first = 0 if saved is None or saved.number is None else saved.number + 1
         total = max(1, train_config(sweep, setting).agent.max_iterations)
         run = _Run(
             trial, seed, name, process, log, slot, time.monotonic(), log.tell(), first, total
@@ -198,8 +197,8 @@ class Runs:
         """Print how a run ended; store the value of its trial after the last seed."""
         run.log.close()
         sweep, setting = self._sweep, setting_of(run.trial)
-        newest = next(iter(sweep.sessions(setting, run.seed)), None)
-        info = {} if newest is None else Run(newest).info
+        sessions = sweep.sessions(setting, run.seed)
+        info = sessions[0].info if sessions else {}
         stopped = interrupting_signal(run.process.returncode)
         if (trained := trained_run(sweep, setting, run.seed)) is not None:
             self._count(run, trained)

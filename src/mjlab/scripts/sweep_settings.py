@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.runs import Run, runs_in
+from mjlab.runs import Checkpoint, Run, runs_in
 from mjlab.runs.run import DONE
 from mjlab.scripts.sweep_objective import Objective
 from mjlab.utils.errors import BadCallError
@@ -150,26 +150,23 @@ class Sweep:
         """Return the file with the output of a run."""
         return self.runs_folder(setting) / f"seed_{seed}.log"
 
-    def sessions(self, setting: Setting, seed: int) -> list[Path]:
-        """Return the run folders of a seed, the newest first."""
-        return [run.folder for run in runs_in(self.runs_folder(setting), run_name=f"seed_{seed}")]
+    def sessions(self, setting: Setting, seed: int) -> list[Run]:
+        """Return the sessions of a seed, the newest first."""
+        return runs_in(self.runs_folder(setting), run_name=f"seed_{seed}")
 
-    def finished_run(self, setting: Setting, seed: int) -> Path | None:
+    def finished_run(self, setting: Setting, seed: int) -> Run | None:
         """Return the last session of a run that was trained to its end; None for others.
 
         A run interrupted in its last iteration lacks the last evaluation.
         """
         runs = self.sessions(setting, seed)
-        return next((run for run in runs if Run(run).info.get("ended") in DONE), None)
+        return next((run for run in runs if run.info.get("ended") in DONE), None)
 
-    def last_checkpoint(self, setting: Setting, seed: int) -> Path | None:
+    def last_checkpoint(self, setting: Setting, seed: int) -> Checkpoint | None:
         """Return the checkpoint to resume a run from: the newest with iterations left."""
         total = train_config(self, setting).agent.max_iterations
-        for run in self.sessions(setting, seed):
-            for checkpoint in reversed(Run(run).checkpoints):
-                if checkpoint.number is not None and checkpoint.number + 1 < total:
-                    return checkpoint.path
-        return None
+        saved = (c for run in self.sessions(setting, seed) for c in reversed(run.checkpoints))
+        return next((c for c in saved if c.number is not None and c.number + 1 < total), None)
 
 
 def digest(text: str) -> str:

@@ -25,6 +25,7 @@ from optuna.distributions import (
 )
 from optuna.trial import FrozenTrial, TrialState
 
+from mjlab.runs import Run
 from mjlab.scripts.reference import read_scalars_of_sessions
 from mjlab.scripts.sweep_objective import Objective
 from mjlab.scripts.sweep_settings import Axis, Setting, Sweep
@@ -243,18 +244,19 @@ def _open(sweep: Sweep) -> optuna.Study:
 class TrainedRun:
     """Results of a run that was trained to its end, over all its sessions."""
 
-    def __init__(self, folder: Path, objective: Objective) -> None:
-        """Read the event files of the run.
+    def __init__(self, run: Run, objective: Objective) -> None:
+        """Read the event files of the last session `run` and of those before.
 
         Raises:
             UserError: the run did not log the objective.
         """
-        self.folder = folder
+        self.run = run
+        """Last session."""
         self._objective = objective
-        self._scalars = read_scalars_of_sessions(folder)
+        self._scalars = read_scalars_of_sessions(run.folder)
         if objective.tag not in self._scalars:
             raise UserError(
-                f"--objective: unknown tag {objective.tag!r} in {folder}; "
+                f"--objective: unknown tag {objective.tag!r} in {run.folder}; "
                 f"{suggest(objective.tag, sorted(self._scalars))}"
             )
 
@@ -296,5 +298,5 @@ def trained_run(sweep: Sweep, setting: Setting, seed: int) -> TrainedRun | None:
     Raises:
         UserError: the run did not log the objective.
     """
-    folder = sweep.finished_run(setting, seed)
-    return None if folder is None else TrainedRun(folder, sweep.objective)
+    run = sweep.finished_run(setting, seed)
+    return None if run is None else TrainedRun(run, sweep.objective)

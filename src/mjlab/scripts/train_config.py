@@ -13,6 +13,7 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import EvaluationCfg, RslRlBaseRunnerCfg
 from mjlab.rl.evaluation import required_return
 from mjlab.rl.learners import Learner, learner_of
+from mjlab.runs.settings import differences
 from mjlab.scripts.flags import is_given
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import BadCallError, UserError, check_count, check_in_range
@@ -39,13 +40,9 @@ _ALGORITHM_COUNTS = (
 # Fields of an environment config that enter the return of an episode: terms, and number and scale
 # of the rewards. Curricula may change the weights of rewards.
 _OF_RETURNS = (
-    "rewards",
-    "curriculum",
-    "terminations",
-    "decimation",
-    "episode_length_s",
-    "scale_rewards_by_dt",
-)
+    "rewards.", "curriculum.", "terminations.", "decimation", "sim.mujoco.timestep",
+    "episode_length_s", "scale_rewards_by_dt",
+)  # fmt: skip
 
 
 @dataclass
@@ -217,24 +214,8 @@ def goal_return(evaluation: EvaluationCfg) -> float | None:
 
 def return_differences(env: ManagerBasedRlEnvCfg, other: ManagerBasedRlEnvCfg) -> list[str]:
     """Return the names of fields that differ and enter the return, such as `rewards.alive.weight`."""
-    pairs = {name: (getattr(env, name), getattr(other, name)) for name in _OF_RETURNS}
-    pairs["sim.mujoco.timestep"] = env.sim.mujoco.timestep, other.sim.mujoco.timestep
-    return [
-        difference
-        for name, (one, two) in pairs.items()
-        for difference in _differences(to_plain(one), to_plain(two), name)
-    ]
-
-
-def _differences(one: Any, two: Any, name: str) -> list[str]:
-    """Return the dotted names of values that differ; a term that is off in one is one name."""
-    if not (isinstance(one, dict) and isinstance(two, dict)):
-        return [] if one == two else [name]
-    return [
-        difference
-        for key in {**one, **two}
-        for difference in _differences(one.get(key), two.get(key), f"{name}.{key}")
-    ]
+    found = (one.path.removeprefix("env.") for one in differences(env, to_plain(other), "env"))
+    return [name for name in found if name.startswith(_OF_RETURNS)]
 
 
 def _check_numbers(cfg: TrainConfig) -> None:
