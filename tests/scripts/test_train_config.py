@@ -156,7 +156,7 @@ def test_a_message_of_a_damaged_file_is_cut_in_the_middle(run, monkeypatch):
     def build(*args, **kwargs):
         raise ValueError("begins " + "x" * 100_000 + " ends")
 
-    monkeypatch.setattr("mjlab.scripts.train.launch_training", build)
+    monkeypatch.setattr("mjlab.scripts.train.train_until_stopped", build)
     outcome = run("train", TASK, *SMALL)
     assert outcome.status == 1
     assert len(outcome.err) < 10_000
