@@ -16,7 +16,7 @@ from typing import Any
 
 from mjlab.runs.run import INFO_FILE, RUNNING_FILE, TIME_FORMAT, Run, runs_in
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import create_locked, dump_yaml, remove_temporary_files, replacing
+from mjlab.utils.os import create_locked, dump_yaml, remove_temporary_files, replacing, to_plain
 from mjlab.utils.signals import FORWARDED, replace_handlers, restore_handlers
 
 
@@ -114,7 +114,7 @@ class SharedRunFolder:
 
 def write_info(run_dir: Path, **info: Any) -> None:
     """Add entries to the metadata of a run (`run.json`)."""
-    text = json.dumps({**Run(run_dir).info, **info}, indent=2)
+    text = json.dumps(to_plain({**Run(run_dir).info, **info}), indent=2)
     with replacing(run_dir / INFO_FILE) as file:
         file.write(f"{text}\n".encode())
 

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from mjlab.rl.learners import Learner
 from mjlab.runs.checkpoint import Checkpoint
 from mjlab.runs.settings import Difference, Settings, apply_settings, differences, read_yaml
 from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
@@ -40,6 +41,8 @@ TIME_FORMAT = "%Y-%m-%d_%H-%M-%S"
 DONE = ("solved", "finished")
 """States of completed training."""
 
+# Characters of a value in a message.
+_LONGEST = 100
 _TIME = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")
 
 
@@ -107,7 +110,8 @@ class Run:
     @property
     def learner(self) -> str | None:
         """Learner; None if not recorded."""
-        return self._text("learner") or self._learner
+        learner = self._text("learner")
+        return learner if learner in get_args(Learner) else self._learner
 
     @cached_property
     def profile(self) -> str | None:
@@ -146,7 +150,8 @@ class Run:
     def started(self) -> datetime | None:
         """Start of the run, as recorded or as in the name of the folder."""
         with contextlib.suppress(ValueError):
-            return datetime.fromisoformat(self._text("started") or "")
+            # Comparable with times in names.
+            return datetime.fromisoformat(self._text("started") or "").replace(tzinfo=None)
         named = _TIME.match(self.folder.name)
         with contextlib.suppress(ValueError):
             return datetime.strptime(named.group(), TIME_FORMAT) if named else None
@@ -173,7 +178,13 @@ class Run:
         """
         recorded = self.info.get("evaluations")
         if isinstance(recorded, list):
-            return [entry for entry in recorded if isinstance(entry, dict)]
+            numbers = ("iteration", "mean_return")
+            return [
+                entry
+                for entry in recorded
+                if isinstance(entry, dict)
+                and all(isinstance(entry.get(n), int | float) for n in numbers)
+            ]
         from mjlab.rl.plot import read_all_scalars
 
         found: dict[int, dict[str, Any]] = {}
@@ -231,8 +242,8 @@ class Run:
         started = self.started
         day = "%H:%M" if started and started.date() == datetime.now().date() else "%Y-%m-%d %H:%M"
         parts = [self.folder.name if started is None else f"{started:{day}}", self.state]
-        if evaluations := self.info.get("evaluations"):
-            parts.append(f"{evaluations[-1]['mean_return']:.4g}")
+        if self.evaluations and "mean_return" in self.evaluations[-1]:
+            parts.append(f"{self.evaluations[-1]['mean_return']:.4g}")
         return ", ".join(parts)
 
     # Configs.
@@ -251,7 +262,7 @@ class Run:
             *differences(env, self.params["env"], "env"),
             *differences(agent, self.params["agent"], "agent"),
         ]
-        return {one.path: one.recorded for one in changes}
+        return {one.path: to_plain(one.recorded) for one in changes}
 
     def cfg(self, purpose: Purpose = "train", **choices: Any) -> RunCfg:
         """Return the configs of the run: those registered today, with the settings of the run.
@@ -306,14 +317,16 @@ class Run:
         found = [*differences(cfg.env, to_plain(env), "env")]
         if purpose == "train":
             found += differences(cfg.agent, to_plain(agent), "agent")
-        lines = [f"{one.path}: {one.now} (registered: {one.recorded})" for one in found]
+        lines = [
+            f"{one.path}: {_short(one.now)} (registered: {_short(one.recorded)})" for one in found
+        ]
         lines += [
-            f"{path}: {self.settings[path]} of the run left out: {reason}"
+            f"{_short(path)}: {_short(self.settings[path])} of the run left out: {_short(reason)}"
             for path, reason in cfg.left_out.items()
         ]
         now = {one.path: one.now for one in found}
         lines += [
-            f"{one.path}: {one.now} today, {one.recorded} when the run was trained"
+            f"{one.path}: {_short(one.now)} today, {_short(one.recorded)} when the run was trained"
             for one in self.changes
             if one.path not in now
         ]
@@ -331,14 +344,14 @@ class Run:
         Raises:
             UserError: names or order differ.
         """
-        recorded, groups = self.params["env"], self.params["agent"].get("obs_groups")
-        read = (
-            [groups.get(network) or () for network in networks] if isinstance(groups, dict) else ()
-        )
-        pairs = {"actions": (env.actions, recorded.get("actions"))}
-        for group in {name for names in read for name in names}:
-            now, then = env.observations.get(group), recorded.get("observations", {}).get(group)
-            if now is not None and isinstance(then, dict):
+        groups = self.params["agent"].get("obs_groups")
+        lists = [groups.get(network) for network in networks] if isinstance(groups, dict) else ()
+        read = [group for names in lists if isinstance(names, list) for group in names]
+        recorded, actions = (self.params["env"].get(name) for name in ("observations", "actions"))
+        pairs = {"actions": (env.actions, actions)}
+        for group, then in recorded.items() if isinstance(recorded, dict) else ():
+            now = env.observations.get(group)
+            if now is not None and isinstance(then, dict) and group in read:
                 pairs[f"observations.{group}"] = now.terms, then.get("terms")
         lines = []
         for name, (now, then) in pairs.items():
@@ -355,6 +368,13 @@ class Run:
                 + "\n".join(lines)
                 + "\nUse the task as it was trained, or train again."
             )
+
+
+def _short(value: Any) -> str:
+    """Return a value in one line; a term with all its parameters is long."""
+    text = str(value)
+    text = text if text.isprintable() else repr(text)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def registered_env_cfg(task: str, profile: str | None, purpose: Purpose) -> ManagerBasedRlEnvCfg:

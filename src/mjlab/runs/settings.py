@@ -75,6 +75,11 @@ def differences(cfg: Any, recorded: Any, path: str) -> Iterator[Difference]:
                 yield from differences(getattr(cfg, field.name), recorded[field.name], inner)
     elif isinstance(cfg, Mapping) and isinstance(recorded, Mapping):
         own = {to_plain(key): value for key, value in cfg.items()}
+        values = (*own.values(), *recorded.values())
+        if own.keys() != recorded.keys() and all(_is_plain(value) for value in values):
+            # Such as another set of joint patterns: it holds as a whole.
+            yield Difference(path, to_plain(cfg), dict(recorded))
+            return
         for key in dict.fromkeys((*own, *recorded)):
             yield from differences(own.get(key), recorded.get(key), f"{path}.{key}")
     elif _holds_configs(cfg) and isinstance(recorded, list) and len(cfg) == len(recorded):
@@ -82,6 +87,10 @@ def differences(cfg: Any, recorded: Any, path: str) -> Iterator[Difference]:
             yield from differences(one, other, f"{path}.{number}")
     elif (now := to_plain(cfg)) != recorded and not isinstance(recorded, Unread):
         yield Difference(path, now, recorded)
+
+
+def _is_plain(value: Any) -> bool:
+    return value is not None and not is_dataclass(value) and not isinstance(value, Mapping)
 
 
 def _holds_configs(value: Any) -> bool:
@@ -98,35 +107,26 @@ def typed_settings(cfg: Any, path: str, flags: list[str]) -> Settings:
         path: Path of the config: "env", "agent" or "options".
         flags: Command line.
     """
-    names = {word.partition("=")[0].replace("_", "-") for word in flags if word.startswith("--")}
+    names = {_flag(word.partition("=")[0]) for word in flags if word.startswith("--")}
 
-    def is_typed(leaf: str) -> bool:
+    def typed(value: Any, leaf: str) -> Iterator[tuple[str, Any]]:
         # Options of a task look like flags of the command.
-        flag = f"--{leaf.removeprefix('options.')}".replace("_", "-")
-        return any(flag == name or flag.startswith(f"{name}.") for name in names)
+        if f"--{_flag(leaf.removeprefix('options.'))}" in names and not is_dataclass(value):
+            yield leaf, to_plain(value)
+        elif is_dataclass(value):
+            for field in dataclasses.fields(value):
+                yield from typed(getattr(value, field.name), f"{leaf}.{field.name}")
+        elif isinstance(value, Mapping) or _holds_configs(value):
+            items = value.items() if isinstance(value, Mapping) else enumerate(value)
+            for key, item in items:
+                yield from typed(item, f"{leaf}.{to_plain(key)}")
 
-    return {
-        leaf: value
-        for leaf, value in _leaves(cfg, path)
-        if is_typed(leaf) and not is_of_the_session(leaf)
-    }
+    return {leaf: value for leaf, value in typed(cfg, path) if not is_of_the_session(leaf)}
 
 
-def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield the paths and plain values of a config, in depth."""
-    if is_dataclass(value):
-        items: Any = (
-            (field.name, getattr(value, field.name)) for field in dataclasses.fields(value)
-        )
-    elif isinstance(value, Mapping):
-        items = value.items()
-    elif _holds_configs(value):
-        items = enumerate(value)
-    else:
-        yield path, to_plain(value)
-        return
-    for name, item in items:
-        yield from _leaves(item, f"{path}.{to_plain(name)}")
+def _flag(path: str) -> str:
+    """Return `path` as it is spelled in flags, where a key that begins with a dot loses it."""
+    return path.replace("_", "-").replace("..", ".")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -164,15 +164,17 @@ def apply_settings(cfg: C, settings: Mapping[str, Any], path: str) -> tuple[C, d
     left_out: dict[str, str] = {}
     for name, value in settings.items():
         first, _, rest = name.partition(".")
-        if first != path or not rest:
+        if first != path or not rest or is_of_the_session(name):
             continue
         try:
-            if path == "agent" and not (_is_import_free(value) or _is_own_network(name, value)):
+            is_file = name == "agent.teacher_checkpoint"
+            is_safe = is_file or _is_import_free(value) or _is_own_network(name, value)
+            if path == "agent" and not is_safe:
                 raise TypeError("code named by a run is not imported; set it by its flag")
             cfg = _updated(cfg, type(cfg), rest.split("."), value)
         except (KeyError, IndexError, AttributeError):
             left_out[name] = "not part of this config"
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RecursionError) as error:
             left_out[name] = str(error)
     return cfg, left_out
 
@@ -197,6 +199,8 @@ def _updated(holder: Any, declared: Any, parts: list[str], value: Any) -> Any:
         return _typed(value, declared, holder)
     key, *rest = parts
     if is_dataclass(holder):
+        if key not in {field.name for field in dataclasses.fields(holder)}:
+            raise KeyError(key)
         new = _updated(getattr(holder, key), _field_types(holder).get(key, Any), rest, value)
         holder = copy.copy(holder)
         # Also fields of frozen dataclasses.
@@ -207,12 +211,12 @@ def _updated(holder: Any, declared: Any, parts: list[str], value: Any) -> Any:
         # Keys may contain dots.
         while key not in names and rest:
             key, rest = f"{key}.{rest[0]}", rest[1:]
-        if key not in names and isinstance(value, dict):
-            raise KeyError(key)
         name, inner = names.get(key, key), _type_of_values(declared)
-        if value is None and not rest and is_dataclass(holder[name]):
-            # A term that is switched off.
-            return {**holder, name: None}
+        if value is None and not rest and (name not in holder or is_dataclass(holder[name])):
+            # A term that is switched off, or that this config does not have.
+            return {**holder, name: None} if name in holder else holder
+        if name not in holder and (isinstance(value, dict) or _is_config(inner)):
+            raise KeyError(name)
         return {**holder, name: _updated(holder.get(name), inner, rest, value)}
     if isinstance(holder, (list, tuple)):
         items = list(holder)
@@ -225,6 +229,10 @@ def _type_of_values(declared: Any) -> Any:
     """Return the type of the values of a dict, also if it may be None."""
     options = (declared, *get_args(declared))
     return next((get_args(o)[1] for o in options if get_origin(o) is dict), Any)
+
+
+def _is_config(declared: Any) -> bool:
+    return any(is_dataclass(option) for option in (declared, *get_args(declared)))
 
 
 def _field_types(cfg: Any) -> dict[str, Any]:
@@ -258,6 +266,9 @@ def _typed(value: Any, declared: Any, current: Any) -> Any:
         each = each if len(each) == len(value) else (Any,) * len(value)
         items = zip(value, each, [*(current or ()), *[None] * len(value)], strict=False)
         return kind(_typed(*item) for item in items)
+    elif kind is dict and isinstance(value, dict):
+        each_value, now = (*arguments, Any, Any)[1], current if isinstance(current, dict) else {}
+        return {key: _typed(item, each_value, now.get(key)) for key, item in value.items()}
     elif isinstance(declared, enum.EnumType) and value in declared.__members__:
         return declared[value]
     elif declared is float and type(value) is int:
@@ -269,7 +280,7 @@ def _typed(value: Any, declared: Any, current: Any) -> Any:
 
 def _is_import_free(value: Any) -> bool:
     if isinstance(value, dict):
-        return all(_is_import_free(item) for item in (*value, *value.values()))
+        return all(_is_import_free(item) for item in value.values())
     if isinstance(value, list):
         return all(_is_import_free(item) for item in value)
     return not isinstance(value, str) or value.isidentifier()

@@ -14,6 +14,7 @@ from mjlab.runs import Run, runs_in
 from mjlab.scripts.flags import parse_flags
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import UserError
+from mjlab.utils.os import to_plain
 
 
 @dataclass
@@ -44,7 +45,7 @@ def command(argv: list[str], prog: str) -> None:
         )
     rows = [row_of(run) for run in runs]
     if cfg.json:
-        print(json.dumps(rows, indent=2))
+        print(json.dumps(to_plain(rows), indent=2))
         return
     table = Table(box=None, pad_edge=False, header_style="dim")
     for title, side in (("run", "left"), ("state", "left"), ("iterations", "right"), ("return", "right"),

@@ -1,0 +1,127 @@
+"""Settings: recorded, read and applied again with the values of the run."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from mjlab.rl.config import RslRlDistillationRunnerCfg
+from mjlab.runs import Run, newest_run, runs_in
+from mjlab.runs.folder import write_info, write_params
+from mjlab.runs.settings import apply_settings, differences, typed_settings
+from mjlab.scripts.flags import parse_flags
+from mjlab.scripts.train import TrainConfig
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.utils.os import to_plain
+
+GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
+CARTPOLE = "Mjlab-Cartpole-Balance"
+CALF = "std_walking..*(FR|FL|RR|RL)_calf_joint.*"
+
+
+def changed(cfg) -> dict[str, object]:
+    registered = to_plain(load_env_cfg(GO1))
+    return {one.path: one.now for one in differences(cfg, registered, "env")}
+
+
+def test_other_joint_patterns_hold_as_a_whole():
+    cfg = load_env_cfg(GO1)
+    cfg.actions["joint_pos"].scale = {".*": 0.5}
+    cfg.scene.entities["robot"].init_state.joint_pos = {".*calf_joint": -1.5}
+    cfg.rewards["pose"].params["std_walking"] = {".*": 0.7}
+    cfg.events["push_robot"].params["velocity_range"] = {"x": (-1.0, 1.0)}
+    again, left_out = apply_settings(load_env_cfg(GO1), changed(cfg), "env")
+    assert left_out == {}
+    assert again.actions["joint_pos"].scale == {".*": 0.5}
+    assert again.scene.entities["robot"].init_state.joint_pos == {".*calf_joint": -1.5}
+    assert again.rewards["pose"].params["std_walking"] == {".*": 0.7}
+    assert again.events["push_robot"].params["velocity_range"] == {"x": (-1.0, 1.0)}
+
+
+def test_typed_patterns_are_recorded_as_typed():
+    flags = ["--env.actions.joint-pos.scale", "{'.*': 0.5}"]
+    # A key that begins with a dot, with the registered value.
+    flags += ["--env.rewards.pose.params.std-walking.*(FR|FL|RR|RL)-calf-joint.*", "0.6"]
+    cfg = parse_flags(TrainConfig, TrainConfig.from_task(GO1), flags, "train")
+    assert typed_settings(cfg.env, "env", flags) == {
+        "env.actions.joint_pos.scale": {".*": 0.5},
+        f"env.rewards.pose.params.{CALF}": 0.6,
+    }
+
+
+def test_settings_of_missing_terms_say_so():
+    settings = {
+        "env.events.push_robot.interval_range_s": [2.0, 4.0],
+        "env.rewards.gone.weight": 2.0,
+        "env.rewards.gone.params.std": 2.0,
+        "env.rewards.upright.__dict__": {"func": "os:system"},
+        # Nothing to switch off.
+        "env.curriculum.gone": None,
+    }
+    cfg, left_out = apply_settings(load_env_cfg(GO1, play=True), settings, "env")
+    assert left_out == dict.fromkeys([*settings][:4], "not part of this config")
+    assert to_plain(cfg) == to_plain(load_env_cfg(GO1, play=True))
+
+
+def test_settings_of_the_machine_are_not_applied():
+    settings = {"env.scene.num_envs": 100_000, "env.seed": 5}
+    cfg, left_out = apply_settings(load_env_cfg(CARTPOLE), settings, "env")
+    registered = load_env_cfg(CARTPOLE)
+    assert (cfg.scene.num_envs, cfg.seed) == (registered.scene.num_envs, registered.seed)
+    assert left_out == {}
+
+
+def test_teacher_and_bounds_of_metrics_are_kept():
+    agent = load_rl_cfg(CARTPOLE, learner="distillation")
+    settings = {
+        "agent.teacher_checkpoint": "/runs/a/model_9.pt",
+        "agent.evaluation.solved_above": {"foot/height m": 0.5},
+    }
+    cfg, left_out = apply_settings(agent, settings, "agent")
+    assert isinstance(cfg, RslRlDistillationRunnerCfg)
+    assert left_out == {}
+    assert cfg.teacher_checkpoint == "/runs/a/model_9.pt"
+    assert cfg.evaluation.solved_above == {"foot/height m": 0.5}
+
+
+def test_each_note_is_a_short_line(tmp_path):
+    settings = {"env.rewards.smooth_reward": None, "env.x\x1b[2J\ny": "a\nb"}
+    write_info(tmp_path, task=CARTPOLE, settings=settings)
+    run = Run(tmp_path)
+    notes = run.notes("train", run.cfg(), None)
+    assert len(notes) == 2
+    assert all(line.isprintable() and len(line) < 200 for line in notes)
+
+
+@pytest.mark.parametrize(
+    "info",
+    [
+        {"evaluations": 5},
+        {"evaluations": [5, {"iteration": "x"}, {"iteration": 1, "mean_return": None}]},
+        {"started": "2026-01-01T00:00:00+00:00"},
+        {"learner": "unknown"},
+    ],
+)
+def test_odd_metadata_do_not_stop_a_command(tmp_path, info):
+    for name, more in (("a", info), ("2026-01-01_00-00-00", {})):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model_1.pt").touch()
+        write_info(tmp_path / name, task=CARTPOLE, **more)
+    run = Run(tmp_path / "a")
+    assert run.describe().endswith("interrupted")
+    assert run.cfg().env.decimation == 5
+    assert newest_run(runs_in(tmp_path, CARTPOLE)) is not None
+
+
+def test_odd_parameters_do_not_stop_a_command(tmp_path):
+    cfg = load_env_cfg(CARTPOLE)
+    write_params(tmp_path, cfg, load_rl_cfg(CARTPOLE))
+    for text in ("observations: null", "observations: [1]\nactions: 5", "decimation: 2026-01-01"):
+        (tmp_path / "params" / "env.yaml").write_text(text)
+        run = Run(tmp_path, CARTPOLE)
+        run.check_terms(cfg, ("actor", "critic"))
+        json.dumps(run.settings)
+    for text in ("obs_groups: {actor: 5}", "obs_groups: {actor: [[1]]}"):
+        (tmp_path / "params" / "agent.yaml").write_text(text)
+        Run(tmp_path, CARTPOLE).check_terms(cfg, ("actor", "critic"))
