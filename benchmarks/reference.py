@@ -165,7 +165,7 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
         status, stopped = run_forwarding_signals(command, left)
         run = _newest_run(folder)
         ended = None if run is None else Run(run).state
-        # A signal sent to the training process alone ends it with 0 as well.
+        # A signal may have been sent to the training process alone.
         if stopped or (ended == "interrupted" and time.monotonic() - begin < left):
             return None
         # The status does not count: the time limit may have passed after training.
@@ -451,7 +451,7 @@ def main() -> int:
         for task in tasks:
             try:
                 if not make(task, args.seeds or SEEDS.get(task, 3), options):
-                    return 0
+                    raise KeyboardInterrupt
             except (UserError, RuntimeError) as error:
                 # Continue with other tasks.
                 print(f"error: {task}: {error}", file=sys.stderr, flush=True)

@@ -40,9 +40,9 @@ _INSTALLERS |= {
     "no-emit-project",
     "no-emit-package",
 }
-# TensorBoard, ruff, sphinx-build, and the commands of Isaac Lab.
-# Flags of Slurm.
+# Slurm.
 _SLURM = {"open-mode", "requeue", "signal", "time"}
+# TensorBoard, ruff, sphinx-build, and the commands of Isaac Lab.
 _OTHERS = {
     "logdir",
     "project",
