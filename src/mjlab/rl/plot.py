@@ -37,7 +37,7 @@ LABELS = {
 # Written in every iteration, so the first value is the first iteration of a session.
 _EVERY_ITERATION = "Perf/collection_time"
 # Widths in characters, of a legend and of a handle in it.
-_LEGEND_WIDTH, _LEGEND_HANDLE = 80, 6
+_LEGEND_WIDTH, _LEGEND_HANDLE = 90, 6
 # Goals so many times as high as the curve are not drawn.
 _FAR = 1000.0
 # Small axes side by side.
@@ -230,7 +230,14 @@ def _draw_evaluations(
     marks: dict[str, dict[str, Any]] = {
         "Evaluation": {"ls": ":", "lw": 1, "marker": "o", "ms": 4, "color": "tab:orange"},
         # Around the evaluation that it confirms.
-        "Confirmation": {"ls": "", "marker": "*", "ms": 15, "mfc": "none", "color": "tab:green"},
+        "Confirmation": {
+            "ls": "",
+            "marker": "*",
+            "ms": 15,
+            "mfc": "none",
+            "color": "tab:green",
+            "clip_on": False,
+        },
     }
     for group, style in marks.items():
         if (curve := curves.get(f"{group}/{name}")) is not None:
