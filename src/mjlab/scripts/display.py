@@ -209,6 +209,7 @@ class RunRecorder(TrainingObserver):
         values = result.to_dict()
         entry = {name: values[name] for name in RESULT_FIELDS if values[name] is not None}
         entry |= {"metrics": {name: value.mean for name, value in result.metrics.items()}}
+        entry |= {"curricula": result.curricula} if result.curricula else {}
         self._evaluations.append({"iteration": iteration, "solved": solved, **entry})
         # On a full disk, the next checkpoint raises a clear error.
         with contextlib.suppress(OSError):
