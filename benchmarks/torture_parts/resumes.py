@@ -115,8 +115,8 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
     trial.trying(f"{learner} resumed with {' '.join(flags)}")
     if stops:
         ended = _resume(Path(folder), Path("stopped"), flags)
-        network = name.split(".")[1].replace("algorithm", "critic")
-        if ended.status != 1 or not (name in ended.err or network in ended.err):
+        words = name.replace("algorithm.num-atoms", "critic").split(".")
+        if ended.status != 1 or not any(word in ended.err for word in words[1:]):
             raise Broken(f"exit status {ended.status}: {ended.err[-200:]}")
         return
     found = learned(_resumed(Path(folder), Path("one"), flags))

@@ -9,6 +9,8 @@ import os
 import pickle
 import random
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +19,12 @@ import torch
 from mjlab.rl.checkpoint import (
     CheckpointError,
     RunFolderError,
+    check_terms,
     ensure_writable_folder,
     load_checkpoint,
     migrate,
     save_checkpoint,
+    term_shapes,
 )
 from mjlab.utils.random import preserved_rng, rng_state, set_rng_state
 
@@ -249,6 +253,21 @@ def test_a_checkpoint_of_rsl_rl_continues_at_the_next_iteration(make_runner, tmp
     assert runner.env.unwrapped.common_step_counter == 17
     torch.save({**runner.alg.save(), "iter": 4, "infos": None}, tmp_path / "model_4.pt")
     assert runner.load(str(tmp_path / "model_4.pt")) == {}
+
+
+@pytest.mark.parametrize("value", [math.nan, {"observations": 3}, {"observations": {"actor": 3}}])
+def test_malformed_sizes_are_an_error(value):
+    actions = SimpleNamespace(
+        active_terms=["push"], get_term=lambda name: SimpleNamespace(action_dim=2)
+    )
+    observations = SimpleNamespace(
+        active_terms={"actor": ["position"]}, group_obs_term_dim={"actor": [(2,)]}
+    )
+    env: Any = SimpleNamespace(action_manager=actions, observation_manager=observations)
+    env.unwrapped = env
+    assert term_shapes(env)
+    with pytest.raises(CheckpointError, match="sizes"):
+        check_terms(value, env, ["actor"], "model_0.pt")
 
 
 @pytest.mark.parametrize("value", [math.nan, "no", None])

@@ -563,16 +563,25 @@ def check_terms(saved: Any, env: Any, groups: Iterable[str], path: str) -> None:
     now = term_shapes(env)
     if not saved or not now:
         return
-    pairs = {
-        f"observations.{group}": (saved["observations"].get(group), now["observations"].get(group))
-        for group in groups
-    }
-    pairs["actions"] = saved["actions"], now["actions"]
-    lines = [
-        f"  {name}: trained with {_listed(trained)}, got {_listed(found)}"
-        for name, (trained, found) in pairs.items()
-        if None not in (trained, found) and list(trained.items()) != list(found.items())
-    ]
+    try:
+        pairs = {
+            f"observations.{group}": (
+                saved["observations"].get(group),
+                now["observations"].get(group),
+            )
+            for group in groups
+        }
+        pairs["actions"] = saved["actions"], now["actions"]
+        lines = [
+            f"  {name}: trained with {_listed(trained)}, got {_listed(found)}"
+            for name, (trained, found) in pairs.items()
+            if None not in (trained, found) and list(trained.items()) != list(found.items())
+        ]
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise CheckpointError(
+            f"Checkpoint {path!r} is malformed: sizes: expected the shapes of observation and action "
+            "terms. Use another checkpoint. Nothing was changed."
+        ) from error
     if lines:
         raise CheckpointError(
             f"Checkpoint {path!r} was trained with other terms, or in another order:\n"

@@ -328,6 +328,11 @@ def _override(runner: Any, typed: Settings, run: Run) -> None:
             recorded = recorded.get(key) if isinstance(recorded, dict) else None
         if part == "agent" and value != recorded:
             changed[name] = value
+    if changed and not run.params["agent"]:
+        print_notice(
+            f"{run.folder}/params/agent.yaml is missing or unreadable: the flags "
+            f"{', '.join(f'--agent.{name}' for name in changed).replace('_', '-')} count as changed."
+        )
     # Runners of other packages restore what they restore.
     if changed and hasattr(runner, "override"):
         runner.override(changed)
