@@ -85,6 +85,17 @@ def test_teacher_and_bounds_of_metrics_are_kept():
     assert cfg.evaluation.solved_above == {"foot/height m": 0.5}
 
 
+def test_lists_of_other_lengths_are_told_apart(tmp_path):
+    cfg = load_env_cfg(GO1)
+    cfg.scene.entities["robot"].articulation.actuators += (
+        cfg.scene.entities["robot"].articulation.actuators[0],
+    )
+    write_info(tmp_path, task=GO1, settings={})
+    write_params(tmp_path, cfg, load_rl_cfg(GO1))
+    (note,) = Run(tmp_path).notes("train", Run(tmp_path).cfg(), None)
+    assert "actuators: 2 entries today, 3 entries" in note
+
+
 def test_each_note_is_a_short_line(tmp_path):
     settings = {"env.rewards.smooth_reward": None, "env.x\x1b[2J\ny": "a\nb"}
     write_info(tmp_path, task=CARTPOLE, settings=settings)

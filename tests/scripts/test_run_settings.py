@@ -15,6 +15,11 @@ from mjlab.runs import Checkpoint, Run
 from mjlab.runs.folder import write_info
 from mjlab.scripts.cli import main
 from mjlab.scripts.train import TrainConfig, launch_training
+from mjlab.tasks.tracking.motion_sources import (
+    record_motions,
+    recorded_motions,
+    shipped_motions,
+)
 
 TYPED = (
     "--env.decimation", "2", "--env.rewards.smooth-reward.weight", "9",
@@ -273,3 +278,15 @@ def test_the_table_of_runs_names_settings_and_states(run_main, first):
     (row,) = json.loads(outcome.out)
     assert (row["run"], row["state"], row["iterations"]) == (first.name, "finished", 2)
     assert row["settings"]["env.decimation"] == 2
+
+
+def test_a_run_like_another_reads_its_motion(run, tmp_path):
+    first, task = tmp_path / "copied", "Mjlab-Tracking-Flat-Unitree-G1"
+    record_motions([shipped_motions()["wave"]], first)
+    write_info(first, task=task, learner="ppo", settings={})
+    (first / "model_0.pt").touch()
+    small = ("--num-envs", "2", "--agent.num-steps-per-env", "2", "--agent.max-iterations", "1")
+    root = ("--like", str(first), "--log-root", str(tmp_path / "logs"), "--device", "cpu")
+    assert run("train", task, *root, *small).status == 0
+    (new,) = (tmp_path / "logs" / "g1_tracking").iterdir()
+    assert [path.name for path in recorded_motions(new)] == ["wave.npz"]

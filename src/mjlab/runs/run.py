@@ -371,7 +371,10 @@ class Run:
 
 
 def _short(value: Any) -> str:
-    """Return a value in one line; a term with all its parameters is long."""
+    """Return a value in one line. Terms with all their parameters are long, and lists of configs
+    of other lengths begin alike."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return f"{len(value)} entries"
     text = str(value)
     text = text if text.isprintable() else repr(text)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

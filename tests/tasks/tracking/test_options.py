@@ -202,3 +202,9 @@ def test_what_is_not_there_is_told(wandb, tmp_path, options, origin, message):
     wandb.runs["org/p/bare"] = a_run()
     with pytest.raises(MotionFileError, match=message):
         prepared(options, origin)
+
+
+def test_a_missing_motion_without_a_record_is_named(tmp_path):
+    origin = PolicyOrigin(G1, tmp_path / "model_0.pt")
+    with pytest.raises(MotionFileError, match="gone.npz"):
+        prepared(MotionOptions(), origin, changed="/elsewhere/gone.npz")

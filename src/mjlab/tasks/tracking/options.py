@@ -72,7 +72,7 @@ class MotionOptions(TaskOptions):
                 return find_motions(command.motion_file)
             except MotionFileError:
                 # The path is of another machine if the run was copied.
-                return recorded
+                return recorded or None
         if origin.wandb_run_path is not None:
             return fetch_motions_of_run(origin.wandb_run_path)
         if origin.checkpoint is None:
