@@ -13,8 +13,10 @@ from commands import TASK
 from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.folder import write_info
+from mjlab.runs.settings import typed_settings
 from mjlab.scripts.cli import main
-from mjlab.scripts.train import TrainConfig, launch_training
+from mjlab.scripts.flags import parse_flags
+from mjlab.scripts.train import TrainConfig, launch_training, settings_to_record
 from mjlab.tasks.tracking.motion_sources import (
     record_motions,
     recorded_motions,
@@ -290,3 +292,17 @@ def test_a_run_like_another_reads_its_motion(run, tmp_path):
     assert run("train", task, *root, *small).status == 0
     (new,) = (tmp_path / "logs" / "g1_tracking").iterdir()
     assert [path.name for path in recorded_motions(new)] == ["wave.npz"]
+
+
+def test_later_settings_replace_those_of_their_entries(tmp_path):
+    task, scale = "Mjlab-Velocity-Flat-Unitree-Go1", "--env.actions.joint-pos.scale"
+    each = "{'.*_hip_joint': 0.5, '.*_thigh_joint': 0.3, '.*_calf_joint': 0.2}"
+    recorded = None
+    for number, value in enumerate((each, "{'.*': 0.7}", each, "0.3")):
+        flags = [scale, value]
+        cfg = parse_flags(TrainConfig, TrainConfig.from_task(task), flags, "train")
+        settings = settings_to_record(task, cfg, typed_settings(cfg.env, "env", flags), recorded)
+        (tmp_path / str(number)).mkdir()
+        write_info(tmp_path / str(number), task=task, settings=settings)
+        recorded = Run(tmp_path / str(number))
+        assert recorded.cfg().env.actions["joint_pos"].scale == cfg.env.actions["joint_pos"].scale

@@ -220,7 +220,7 @@ def _train(
             if rank.is_first:
                 _report_settings(cfg, run or like)
             with fail_together():
-                settings = _settings(task, requested, typed, run)
+                settings = settings_to_record(task, requested, typed, run)
                 runner = training_runner(task, cfg, env, folder.path, device, settings)
                 if checkpoint is not None and run is not None:
                     checkpoint.load_into(runner)
@@ -287,7 +287,7 @@ def _typed(task: str, cfg: TrainConfig, flags: list[str] | None) -> Settings:
     return found | ({} if cfg.num_envs is None else {"env.scene.num_envs": cfg.num_envs})
 
 
-def _settings(task: str, cfg: TrainConfig, typed: Settings, run: Run | None) -> Settings:
+def settings_to_record(task: str, cfg: TrainConfig, typed: Settings, run: Run | None) -> Settings:
     """Return the settings to record: those of the resumed run, updated by those of `cfg`."""
     registered = TrainConfig.from_task(task, cfg.profile, cfg.learner)
     parts = [
@@ -302,8 +302,15 @@ def _settings(task: str, cfg: TrainConfig, typed: Settings, run: Run | None) -> 
     }
     hidden = {f"options.{name}" for name in options_of(task, cfg).unrecorded}
     typed = {path: value for path, value in typed.items() if not is_of_the_session(path)}
+    now = changed | typed
     before = {} if run is None or cfg.as_registered else run.settings
-    found = {**before, **changed, **typed}
+    # A term or dict set as a whole replaces earlier settings of its entries.
+    kept = {
+        path: value
+        for path, value in before.items()
+        if not any(path == new or path.startswith(f"{new}.") for new in now)
+    }
+    found = kept | now
     return {path: value for path, value in found.items() if path not in hidden}
 
 
