@@ -85,6 +85,15 @@ def test_teacher_and_bounds_of_metrics_are_kept():
     assert cfg.evaluation.solved_above == {"foot/height m": 0.5}
 
 
+def test_a_profile_that_is_gone_is_one_line(tmp_path, capsys):
+    write_info(tmp_path, task=CARTPOLE, profile="gone", settings={})
+    run = Run(tmp_path)
+    assert run.profile is None
+    (note,) = run.notes("play", run.cfg("play"), None)
+    assert "profile: 'gone' of the run left out" in note
+    assert capsys.readouterr().err == ""
+
+
 def test_lists_of_other_lengths_are_told_apart(tmp_path):
     cfg = load_env_cfg(GO1)
     cfg.scene.entities["robot"].articulation.actuators += (

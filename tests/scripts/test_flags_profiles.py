@@ -177,7 +177,7 @@ def test_play_without_the_profile_refuses_the_policy(run, profiled):
     flags = ("--log-root", str(profiled.parents[1]), "--device", "cpu", "--profile", "None")
     outcome = run("play", PROFILED, "--viewer", "none", "--num-steps", "2", *flags)
     assert outcome.status == 1
-    assert "model_0.pt" in outcome.message
+    assert profiled.name in outcome.message
 
 
 def test_a_profile_that_the_task_no_longer_has_is_told(run, profiled):
@@ -185,7 +185,7 @@ def test_a_profile_that_the_task_no_longer_has_is_told(run, profiled):
     flags = ("--log-root", str(profiled.parents[1]), "--device", "cpu")
     outcome = run("play", PROFILED, "--viewer", "none", "--num-steps", "2", *flags)
     assert outcome.status == 1
-    assert "profile 'gone', unknown to Test-Profiled" in outcome.err
+    assert "profile: 'gone' of the run left out: unknown to Test-Profiled" in outcome.err
 
 
 def test_on_a_cpu_the_profile_is_suggested_in_one_line(run, tmp_path):

@@ -113,17 +113,12 @@ class Run:
         learner = self._text("learner")
         return learner if learner in get_args(Learner) else self._learner
 
-    @cached_property
+    @property
     def profile(self) -> str | None:
         """Profile of the task; None if the run had none, or one that the task no longer has."""
         profile = self._text("profile")
-        if profile is None or self.task is None or profile in list_profiles(self.task):
-            return profile
-        print_notice(
-            f"The run in {self.folder} used the profile {profile!r}, unknown to {self.task}; using the "
-            "default settings of the task."
-        )
-        return None
+        is_known = self.task is None or profile in list_profiles(self.task)
+        return profile if is_known else None
 
     def _text(self, name: str) -> str | None:
         value = self.info.get(name)
@@ -320,6 +315,8 @@ class Run:
         lines = [
             f"{one.path}: {_short(one.now)} (registered: {_short(one.recorded)})" for one in found
         ]
+        if (unknown := self._text("profile")) != self.profile:
+            lines.append(f"profile: {unknown!r} of the run left out: unknown to {self.task}")
         lines += [
             f"{_short(path)}: {_short(self.settings[path])} of the run left out: {_short(reason)}"
             for path, reason in cfg.left_out.items()

@@ -224,7 +224,6 @@ def report_policy(
     run = run_of(checkpoint, task)
     if flags.checkpoint_file is None:
         print_notice(f"Checkpoint: {checkpoint} ({run.describe()})")
-    run.check_terms(env, ("actor", "student"))
     cfg = RunCfg(env=env, agent=load_rl_cfg(task), left_out={})
     if not flags.as_registered:
         cfg = replace(run.cfg(purpose), env=env)
@@ -232,6 +231,7 @@ def report_policy(
         f"Settings of {run.folder.name} and of this command:",
         run.notes(purpose, cfg, flags.profile),
     )
+    run.check_terms(env, ("actor", "student"))
 
 
 # Policy loading.
