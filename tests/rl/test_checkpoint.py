@@ -9,8 +9,6 @@ import os
 import pickle
 import random
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +22,6 @@ from mjlab.rl.checkpoint import (
     load_checkpoint,
     migrate,
     save_checkpoint,
-    term_shapes,
 )
 from mjlab.utils.random import preserved_rng, rng_state, set_rng_state
 
@@ -255,19 +252,10 @@ def test_a_checkpoint_of_rsl_rl_continues_at_the_next_iteration(make_runner, tmp
     assert runner.load(str(tmp_path / "model_4.pt")) == {}
 
 
-@pytest.mark.parametrize("value", [math.nan, {"observations": 3}, {"observations": {"actor": 3}}])
+@pytest.mark.parametrize("value", [math.nan, {"actor": 3}, [1]])
 def test_malformed_sizes_are_an_error(value):
-    actions = SimpleNamespace(
-        active_terms=["push"], get_term=lambda name: SimpleNamespace(action_dim=2)
-    )
-    observations = SimpleNamespace(
-        active_terms={"actor": ["position"]}, group_obs_term_dim={"actor": [(2,)]}
-    )
-    env: Any = SimpleNamespace(action_manager=actions, observation_manager=observations)
-    env.unwrapped = env
-    assert term_shapes(env)
     with pytest.raises(CheckpointError, match="sizes"):
-        check_terms(value, env, ["actor"], "model_0.pt")
+        migrate({"sizes": value}, "model_0.pt")
 
 
 @pytest.mark.parametrize("value", [math.nan, "no", None])
@@ -370,3 +358,16 @@ def test_an_unwritable_folder_is_named(tmp_path: Path):
     with pytest.raises(RunFolderError, match="file/run.*--log-root"):
         ensure_writable_folder(tmp_path / "file" / "run")
     assert list(ensure_writable_folder(tmp_path / "new" / "run").iterdir()) == []
+
+
+def test_networks_read_terms_in_the_order_of_training():
+    saved = {"actor": {"a.x": [1], "b.y": [2]}, "critic": {"a.x": [1]}, "actions": {"push": [1]}}
+    check_terms(saved, saved, ("actor", "critic"), "p")
+    check_terms(None, saved, ("actor",), "p")
+    swapped = {**saved, "actor": {"b.y": [2], "a.x": [1]}}
+    with pytest.raises(CheckpointError, match=r"actor: trained with a\.x \[1\], b\.y \[2\]"):
+        check_terms(saved, swapped, ("actor",), "p")
+    # Other networks are not loaded.
+    check_terms(saved, swapped, ("critic",), "p")
+    with pytest.raises(CheckpointError, match=r"actions: trained with push \[1\]; got push \[2\]"):
+        check_terms(saved, {**saved, "actions": {"push": [2]}}, (), "p")

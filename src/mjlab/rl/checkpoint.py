@@ -49,7 +49,7 @@ _SAC_KEY = "sac_state_dict"
 _DICT_ENTRIES = (
     "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
     "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
-    "infos", "training_state",
+    "infos", "training_state", "sizes",
 )  # fmt: skip
 _COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
 # Entries of the optimizers and of SAC.
@@ -524,64 +524,54 @@ def not_finite(value: Any, name: str = "") -> list[str]:
 # Terms of observations and actions.
 
 
-def term_shapes(env: Any) -> dict[str, Any]:
-    """Return names and shapes of observation terms by group, and of action terms, in their order.
+def term_shapes(env: Any, obs_groups: Mapping[str, Iterable[str]]) -> dict[str, Any]:
+    """Return names and shapes of the terms that each network reads, and of `actions`, in their order.
 
     Empty for environments without managers.
+
+    Args:
+        env: Environments.
+        obs_groups: Observation groups of each network.
     """
     env = getattr(env, "unwrapped", env)
     observations = getattr(env, "observation_manager", None)
     actions = getattr(env, "action_manager", None)
     if observations is None or actions is None:
         return {}
-    return {
-        "observations": {
-            group: {
-                name: list(shape)
-                for name, shape in zip(names, observations.group_obs_term_dim[group], strict=True)
-            }
-            for group, names in observations.active_terms.items()
-        },
-        "actions": {name: [actions.get_term(name).action_dim] for name in actions.active_terms},
+    names, shapes = observations.active_terms, observations.group_obs_term_dim
+    read = {
+        network: {
+            f"{group}.{name}": list(shape)
+            for group in groups
+            for name, shape in zip(names[group], shapes[group], strict=True)
+        }
+        for network, groups in obs_groups.items()
     }
+    sizes = {name: [actions.get_term(name).action_dim] for name in actions.active_terms}
+    return {**read, "actions": sizes}
 
 
-def check_terms(saved: Any, env: Any, groups: Iterable[str], path: str) -> None:
-    """Check that the terms of `groups` and the actions of `env` are those in a checkpoint.
+def check_terms(saved: Any, now: Mapping[str, Any], networks: Iterable[str], path: str) -> None:
+    """Check that `networks` read the terms that they were trained with, and that actions are the same.
 
-    Networks of equal sizes would otherwise read other terms than those they were trained with.
+    Networks of equal sizes would otherwise read other terms.
 
     Args:
-        saved: Result of `term_shapes`, from the checkpoint; empty if unknown.
-        env: Environments.
-        groups: Observation groups of the networks to load.
+        saved: Result of `term_shapes`, from the checkpoint; None if unknown.
+        now: The same of the environments.
+        networks: Networks to load.
         path: Checkpoint file, for messages.
 
     Raises:
         CheckpointError: names, order or shapes differ.
     """
-    now = term_shapes(env)
-    if not saved or not now:
-        return
-    try:
-        pairs = {
-            f"observations.{group}": (
-                saved["observations"].get(group),
-                now["observations"].get(group),
-            )
-            for group in groups
-        }
-        pairs["actions"] = saved["actions"], now["actions"]
-        lines = [
-            f"  {name}: trained with {_listed(trained)}, got {_listed(found)}"
-            for name, (trained, found) in pairs.items()
-            if None not in (trained, found) and list(trained.items()) != list(found.items())
-        ]
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise CheckpointError(
-            f"Checkpoint {path!r} is malformed: sizes: expected the shapes of observation and action "
-            "terms. Use another checkpoint. Nothing was changed."
-        ) from error
+    lines = []
+    for name in (*networks, "actions"):
+        # Older files lack both, and environments without managers the second.
+        found: Any = now.get(name, {})
+        trained: Any = (saved or {}).get(name, found) if found else found
+        if list(trained.items()) != list(found.items()):
+            lines.append(f"  {name}: trained with {_listed(trained)}; got {_listed(found)}")
     if lines:
         raise CheckpointError(
             f"Checkpoint {path!r} was trained with other terms, or in another order:\n"
@@ -591,7 +581,7 @@ def check_terms(saved: Any, env: Any, groups: Iterable[str], path: str) -> None:
 
 
 def _listed(terms: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {tuple(shape)}" for name, shape in terms.items()) or "nothing"
+    return ", ".join(f"{name} {shape}" for name, shape in terms.items()) or "nothing"
 
 
 # Exact resume.
@@ -776,7 +766,9 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
         counts["common_step_counter"] = env_state.get("common_step_counter", 0)
     try:
         # None is a missing entry: rsl_rl writes `infos` as None.
-        for name, value in {**dicts, "infos.env_state": env_state}.items():
+        sizes = dicts["sizes"] if isinstance(dicts["sizes"], dict) else {}
+        parts = {f"sizes.{name}": terms for name, terms in sizes.items()}
+        for name, value in {**dicts, **parts, "infos.env_state": env_state}.items():
             if not isinstance(value, dict | None):
                 raise ValueError(f"{name}: expected a dict, got a {type(value).__name__}.")
         for name, value in counts.items():

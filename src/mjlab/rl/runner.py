@@ -560,13 +560,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """
         # torch's optimizers keep the loaded tensors, and write to them.
         checkpoint = migrate(copy.deepcopy(content), str(path))
-        groups = {
-            group
-            for network, names in (self.cfg.get("obs_groups") or {}).items()
-            for group in names
-            if load_cfg is None or load_cfg.get(network)
-        }
-        check_terms(checkpoint.get("sizes"), self.env, sorted(groups), str(path))
+        groups = self.cfg.get("obs_groups") or {}
+        networks = [name for name in groups if load_cfg is None or load_cfg.get(name)]
+        check_terms(checkpoint.get("sizes"), term_shapes(self.env, groups), networks, str(path))
         storage: Any = getattr(self.alg, "storage", None)
         replay = None
         if load_cfg is None and isinstance(storage, ReplayStorage):
@@ -673,7 +669,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             # Of the state, not of the file: the same if it is saved again before the next iteration.
             "identity": f"{self._token}-{done}",
             "task": self.task,
-            "sizes": term_shapes(self.env),
+            "sizes": term_shapes(self.env, self.cfg.get("obs_groups") or {}),
         }
 
     def _evaluation_entries(self) -> dict[str, Any]:

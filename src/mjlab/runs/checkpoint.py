@@ -79,7 +79,7 @@ class Checkpoint:
 
     @property
     def sizes(self) -> dict[str, Any]:
-        """Terms and their shapes, in order: `observations` by group, and `actions`; empty if unknown."""
+        """Terms and their shapes, in order, of each network and of `actions`; empty if unknown."""
         return self.content.get("sizes") or {}
 
     @property

@@ -191,7 +191,9 @@ def with_task_options(cfg: C, task: str, run: Run | None = None) -> C:
         )
     default = options()
     if run is not None:
-        default, _ = apply_settings(default, run.settings, "options")
+        default, left_out = apply_settings(default, run.settings, "options")
+        for name, reason in left_out.items():
+            print_notice(f"{name}: {run.settings[name]} of the run left out: {reason}")
     # No prefix: options look like flags of the command.
     annotation: Any = Annotated[options, tyro.conf.arg(name="")]  # ty: ignore[invalid-type-form]
     kind: Any = dataclasses.make_dataclass(
