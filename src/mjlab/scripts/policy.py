@@ -149,17 +149,20 @@ def _run_of_policy(task: str, flags: PolicyFlags) -> Run | None:
     Errors are reported by `find_checkpoint`.
     """
     # Runs of Weights & Biases are downloaded once, after parsing.
-    if flags.as_registered or (flags.wandb_run_path and flags.checkpoint_file is None):
+    if flags.wandb_run_path and flags.checkpoint_file is None:
         return None
     try:
         checkpoint = _select(task, flags)
     except UserError:
         return None
-    return None if checkpoint is None else run_of(checkpoint, task)
+    if checkpoint is None:
+        return None
+    run = run_of(checkpoint, task)
+    return run.as_registered() if flags.as_registered else run
 
 
 def run_of(checkpoint: Checkpoint, task: str) -> Run:
-    """Return the run that wrote `checkpoint`, a run of `task` unless it records another."""
+    """Return the run that wrote `checkpoint`, used in `task`."""
     return Run(checkpoint.path.parent, task)
 
 
@@ -343,9 +346,9 @@ def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Run | None) -> 
                 f"{flag}: expected a checkpoint of the learner 'ppo', got {checkpoint} of {learner!r}."
             )
         run = run_of(checkpoint, task)
-        if run.task != task:
+        if not run.is_of(task, None):
             raise UserError(
-                f"{flag}: expected a checkpoint of {task}, got {checkpoint} of {run.task}."
+                f"{flag}: expected a checkpoint of {task}, got {checkpoint} of {run.info['task']}."
             )
         cfg.teacher_checkpoint = str(checkpoint)
         of_teacher: Any = run.cfg("train", learner="ppo").agent

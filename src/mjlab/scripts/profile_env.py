@@ -22,6 +22,7 @@ from mjlab.scripts.policy import (
     find_checkpoint,
     make_policy,
     parse_policy_flags,
+    report_policy,
 )
 from mjlab.utils.errors import check_count
 from mjlab.utils.string import counted
@@ -99,9 +100,11 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
         check_count(f"--{name.replace('_', '-')}", getattr(cfg, name), minimum)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
+    env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="train")
+    report_policy(task, checkpoint, cfg, env_cfg, "train")
     env = make_env(
         task,
-        env_cfg_of(task, cfg, checkpoint, purpose="train"),
+        env_cfg,
         device,
         cfg.num_envs,
         cfg.engine,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.rl.learners import learner_of
 from mjlab.runs import Checkpoint, Run, resolve_checkpoint, runs_in
-from mjlab.runs.settings import apply_to_unchanged
+from mjlab.runs.settings import Settings, apply_settings
 from mjlab.scripts.policy import has_foreign_runner
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
@@ -76,15 +76,21 @@ def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Run]:
         UserError: all runs that match the pattern are of other tasks or learners.
     """
     experiment, pattern, learner = cfg.experiment_folder, cfg.agent.load_run, cfg.learner
+    # Jobs that run side by side are told apart by their names.
+    run_name = cfg.agent.run_name if cfg.agent.resume == "auto" else ""
     # Matching rule of `get_checkpoint_path`.
-    runs = runs_in(experiment)
+    runs = runs_in(experiment, run_name=run_name or None)
     matching = [run for run in runs if re.fullmatch(pattern, run.folder.name)]
     matching = matching or [run for run in runs if re.match(pattern, run.folder.name)]
     others = [run for run in matching if not run.is_of(task, learner)]
     if others and len(others) == len(matching) and cfg.agent.resume != "auto":
         listed = [
             f"{run.folder.name} is of "
-            + (f"the learner {run.learner!r}" if run.is_of(task, None) else str(run.task))
+            + (
+                f"the learner {run.learner!r}"
+                if run.is_of(task, None)
+                else str(run.info.get("task"))
+            )
             for run in others
         ]
         listed[3:] = [f"and {len(listed) - 3} more"] if len(listed) > 3 else []
@@ -110,7 +116,7 @@ def run_to_continue(task: str, cfg: TrainConfig) -> Run | None:
             raise UserError("--like: expected a new run, got --agent.resume; use one of them.")
         return Run(resolve_checkpoint(Path(cfg.like), task).path.parent, task)
     # Runs of Weights & Biases are downloaded once, when training starts.
-    if cfg.as_registered or cfg.wandb_run_path is not None:
+    if cfg.wandb_run_path is not None:
         return None
     try:
         checkpoint = checkpoint_to_resume(task, cfg)
@@ -121,18 +127,18 @@ def run_to_continue(task: str, cfg: TrainConfig) -> Run | None:
     run = Run(checkpoint.path.parent, task)
     if run.learner is None and not has_foreign_runner(task):
         with contextlib.suppress(CheckpointError):
-            return Run(run.folder, task, checkpoint.learner)
-    return run
+            run = Run(run.folder, task, checkpoint.learner)
+    return run.as_registered() if cfg.as_registered else run
 
 
-def with_settings_of(run: Run, task: str, cfg: TrainConfig) -> None:
-    """Apply the settings of `run` to fields of `cfg` that are as registered, in place.
+def with_settings_of(run: Run, cfg: TrainConfig, typed: Settings) -> None:
+    """Apply the settings of `run` that were not `typed` to `cfg`, in place.
 
-    For runs that are unknown when flags are parsed: changes of `cfg` count as typed flags.
+    For runs that are unknown when flags are parsed.
     """
-    registered = type(cfg).from_task(task, cfg.profile, cfg.learner)
-    cfg.env = apply_to_unchanged(cfg.env, registered.env, run.settings, "env")
-    cfg.agent = apply_to_unchanged(cfg.agent, registered.agent, run.settings, "agent")
+    rest = {path: value for path, value in run.settings.items() if path not in typed}
+    cfg.env, _ = apply_settings(cfg.env, rest, "env")
+    cfg.agent, _ = apply_settings(cfg.agent, rest, "agent")
 
 
 def resume_flags(run_dir: Path, checkpoint: Path | None = None) -> list[str]:

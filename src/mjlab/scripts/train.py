@@ -178,10 +178,13 @@ def _train(
     run = None if path is None else Run(path.parent, task)
     like = None if cfg.like is None else run_to_continue(task, cfg)
     typed = _typed(task, cfg, flags)
-    if run is not None and (flags is None or cfg.wandb_run_path is not None):
-        with_settings_of(run, task, cfg)
-    if run is not None and "agent.seed" not in typed:
-        cfg.agent.seed = run.seed if run.seed is not None else cfg.agent.seed
+    source = run or like
+    # A command line was parsed with the settings of the run, unless the run was unknown.
+    is_parsed = flags is not None and cfg.wandb_run_path is None
+    if source is not None and not is_parsed and not cfg.as_registered:
+        with_settings_of(source, cfg, typed)
+    if run is not None and run.seed is not None and "agent.seed" not in typed:
+        cfg.agent.seed = run.seed
     if cfg.agent.seed == -1:
         cfg.agent.seed = broadcast_from_first(lambda: choose_seed(run))
     cfg.apply_short_forms(rank)
@@ -302,7 +305,8 @@ def settings_to_record(task: str, cfg: TrainConfig, typed: Settings, run: Run | 
     }
     hidden = {f"options.{name}" for name in options_of(task, cfg).unrecorded}
     typed = {path: value for path, value in typed.items() if not is_of_the_session(path)}
-    now = changed | typed
+    # Last, because a typed path may have been resolved since.
+    now = typed | changed
     before = {} if run is None or cfg.as_registered else run.settings
     # A term or dict set as a whole replaces earlier settings of its entries.
     kept = {

@@ -17,7 +17,7 @@ _CODES = {
 }
 
 _LONGEST = 8000
-_MOST_LINES = 24
+_MOST_LINES = 100
 
 
 def print_info(message: str, color: str = "green") -> None:

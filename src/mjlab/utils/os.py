@@ -30,7 +30,8 @@ except ImportError:
 
 logger = logging.getLogger(__name__)
 
-_WANDB_CACHE = "wandb_checkpoints"
+WANDB_CACHE = "wandb_checkpoints"
+"""Folder of an experiment with downloads from Weights & Biases, a folder per run."""
 # Names of `temporary_path`. Files of other programs and of earlier versions are not locked.
 _TEMPORARY = re.compile(r"\.(.+)\.\d+-[0-9a-f]{8}\.tmp")
 # Age for removal of files of other machines, because their locks may not be visible here.
@@ -139,7 +140,7 @@ def get_checkpoint_path(
     log_path = Path(log_path)
     if not log_path.is_dir():
         raise ValueError(f"Log folder {str(log_path)!r} not found; train the task first.")
-    folders = [p for p in log_path.iterdir() if p.is_dir() and p.name != _WANDB_CACHE]
+    folders = [p for p in log_path.iterdir() if p.is_dir() and p.name != WANDB_CACHE]
     folders.sort(key=lambda p: p.name if sort_alpha else (p.stat().st_mtime_ns, p.name))
     runs = [p for p in folders if re.fullmatch(run_dir, p.name)]
     runs = runs or [p for p in folders if re.match(run_dir, p.name)]
@@ -178,7 +179,7 @@ def get_wandb_checkpoint_path(
     the checkpoint is not found, `UserError` without a login, and `ConnectionError` if the download
     fails.
     """
-    cache = Path(log_path) / _WANDB_CACHE / Path(run_path).name
+    cache = Path(log_path) / WANDB_CACHE / Path(run_path).name
     if checkpoint_name is not None and checkpoint_number(checkpoint_name) is not None:
         cached = cache / checkpoint_name
         if cached.is_file():
