@@ -10,6 +10,7 @@ import pytest
 
 from mjlab.runs import Run, newest_run, resolve_checkpoint, runs_in
 from mjlab.runs.folder import NewRunFolder, write_info
+from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import UserError
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -65,6 +66,23 @@ def test_checkpoints_are_in_the_order_of_numbers(tmp_path):
     assert [checkpoint.number for checkpoint in run.checkpoints] == [3, 20, 100]
     assert run.newest.number == 100
     assert make_run(tmp_path, "empty").newest is None
+
+
+def test_a_policy_is_used_in_the_task_asked_for(tmp_path):
+    make_run(tmp_path, "run", task=TASK, settings={"env.decimation": 2})
+    other = "Mjlab-Cartpole-Balance"
+    assert Run(tmp_path / "run").task == TASK
+    run = Run(tmp_path / "run", other)
+    assert (run.task, run.is_of(other, None), run.is_of(TASK, None)) == (other, False, True)
+    assert run.cfg("play").env.decimation == 2
+    assert set(run.cfg("play").env.rewards) == set(load_env_cfg(other, play=True).rewards)
+
+
+def test_a_run_as_registered_keeps_its_profile(tmp_path):
+    make_run(tmp_path, "run", task=TASK, profile="cpu", settings={"env.decimation": 2})
+    run = Run(tmp_path / "run").as_registered()
+    assert (run.profile, run.settings) == ("cpu", {})
+    assert run.cfg().env.decimation == load_env_cfg(TASK).decimation
 
 
 # State.

@@ -132,6 +132,21 @@ def test_auto_resumes_if_there_is_a_run(first, train_more):
     assert new.info.get("resumed") is None
 
 
+def test_auto_resumes_runs_of_its_name_only(first, train_more):
+    name = ("--agent.resume", "auto", "--agent.run-name", "seed_2", "--num-envs", "4")
+    new, outcome = train_more(*name, iterations=1)
+    assert "Resumed:" not in outcome.out
+    resumed, _ = train_more(*name, iterations=2)
+    assert [run.folder for run in resumed.joined] == [new.folder, resumed.folder]
+
+
+def test_python_starts_a_run_like_another(first, tmp_path):
+    cfg = TrainConfig.from_task(TASK)
+    cfg.device, cfg.log_root, cfg.like = "cpu", str(tmp_path / "new"), str(first)
+    cfg.agent.max_iterations = 1
+    assert trained_with(Run(launch_training(TASK, cfg))) == SETTINGS
+
+
 def test_auto_leaves_a_solved_run_alone(run, first):
     write_info(first, ended="solved")
     argv = (TASK, "--device", "cpu", "--log-root", str(first.parents[1]), "--agent.resume", "auto")

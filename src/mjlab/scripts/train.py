@@ -208,8 +208,8 @@ def _train(
             fetched_from = None if checkpoint is None else cfg.wandb_run_path
             requested = copy.deepcopy(cfg)
             # A run like another one also reads the files recorded with that one, such as motions.
-            source = path if like is None or like.newest is None else like.newest.path
-            prepare_env_cfg(task, cfg, cfg.env, source, fetched_from)
+            beside = path if like is None or like.newest is None else like.newest.path
+            prepare_env_cfg(task, cfg, cfg.env, beside, fetched_from)
             if run is not None:
                 run.check_terms(cfg.env, cfg.agent.obs_groups)
             view = None
