@@ -290,7 +290,7 @@ def _numbers(values: Any, path: str) -> dict[str, Any]:
 
 
 def lasting_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return what may be memory of curricula.
+    """Return possible memory of curricula.
 
     Terms of observations are left out: histories, delays and biases are of an episode.
     """
@@ -456,7 +456,7 @@ class Fit:
 
 
 def _takes(cfg: Any, key: str) -> bool:
-    """Return whether a term's function takes the parameter `key`, which curricula may add."""
+    """Return True if a term's function takes the parameter `key`, which curricula may add."""
     if key in cfg.params:
         return True
     try:

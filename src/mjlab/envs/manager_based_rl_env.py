@@ -765,7 +765,7 @@ class ManagerBasedRlEnv(Tabular):
         return curriculum_state.load_curriculum_state(self, state)
 
     def curricula_in_use(self) -> dict[str, Any]:
-        """Return what curricula have changed, by path in the config: numbers, and lists of numbers.
+        """Return the changes made by curricula, by path in the config: numbers, and lists of numbers.
 
         Attributes of terms and of the environment follow the same naming (`env.<name>`); numbers that
         curriculum terms log, and nothing else shows, are `Curriculum/<term>`.

@@ -309,7 +309,7 @@ class Bound:
         return self.name in ("failure_rate", "success_rate")
 
     def is_met(self, result: EvaluationResult) -> bool:
-        """Return whether `result` meets the bound. NaN does not."""
+        """Return True if `result` meets the bound. NaN does not."""
         value = result.judged(self.name)
         return value <= self.limit if self.is_upper else value >= self.limit
 
@@ -379,7 +379,7 @@ class SolvedCheck:
         self.last_iteration = 0
 
     def should_evaluate(self, iteration: int, mean_step_reward: float) -> bool:
-        """Return whether the training data suggest that the policy may be good enough.
+        """Return True if the training data suggest that the policy may be good enough.
 
         Args:
             iteration: Number of iterations finished.
@@ -395,7 +395,7 @@ class SolvedCheck:
         return trigger is None or mean_step_reward * int(self._env.max_episode_length) >= trigger
 
     def is_solved_by(self, result: EvaluationResult) -> bool:
-        """Return whether `result` meets all conditions of the config."""
+        """Return True if `result` meets all conditions of the config."""
         return bool(self._bounds) and all(bound.is_met(result) for bound in self._bounds)
 
     @property

@@ -74,7 +74,7 @@ def live_view(task: str, cfg: TrainConfig) -> Generator[LiveView]:
             view.print_url()
             yield view
         finally:
-            # It has nothing to save.
+            # The view has nothing to save.
             process.kill()
             process.wait()
 

@@ -148,6 +148,9 @@ def _differences(runs: Sequence[Run]) -> list[str]:
 
 
 def _recorded(run: Run, path: str) -> Any:
+    """Return the value of a setting: as recorded, else in the configs. Names of keys may hold dots."""
+    if path in run.settings:
+        return run.settings[path]
     value: Any = run.params
     for name in path.split("."):
         value = value.get(name) if isinstance(value, dict) else None

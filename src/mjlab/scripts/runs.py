@@ -62,7 +62,7 @@ def command(argv: list[str], prog: str) -> None:
 
 
 def row_of(run: Run) -> dict[str, Any]:
-    """Return what the table says of a run.
+    """Return the row of a run.
 
     Settings are those that differ from the registered task, profile and learner included.
     """

@@ -140,7 +140,7 @@ class Comparison:
         return Table("settings", tuple(columns), rows)
 
     def verdict(self) -> str:
-        """Return how the first setting compares: best, or not distinguishable from others."""
+        """Return the verdict on the first setting: best, or not distinguishable from others."""
         objective = self._sweep.objective
         if not objective.is_ranked:
             return f"Settings: {objective.reason}"
