@@ -111,7 +111,7 @@ def test_an_evaluation_ends_at_a_signal_and_is_made_up_for(train, tmp_path):
     assert list(read_scalars(resumed, "Evaluation/mean_return")[0]) == [0, 1, 2]
 
 
-@pytest.mark.parametrize("flags", [(), ("--grace", "0")])
+@pytest.mark.parametrize("flags", [("--grace", "0"), pytest.param((), marks=pytest.mark.slow)])
 def test_a_long_iteration_is_given_up(tmp_path, flags):
     """By a second signal, or after the grace: what was finished before is saved."""
     log_root, steps = tmp_path / "logs", ("--agent.num-steps-per-env", "1000")

@@ -138,6 +138,8 @@ ENV = {
 }
 
 
+# `tests/envs/test_env_state.py` holds the kinds of settings.
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENV)
 def test_flags_of_the_environment_act(resume, name):
     outcome, content, params = resume(f"--{name}", ENV[name])
