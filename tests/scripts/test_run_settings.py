@@ -13,6 +13,7 @@ from commands import TASK
 from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.folder import write_info
+from mjlab.runs.run import RUNNING_FILE
 from mjlab.runs.settings import typed_settings
 from mjlab.scripts.cli import main
 from mjlab.scripts.flags import parse_flags
@@ -22,6 +23,7 @@ from mjlab.tasks.tracking.motion_sources import (
     recorded_motions,
     shipped_motions,
 )
+from mjlab.utils.os import create_locked
 
 TYPED = (
     "--env.decimation", "2", "--env.rewards.smooth-reward.weight", "9",
@@ -145,6 +147,17 @@ def test_python_starts_a_run_like_another(first, tmp_path):
     cfg.device, cfg.log_root, cfg.like = "cpu", str(tmp_path / "new"), str(first)
     cfg.agent.max_iterations = 1
     assert trained_with(Run(launch_training(TASK, cfg))) == SETTINGS
+
+
+def test_a_running_run_is_named_and_not_restarted(run, first, train_more):
+    write_info(first, ended=None)
+    with create_locked(first / RUNNING_FILE):
+        argv = (TASK, "--device", "cpu", "--log-root", str(first.parents[1]))
+        outcome = run("train", *argv, "--agent.resume", "auto")
+        assert outcome.status == 1
+        assert f"{first} is still running" in outcome.message
+        _, outcome = train_more("--agent.resume", "True")
+        assert outcome.err.count("is still running") == 1
 
 
 def test_auto_leaves_a_solved_run_alone(run, first):

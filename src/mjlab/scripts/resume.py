@@ -30,8 +30,8 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Checkpoint | None:
     task; runs without a recorded learner match any learner.
 
     Raises:
-        UserError: the matching runs are of other tasks or learners, or still running; or a pattern is
-            not a regular expression.
+        UserError: the matching runs are of other tasks or learners; or the run to resume is still
+            running, and resume is `auto`; or a pattern is not a regular expression.
         ValueError: run or checkpoint not found, and resume is not `auto`; the message lists the
             available ones.
     """
@@ -52,16 +52,17 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Checkpoint | None:
             ) from error
     runs = _runs_to_resume(task, cfg)
     for run in runs:
-        found = [c for c in run.folder.iterdir() if re.fullmatch(agent.load_checkpoint, c.name)]
-        if any(path.is_file() for path in found):
-            if run.state == "running":
-                raise UserError(
-                    f"{run.folder} is still running; stop it, or name another run by --agent.load-run."
-                )
-            path = get_checkpoint_path(
-                experiment, re.escape(run.folder.name), agent.load_checkpoint
+        try:
+            folder = re.escape(run.folder.name)
+            path = get_checkpoint_path(experiment, folder, agent.load_checkpoint)
+        except ValueError:
+            # No checkpoint of this name.
+            continue
+        if run.state == "running" and agent.resume == "auto":
+            raise UserError(
+                f"{run.folder} is still running; stop it, or name this run by --agent.run-name."
             )
-            return Checkpoint(path)
+        return Checkpoint(path)
     if agent.resume == "auto":
         return None
     own = "|".join(re.escape(run.folder.name) for run in runs)

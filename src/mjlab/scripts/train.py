@@ -176,6 +176,8 @@ def _train(
     )
     checkpoint = None if path is None else Checkpoint(path)
     run = None if path is None else Run(path.parent, task)
+    if run is not None and run.state == "running" and rank.is_first:
+        print_notice(f"{run.folder} is still running; its last checkpoint is resumed.")
     like = None if cfg.like is None else run_to_continue(task, cfg)
     typed = _typed(task, cfg, flags)
     source = run or like
