@@ -15,7 +15,6 @@ from types import FrameType
 from typing import Any
 
 from mjlab.runs.run import INFO_FILE, RUNNING_FILE, TIME_FORMAT, Run, runs_in
-from mjlab.utils.logging import print_notice
 from mjlab.utils.os import create_locked, dump_yaml, remove_temporary_files, replacing, to_plain
 from mjlab.utils.signals import FORWARDED, replace_handlers, restore_handlers
 
@@ -89,7 +88,9 @@ def exit_by_signal(unless: Callable[[], bool]) -> Generator[None]:
         if unless():
             os.kill(os.getpid(), number)
             return
-        print_notice(f"{signal.Signals(number).name}: stopped before the first iteration.")
+        # Unlike print, also while the interrupted code is printing.
+        name = signal.Signals(number).name
+        os.write(2, f"{name}: stopped before the first iteration.\n".encode())
         raise SystemExit(128 + number)
 
     ending = [n for n in FORWARDED if n != signal.SIGINT and signal.getsignal(n) is signal.SIG_DFL]
