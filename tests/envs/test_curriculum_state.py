@@ -1,4 +1,4 @@
-"""What curricula have changed continues in other numbers of environments, and in changed tasks."""
+"""Curriculum state, restored in other numbers of environments and in changed tasks."""
 
 from __future__ import annotations
 

@@ -89,8 +89,8 @@ def curricula_in(state: dict[str, Any]) -> dict[str, Any]:
 def settings_of(cfg: ManagerBasedRlEnvCfg) -> dict[str, str]:
     """Return the settings that the state of an environment depends on, as text by dotted path.
 
-    Terms and entities compute attributes from settings (scales, gains, thresholds), which are part of
-    the state: a state restored under other settings would undo them.
+    Terms and entities compute attributes from settings (scales, gains, thresholds). The attributes are
+    part of the state, so a state is restored under its own settings only.
     """
     return {
         path: text

@@ -268,6 +268,16 @@ class Run:
         ]
         return {one.path: to_plain(one.recorded) for one in changes}
 
+    def recorded(self, path: str) -> Any:
+        """Return the value of a setting by its path, else that in the resolved configs; None if absent."""
+        # First, because names of keys in paths may hold dots.
+        if path in self.settings:
+            return self.settings[path]
+        value: Any = self.params
+        for name in path.split("."):
+            value = value.get(name) if isinstance(value, dict) else None
+        return value
+
     def cfg(self, purpose: Purpose = "train", **choices: Any) -> RunCfg:
         """Return the configs of the run: those registered today, with the settings of the run.
 

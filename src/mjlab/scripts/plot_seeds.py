@@ -143,18 +143,8 @@ def _differences(runs: Sequence[Run]) -> list[str]:
     paths = {"env.scene.num_envs"}.union(*(run.info.get("settings") or {} for run in runs))
     # More iterations of the same.
     paths.discard("agent.max_iterations")
-    different = [p for p in sorted(paths) if len({str(_recorded(run, p)) for run in runs}) > 1]
+    different = [p for p in sorted(paths) if len({str(run.recorded(p)) for run in runs}) > 1]
     return [*(["task"] if is_mixed else []), *different]
-
-
-def _recorded(run: Run, path: str) -> Any:
-    """Return the value of a setting: as recorded, else in the configs. Names of keys may hold dots."""
-    if path in run.settings:
-        return run.settings[path]
-    value: Any = run.params
-    for name in path.split("."):
-        value = value.get(name) if isinstance(value, dict) else None
-    return value
 
 
 def common_goal(seeds: Sequence[Seed], tag: str) -> float | None:

@@ -175,7 +175,7 @@ def _train(
         lambda: None if (found := checkpoint_to_resume(task, cfg)) is None else found.path
     )
     checkpoint = None if path is None else Checkpoint(path)
-    run = None if path is None else Run(path.parent, task)
+    run = None if path is None else Run(path.parent, task, cfg.learner_name)
     if run is not None and run.state == "running" and rank.is_first:
         print_notice(f"{run.folder} is still running; its last checkpoint is resumed.")
     like = None if cfg.like is None else run_to_continue(task, cfg)
@@ -335,14 +335,11 @@ def _override(runner: Any, typed: Settings, run: Run) -> None:
     Flags with the values of `run` change nothing: job scripts type all flags at every restart, and
     the resumed run is the one that was interrupted.
     """
-    changed = {}
-    for path, value in typed.items():
-        part, _, name = path.partition(".")
-        recorded: Any = run.params["agent"]
-        for key in name.split("."):
-            recorded = recorded.get(key) if isinstance(recorded, dict) else None
-        if part == "agent" and value != recorded:
-            changed[name] = value
+    changed = {
+        path.removeprefix("agent."): value
+        for path, value in typed.items()
+        if path.startswith("agent.") and value != run.recorded(path)
+    }
     if changed and not run.params["agent"]:
         print_notice(
             f"{run.folder}/params/agent.yaml is missing or unreadable: the flags "
