@@ -12,7 +12,7 @@ train:  ## Train the cartpole swing-up on this machine's CPU until it is solved.
 	$(UV) run train Mjlab-Cartpole-Swingup --profile cpu --device cpu --result-video True
 
 test:  ## Run the test suite.
-	$(DEV) pytest -n 2 -m "not slow" tests
+	$(DEV) pytest -n 2 -m "not slow and not robustness" tests
 
 test-slow:  ## Run the tests that take long.
 	$(DEV) pytest -m slow tests
@@ -58,9 +58,10 @@ DEVICE ?= cuda:0
 gpu:  ## Test and measure on an NVIDIA GPU, in ten minutes; PARTS="parity speed" for some parts.
 	$(PYTHON) benchmarks/gpu.py --device $(DEVICE) $(if $(PARTS),--part $(PARTS)) $(GPU_FLAGS)
 
-torture:  ## Kill, damage, limit, mistake and attack, in 15 minutes; PARTS="kills page" SEED=N MINUTES=N.
-	$(DEV) python benchmarks/torture.py $(if $(PARTS),--part $(PARTS)) $(if $(SEED),--seed $(SEED)) \
-		$(if $(MINUTES),--minutes $(MINUTES)) $(TORTURE_FLAGS)
+torture:  ## Kill, damage, limit, mistake and attack; PARTS="kills page" SEED=N MINUTES=N TRIAL=N.
+	$(DEV) pytest -s -m robustness tests/robustness $(if $(PARTS),--parts $(PARTS)) \
+		$(if $(SEED),--seed $(SEED)) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(TRIAL),--trial $(TRIAL)) \
+		$(TORTURE_FLAGS)
 
 packages:  ## Try task packages: make packages DIRS="../a ../b"; without DIRS, those of the tests.
 	$(DEV) python tools/packages.py $(DIRS) $(if $(ENGINES),--engines $(ENGINES))

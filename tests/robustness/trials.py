@@ -16,6 +16,7 @@ trials.
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import ctypes
 import os
@@ -26,11 +27,13 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+import pytest
 
 _SET_CHILD_SUBREAPER = 36
 # Seconds for child processes of a command to end after it.
@@ -78,9 +81,71 @@ class Verdict:
 
     def line(self, seed: int) -> str:
         """Return the failure, and the command that repeats it, in one line."""
-        flags = f"--part {self.family} --seed {seed} --trial {self.number}"
         text = " ".join(f"{self.what}: {self.broken}".split())
-        return f"{text} (`python benchmarks/torture.py {flags}`)"
+        return f"{text} (`make torture PARTS={self.family} SEED={seed} TRIAL={self.number}`)"
+
+
+@dataclass
+class Result:
+    """Outcome of a family."""
+
+    family: str
+    seconds: float = 0.0
+    tried: int = 0
+    failed: list[Verdict] = field(default_factory=list)
+    notes: collections.Counter[str] = field(default_factory=collections.Counter)
+
+
+RESULTS = pytest.StashKey[list[Result]]()
+
+
+def run_family(
+    family: str,
+    module: ModuleType,
+    numbers: Sequence[int],
+    seed: int,
+    folder: Path,
+    *,
+    show: bool = False,
+) -> Result:
+    """Run the trials of a family, and print failures as they come."""
+    result = Result(family)
+    print(f"\n{family}: {module.WHAT} ({len(numbers)})", flush=True)
+    begin = time.monotonic()
+    for verdict in run_trials(family, module, numbers, seed, folder, show=show):
+        result.tried += 1
+        result.notes.update(verdict.notes)
+        if verdict.broken is not None:
+            result.failed.append(verdict)
+            print(f"  failed: {verdict.line(seed)}", flush=True)
+        elif show:
+            print(f"  held: {verdict.what}", flush=True)
+    result.seconds = time.monotonic() - begin
+    result.failed.sort(key=lambda verdict: verdict.number)
+    return result
+
+
+def table(results: Sequence[Result], seed: int) -> str:
+    """Return the numbers by family, the failures and the notes as Markdown."""
+    lines = ["| family | tried | held | failed |", "| --- | ---: | ---: | ---: |"]
+    tried = failed = 0
+    for result in results:
+        bad = len(result.failed)
+        tried, failed = tried + result.tried, failed + bad
+        lines.append(f"| {result.family} | {result.tried} | {result.tried - bad} | {bad} |")
+    lines += [f"| all | {tried} | {tried - failed} | {failed} |", ""]
+    took = ", ".join(f"{result.family} {result.seconds:.0f} s" for result in results)
+    lines += [f"Seed {seed}. Took: {took}.", ""]
+    for title, said in (
+        ("Failed", [f"- {v.line(seed)}" for result in results for v in result.failed]),
+        (
+            "Noticed",
+            [f"- {text} ({n} times)" for result in results for text, n in result.notes.items()],
+        ),
+    ):
+        if said:
+            lines += [f"{title}:", "", *said, ""]
+    return "\n".join(lines)
 
 
 def run_trials(

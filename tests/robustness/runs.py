@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import SMALL, TASK, Command
-from torture_parts.trials import Broken
+from .commands import SMALL, TASK, Command
+from .trials import Broken
 
 
 def train_flags(log_root: Path, iterations: int, *flags: str) -> tuple[str, ...]:

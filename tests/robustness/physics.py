@@ -9,9 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import SMALL, TASK, check_end, command
-from torture_parts.runs import check_loadable, checkpoints, learned
-from torture_parts.trials import Broken, Trial
+from .commands import SMALL, TASK, check_end, command
+from .runs import check_loadable, checkpoints, learned
+from .trials import Broken, Trial
 
 WHAT = (
     "time steps, gains, actions, states, rewards and models that break the physics, on both engines"

@@ -6,8 +6,8 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import Command, check_end
-from torture_parts.runs import (
+from .commands import Command, check_end
+from .runs import (
     check_loadable,
     checkpoints,
     leftovers,
@@ -15,7 +15,7 @@ from torture_parts.runs import (
     train_flags,
     trained,
 )
-from torture_parts.trials import Broken, Trial
+from .trials import Broken, Trial
 
 WHAT = "chains of signals in evaluations of PPO and SAC, compared with the run that none ended"
 TRIALS = 12

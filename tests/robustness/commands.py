@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mjlab.scripts import cli
-from torture_parts.trials import Broken, descendants
+
+from .trials import Broken, descendants
 
 TASK = "Mjlab-Cartpole-Swingup"
 SMALL = (

@@ -6,9 +6,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import TASK, check_end, command
-from torture_parts.runs import check_loadable, learned, same, trained
-from torture_parts.trials import Broken, Trial
+from .commands import TASK, check_end, command
+from .runs import check_loadable, learned, same, trained
+from .trials import Broken, Trial
 
 WHAT = "runs of PPO and SAC resumed under other flags of learner and environment, or under the same"
 TRIALS = 60

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import PATIENCE, Command, Ended, check_end, free_port
-from torture_parts.runs import check_loadable, checkpoints, leftovers, train_flags
-from torture_parts.trials import Broken, Trial
+from .commands import PATIENCE, Command, Ended, check_end, free_port
+from .runs import check_loadable, checkpoints, leftovers, train_flags
+from .trials import Broken, Trial
 
 WHAT = "limits on files and memory, read-only and vanishing folders, odd variables"
 TRIALS = 112

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import Command, Ended, check_end
-from torture_parts.runs import (
+from .commands import Command, Ended, check_end
+from .runs import (
     check_loadable,
     checkpoints,
     learned,
@@ -20,7 +20,7 @@ from torture_parts.runs import (
     train_flags,
     trained,
 )
-from torture_parts.trials import Broken, Trial
+from .trials import Broken, Trial
 
 WHAT = "chains of signals at random moments and resumes, compared with the run that none ended"
 TRIALS = 30

@@ -1,8 +1,7 @@
-"""`make torture` tells what broke, whatever way a trial ends, and a small one of it holds."""
+"""Outcomes of trials, whatever way they end."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import random
 import subprocess
@@ -12,27 +11,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-ROOT = Path(__file__).resolve().parents[2]
-BENCHMARKS = ROOT / "benchmarks"
-PARTS = (
-    "kills",
-    "evaluations",
-    "resumes",
-    "damage",
-    "limits",
-    "command_lines",
-    "config_files",
-    "physics",
-    "page",
-)
+from . import damage
+from .commands import Ended, check_end
+from .runs import same
+from .test_robustness import FAMILIES
+from .trials import Broken, Result, Trial, Verdict, table
 
 # Trials that end in every way there is. Run apart, because processes are forked.
 STUB = """
 import json, os, signal, subprocess, sys, time
 from pathlib import Path
 from types import SimpleNamespace
-from torture_parts.trials import Broken, run_trials
+from robustness.trials import Broken, run_trials
 
 def run(trial, prepared):
     trial.trying(f"trial {trial.number} of {prepared}")
@@ -58,18 +50,13 @@ print(json.dumps([verdicts[number] for number in range(7)]))
 """
 
 
-@pytest.fixture(autouse=True)
-def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-
-
 def test_trials_that_fail_hang_crash_or_leave_processes_are_told(tmp_path: Path) -> None:
     folder = tmp_path / "stub"
     folder.mkdir()
     begin = time.monotonic()
     done = subprocess.run(
         [sys.executable, "-c", STUB, str(folder)],
-        env={"PYTHONPATH": str(BENCHMARKS), "PATH": "/usr/bin:/bin"},
+        env={"PYTHONPATH": str(Path(__file__).parents[1]), "PATH": "/usr/bin:/bin"},
         capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -90,13 +77,12 @@ def test_trials_that_fail_hang_crash_or_leave_processes_are_told(tmp_path: Path)
 
 
 def test_a_trial_follows_from_family_number_and_seed(tmp_path: Path) -> None:
-    trials = importlib.import_module("torture_parts.trials")
     draws = {
-        key: trials.Trial(*key, tmp_path).rng.random()
+        key: Trial(*key, tmp_path).rng.random()
         for key in (("page", 3, 0), ("page", 4, 0), ("page", 3, 1), ("kills", 3, 0))
     }
     assert len(set(draws.values())) == 4
-    assert trials.Trial("page", 3, 0, tmp_path).rng.random() == draws["page", 3, 0]
+    assert Trial("page", 3, 0, tmp_path).rng.random() == draws["page", 3, 0]
 
 
 @pytest.mark.parametrize(
@@ -116,19 +102,16 @@ def test_a_trial_follows_from_family_number_and_seed(tmp_path: Path) -> None:
     ],
 )
 def test_a_command_ends_well_or_says_why_not(changes: dict[str, Any], reason: str | None) -> None:
-    commands = importlib.import_module("torture_parts.commands")
     usual: dict[str, Any] = {"status": 0, "out": "", "err": "", "size": 0, "stuck": None}
-    ended = commands.Ended(**{**usual, **changes}, was_asked=False)
+    ended = Ended(**{**usual, **changes}, was_asked=False)
     if reason is None:
-        commands.check_end(ended)
+        check_end(ended)
         return
-    with pytest.raises(Exception, match=reason) as caught:
-        commands.check_end(ended)
-    assert type(caught.value).__name__ == "Broken"
+    with pytest.raises(Broken, match=reason):
+        check_end(ended)
 
 
 def test_damages_change_a_file_and_repeat() -> None:
-    damage = importlib.import_module("torture_parts.damage")
     data = random.Random(0).randbytes(500)
     for apply in set(damage._DAMAGES):
         first, again = (apply(data, random.Random(5)) for _ in range(2))
@@ -140,50 +123,25 @@ def test_damages_change_a_file_and_repeat() -> None:
 
 
 def test_contents_are_compared_to_the_bit() -> None:
-    import torch
-
-    runs = importlib.import_module("torture_parts.runs")
     nan = torch.tensor([float("nan")])
-    assert runs.same({"a": [nan, float("nan")]}, {"a": [nan.clone(), float("nan")]})
-    assert not runs.same(torch.tensor([0.0]), torch.tensor([-0.0]))
-    assert not runs.same({"a": 1}, {"a": True})
-    assert not runs.same([1], [1, 2])
+    assert same({"a": [nan, float("nan")]}, {"a": [nan.clone(), float("nan")]})
+    assert not same(torch.tensor([0.0]), torch.tensor([-0.0]))
+    assert not same({"a": 1}, {"a": True})
+    assert not same([1], [1, 2])
 
 
-def test_the_table_counts_and_lists_failures(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The script sets these for the processes it starts.
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setenv("PYTHONPATH", "")
-    torture = importlib.import_module("torture")
-    broken = torture.Verdict("page", 7, "odd bytes", "it\nended")
-    result = torture.Result("page", "", 3.0, 12, [broken])
+def test_the_table_counts_failures() -> None:
+    broken = Verdict("page", 7, "odd bytes", "it\nended")
+    result = Result("page", 3.0, 12, [broken])
     result.notes["seen"] = 2
-    text = torture.table([result], seed=5)
+    text = table([result], seed=5)
     assert "| page | 12 | 11 | 1 |" in text
     assert "| all | 12 | 11 | 1 |" in text
-    assert (
-        "odd bytes: it ended (`python benchmarks/torture.py --part page --seed 5 --trial 7`)"
-        in text
-    )
+    assert "odd bytes: it ended (`make torture PARTS=page SEED=5 TRIAL=7`)" in text
     assert "seen (2 times)" in text
 
 
-@pytest.mark.slow
-def test_a_small_examination_holds(tmp_path: Path) -> None:
-    table = tmp_path / "table.md"
-    command = [
-        sys.executable,
-        str(BENCHMARKS / "torture.py"),
-        "--minutes",
-        "1",
-        "--out",
-        str(table),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=900)
-    assert done.returncode == 0, done.stdout + done.stderr
-    for part in PARTS:
-        (row,) = (line for line in table.read_text().splitlines() if line.startswith(f"| {part} "))
-        _, tried, held, failed = row.strip("| ").split(" | ")
-        assert int(tried) == int(held) >= 1
-        assert int(failed) == 0
-    assert list(tmp_path.iterdir()) == [table]
+def test_every_family_is_registered() -> None:
+    modules = {path.stem for path in Path(__file__).parent.glob("*.py")}
+    helpers = {"commands", "conftest", "runs", "trials", "test_robustness", "test_trials"}
+    assert modules - helpers == set(FAMILIES)

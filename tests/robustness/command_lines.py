@@ -8,9 +8,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from torture_parts.commands import SMALL, TASK, check_end, command
-from torture_parts.runs import trained
-from torture_parts.trials import Broken, Trial
+from .commands import SMALL, TASK, check_end, command
+from .runs import trained
+from .trials import Broken, Trial
 
 WHAT = "flags and arguments of all commands, with values that they should not have"
 TRIALS = 280

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import TASK, Command, check_end, free_port, last_error
-from torture_parts.runs import trained
-from torture_parts.trials import Broken, Trial, name_of
+from .commands import TASK, Command, check_end, free_port, last_error
+from .runs import trained
+from .trials import Broken, Trial, name_of
 
 WHAT = "malformed HTTP, odd websockets and random bytes to the page of `play`"
 TRIALS = 36

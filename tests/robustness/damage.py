@@ -13,9 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import TASK, Command, Ended, check_end, command, free_port
-from torture_parts.runs import check_loadable, learned, same, train_flags, trained
-from torture_parts.trials import Broken, Trial, name_of
+from .commands import TASK, Command, Ended, check_end, command, free_port
+from .runs import check_loadable, learned, same, train_flags, trained
+from .trials import Broken, Trial, name_of
 
 WHAT = "one flipped bit, cut, emptied, overwritten and absurdly nested files of all kinds"
 TRIALS = 280

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torture_parts.commands import TASK, check_end, command
-from torture_parts.runs import check_loadable, train_flags, trained
-from torture_parts.trials import Broken, Trial
+from .commands import TASK, check_end, command
+from .runs import check_loadable, train_flags, trained
+from .trials import Broken, Trial
 
 WHAT = "files of a run that want to execute something, or hold what they should not"
 TRIALS = 60
