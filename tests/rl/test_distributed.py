@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 
 import pytest
+import torch
 
 from mjlab.rl import distributed
 
@@ -47,7 +48,28 @@ def test_an_address_that_is_taken_is_named(one_of_two):
             distributed.join_processes("cpu")
 
 
-def test_an_address_that_is_missing_is_named(monkeypatch):
+@pytest.mark.parametrize("port", [None, "many", "0", "99999"])
+def test_an_address_that_is_missing_is_named(monkeypatch, port):
     monkeypatch.setenv("WORLD_SIZE", "2")
+    if port is not None:
+        monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
+        monkeypatch.setenv("MASTER_PORT", port)
     with pytest.raises(ValueError, match="expected MASTER_ADDR and MASTER_PORT"):
+        distributed.join_processes("cpu")
+
+
+def test_a_stale_launch_is_named(monkeypatch, tmp_path):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("MJLAB_PROCESS_STORE", str(tmp_path / "gone"))
+    with pytest.raises(ValueError, match="MJLAB_PROCESS_STORE: expected .*gone.*unset"):
+        distributed.join_processes("cpu")
+    assert not (tmp_path / "gone").exists()
+
+
+def test_processes_beyond_the_world_are_named(monkeypatch, tmp_path):
+    store = tmp_path / "store"
+    torch.distributed.FileStore(str(store), 2).add("mjlab/joined", 2)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("MJLAB_PROCESS_STORE", str(store))
+    with pytest.raises(ValueError, match="expected no more processes at .*store, got 3"):
         distributed.join_processes("cpu")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -30,7 +32,79 @@ def test_every_process_gets_a_number_and_the_same_store(tmp_path):
         [str(rank), str(rank), "3", "3", "more"] for rank in range(3)
     ]
     assert len({word[4] for word in words}) == 1
-    assert words[0][4].startswith("127.0.0.1:")
+    assert not Path(words[0][4]).exists()
+
+
+LISTENING = r"""
+import os, re
+def listening(pid):
+    links = [os.readlink(entry.path) for entry in os.scandir(f'/proc/{pid}/fd')]
+    inodes = {link[8:-1] for link in links if link.startswith('socket:[')}
+    rows = [line.split() for name in ('tcp', 'tcp6') for line in open(f'/proc/net/{name}')]
+    return [row[1].split(':')[0] for row in rows if row[3] == '0A' and row[9] in inodes]
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_only_this_machine_can_connect(tmp_path):
+    code = f"""{LISTENING}
+import torch
+from mjlab.rl.distributed import join_processes
+join_processes('cpu')
+torch.distributed.all_reduce(torch.ones(1))
+found = listening(os.getpid()) + listening(os.getppid())
+interfaces = [os.environ['GLOO_SOCKET_IFNAME'], os.environ['NCCL_SOCKET_IFNAME']]
+text = ' '.join([oct(os.stat(os.environ['MJLAB_PROCESS_STORE']).st_mode), *interfaces, *found])
+torch.distributed.barrier()
+pathlib.Path({str(tmp_path)!r}, rank).write_text(text)
+"""
+    launch(code)
+    for rank in "01":
+        mode, gloo, nccl, *addresses = (tmp_path / rank).read_text().split()
+        assert (mode, gloo, nccl) == ("0o100600", "lo", "lo")
+        # 127.0.0.1 in the byte order of x86 and ARM.
+        assert set(addresses) == {"0100007F"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_store_at_loopback_listens_there(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    code = f"""{LISTENING}
+from mjlab.rl.distributed import join_processes
+os.environ.update(MASTER_ADDR='127.0.0.1', MASTER_PORT='{port}')
+del os.environ['MJLAB_PROCESS_STORE']
+join_processes('cpu')
+pathlib.Path({str(tmp_path)!r}, rank).write_text(' '.join(listening(os.getpid())))
+"""
+    launch(code)
+    assert set((tmp_path / "0").read_text().split()) == {"0100007F"}
+
+
+def test_a_killed_launch_leaves_no_store(tmp_path, monkeypatch):
+    """The last worker removes it."""
+    child = (
+        f"{PROGRAM}from mjlab.rl.distributed import joined_processes\n"
+        "store = pathlib.Path(os.environ['MJLAB_PROCESS_STORE'])\n"
+        "with joined_processes('cpu'):\n"
+        f"    pathlib.Path({str(tmp_path)!r}, rank).write_text(str(store))\n"
+        "    time.sleep(1)\n"
+    )
+    parent = (
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
+        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent])
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "1").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    store = Path((tmp_path / "1").read_text())
+    while store.exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not store.exists()
 
 
 def test_processes_that_are_many_get_few_threads_each(tmp_path, monkeypatch):

@@ -43,12 +43,11 @@ class ProcessRun:
     ) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        self._store = torch.distributed.TCPStore(
-            "127.0.0.1", 0, is_master=True, wait_for_workers=False
-        )
+        store = folder / "store"
+        store.touch()
         argv = [TASK, *SMALL, "--log-root", str(folder / "logs"), *flags]
         shared = {
-            "MJLAB_PROCESS_STORE": f"127.0.0.1:{self._store.port}",
+            "MJLAB_PROCESS_STORE": str(store),
             "WORLD_SIZE": str(count),
             "LOCAL_WORLD_SIZE": str(count),
             "OMP_NUM_THREADS": "1",

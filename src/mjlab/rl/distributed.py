@@ -16,8 +16,10 @@ import io
 import logging
 import os
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -47,8 +49,10 @@ from mjlab.utils.signals import (
 
 T = TypeVar("T")
 
-# host:port, set by our launcher; torchrun sets MASTER_ADDR and MASTER_PORT instead.
+# File through which processes of our launcher meet; torchrun sets MASTER_ADDR and MASTER_PORT instead.
 STORE_VARIABLE = "MJLAB_PROCESS_STORE"
+# Interfaces on which Gloo and NCCL listen. A user's own choice is kept.
+_INTERFACE_VARIABLES = ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")
 # Name used by the launcher of mjlab 1.6.
 LOG_DIR_VARIABLE = "TORCHRUNX_LOG_DIR"
 
@@ -82,10 +86,14 @@ def launch_workers(
         UserError: a process failed; the message has its rank and exit status.
         Interrupted: a signal stopped the processes.
     """
-    # The launcher owns the store of the process group, so that no other program can take its port in
-    # the meantime.
-    store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
-    shared = {**os.environ, **(environment or {}), STORE_VARIABLE: f"127.0.0.1:{store.port}"}
+    # A file that only this user can read: torch's TCPStore listens on all interfaces. The last worker
+    # removes it, also when the launcher was killed.
+    descriptor, store = tempfile.mkstemp(prefix="mjlab-processes-")
+    os.close(descriptor)
+    shared = {**os.environ, **(environment or {}), STORE_VARIABLE: store}
+    for name in ("lo", "lo0"):
+        if name in dict(socket.if_nameindex()).values():
+            shared = dict.fromkeys(_INTERFACE_VARIABLES, name) | shared
     shared |= {PARENT_VARIABLE: str(os.getpid())}
     shared |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
@@ -99,14 +107,14 @@ def launch_workers(
             send_signal(worker, FORWARDED[number])
 
     with handled_signals(forward, FORWARDED):
-        for rank in range(count):
-            own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
-            # A terminal sends Ctrl-C to all of its processes, and a second signal gives up the running
-            # iteration.
-            workers.append(start_in_background(command, own))
-            for number in received:
-                send_signal(workers[-1], FORWARDED[number])
         try:
+            for rank in range(count):
+                own = {**shared, "RANK": str(rank), "LOCAL_RANK": str(rank)}
+                # A terminal sends Ctrl-C to all of its processes, and a second signal gives up the
+                # running iteration.
+                workers.append(start_in_background(command, own))
+                for number in received:
+                    send_signal(workers[-1], FORWARDED[number])
             while None in (codes := [worker.poll() for worker in workers]) and not any(codes):
                 time.sleep(_SECONDS_BETWEEN_LOOKS)
         finally:
@@ -118,6 +126,7 @@ def launch_workers(
                 worker.kill()
             for worker in workers:
                 worker.wait()
+            Path(store).unlink(missing_ok=True)
     failed = [rank for rank, code in enumerate(codes) if code]
     if not failed:
         return
@@ -311,44 +320,19 @@ class ProcessOutput(io.TextIOBase):
 
 def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
     """Return the store of the process group once all processes have joined."""
-    address = os.environ.get(STORE_VARIABLE)
-    host, port = os.environ.get("MASTER_ADDR"), os.environ.get("MASTER_PORT")
-    if address is not None:
-        host, _, port = address.rpartition(":")
-    if not host or port is None or not port.isdigit():
-        raise ValueError(
-            f"WORLD_SIZE={rank.world_size}: expected MASTER_ADDR and MASTER_PORT of process 0, got "
-            f"{host!r} and {port!r}; use torchrun, or unset WORLD_SIZE."
-        )
-    hosts = rank.is_first and address is None
-    begin, where = time.monotonic(), f"{host}:{port}"
+    begin = time.monotonic()
     names = f"Process {rank.rank} of {rank.world_size}"
     hint = "WORLD_SIZE sets the number of processes; unset it to train in one process."
-    # The constructor does not return while the store is missing.
-    timer = threading.Timer(
-        _SECONDS_OF_SILENCE,
-        lambda: logger.warning("%s waits for process 0 at %s. %s", names, where, hint),
-    )
-    timer.daemon = True
-    timer.start()
-    try:
-        store = torch.distributed.TCPStore(
-            host,
-            int(port),
-            rank.world_size,
-            is_master=hosts,
-            timeout=timedelta(seconds=_SECONDS_TO_JOIN),
-            wait_for_workers=False,
+    where = os.environ.get(STORE_VARIABLE)
+    if where is None:
+        store, where = _store_at_address(rank, names, hint)
+    elif os.path.isfile(where):
+        store = torch.distributed.FileStore(where, rank.world_size)
+    else:
+        raise ValueError(
+            f"{STORE_VARIABLE}: expected the file of a running launcher, got {where!r}; unset it and "
+            "WORLD_SIZE."
         )
-    except torch.distributed.DistError as error:
-        if hosts:
-            raise OSError(
-                f"MASTER_ADDR, MASTER_PORT: expected an address that {names} can listen on, got "
-                f"{where}; use another port."
-            ) from error
-        raise TimeoutError(f"{names} found no process 0 at {where}. {hint}") from error
-    finally:
-        timer.cancel()
     joined, warned = store.add("mjlab/joined", 1), False
     while joined < rank.world_size:
         waited = time.monotonic() - begin
@@ -360,4 +344,52 @@ def _store_with_all(rank: ProcessRank) -> torch.distributed.Store:
             warned = True
         time.sleep(_SECONDS_BETWEEN_LOOKS)
         joined = store.add("mjlab/joined", 0)
+    if joined > rank.world_size:
+        raise ValueError(f"{names}: expected no more processes at {where}, got {joined}. {hint}")
     return store
+
+
+def _store_at_address(
+    rank: ProcessRank, names: str, hint: str
+) -> tuple[torch.distributed.Store, str]:
+    """Return the store at MASTER_ADDR and MASTER_PORT, and its address; process 0 owns it.
+
+    torch listens on all interfaces, unless the address is one of this machine only.
+    """
+    host, port = os.environ.get("MASTER_ADDR"), os.environ.get("MASTER_PORT")
+    if not host or port is None or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ValueError(
+            f"WORLD_SIZE={rank.world_size}: expected MASTER_ADDR and MASTER_PORT (1 to 65535) of process "
+            f"0, got {host!r} and {port!r}; use torchrun, or unset WORLD_SIZE."
+        )
+    where = f"{host}:{port}"
+    # The constructor does not return while the store is missing.
+    timer = threading.Timer(
+        _SECONDS_OF_SILENCE,
+        lambda: logger.warning("%s waits for process 0 at %s. %s", names, where, hint),
+    )
+    timer.daemon = True
+    timer.start()
+    listening = None
+    try:
+        if rank.is_first and os.name == "posix" and host.startswith(("127.", "localhost")):
+            listening = socket.create_server((host, int(port))).detach()
+        store = torch.distributed.TCPStore(
+            host,
+            int(port),
+            rank.world_size,
+            is_master=rank.is_first,
+            timeout=timedelta(seconds=_SECONDS_TO_JOIN),
+            wait_for_workers=False,
+            master_listen_fd=listening,
+        )
+    except (torch.distributed.DistError, OSError) as error:
+        if rank.is_first:
+            raise OSError(
+                f"MASTER_ADDR, MASTER_PORT: expected an address that {names} can listen on, got "
+                f"{where}; use another port."
+            ) from error
+        raise TimeoutError(f"{names} found no process 0 at {where}. {hint}") from error
+    finally:
+        timer.cancel()
+    return store, where
