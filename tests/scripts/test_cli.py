@@ -6,6 +6,7 @@ import importlib
 import inspect
 import io
 import logging
+import operator
 import os
 import signal
 import subprocess
@@ -58,8 +59,8 @@ def failing(capsys, monkeypatch):
 def test_an_error_that_a_user_can_mend_is_one_message_and_status_1(failing, kind):
     status, out, err = failing(kind("Do this instead."))
     assert (status, out) == (1, "")
-    assert err == (
-        f"error: Do this instead.\n(Set {cli.TRACEBACK_VARIABLE}=1 for the traceback.)\n"
+    assert err.endswith(
+        f"\nerror: Do this instead.\n(Set {cli.TRACEBACK_VARIABLE}=1 for the traceback.)\n"
     )
 
 
@@ -70,9 +71,39 @@ def test_the_traceback_of_such_an_error_is_there_for_the_asking(failing, monkeyp
     assert "raise error" in err
 
 
-def test_a_defect_keeps_its_traceback(failing):
-    with pytest.raises(AttributeError, match="oops"):
-        failing(AttributeError("oops"))
+def test_an_error_shows_only_lines_of_users_code(failing, capsys):
+    status, _, err = failing(AttributeError("oops"))
+    assert status == 1
+    assert err.startswith("Traceback (most recent call last):\n")
+    assert [line.split('"')[1] for line in err.splitlines() if "  File " in line] == [__file__]
+    assert "\nerror: AttributeError: oops\n" in err
+
+
+def test_the_first_cause_in_users_code_is_shown(capsys):
+    def term(argv):
+        raise KeyError("height")
+
+    def command(argv):
+        try:
+            term(argv)
+        except KeyError as error:
+            raise UserError("The term failed.") from error
+
+    status, _, err = ended(command, capsys)
+    assert (status, "in term" in err) == (1, True)
+    assert "\nerror: The term failed.\n" in err
+
+
+def test_the_traceback_of_a_defect_is_kept_in_a_file(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    # Python's function, called without a line of a user.
+    status, _, err = ended(operator.itemgetter("height"), capsys)
+    assert status == 1
+    assert err.startswith("error: TypeError: ")
+    (file,) = tmp_path.iterdir()
+    assert str(file) in err
+    assert "Traceback" in file.read_text()
+    assert "Traceback" not in err
 
 
 def test_an_error_of_any_kind_that_this_package_raises_on_purpose_is_a_message(capsys, failing):
@@ -88,13 +119,12 @@ def test_an_error_of_any_kind_that_this_package_raises_on_purpose_is_a_message(c
 
     status, _, err = ended(unknown_entity, capsys)
     assert status == 1
-    assert err.startswith("error: Unknown entity or sensor 'robot'.")
-    with pytest.raises(TypeError, match="no_such_field"):
-        ended(wrong_arguments, capsys)
+    assert "\nerror: Unknown entity or sensor 'robot'." in err
+    assert "no_such_field" in ended(wrong_arguments, capsys)[2]
 
 
 def test_an_error_without_a_text_is_called_by_its_name(failing):
-    assert failing(ValueError())[2].startswith("error: ValueError\n")
+    assert "\nerror: ValueError\n" in failing(ValueError())[2]
 
 
 def test_an_error_may_have_another_status(failing):

@@ -110,9 +110,7 @@ def test_a_package_is_imported_once_and_only_when_tasks_are_asked_for(install):
         ),
     ],
 )
-def test_a_broken_package_is_reported_with_its_traceback_and_skipped(
-    install, caplog, value, text, told
-):
+def test_a_broken_package_is_reported_and_skipped(install, caplog, value, text, told):
     install("broken-package", {"first": value}, {"broken.py": text})
     working = textwrap.dedent(REGISTERS.format(task="Working-Task")) + "\nregister()\n"
     install("working-package", {"second": "working"}, {"working.py": working})
@@ -121,8 +119,10 @@ def test_a_broken_package_is_reported_with_its_traceback_and_skipped(
     assert "Working-Task" in tasks
     assert "Mjlab-Cartpole-Balance" in tasks
     (record,) = caplog.records
-    for part in ("'first'", value, told, "Traceback"):
+    for part in ("'first'", value, told):
         assert part in record.getMessage()
+    assert ("broken.py" in record.getMessage()) == ("not_installed" not in value and text != "")
+    assert "importlib" not in record.getMessage()
     assert "mjlab[compat]" not in record.getMessage()
 
 

@@ -6,6 +6,7 @@ imported before a command runs, so that `--help` and a mistyped task name answer
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 import logging
@@ -21,6 +22,7 @@ from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
 from mjlab.utils.signals import Interrupted
+from mjlab.utils.tracebacks import users_lines
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
 
@@ -487,9 +489,9 @@ class _Once(logging.Filter):
 def run_command(command: Callable[[list[str]], None]) -> None:
     """Run `command` with the command line's arguments; return if it succeeds, else exit.
 
-    Errors that a user can fix (`MjlabError`, `ValueError`, `OSError`) are printed as one message;
-    the exit status is `MjlabError.exit_status`, else 1. Other errors keep their traceback. A command
-    that a signal ended exits with 128 + its number.
+    Errors are printed as one message, after the lines of the user's own code that they passed through,
+    such as a reward. The exit status is `MjlabError.exit_status`, else 1. A command that a signal ended
+    exits with 128 + its number.
     """
     prepare_threads()
     # Plain library messages.
@@ -515,25 +517,43 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:
-        text = shorten(str(error).strip() or type(error).__name__)
-        if isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY):
-            # The original message names the failed call, not the lack of memory.
-            text = (
-                f"Out of memory or threads ({text}). Use fewer environments, or raise the limits "
-                "(ulimit)."
-            )
-            error = UserError(text)
-        elif not isinstance(error, (MjlabError, ValueError, OSError)):
-            raise
-        if os.environ.get(TRACEBACK_VARIABLE):
-            traceback.print_exc()
-        rank = os.environ.get("RANK", "0")
-        # Only the failed process and rank 0 report.
-        if rank == "0" or not isinstance(error, OtherProcessError):
-            process = "" if rank == "0" else f" in process {rank}"
-            print(f"error{process}: {text}", file=sys.stderr)
-            print(f"(Set {TRACEBACK_VARIABLE}=1 for the traceback.)", file=sys.stderr)
+        _report(error)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
+
+
+def _report(error: Exception) -> None:
+    """Print an error as one message, after the lines of the user's code that it passed through."""
+    text = shorten(str(error).strip() or type(error).__name__)
+    is_expected = isinstance(error, (MjlabError, ValueError, OSError))
+    if isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY):
+        # The original message names the failed call, not the lack of memory.
+        text = f"Out of memory or threads ({text}). Use fewer environments, or raise the limits (ulimit)."
+        is_expected = True
+    elif not is_expected and text != type(error).__name__:
+        text = f"{type(error).__name__}: {text}"
+    rank = os.environ.get("RANK", "0")
+    # Only the failed process and rank 0 report.
+    if rank != "0" and isinstance(error, OtherProcessError):
+        return
+    hint = f"Set {TRACEBACK_VARIABLE}=1 for the traceback."
+    if os.environ.get(TRACEBACK_VARIABLE):
+        traceback.print_exc()
+    elif lines := users_lines(error):
+        print(lines, end="", file=sys.stderr)
+    elif not is_expected:
+        import tempfile
+
+        # The only trace of a defect, at times after hours.
+        with (
+            contextlib.suppress(OSError),
+            tempfile.NamedTemporaryFile(
+                "w", encoding="utf-8", prefix="mjlab_error_", suffix=".txt", delete=False
+            ) as file,
+        ):
+            traceback.print_exc(file=file)
+            hint = f"The traceback is in {file.name}."
+    process = "" if rank == "0" else f" in process {rank}"
+    print(f"error{process}: {text}\n({hint})", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ from mjlab.compat import older_names
 from mjlab.utils.config_fields import check_fields_exist
 from mjlab.utils.errors import MjlabError, UnknownNameError
 from mjlab.utils.string import suggest
+from mjlab.utils.tracebacks import TASK_PACKAGES, users_lines
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     Profile = Callable[[Any, Any], RslRlBaseRunnerCfg | None]
 
 logger = logging.getLogger(__name__)
-ENTRY_POINT_GROUP = "mjlab.tasks"
 # Modules that 1.x releases depend on, and that are an extra here.
 _COMPAT_MODULES = frozenset({"torchrunx", "mediapy", "moviepy"})
 _tasks: dict[str, _Task] = {}
@@ -354,7 +354,7 @@ def _discover() -> None:
         if module.ispkg:
             load = functools.partial(importlib.import_module, module.name)
             _register_all(f"the package {module.name!r}", load)
-    for entry_point in entry_points(group=ENTRY_POINT_GROUP):
+    for entry_point in entry_points(group=TASK_PACKAGES):
         source = f"the package behind entry point {entry_point.name!r} ({entry_point.value})"
         _register_all(source, entry_point.load)
 
@@ -370,9 +370,10 @@ def _register_all(source: str, load: Callable[[], object]) -> None:
         _tasks.clear()
         _tasks.update(before)
         logger.error(
-            "Skipping the tasks of %s: import failed:\n%s%s",
+            "Skipping the tasks of %s: import failed:\n%s%s%s",
             source,
-            traceback.format_exc().rstrip(),
+            users_lines(error),
+            "".join(traceback.format_exception_only(error)).rstrip(),
             _missing_extra(error),
         )
 
