@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import pytest
 from commands import SMALL, TASK
 
@@ -118,10 +120,7 @@ def test_settings_that_are_not_finite_are_refused(run, tmp_path, name, value):
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
 def test_too_little_memory_is_one_message(run, tmp_path, monkeypatch, error):
-    def build(*args):
-        raise error
-
-    monkeypatch.setattr("mjlab.scripts.train.training_env", build)
+    monkeypatch.setattr("mjlab.scripts.train.training_env", Mock(side_effect=error))
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path))
     assert outcome.status == 1
     assert "memory" in outcome.message

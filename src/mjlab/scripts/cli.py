@@ -532,13 +532,14 @@ def _report(error: Exception) -> None:
     elif not is_expected and text != type(error).__name__:
         text = f"{type(error).__name__}: {text}"
     rank = os.environ.get("RANK", "0")
+    is_elsewhere = isinstance(error, OtherProcessError)
     # Only the failed process and rank 0 report.
-    if rank != "0" and isinstance(error, OtherProcessError):
+    if rank != "0" and is_elsewhere:
         return
     hint = f"Set {TRACEBACK_VARIABLE}=1 for the traceback."
     if os.environ.get(TRACEBACK_VARIABLE):
         traceback.print_exc()
-    elif lines := users_lines(error):
+    elif not is_elsewhere and (lines := users_lines(error)):
         print(lines, end="", file=sys.stderr)
     elif not is_expected:
         import tempfile
