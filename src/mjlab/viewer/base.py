@@ -28,6 +28,7 @@ from mjlab.compat import older_names
 from mjlab.utils.errors import check_count, check_positive
 from mjlab.utils.signals import first_interrupt_calls
 from mjlab.utils.string import counted
+from mjlab.utils.tracebacks import users_lines
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -422,14 +423,21 @@ class BaseViewer(ABC):
 
     @contextlib.contextmanager
     def _pause_on_error(self, activity: str) -> Generator[None]:
-        """On an error, log the traceback, pause, and show the last line of the error."""
+        """On an error, log it with the lines of the user's code, pause, and show its last line."""
         try:
             yield
         except Exception as error:
             last_line = traceback.format_exception_only(error)[-1].strip()
             # A failing display fails at every frame; log the error once.
             if last_line != self._last_error:
-                log.exception("The viewer is paused after an error while %s.", activity)
+                lines = users_lines(error)
+                log.error(
+                    "The viewer is paused after an error while %s.\n%s%s",
+                    activity,
+                    lines,
+                    last_line,
+                )
+                log.debug("Its traceback:", exc_info=True)
             self.pause()
             self._last_error = last_line
 

@@ -440,7 +440,6 @@ class CheckpointPanel:
         try:
             checkpoints = self._manager.fetch_available()
         except Exception as error:
-            log.exception("Cannot list checkpoints.")
             self.show_error(f"Cannot list checkpoints: {error}")
             return
         self._about.content = "**Local checkpoints**"
@@ -467,7 +466,6 @@ class CheckpointPanel:
         try:
             policy = self._manager.load_checkpoint(name)
         except Exception as error:
-            log.exception("Cannot load checkpoint %s.", name)
             self.show_error(f"Cannot load {name}: {error}")
             return None
         self._manager.current_name = name
@@ -476,7 +474,8 @@ class CheckpointPanel:
         return policy
 
     def show_error(self, message: str) -> None:
-        """Show an error message."""
+        """Show an error message, and log it."""
+        log.error("%s", message)
         self._show(message, color="#e03131")
 
     def load_latest(self) -> None:
