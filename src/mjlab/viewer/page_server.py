@@ -52,14 +52,14 @@ def serve_page(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> viser.Vise
     Raises:
         ValueError: see `check_address`.
     """
-    import viser
+    from mjlab.viewer.page_proxy import PageServer
 
     check_address(host, port)
     if host not in _LOOPBACK:
         log.warning(
             "The page is served on %s: anyone who can reach this machine can control it.", host
         )
-    return viser.ViserServer(host=host, port=port, verbose=False)
+    return PageServer(host, port)
 
 
 def page_url(server: viser.ViserServer) -> str:

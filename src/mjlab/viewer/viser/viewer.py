@@ -117,6 +117,8 @@ class ViserPlayViewer(BaseViewer):
         """
         super().__init__(env, policy, frame_rate, verbosity)
         self._server = viser_server or serve_page(host, port)
+        if viser_server is None:
+            print(f"Open {self.url} in a browser. Ctrl-C ends.", flush=True)
         self._checkpoint_manager = checkpoint_manager
         self._closed = False
         self._scene: MjlabViserScene | None = None
@@ -186,7 +188,6 @@ class ViserPlayViewer(BaseViewer):
             for name, _ in part.get_visualizable_terms():
                 part.set_debug_vis(name, False)
         self._create_gui()
-        log.debug("Viewer URL: %s", self.url)
 
     def is_running(self) -> bool:
         return not self._closed
