@@ -392,18 +392,17 @@ def test_origin_must_be_a_point():
         assert len(caught) == 1
 
 
-def test_fields_beyond_the_memory_are_refused_with_an_estimate(monkeypatch):
-    reads = []
-
-    def available_memory(device):
-        reads.append(device)
-        return 70_000
-
-    monkeypatch.setattr("mjlab.terrains.terrain_generator.available_memory", available_memory)
+def test_fields_beyond_the_memory(monkeypatch):
+    monkeypatch.setattr("mjlab.utils.memory._SMALL", 0)
+    monkeypatch.setattr("mjlab.utils.memory._limits", lambda device: [(70_000, 70_000)])
     rough = ALL_TERRAIN_PRESETS["random_rough"]()
-    with pytest.raises(ValueError, match=r"expected at most 5,000 pixels.*got 7,200"):
+    with pytest.raises(ValueError, match=r"expected at most 5,000 .*got 7,200"):
         build(sub_terrains={"rough": rough}, num_rows=2, num_cols=2)
-    assert reads == ["cpu"]
+
+
+def test_cells_beyond_the_memory():
+    with pytest.raises(ValueError, match=r"cells: expected at most .*got 1,000,000,000,000"):
+        build(num_rows=10**6, num_cols=10**6)
 
 
 # Size and time.

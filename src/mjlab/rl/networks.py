@@ -7,6 +7,7 @@ Unknown groups, and encoders without images, are errors of rsl_rl.
 from __future__ import annotations
 
 import contextlib
+import copy
 import warnings
 from collections.abc import Generator, Mapping
 from typing import Any
@@ -17,15 +18,19 @@ from rsl_rl.models import CNNModel, MLPModel
 from rsl_rl.modules import CNN
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
+from torch import nn
 
 from mjlab.rl.learners import drop_unchanged_additions
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.rl.spatial_softmax import SPATIAL_SOFTMAX_KEYS, cnn_cfg_by_group
 from mjlab.utils.errors import check_positive
+from mjlab.utils.memory import check_memory
 from mjlab.utils.string import counted
 
 _MODELS = ("actor", "critic", "student", "teacher")
 _PACKAGES = ("mjlab", "rsl_rl")
+# Rows of the replay that is measured; final observations then take one more row.
+_REPLAY_ROWS = 32
 _SAC_MODELS = {"actor": SacActorModel, "critic": TwinCriticModel}
 _RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 _CNN_EXAMPLE = (
@@ -122,6 +127,56 @@ def check_actor_distribution(cfg: Mapping[str, Any]) -> None:
             "agent.actor distribution_cfg: expected a distribution to explore with, got None; use "
             f"RslRlModelCfg(distribution_cfg={example}), with the function of mjlab.rl.config."
         )
+
+
+def check_sizes(env: Any, cfg: Mapping[str, Any], device: str) -> None:
+    """Check networks, rollouts and replay against the memory of `device`; see `check_memory`.
+
+    Measured by building the algorithm without allocating memory. Classes of other packages are not
+    checked, because they may not support it.
+
+    Raises:
+        ValueError: they do not fit.
+    """
+    parts = [cfg[name] for name in ("algorithm", *_MODELS) if isinstance(cfg.get(name), dict)]
+    kinds = [resolve_callable(part["class_name"]) for part in parts]
+    if not all(kind.__module__.partition(".")[0] in _PACKAGES for kind in kinds):
+        return
+    one: dict[str, Any] = {
+        **copy.deepcopy(dict(cfg)),
+        "multi_gpu": None,
+        "torch_compile_mode": None,
+    }
+    name, steps, rows = "agent num_steps_per_env", cfg["num_steps_per_env"], 1
+    one["num_steps_per_env"] = 1
+    if "replay_steps" in cfg["algorithm"]:
+        name, steps, rows = "SAC replay_steps", cfg["algorithm"]["replay_steps"], _REPLAY_ROWS
+        one["algorithm"]["replay_steps"] = rows - 1
+    algorithm: Any = kinds[0]
+    try:
+        # The algorithm that is built for use warns.
+        with torch.device("meta"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            made = algorithm.construct_algorithm(env.get_observations(), env, one, "meta")
+    except (RuntimeError, TypeError) as error:
+        if "overflow" not in str(error).lower():
+            raise
+        raise ValueError(
+            f"agent networks: expected sizes below 2**63, got {str(error).splitlines()[0]}; use smaller "
+            "hidden_dims."
+        ) from error
+    for field, module in vars(made).items():
+        if isinstance(module, nn.Module) and not field.startswith("_"):
+            weights = sum(parameter.numel() for parameter in module.parameters())
+            check_memory(f"agent.{field} weights", weights, 4, device, "smaller hidden_dims")
+    stored = list(vars(made.storage).values())
+    stored += [
+        part for parts in stored if isinstance(parts, (dict, TensorDict)) for part in parts.values()
+    ]
+    size = sum(value.nbytes for value in stored if torch.is_tensor(value))
+    check_memory(
+        name, steps, size // rows, device, f"fewer steps, or fewer than {env.num_envs} environments"
+    )
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:

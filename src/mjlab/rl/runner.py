@@ -54,6 +54,7 @@ from mjlab.rl.evaluation import (
 from mjlab.rl.exporter_utils import export_to_onnx, export_with_metadata, get_base_metadata
 from mjlab.rl.networks import (
     check_mini_batches,
+    check_sizes,
     deduplicate_parameters,
     prepare_train_cfg,
     shared_parameters_allowed,
@@ -62,6 +63,7 @@ from mjlab.rl.progress import NotebookProgress, ProgressCfg, in_notebook
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 from mjlab.rl.run_logger import RunLogger, TrainingObserver
 from mjlab.utils.errors import UserError
+from mjlab.utils.memory import check_memory
 from mjlab.utils.processes import process_rank
 from mjlab.utils.random import process_seed, seed_rng, session_seed
 from mjlab.utils.signals import Interrupted, StopRequest
@@ -111,6 +113,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         prepare_train_cfg(env, train_cfg)
         # rsl_rl prints networks and observation sets.
         with contextlib.redirect_stdout(io.StringIO()) as printed, shared_parameters_allowed():
+            check_sizes(env, train_cfg, device)
             super().__init__(env, train_cfg, log_dir, device)
         logger.debug("%s", printed.getvalue().rstrip())
         deduplicate_parameters(self.alg.optimizer)
@@ -185,6 +188,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             )
         # Checked here, because runners are also built to play, in any number of environments.
         check_mini_batches(self.env.num_envs, self.cfg)
+        groups = self.alg.optimizer.param_groups
+        weights = sum(weight.numel() for group in groups for weight in group["params"])
+        # Weights, gradients, and two moments.
+        check_memory("agent trained weights", weights, 16, self.device, "smaller hidden_dims")
         if in_notebook() and not any(observer.shows_progress for observer in self.observers):
             self.observers.append(NotebookProgress(ProgressCfg.of_runner(self)))
         first, total, reason = self.current_learning_iteration, num_learning_iterations, ""

@@ -33,6 +33,7 @@ from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.utils.errors import check_count, check_field
+from mjlab.utils.memory import check_memory
 
 # Range of scaled returns if `value_range` is None.
 _SCALED_RANGE = (-5.0, 5.0)
@@ -74,6 +75,9 @@ class SAC:
         self._policy = copy.deepcopy(self.actor).requires_grad_(False)
         self._target = copy.deepcopy(self.critic).requires_grad_(False)
         self._log_alpha = nn.Parameter(torch.tensor(math.log(cfg.init_alpha), device=device))
+        # The meta device, on which sizes are measured, has neither a fused optimizer nor generators.
+        kind = torch.device(device).type
+        is_real = kind != "meta"
         # The fused optimizer takes a quarter of the time. The decay of second moments is faster than
         # usual, because targets move (arXiv 2512.01996).
         self.optimizer = torch.optim.AdamW(
@@ -84,17 +88,22 @@ class SAC:
             ],
             betas=(0.9, 0.95),
             weight_decay=cfg.weight_decay,
-            fused=True,
+            fused=is_real,
         )
         self.learning_rate = cfg.actor_learning_rate
         self._teacher = _Teacher(cfg)
         symmetry, self._env = cfg.symmetry_cfg, env
         self._mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
+        transition = storage.num_bytes // ((cfg.replay_steps + 1) * env.num_envs)
+        check_memory(
+            "SAC batch_size times num_updates", cfg.batch_size * cfg.num_updates, transition, device,
+            "a smaller batch_size",
+        )  # fmt: skip
         is_whole = not symmetry or cfg.batch_size % 2 == 0
         check_field(cfg, "batch_size", is_whole, "an even number, because half is mirrored")
         self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb
 
-        self._generator = torch.Generator(device=device)
+        self._generator = torch.Generator(device=device if is_real else "cpu")
         self._generator.manual_seed(torch.initial_seed() % 2**63)
         self._noise = _HeldNoise(env.num_envs, env.num_actions, cfg.noise_hold, device)
         scales = cfg.value_range is None

@@ -20,6 +20,7 @@ import torch
 from mjlab.compat import offers_older_attributes
 from mjlab.sensor.sensor import Sensor, SensorCfg
 from mjlab.utils.errors import WrongStateError, check_count, check_one_of
+from mjlab.utils.memory import check_memory
 from mjlab.utils.mujoco import OBJECT_TYPES
 from mjlab.utils.state import stateful
 from mjlab.utils.string import compile_pattern, name_list, suggest
@@ -498,11 +499,18 @@ class _SubstepHistory:
 
     def __init__(self, length: int, num_envs: int, width: int, device: str) -> None:
         # `_head` is the newest block; older ones follow it cyclically.
+        check_memory(
+            "ContactSensorCfg history_length",
+            length,
+            4 * num_envs * width,
+            device,
+            "a shorter history",
+        )
         self._ring = torch.zeros(length, num_envs, width, dtype=torch.float32, device=device)
         self._head = 0
         self._slots = list(self._ring.unbind())
-        slots = torch.arange(length, device=device)
-        self._orders = [slots.roll(-head) for head in range(length)]
+        slots = torch.arange(length, device=device).repeat(2)
+        self._orders = [slots[head : head + length] for head in range(length)]
 
     def record(self, block: torch.Tensor) -> None:
         """Replace the oldest block by `block`, (N, width)."""

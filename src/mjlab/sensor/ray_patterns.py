@@ -13,6 +13,7 @@ import mujoco
 import torch
 
 from mjlab.utils.errors import check_exists, check_field, check_fields_positive
+from mjlab.utils.memory import check_memory
 
 Rays = tuple[torch.Tensor, torch.Tensor]
 """Offsets (m) and unit directions in the aligned frame, (n, 3) each."""
@@ -43,10 +44,14 @@ class GridPatternCfg:
         check_fields_positive(self, "resolution")
         is_extent = all(side >= 0.0 and math.isfinite(side) for side in self.size)
         check_field(self, "size", is_extent, "lengths >= 0 m")
+        # All k with k d < side + d / 2. The margin keeps rounding from adding a ray. Tiny distances
+        # divide to infinity.
+        counts = [
+            max(1, math.ceil(min(side / self.resolution, 1e18) + 0.5 - 1e-9)) for side in self.size
+        ]
+        _check_memory("GridPatternCfg", math.prod(counts), "a larger resolution")
         axes = []
-        for side in self.size:
-            # All k with k d < side + d / 2. The margin keeps rounding from adding a ray.
-            count = max(1, math.ceil(side / self.resolution + 0.5 - 1e-9))
+        for side, count in zip(self.size, counts, strict=True):
             steps = torch.arange(count, dtype=torch.float64) * self.resolution - side / 2
             axes.append(steps.to(device, torch.float32))
         grid_y, grid_x = torch.meshgrid(axes[1], axes[0], indexing="ij")
@@ -99,6 +104,7 @@ class PinholeCameraPatternCfg:
             ValueError: unknown camera, or a camera without `mj_model`.
         """
         width, height, half_x, half_y, center = self._image_plane(mj_model)
+        _check_memory("PinholeCameraPatternCfg", width * height, "a smaller image")
         u = (torch.arange(width, dtype=torch.float64) + 0.5) * 2.0 / width - 1.0
         v = 1.0 - (torch.arange(height, dtype=torch.float64) + 0.5) * 2.0 / height
         grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
@@ -174,6 +180,9 @@ class RingPatternCfg:
 
     def generate_rays(self, mj_model: mujoco.MjModel | None, device: str) -> Rays:
         """Return offsets and directions: center, then ring by ring."""
+        _check_memory(
+            "RingPatternCfg", sum(ring.num_samples for ring in self.rings), "fewer samples"
+        )
         points = [(0.0, 0.0, 0.0)] if self.include_center else []
         for ring in self.rings:
             for k in range(ring.num_samples):
@@ -184,6 +193,11 @@ class RingPatternCfg:
 
 
 PatternCfg = GridPatternCfg | PinholeCameraPatternCfg | RingPatternCfg
+
+
+def _check_memory(owner: str, count: int, cure: str) -> None:
+    # Offset and direction in single precision.
+    check_memory(f"{owner} rays", count, 24, "cpu", cure)
 
 
 def _parallel(direction: tuple[float, ...], count: int, owner: str, device: str) -> torch.Tensor:

@@ -28,6 +28,7 @@ from mjlab.sensor.sensor import Sensor, SensorCfg
 from mjlab.sim.engine import NUM_GEOM_GROUPS
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.lab_api.math import quat_from_matrix
+from mjlab.utils.memory import check_memory
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -229,6 +230,11 @@ class RayCastSensor(Sensor[RayCastData]):
         alignment, is_vertical = self.cfg.ray_alignment, bool((directions[:, :2] == 0.0).all())
         self._moving_directions = alignment == "base" or (alignment == "yaw" and not is_vertical)
         shape = (data.qpos.shape[0], self.num_frames)
+        # Origin, direction, distance, normal and hit point.
+        check_memory(
+            f"Ray sensor {self.cfg.name!r} rays of {shape[0]} environments", shape[0] * self.num_rays,
+            52, device, "fewer rays, or fewer environments",
+        )  # fmt: skip
         self._frame_pos = torch.zeros(*shape, 3, dtype=torch.float32, device=device)
         self._frame_mat = torch.eye(3, dtype=torch.float32, device=device).repeat(*shape, 1, 1)
         self.set_buffers(

@@ -9,6 +9,7 @@ loads Warp and `import mjlab.envs` works without Warp.
 from __future__ import annotations
 
 import importlib
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Container
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import mujoco
 import torch
 
 from mjlab.utils.errors import MjlabError, check_one_of
+from mjlab.utils.memory import check_memory
 
 if TYPE_CHECKING:
     from mjlab.sim.config import SimulationCfg
@@ -182,6 +184,10 @@ class Images:
         ):
             if name in view.data_types:
                 shape = (num_envs, view.height, view.width, channels)
+                check_memory(
+                    f"{name} numbers of all cameras", math.prod(shape), dtype.itemsize, str(device),
+                    "smaller images, or fewer environments",
+                )  # fmt: skip
                 setattr(images, name, torch.full(shape, nothing, dtype=dtype, device=device))
         return images
 
@@ -235,6 +241,22 @@ class Engine(ABC):
     """Live tensors of the expanded `MjModel` and `MjOption` fields, (N, ...)."""
     checked_fields: tuple[str, ...] = ("qpos", "qvel")
     """`MjData` fields checked by `bad_states`."""
+    bytes_each: int = 0
+    """Memory reserved per environment (bytes): physics only. An environment takes 1.2 to 3.6 times as
+    much (cartpole, Go1, G1)."""
+    _fits = True
+
+    def reserve(self, bytes_each: int, device: str = "cpu") -> None:
+        """Add to the memory per environment, before allocating it; see `check_memory`.
+
+        Raises:
+            ValueError: all environments together exceed the memory.
+        """
+        self.bytes_each += bytes_each
+        self._fits &= check_memory(
+            "num_envs", self.num_envs, self.bytes_each, device, "fewer environments",
+            usual=2.0, warns=self._fits,
+        )  # fmt: skip
 
     @abstractmethod
     def data_field(self, name: str) -> torch.Tensor:

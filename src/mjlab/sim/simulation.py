@@ -29,7 +29,6 @@ from mjlab.sim.engine import (
     resolve_engine_name,
     why_not_computed,
 )
-from mjlab.sim.memory import LEAST_BYTES, bytes_per_environment, check_memory
 from mjlab.sim.randomization import (
     BASES_OF_CONSTANTS,
     RecomputeLevel,
@@ -41,6 +40,7 @@ from mjlab.sim.sim_data import FieldView
 from mjlab.sim.warning_log import collect_mujoco_warnings
 from mjlab.utils.errors import UnknownAttributeError, check_positive
 from mjlab.utils.indexing import EnvIds, as_ids
+from mjlab.utils.memory import check_memory
 from mjlab.utils.mujoco import moving_dofs
 from mjlab.utils.nan_guard import NanGuard
 from mjlab.utils.spec import compile_spec
@@ -48,6 +48,8 @@ from mjlab.utils.string import counted
 
 logger = logging.getLogger(__name__)
 
+# Bytes of an environment of any model: state of one joint, origin, episode length, reward.
+_LEAST_BYTES = 300
 # Row shapes of fields that MuJoCo stores flat; the same as in MuJoCo Warp.
 _ROW_SHAPES = {"cam_mat0": (3, 3), "geom_aabb": (2, 3)}
 
@@ -106,7 +108,6 @@ class Simulation:
         self.mj_model: mujoco.MjModel = compile_spec(spec) if spec is not None else model
         """Compiled model on the host, without randomized values."""
         cfg.mujoco.apply(self.mj_model)
-        check_memory(num_envs, bytes_per_environment(self.mj_model, cfg, engine_name), device)
         self.mj_data = mujoco.MjData(self.mj_model)
         """Host data of the compiled model, forwarded once at `qpos0`."""
         mujoco.mj_forward(self.mj_model, self.mj_data)
@@ -144,7 +145,8 @@ class Simulation:
     def check(num_envs: int, cfg: SimulationCfg, device: str) -> None:
         """Check engine, device and memory before a model exists. Raises as the constructor does."""
         resolve_engine_name(cfg.engine, device)
-        check_memory(num_envs, LEAST_BYTES, device)
+        cure = "fewer environments"
+        check_memory("num_envs", num_envs, _LEAST_BYTES, device, cure, warns=False)
 
     # Properties.
 

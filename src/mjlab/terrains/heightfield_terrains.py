@@ -15,6 +15,7 @@ import numpy as np
 
 from mjlab.compat import older_names
 from mjlab.terrains.terrain_generator import (
+    BYTES_PER_PIXEL,
     SubTerrainCfg,
     TerrainGeometry,
     TerrainOutput,
@@ -28,15 +29,13 @@ from mjlab.terrains.utils import (
     resample_linear,
 )
 from mjlab.utils.errors import check_field, check_fields_positive
+from mjlab.utils.memory import check_memory
 
 # A thin sheet lets fast or deep contacts through to the other side.
 MIN_BASE_THICKNESS = 0.5
 
 # Radius around the center of the area robots start in and touch (m).
 SPAWN_RADIUS = 1.0
-
-# A mistyped pixel size should raise an error instead of filling the memory.
-_MAX_PIXELS = 10_000_000
 
 # Step of obstacle positions and side lengths (pixels).
 _OBSTACLE_STEP = 4
@@ -330,12 +329,11 @@ def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale"
     least = min(pixel, getattr(cfg, "horizontal_scale"))  # noqa: B009
     expected = f"0 or a length >= {least:g} m (horizontal_scale or {pixel_field})"
     check_field(cfg, "border_width", border_width <= 0.0 or border_width >= least, expected)
-    # In floats, because the number of tiny pixels overflows an integer.
-    num_pixels = float(np.floor(cfg.size[0] / pixel) * np.floor(cfg.size[1] / pixel))
-    expected = f"at most {_MAX_PIXELS:,} pixels in {tuple(cfg.size)} m, not {num_pixels:,.0f}"
-    check_field(cfg, pixel_field, num_pixels <= _MAX_PIXELS, expected)
-    border = max(int(border_width / pixel), 0)
-    cols, rows = (int(extent / pixel) for extent in cfg.size)
+    # Tiny pixels divide to infinity.
+    cols, rows = (int(min(extent / pixel, 1e18)) for extent in cfg.size)
+    owner = f"{type(cfg).__name__}.{pixel_field} {pixel}: pixels"
+    check_memory(owner, rows * cols, BYTES_PER_PIXEL, "cpu", f"a larger {pixel_field}")
+    border = max(int(min(border_width / pixel, 1e18)), 0)
     check_field(
         cfg, "size", min(rows, cols) >= 2, f"at least 2 x 2 pixels with {pixel_field} = {pixel:g}",
     )  # fmt: skip

@@ -15,13 +15,13 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from mjlab.sim.memory import available_memory
 from mjlab.terrains.utils import FlatPatchSamplingCfg, check_flat_patch, make_border
 from mjlab.utils.errors import (
     WrongStateError,
     check_count,
     check_field,
 )
+from mjlab.utils.memory import check_memory
 
 _COLOR_SCHEMES = ("height", "random", "none")
 
@@ -30,7 +30,7 @@ _DARK_GRAY = (0.2, 0.2, 0.2)
 _PLAIN = (0.5, 0.5, 0.5, 1.0)
 
 # Minimum bytes per pixel: heights in the spec, the model and the host data's model, and color.
-_BYTES_PER_PIXEL = 14
+BYTES_PER_PIXEL = 14
 
 # The signature of `SubTerrainCfg.function` has no argument for the cell.
 _CELL: ContextVar[tuple[int, int] | None] = ContextVar("cell", default=None)
@@ -146,6 +146,8 @@ class TerrainGenerator:
         seed = int(np.random.randint(0, 10000)) if cfg.seed is None else cfg.seed
         self.np_rng = np.random.default_rng(seed)
         """Source of all random numbers."""
+        num_cells = self.num_rows * self.num_cols
+        check_memory("TerrainGeneratorCfg cells", num_cells, 24, "cpu", "fewer rows and columns")
         self.terrain_origins = np.zeros((self.num_rows, self.num_cols, 3))
         """Spawn points in the world frame (m), (R, C, 3). Zero before `compile`."""
         self.flat_patches: dict[str, np.ndarray] = {}
@@ -171,7 +173,7 @@ class TerrainGenerator:
     def compile(self, spec: mujoco.MjSpec) -> None:
         """Add the terrain to `spec` as one static body `terrain`."""
         body = spec.worldbody.add_body(name="terrain")
-        self._num_pixels, self._memory = 0, available_memory("cpu")
+        self._num_pixels, self._fits = 0, True
         self._dropped_patches: set[str] = set()
         low, high = self.cfg.difficulty_range
         names, shares = list(self._sub_terrains), self.proportions
@@ -226,7 +228,13 @@ class TerrainGenerator:
             with naming_cell(row, col):
                 output = sub.function(difficulty, spec, self.np_rng)
             check_output(output, self.flat_patches)
-            self._check_memory(output)
+            fields = [part.hfield for part in output.geometries if part.hfield is not None]
+            self._num_pixels += sum(field.nrow * field.ncol for field in fields)
+            cure = "a larger horizontal_scale, or fewer sub-terrains"
+            self._fits &= check_memory(
+                "pixels of all height fields", self._num_pixels, BYTES_PER_PIXEL, "cpu", cure,
+                warns=self._fits,
+            )  # fmt: skip
         except (ValueError, RuntimeError) as error:
             kinds = (ValueError, WrongStateError, RuntimeError)
             kind = next(kind for kind in kinds if isinstance(error, kind))
@@ -251,17 +259,6 @@ class TerrainGenerator:
             kept[row, col] = self.terrain_origins[row, col]
             found = (output.flat_patches or {}).get(patch, np.zeros((0, 3)))
             kept[row, col, : len(found)] = found + corner
-
-    def _check_memory(self, output: TerrainOutput) -> None:
-        """Raise `ValueError` if the height fields so far exceed the available memory."""
-        fields = [part.hfield for part in output.geometries if part.hfield is not None]
-        self._num_pixels += sum(field.nrow * field.ncol for field in fields)
-        if self._memory is not None and self._num_pixels * _BYTES_PER_PIXEL > self._memory:
-            raise ValueError(
-                f"height fields: expected at most {self._memory // _BYTES_PER_PIXEL:,} pixels "
-                f"({self._memory / 1e9:.1f} GB of memory), got {self._num_pixels:,} so far; use a "
-                "larger horizontal_scale, or fewer sub-terrains."
-            )
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjlab.utils.errors import check_in_range, check_one_of
+from mjlab.utils.memory import check_memory
 from mjlab.utils.os import own_folder, replacing, write_atomically
 
 if TYPE_CHECKING:
@@ -110,6 +111,12 @@ class NanGuard:
         sizes = {"act": mj_model.na, "history": mj_model.nhistory}
         self._state_fields = [n for n in (*_PHYSICS_STATE, *mocap) if sizes.get(n, 1)]
         self._input_fields = [n for n in _INPUTS if n != "ctrl" or mj_model.nu]
+        if cfg.enabled:
+            numbers = mj_model.nq + mj_model.nv + mj_model.nu + 6 * mj_model.nbody
+            cure = "a smaller buffer_size, or fewer environments"
+            check_memory(
+                "NanGuardCfg buffer_size", cfg.buffer_size, 4 * numbers * num_envs, "cpu", cure
+            )
 
     def capture(self, wp_data: Any) -> None:
         """Record the current state of all environments. Call before each substep."""

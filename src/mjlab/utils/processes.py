@@ -29,8 +29,7 @@ _OWN_CGROUPS = Path("/proc/self/cgroup")
 _CGROUP_ROOT = Path("/sys/fs/cgroup")
 # Files with quota and period in microseconds, by version of control groups. Without a limit, the
 # quota is "max" or -1.
-_QUOTA_V2 = ("cpu.max",)
-_QUOTA_V1 = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
+_QUOTA_FILES = {1: ("cpu.cfs_quota_us", "cpu.cfs_period_us"), 2: ("cpu.max",)}
 
 
 @dataclass(frozen=True)
@@ -146,21 +145,20 @@ def available_cores() -> int:
         cores = len(os.sched_getaffinity(0))
     else:
         cores = os.cpu_count() or 1
-    # Quotas of this process's control group and of all its ancestors apply.
     quotas = [
         quota
-        for folder, files in _control_groups()
-        for group in (folder, *folder.parents)
-        if group.is_relative_to(_CGROUP_ROOT) and (quota := _quota(group, files)) is not None
+        for group, version in control_groups("cpu")
+        if (quota := _quota(group, _QUOTA_FILES[version])) is not None
     ]
     limit = environment_integer(CORES_VARIABLE, cores)
     return max(1, min(cores, limit, math.ceil(min(quotas, default=cores))))
 
 
-def _control_groups() -> Iterator[tuple[Path, tuple[str, ...]]]:
-    """Yield folder and quota files of each control group that may limit this process.
+def control_groups(controller: str) -> Iterator[tuple[Path, int]]:
+    """Yield folder and version (1 or 2) of each control group that may limit this process.
 
-    Lines of `/proc/self/cgroup` are `<number>:<controllers>:<path>`; version 2 has no controllers.
+    Limits of a group's ancestors apply too. Lines of `/proc/self/cgroup` are
+    `<number>:<controllers>:<path>`; version 2 has no controllers.
     """
     try:
         lines = _OWN_CGROUPS.read_text(encoding="utf-8").splitlines()
@@ -168,13 +166,13 @@ def _control_groups() -> Iterator[tuple[Path, tuple[str, ...]]]:
         return
     for line in lines:
         _, controllers, path = line.split(":", 2)
-        group = path.lstrip("/")
-        if not controllers:
-            yield _CGROUP_ROOT / group, _QUOTA_V2
-            yield _CGROUP_ROOT / "unified" / group, _QUOTA_V2
-        elif "cpu" in controllers.split(","):
-            yield _CGROUP_ROOT / controllers / group, _QUOTA_V1
-            yield _CGROUP_ROOT / "cpu" / group, _QUOTA_V1
+        if controllers and controller not in controllers.split(","):
+            continue
+        for mount in {controllers, controller} if controllers else ("", "unified"):
+            folder = _CGROUP_ROOT / mount / path.lstrip("/")
+            for group in (folder, *folder.parents):
+                if group.is_relative_to(_CGROUP_ROOT):
+                    yield group, 2 - bool(controllers)
 
 
 def _quota(group: Path, files: tuple[str, ...]) -> float | None:

@@ -27,6 +27,7 @@ from mjlab.utils.errors import (
     check_count,
     check_exists,
 )
+from mjlab.utils.memory import check_memory
 from mjlab.viewer.camera import nearest_envs, resolve_camera
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import (
@@ -100,6 +101,8 @@ class OffscreenRenderer:
         check_count("viewer.max_extra_envs", cfg.max_extra_envs, minimum=0)
         check_count("viewer.width", cfg.width)
         check_count("viewer.height", cfg.height)
+        # Color and depth.
+        check_memory("pixels of an image", cfg.width * cfg.height, 7, "cpu", "a smaller image")
         self._cfg = cfg
         self._scene = scene
         self._sim_model = sim_model

@@ -122,6 +122,9 @@ class NativeEngine(Engine):
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # By default `Batch` uses every core of the machine.
         threads = cfg.num_threads or min(cores_per_process(), num_envs)
+        # State before and after the last step.
+        size = mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+        self.reserve(2 * 8 * size)
         try:
             self._batch = self._make_batch(self._model, num_envs, threads)
         except (ValueError, RuntimeError) as error:
@@ -175,6 +178,8 @@ class NativeEngine(Engine):
                 source = _as_tensor(self._batch.bind(name))
             except ValueError as error:
                 raise UnknownAttributeError(f"The native engine: {error}.") from error
+            # Two copies of a view on the rows, or a source and its copy.
+            self.reserve((4 + 4 if name in INPUTS else 8 + 4) * source[0].numel())
             is_float, is_bool = source.dtype == torch.float64, name == "eq_active"
             dtype = torch.bool if is_bool else torch.float32 if is_float else source.dtype
             if name in INPUTS:
@@ -217,6 +222,9 @@ class NativeEngine(Engine):
             if name in self.model_fields:
                 continue
             self._check_expandable(name)
+            shared = getattr(self._model, name, getattr(self._model.opt, name, None))
+            # With two copies in single precision.
+            self.reserve(2 * np.asarray(shared, dtype=np.float64).nbytes)
             for mark in _FRAME_MARKS.get(name, ()):
                 if mark not in self._frame_marks:
                     self._frame_marks[mark] = self._batch.expand(mark)

@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import gc
 import logging
+import math
 import os
 from collections.abc import Callable, Generator, Hashable, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -168,11 +169,10 @@ class WarpEngine(Engine):
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
             mujoco.mj_forward(model, self._host)
             model.opt.disableflags = flags
+        sizes = {"nconmax": cfg.nconmax, "njmax": cfg.njmax}
         try:
             self.wp_model = mjwarp.put_model(model)
-            self.wp_data = mjwarp.put_data(
-                model, self._host, self.num_envs, nconmax=cfg.nconmax, njmax=cfg.njmax
-            )
+            one = mjwarp.put_data(model, self._host, 1, **sizes)
         except NotImplementedError as error:
             raise UnsupportedByWarpError(
                 f"The warp engine does not support this model: {error} "
@@ -183,6 +183,8 @@ class WarpEngine(Engine):
                 f"MuJoCo Warp rejects nconmax={cfg.nconmax}, njmax={cfg.njmax} or the model: "
                 f"{error}; change SimulationCfg.nconmax or njmax (None: estimated)."
             ) from error
+        self.reserve(sum(array.capacity for array in _arrays(one)), str(self.device))
+        self.wp_data = mjwarp.put_data(model, self._host, self.num_envs, **sizes)
         # Kernels would print to stdout at every overflow. Instead, `OverflowWatch` polls the
         # overflow flags and logs each kind once.
         self.wp_model.opt.warn_overflow = 0
@@ -262,9 +264,7 @@ class WarpEngine(Engine):
         self._graphs.clear()
         if not self._on_cuda:
             return
-        data = self.wp_data
-        arrays = [a for part in (data, data.contact, data.efc) for a in vars(part).values()]
-        with _restoring([(as_torch(a), None) for a in arrays if isinstance(a, wp.array)]):
+        with _restoring([(as_torch(array), None) for array in _arrays(self.wp_data)]):
             self.launch("step", self._substep)
             for stage in STAGES:
                 self.launch(stage, lambda stage=stage: self._forward(stage))
@@ -297,6 +297,10 @@ class WarpEngine(Engine):
     @torch.inference_mode(False)
     def expand(self, fields: tuple[str, ...]) -> None:
         new = [name for name in dict.fromkeys(fields) if name not in self.model_fields]
+        for name in new:
+            shared = getattr(*find_model_field(self.wp_model, name))
+            size = math.prod(shared.shape[1:]) * wp.types.type_size_in_bytes(shared.dtype)
+            self.reserve(size, str(self.device))
         with self.ordered():
             arrays = expand_arrays(self.wp_model, self.num_envs, new)
         for name, array in zip(new, arrays, strict=True):
@@ -663,6 +667,12 @@ def _fields_over(struct: type[Any], dimension: str) -> set[str]:
         for field in dataclasses.fields(struct)
         if (getattr(field.type, "shape", None) or (None,))[0] == dimension
     }
+
+
+def _arrays(data: Any) -> list[wp.array]:
+    """Return all arrays of a `mujoco_warp.Data`."""
+    values = [a for part in (data, data.contact, data.efc) for a in vars(part).values()]
+    return [value for value in values if isinstance(value, wp.array)]
 
 
 def expand_arrays(model: Any, nworld: int, names: list[str]) -> list[Any]:

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from mjlab.tasks.tracking.motion_file import Motion, MotionFileError
+from mjlab.utils.memory import check_memory
 from mjlab.utils.string import is_number
 
 _ROOT_COLUMNS = 7
@@ -153,12 +154,15 @@ def resampled(recording: Recording, fps: float) -> Recording:
     """
     intervals = len(recording) - 1
     # 1e-6 absorbs rounding, so that 10.000000001 s counts as 10 s.
-    count = math.ceil(intervals * fps / recording.fps - 1e-6)
+    count = math.ceil(min(intervals * fps / recording.fps, 1e18) - 1e-6)
     if count < 2:
         raise ValueError(
             f"Recording: expected at least 2 poses at {fps:g} per second, got {max(count, 0)} from "
             f"{len(recording)} poses at {recording.fps:g} per second."
         )
+    # Two neighbors and the pose between them.
+    size = 3 * 8 * (7 + recording.joint_pos.shape[1])
+    check_memory("poses of the recording", count, size, "cpu", f"less than {fps:g} per second")
     phase = np.arange(count) * (recording.fps / fps)
     # Times that coincide with a pose return the pose without interpolation.
     phase = np.where(

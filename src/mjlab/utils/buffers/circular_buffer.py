@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from mjlab.utils.errors import WrongStateError, check_count
+from mjlab.utils.memory import check_memory
 from mjlab.utils.state import stateful
 
 BatchIds = Sequence[int] | torch.Tensor | slice
@@ -106,6 +107,10 @@ class CircularBuffer:
         """Append a frame, (batch_size, ...). Raises `ValueError` for a wrong first shape."""
         if self._buffer is None:
             self._check_batch(data)
+            check_memory(
+                "CircularBuffer max_len", self._max_len, data.nbytes, str(data.device),
+                "a shorter history or delay",
+            )  # fmt: skip
             # If the first frame is appended under `inference_mode`, later appends outside it must work.
             with torch.inference_mode(False):
                 self._buffer = torch.zeros(

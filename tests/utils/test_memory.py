@@ -1,0 +1,272 @@
+"""Memory check: errors beyond the total, warnings beyond what is available, both before allocation."""
+
+from __future__ import annotations
+
+import resource
+import time
+
+import mujoco
+import pytest
+import torch
+from tensordict import TensorDict
+
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+from mjlab.rl.learners import train_dict, with_learner
+from mjlab.rl.replay import ReplayStorage
+from mjlab.sim import Simulation, SimulationCfg
+from mjlab.sim.native.engine import NativeEngine
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.utils import memory, processes
+from mjlab.utils.buffers import CircularBuffer
+from mjlab.utils.memory import check_memory
+
+CARTPOLE = "Mjlab-Cartpole-Balance"
+GB = 10**9
+
+
+@pytest.fixture
+def machine(monkeypatch, tmp_path):
+    """Return a function that sets the memory reported by the system (bytes)."""
+
+    def pretend(total=None, available=None, swap=0, group=None, used=0, cached=0, version=2):
+        monkeypatch.setattr(memory, "_PROCESS", tmp_path)
+        monkeypatch.setattr(memory, "_SMALL", 0)
+        monkeypatch.setattr(processes, "_OWN_CGROUPS", tmp_path / "cgroup")
+        monkeypatch.setattr(processes, "_CGROUP_ROOT", tmp_path / "fs")
+        (tmp_path / "meminfo").unlink(missing_ok=True)
+        if total is not None:
+            free = total if available is None else available
+            sizes = {"MemTotal": total, "MemAvailable": free, "SwapTotal": swap, "SwapFree": swap}
+            lines = [f"{name}: {size // 1024} kB" for name, size in sizes.items()]
+            (tmp_path / "meminfo").write_text("\n".join(lines))
+        (tmp_path / "cgroup").write_text("0::/a/b\n" if version == 2 else "4:memory:/a/b\n")
+        folder = tmp_path / "fs" / ("a" if version == 2 else "memory/a")
+        folder.mkdir(parents=True, exist_ok=True)
+        limit, usage, prefix = memory._GROUP_FILES[version]
+        (folder / limit).write_text("max\n" if group is None else f"{group}\n")
+        (folder / usage).write_text(f"{used}\n")
+        stat = f"{prefix}active_file {cached}\n{prefix}inactive_file 0\n"
+        (folder / "memory.stat").write_text(stat)
+
+    return pretend
+
+
+@pytest.fixture(scope="module")
+def env():
+    cfg = load_env_cfg(CARTPOLE)
+    cfg.scene.num_envs = 4
+    return RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
+
+
+def items(count: int, size: int = GB) -> bool:
+    return check_memory("Items", count, size, "cpu", "fewer items")
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"total": 8 * GB},
+        {"total": 6 * GB, "swap": 2 * GB},
+        {"total": 64 * GB, "group": 8 * GB},
+        {"total": 64 * GB, "group": 8 * GB, "version": 1},
+    ],
+)
+def test_the_smallest_total_is_the_limit(machine, sizes):
+    machine(**sizes)
+    assert items(7)
+    with pytest.raises(
+        ValueError, match=r"Items: expected at most 8 .*got 9 .*9.0 GB.*fewer items"
+    ):
+        items(9)
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        {"total": 8 * GB, "available": 4 * GB},
+        {"total": 64 * GB, "group": 8 * GB, "used": 6 * GB, "cached": 2 * GB},
+        {"total": 64 * GB, "group": 8 * GB, "used": 6 * GB, "cached": 2 * GB, "version": 1},
+    ],
+)
+def test_more_than_is_available_warns(machine, sizes, recwarn):
+    machine(**sizes)
+    assert items(3)
+    assert not recwarn
+    with pytest.warns(UserWarning, match=r"Items: expected about 4 .*got 6 .*fewer items"):
+        assert not items(6)
+
+
+def test_processes_share_the_memory(machine, monkeypatch):
+    machine(total=8 * GB)
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    monkeypatch.setenv("RANK", "0")
+    assert items(1)
+    with pytest.raises(ValueError, match="expected at most 2 "):
+        items(3)
+
+
+def test_unknown_memory_is_unlimited(machine):
+    machine()
+    assert items(10**30)
+
+
+def test_sizes_beyond_every_float(machine):
+    machine(total=8 * GB)
+    with pytest.raises(ValueError, match="expected at most 8 "):
+        items(10**400)
+
+
+def test_address_space_limits(machine, monkeypatch):
+    machine(total=64 * GB)
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (8 * GB, 8 * GB))
+    (memory._PROCESS / "self").mkdir()
+    (memory._PROCESS / "self" / "status").write_text(f"VmSize:\t{4 * GB // 1024} kB\n")
+    assert items(3)
+    with pytest.warns(UserWarning, match="available"):
+        items(5)
+    with pytest.raises(ValueError, match="at most 8 "):
+        items(9)
+
+
+# Estimates are lower bounds.
+
+
+def bytes_of(*holders: object) -> int:
+    """Return the size of the arrays and tensors among the attributes of the holders."""
+    values = [value for holder in holders for value in vars(holder).values()]
+    return sum(getattr(value, "nbytes", None) or getattr(value, "capacity", 0) for value in values)
+
+
+@pytest.mark.parametrize("task", [CARTPOLE, "Mjlab-Velocity-Flat-Unitree-Go1"])
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_environments_take_what_is_reserved(task, engine):
+    cfg = load_env_cfg(task)
+    cfg.scene.num_envs, cfg.sim.engine = 32, engine
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    reserved = 32 * env.sim._engine.bytes_each
+    if engine == "warp":
+        data, model = env.sim.wp_data, env.sim.wp_model
+        expanded = [value for value in vars(model).values() if getattr(value, "_is_batched", False)]
+        taken = bytes_of(data, data.efc, data.contact) + sum(value.capacity for value in expanded)
+    else:
+        own = env.sim._engine
+        fields = [*own._inputs.values(), *own._outputs.values(), *own._model_copies.values()]
+        copies = sum(2 * field.values.nbytes for field in own._inputs.values())
+        copies += sum(field.values.nbytes for field in own._outputs.values())
+        copies += sum(2 * field.values.nbytes for field in own._model_copies.values())
+        sources = {
+            field.source.data_ptr(): field.source.nbytes for field in fields[len(own._inputs) :]
+        }
+        taken = 2 * own._batch.state.nbytes + copies + sum(sources.values())
+    assert 0.5 * taken < reserved <= 1.001 * taken
+
+
+@pytest.mark.parametrize(
+    ("learner", "change", "named"),
+    [
+        ("ppo", {"actor": {"hidden_dims": (30_000, 30_000)}}, "agent.actor weights"),
+        ("ppo", {"critic": {"hidden_dims": (30_000, 30_000)}}, "agent.critic weights"),
+        ("ppo", {"critic": {"hidden_dims": (10**10, 10**10)}}, "agent networks"),
+        ("ppo", {"num_steps_per_env": 10**12}, "num_steps_per_env"),
+        ("ppo", {"num_steps_per_env": 10**30}, "num_steps_per_env"),
+        ("distillation", {"student": {"hidden_dims": (30_000, 30_000)}}, "agent.student weights"),
+        ("sac", {"algorithm": {"replay_steps": 10**9}}, "replay_steps"),
+        ("sac", {"algorithm": {"batch_size": 10**9}}, "batch_size"),
+        ("sac", {"actor": {"hidden_dims": (30_000, 30_000)}}, "agent.actor weights"),
+    ],
+)
+def test_learners_beyond_the_memory(machine, env, learner, change, named):
+    cfg = train_dict(with_learner(load_rl_cfg(CARTPOLE), learner))
+    for name, value in change.items():
+        cfg[name] = {**cfg[name], **value} if isinstance(value, dict) else value
+    machine(total=3 * GB)
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match=f"{named}.*use (fewer|smaller|a smaller)"):
+        MjlabOnPolicyRunner(env, cfg, device="cpu")
+    assert time.monotonic() - begin < 10.0
+
+
+def test_training_takes_four_times_the_weights(machine, env):
+    cfg = train_dict(load_rl_cfg(CARTPOLE))
+    runner = MjlabOnPolicyRunner(env, cfg, device="cpu")
+    machine(total=4 * 4 * 9000)
+    with pytest.raises(ValueError, match="trained weights: expected at most 8,9.*got 9,219"):
+        runner.learn(1)
+
+
+def test_replay_and_rollout_estimates(machine, env):
+    """The largest number of steps that the message allows takes the memory, within a row."""
+    machine(total=10**6)
+    observations = env.get_observations()
+    for learner, steps in (("ppo", "num_steps_per_env"), ("sac", "replay_steps")):
+        cfg = train_dict(with_learner(load_rl_cfg(CARTPOLE), learner))
+        for name in ("actor", "critic"):
+            cfg[name]["hidden_dims"] = (8,)
+        (cfg["algorithm"] if learner == "sac" else cfg)[steps] = 10**6
+        with pytest.raises(ValueError, match=f"{steps}: expected at most") as caught:
+            MjlabOnPolicyRunner(env, cfg, device="cpu")
+        most = int(str(caught.value).split("at most ")[1].split()[0].replace(",", ""))
+        (cfg["algorithm"] if learner == "sac" else cfg)[steps] = most
+        storage = MjlabOnPolicyRunner(env, cfg, device="cpu").alg.storage
+        assert isinstance(observations, TensorDict)
+        if isinstance(storage, ReplayStorage):
+            assert 0.9e6 < storage.num_bytes < 1.1e6
+        else:
+            values = [value for value in vars(storage).values() if torch.is_tensor(value)]
+            values += storage.observations.values()
+            assert 0.9e6 < sum(value.nbytes for value in values) <= 1e6
+
+
+# Other sizes.
+
+
+def test_a_billion_environments_end_at_once():
+    cfg = load_env_cfg(CARTPOLE)
+    cfg.scene.num_envs = 10**10
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match="num_envs: expected at most .* got 10,000,000,000"):
+        ManagerBasedRlEnv(cfg, device="cpu")
+    assert time.monotonic() - begin < 20.0
+
+
+@pytest.mark.parametrize("engine", ["native", "warp"])
+def test_simulations_beyond_the_memory(machine, engine):
+    xml = "<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(xml)
+    cfg = SimulationCfg(engine=engine, nconmax=4, njmax=8)
+    machine(total=10**7)
+    sim = Simulation(2, cfg, model, device="cpu")
+    most = 10**7 // sim._engine.bytes_each
+    with pytest.raises(ValueError, match=f"num_envs: expected at most {most // 1000},.*fewer"):
+        Simulation(2 * most, cfg, model, device="cpu")
+
+
+def test_expanded_fields_count(machine):
+    spec = mujoco.MjSpec()
+    for _ in range(100):
+        spec.worldbody.add_geom(size=(0.1, 0.0, 0.0), contype=0, conaffinity=0)
+    machine(total=10**6)
+    sim = Simulation(100, SimulationCfg(engine="native"), spec.compile(), device="cpu")
+    assert isinstance(sim._engine, NativeEngine)
+    before = sim._engine.bytes_each
+    sim.expand_model_fields(("geom_friction",))
+    # In double precision, with two copies in single precision.
+    assert sim._engine.bytes_each - before == 100 * 3 * (8 + 4 + 4)
+    with pytest.raises(ValueError, match="num_envs: expected at most"):
+        sim.expand_model_fields(("geom_pos", "geom_quat", "geom_rgba", "geom_size"))
+
+
+def test_environments_warn_once(machine, recwarn):
+    machine(total=10**9, available=10**5)
+    cfg = load_env_cfg(CARTPOLE)
+    cfg.scene.num_envs = 1000
+    ManagerBasedRlEnv(cfg, device="cpu")
+    told = [str(one.message) for one in recwarn if "num_envs" in str(one.message)]
+    assert len(told) == 1
+
+
+def test_histories_beyond_the_memory(machine):
+    machine(total=10**6)
+    with pytest.raises(ValueError, match="at most 2,49.*shorter history"):
+        CircularBuffer(10**9, 10, "cpu").append(torch.zeros(10, 10))
