@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import copy
 import errno
 import math
 import os
 import pickle
 import random
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from mjlab.rl.checkpoint import (
     CheckpointError,
     RunFolderError,
     check_terms,
+    copied,
     ensure_writable_folder,
     load_checkpoint,
     migrate,
@@ -135,24 +137,155 @@ def test_weights_and_rates_that_are_not_finite_are_refused(make_runner, tmp_path
         broken[part][name].view(-1)[0] = value
     save_checkpoint(broken, tmp_path / "model_1.pt")
     before = {key: value.clone() for key, value in runner.alg.get_policy().state_dict().items()}
-    with pytest.raises(CheckpointError, match=r"model_1.pt.*NaN or infinite"):
+    with pytest.raises(CheckpointError, match=r"model_1.pt.*(NaN or infinite|float inf)"):
         runner.load(str(tmp_path / "model_1.pt"))
     after = runner.alg.get_policy().state_dict()
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
-def test_an_optimizer_without_moments_or_with_odd_switches_is_refused(make_runner, tmp_path: Path):
+def entry(*way: Any) -> Any:
+    """Return a function that edits the entry at `way` of a checkpoint; None: removes it."""
+
+    def edit(content: dict[str, Any], change: Callable[[Any], Any] | None) -> None:
+        for key in way[:-1]:
+            content = content[key]
+        if change is None:
+            del content[way[-1]]
+        else:
+            content[way[-1]] = change(content[way[-1]])
+
+    return edit
+
+
+WEIGHT = entry("actor_state_dict", "mlp.0.weight")
+MOMENT = entry("optimizer_state_dict", "state", 1, "exp_avg")
+SQUARE = entry("optimizer_state_dict", "state", 1, "exp_avg_sq")
+STEP = entry("optimizer_state_dict", "state", 1, "step")
+GROUP = ("optimizer_state_dict", "param_groups", 0)
+DAMAGES: dict[str, tuple[Any, Any]] = {
+    "sparse weights": (WEIGHT, torch.Tensor.to_sparse),
+    "weights in rows": (WEIGHT, torch.Tensor.to_sparse_csr),
+    "weights without memory": (WEIGHT, lambda x: x.to("meta")),
+    "quantized weights": (WEIGHT, lambda x: torch.quantize_per_tensor(x, 0.1, 0, torch.qint8)),
+    "complex weights": (WEIGHT, lambda x: x + 1j),
+    "integer weights": (WEIGHT, torch.Tensor.long),
+    "a number for weights": (WEIGHT, lambda x: 0.5),
+    "a text for weights": (WEIGHT, lambda x: "mlp"),
+    "weights beyond floats": (WEIGHT, lambda x: x.double() + 1e300),
+    "integer keys": (entry("actor_state_dict"), lambda x: dict(enumerate(x.values()))),
+    "infinite moments": (MOMENT, lambda x: x + math.inf),
+    "infinite squares": (SQUARE, lambda x: x + math.inf),
+    "negative squares": (SQUARE, lambda x: -x - 1e-9),
+    "moments of another shape": (MOMENT, lambda x: x[:1]),
+    "sparse moments": (MOMENT, torch.Tensor.to_sparse),
+    "no moment": (MOMENT, None),
+    "no moments": (entry("optimizer_state_dict", "state", 1), lambda x: {}),
+    "moments of another optimizer": (
+        entry("optimizer_state_dict", "state", 1), lambda x: {"momentum_buffer": x["exp_avg"]},
+    ),
+    "a negative step": (STEP, lambda x: -x),
+    "an infinite step": (STEP, lambda x: x + math.inf),
+    "a step of text": (STEP, str),
+    "a step per weight": (STEP, lambda x: x.repeat(3)),
+    "a negative rate": (entry(*GROUP, "lr"), lambda x: -x),
+    "a rate of text": (entry(*GROUP, "lr"), str),
+    "no rate": (entry(*GROUP, "lr"), None),
+    "large betas": (entry(*GROUP, "betas"), lambda x: (1.5, 0.9)),
+    "a third beta": (entry(*GROUP, "betas"), lambda x: (*x, 0.9)),
+    "odd switches": (entry(*GROUP, "capturable"), lambda x: 0.5),
+    "odd parameters": (entry(*GROUP, "params"), lambda x: [*x[:-1], 0.5]),
+    "a group too many": (entry(*GROUP[:2]), lambda x: x * 2),
+    "states in a list": (entry("optimizer_state_dict", "state"), lambda x: list(x.values())),
+    "no states": (entry("optimizer_state_dict", "state"), None),
+    "a text for iterations": (entry("iter"), str),
+    "a truth value for iterations": (entry("iter"), bool),
+    "NaN iterations": (entry("iterations_finished"), lambda x: math.nan),
+    "too many iterations": (entry("iterations_finished"), lambda x: 10**30),
+    "a list of infos": (entry("infos"), lambda x: [x]),
+    "a number as identity": (entry("identity"), lambda x: 3),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> dict[str, Any]:
+    from rl_fake_env import FakeEnv, FakeEnvCfg, runner_cfg
+
+    from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+
+    runner = MjlabOnPolicyRunner(RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg())), runner_cfg())
+    runner.learn(2)
+    path = tmp_path_factory.mktemp("saved") / "model_1.pt"
+    runner.save(str(path))
+    return load_checkpoint(path)
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_a_damaged_entry_is_an_error_with_its_cure(make_runner, tmp_path: Path, saved, what):
+    save_checkpoint({}, tmp_path / "model_0.pt")
+    edit, change = DAMAGES[what]
+    content = copied(saved)
+    edit(content, change)
+    torch.save(content, tmp_path / "model_1.pt")
     runner = make_runner()
-    runner.learn(1)
-    runner.save(str(tmp_path / "model_0.pt"))
-    broken = load_checkpoint(tmp_path / "model_0.pt")
-    for place, name, value in (("state", 1, {}), ("param_groups", 0, {"capturable": 0.5})):
-        changed = copy.deepcopy(broken)
-        entry = changed["optimizer_state_dict"][place]
-        entry[name] = {**entry[name], **value} if value else {}
-        save_checkpoint(changed, tmp_path / "model_0.pt")
-        with pytest.raises(CheckpointError, match="optimizer state"):
-            runner.load(str(tmp_path / "model_0.pt"))
+    before = copied(runner.alg.save())
+    with pytest.raises(CheckpointError) as caught:
+        runner.load(str(tmp_path / "model_1.pt"))
+    text = str(caught.value)
+    assert "model_1.pt" in text
+    assert "model_0.pt" in text or "a checkpoint of this task" in text
+    after = runner.alg.save()
+    for part in ("actor_state_dict", "critic_state_dict"):
+        assert all(torch.equal(before[part][key], after[part][key]) for key in before[part])
+
+
+KEPT: dict[str, tuple[Any, Any]] = {
+    "doubles": (WEIGHT, torch.Tensor.double),
+    "parameters": (WEIGHT, torch.nn.Parameter),
+    "steps as numbers": (STEP, float),
+    "moments in one memory": (MOMENT, lambda x: x.t().contiguous().t() if x.dim() == 2 else x),
+    "settings of an earlier torch": (entry(*GROUP, "decoupled_weight_decay"), None),
+    "settings of a later torch": (entry(*GROUP), lambda x: {**x, "later": "text"}),
+    "betas in a list": (entry(*GROUP, "betas"), list),
+}
+
+
+@pytest.mark.parametrize("what", KEPT)
+def test_the_same_state_in_another_form_resumes(make_runner, tmp_path: Path, saved, what):
+    edit, change = KEPT[what]
+    content = copied(saved)
+    edit(content, change)
+    torch.save(content, tmp_path / "model_1.pt")
+    save_checkpoint(saved, tmp_path / "model_2.pt")
+    results = []
+    for name in ("model_1.pt", "model_2.pt"):
+        runner = make_runner()
+        runner.load(str(tmp_path / name))
+        runner.learn(3)
+        results.append(runner.alg.save()["actor_state_dict"])
+    assert all(torch.equal(results[0][key], results[1][key]) for key in results[0])
+
+
+def test_moments_that_share_memory_are_separated(make_runner, tmp_path: Path, saved):
+    content = copied(saved)
+    state = content["optimizer_state_dict"]["state"][1]
+    state["exp_avg_sq"] = state["exp_avg"] = torch.ones(1).expand(state["exp_avg"].shape)
+    torch.save(content, tmp_path / "model_1.pt")
+    runner = make_runner()
+    runner.load(str(tmp_path / "model_1.pt"))
+    runner.learn(3)
+    state = runner.alg.optimizer.state_dict()["state"][1]
+    assert not torch.equal(state["exp_avg"], state["exp_avg_sq"])
+
+
+@pytest.mark.parametrize("left", [0, 1])
+def test_missing_moments_are_a_warning(make_runner, tmp_path: Path, saved, caplog, left):
+    content = copied(saved)
+    states = content["optimizer_state_dict"]["state"]
+    for number in list(states)[left:]:
+        del states[number]
+    save_checkpoint(content, tmp_path / "model_1.pt")
+    make_runner().load(str(tmp_path / "model_1.pt"))
+    assert "has no moments of" in caplog.text
 
 
 @pytest.mark.parametrize("garbage", [7, {}, None, {"a": torch.zeros(2)}])

@@ -121,14 +121,24 @@ def test_nan_at_the_first_action_of_the_next_rollout_is_explained(make_runner):
     assert runner.current_learning_iteration == 1
 
 
-def test_a_policy_that_breaks_on_its_own_keeps_its_error(make_runner):
+def test_a_policy_that_breaks_on_its_own_is_named(make_runner):
     runner = make_runner(armature=0.01)
     with torch.no_grad():
         for parameter in runner.alg.get_policy().parameters():
             parameter.fill_(float("nan"))
-    with pytest.raises((RuntimeError, ValueError)) as caught:
+    with pytest.raises(DivergedError, match="weights are NaN.*learning rate") as caught:
         runner.learn(1)
-    assert not isinstance(caught.value, DivergedError)
+    assert "joint" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [float("inf"), 1e38])
+def test_observations_that_break_the_policy_are_named(make_runner, value):
+    runner = make_runner(armature=0.01, normalized=True)
+    env = runner.env.unwrapped
+    term = env.observation_manager.get_term_cfg("critic", "vel")
+    term.func = lambda env: torch.full((8, 3), value)
+    with pytest.raises(DivergedError, match=r"'critic' reach (inf|1e\+38): scale or clip"):
+        runner.learn(5)
 
 
 def test_an_error_that_is_not_about_numbers_passes(make_runner, monkeypatch):

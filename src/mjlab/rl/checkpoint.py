@@ -21,7 +21,8 @@ import tempfile
 import warnings
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,8 +30,8 @@ import numpy as np
 import torch
 
 from mjlab.envs.env_state import curricula_in
-from mjlab.utils.errors import MjlabError, UserError, check_count, check_positive
-from mjlab.utils.os import checkpoint_names, replacing
+from mjlab.utils.errors import MjlabError, UserError, check_count, check_in_range, check_positive
+from mjlab.utils.os import checkpoint_number, checkpoints_in, replacing
 from mjlab.utils.random import rng_state, set_rng_state
 from mjlab.utils.torch import to_device
 
@@ -43,17 +44,18 @@ logger = logging.getLogger(__name__)
 VERSION = 1
 """Format of `training_state`."""
 
-# Only in checkpoints of SAC.
-_SAC_KEY = "sac_state_dict"
 # Entries with the same type in files of mjlab and rsl_rl: dicts and numbers of iterations.
 _DICT_ENTRIES = (
     "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
     "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
-    "infos", "training_state", "sizes",
+    "sac_state_dict", "infos", "training_state", "sizes",
 )  # fmt: skip
 _COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
-# Entries of the optimizers and of SAC.
-_LEARNING_ENTRIES = ("optimizer_state_dict", "rnd_optimizer_state_dict", _SAC_KEY)
+# Entries of networks, optimizers and SAC whose values are never negative.
+_NEVER_NEGATIVE = frozenset((
+    "step", "exp_avg_sq", "max_exp_avg_sq", "square_avg", "_var", "_std", "count", "running_var",
+    "steps_left", "_count", "_sum", "_largest", "factor",
+))  # fmt: skip
 
 # Legacy layouts: names of the standard deviation, and prefixes of actor and critic in one state dict.
 _STD_NAMES = {
@@ -142,7 +144,8 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     corruption on disk is detected (files of torch before 1.6 have no checksums).
 
     Raises:
-        CheckpointError: the file is missing, truncated, not a checkpoint, or hostile.
+        CheckpointError: the file is missing, truncated, not a checkpoint, or hostile, or contains
+            tensors other than dense ones.
     """
     path = Path(path)
     if not path.is_file():
@@ -162,6 +165,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
                     if (damaged := archive.testzip()) is not None:
                         raise zipfile.BadZipFile(f"the checksum of {damaged} is wrong")
             data = torch.load(path, map_location="cpu", weights_only=True)
+        tensors = [(name, x) for name, x in _leaves(data) if isinstance(x, torch.Tensor)]
     except pickle.UnpicklingError as error:
         called = re.search(r"(?:GLOBAL|class|function) ([\w.]+)", str(error))
         reason, hint = "not a file of torch, or corrupt", ""
@@ -176,25 +180,35 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         ) from error
     except Exception as error:
         # Damaged bytes make the reader raise arbitrary exceptions.
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:160]
-        raise CheckpointError(
-            f"Checkpoint {str(path)!r} is truncated or corrupt "
-            f"({path.stat().st_size} bytes; {reason}); use an earlier checkpoint."
+        text = error.strerror if isinstance(error, OSError) else str(error)
+        text = ((text or "").strip() or type(error).__name__).splitlines()[0][:160]
+        raise unusable(
+            path, f"truncated or corrupt ({path.stat().st_size} bytes; {text})"
         ) from error
     if not isinstance(data, dict):
-        raise CheckpointError(
-            f"Checkpoint {str(path)!r}: expected a dict, got a {type(data).__name__}; use a checkpoint "
-            "of a training run."
-        )
+        raise unusable(path, f"expected a dict, got a {type(data).__name__}")
+    for name, value in tensors:
+        if not _is_dense(value):
+            raise unusable(path, f"{name}: expected a dense tensor, got {_described(value)}")
     return data
 
 
-def latest_checkpoint(folder: Path) -> Path | None:
-    """Return the `model_<number>.pt` with the highest number in `folder`, or None."""
-    if not folder.is_dir():
-        return None
-    names = checkpoint_names(path.name for path in folder.iterdir())
-    return folder / names[-1] if names else None
+def unusable(path: str | os.PathLike[str], reason: str) -> CheckpointError:
+    """Return the error for a checkpoint that is damaged: file, reason, and the checkpoint to use instead."""
+    earlier = latest_checkpoint(Path(path).parent, before=Path(path).name)
+    cure = "another checkpoint" if earlier is None else f"an earlier checkpoint, {str(earlier)!r}"
+    return CheckpointError(f"Checkpoint {str(path)!r}: {reason}; use {cure}. Nothing was changed.")
+
+
+def latest_checkpoint(folder: Path, before: str = "") -> Path | None:
+    """Return the checkpoint with the highest number in `folder`, or None.
+
+    `before` is the name of a checkpoint; only those with a lower number count.
+    """
+    limit = checkpoint_number(before)
+    paths = checkpoints_in(folder)
+    paths = [p for p in paths if limit is None or (checkpoint_number(p.name) or 0) < limit]
+    return paths[-1] if paths else None
 
 
 def ensure_writable_folder(folder: str | os.PathLike[str]) -> Path:
@@ -268,21 +282,20 @@ class RunRescue:
         if not isinstance(error, Exception) or isinstance(error, (CheckpointError, RunFolderError)):
             return
         path = os.path.join(self._folder, f"model_{self.learned['iter']}.pt")
-        # NaN weights may be the reason of the failure, and could not be loaded.
-        if os.path.exists(path) or not_finite(self.learned):
-            return
+        is_new = not os.path.exists(path)
         # In the same episodes, the failure may come again.
         state = lasting_state(self.learned["training_state"])
         try:
-            save_checkpoint({**self.learned, "training_state": state}, path)
+            if is_new:
+                save_checkpoint({**self.learned, "training_state": state}, path)
         except CheckpointError as failure:
             # The first error is the one that the user needs to see.
             logger.warning("%s", failure)
             return
         logger.warning(
-            "Training failed in iteration %d. Weights and optimizer of the previous iteration are in %s; "
-            "a run resumed from there starts in new episodes.",
+            "Training failed in iteration %d. Weights and optimizer of the previous iteration are in %s%s.",
             self.learned["iterations_finished"] + 1, path,
+            "; a run resumed from there starts in new episodes" if is_new else "",
         )  # fmt: skip
 
 
@@ -314,33 +327,32 @@ def load_algorithm(
         CheckpointError: a part is missing, does not fit, or is not finite. Nothing was changed.
     """
     optimizer, changed_from = algorithm.optimizer, None
-    for name in ("actor", "critic", "student", "teacher"):
-        model = getattr(algorithm, f"_raw_{name}", None)
-        if strict and model is not None and (load_cfg is None or load_cfg.get(name)):
+
+    def is_wanted(name: str) -> bool:
+        return load_cfg is None or bool(load_cfg.get(name))
+
+    # rsl_rl loads one part after the other: an error leaves the algorithm partly loaded.
+    before = copy.deepcopy(algorithm.save())
+    for name in ("actor", "critic", "student", "teacher", "rnd"):
+        model = getattr(algorithm, "rnd" if name == "rnd" else f"_raw_{name}", None)
+        if strict and is_wanted(name) and f"{name}_state_dict" in before and model is not None:
             check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)
-    if load_cfg is None or load_cfg.get("optimizer"):
-        saved = checkpoint.get("optimizer_state_dict")
-        changed_from = _other_kind(optimizer, saved)
+            if name == "rnd":
+                check_optimizer_fits(model.optimizer, checkpoint, "rnd_optimizer_state_dict", path)
+    if is_wanted("optimizer"):
+        changed_from = _other_kind(optimizer, checkpoint.get("optimizer_state_dict"))
         if changed_from is not None:
             checkpoint = {**checkpoint, "optimizer_state_dict": optimizer.state_dict()}
         else:
-            check_optimizer_fits(optimizer, saved, path=path)
-        broken = not_finite({name: checkpoint.get(name) for name in _LEARNING_ENTRIES})
-        if broken:
-            raise CheckpointError(
-                f"Checkpoint {path!r}: expected finite values, got NaN or infinite in "
-                f"{', '.join(broken)}; use an earlier checkpoint. Nothing was changed."
-            )
-    # rsl_rl loads one part after the other: an error leaves the algorithm partly loaded.
-    before = copy.deepcopy(algorithm.save())
+            check_optimizer_fits(optimizer, checkpoint, "optimizer_state_dict", path)
     try:
         loads_iteration = algorithm.load(checkpoint, load_cfg, strict)
-    except (KeyError, ValueError, RuntimeError, TypeError, AttributeError) as error:
+    except Exception as error:
         algorithm.load(before, None, True)
-        raise CheckpointError(
-            f"Checkpoint {path!r} does not fit this algorithm: {error}. To load only its policy, use "
-            "load_cfg={'actor': True}."
-        ) from error
+        if isinstance(error, torch.OutOfMemoryError):
+            raise
+        text = f"{type(error).__name__}: {error}" if isinstance(error, KeyError) else str(error)
+        raise unusable(path, f"does not fit this algorithm: {text}") from error
     if hasattr(algorithm, "student"):
         # rsl_rl's distillation loads the rate of its optimizer only.
         algorithm.learning_rate = optimizer.param_groups[0]["lr"]
@@ -407,74 +419,175 @@ def check_fits(
     """Check that the state dict `saved` fits `model`.
 
     Raises:
-        CheckpointError: parameters are missing, unknown, of the wrong shape, or NaN or infinite. The
-            message lists all of them.
+        CheckpointError: parameters are missing, unknown, or of the wrong shape or type, or NaN or
+            infinite. The message lists all of wrong names and shapes.
     """
     if saved is None:
         raise CheckpointError(
             f"Checkpoint {path!r} holds no {name} weights; use a checkpoint of the same learner."
         )
-    own = model.state_dict()
+    own = {k: value for k, value in model.state_dict().items() if isinstance(value, torch.Tensor)}
     expected = {key: tuple(value.shape) for key, value in own.items()}
     found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
-    if expected == found:
-        # Values that are not finite in a new network either, such as a mask of -inf, are allowed.
-        broken = [
-            key
-            for key, value in own.items()
-            if value.isfinite().all() and not saved[key].isfinite().all()
+    if expected != found:
+        lines = [
+            f"  {key}: expected {expected.get(key, 'nothing')}, found {found.get(key, 'nothing')}"
+            for key in sorted(expected.keys() | found.keys(), key=str)
+            if expected.get(key) != found.get(key)
         ]
-        if broken:
-            raise CheckpointError(
-                f"Checkpoint {path!r}: expected finite {name} weights, got NaN or infinite in "
-                f"{', '.join(broken)}; use an earlier checkpoint. Nothing was changed."
-            )
-        return
-    lines = [
-        f"  {key}: expected {expected.get(key, 'nothing')}, found {found.get(key, 'nothing')}"
-        for key in sorted(expected.keys() | found.keys())
-        if expected.get(key) != found.get(key)
-    ]
-    raise CheckpointError(
-        f"Checkpoint {path!r}: its {name} does not fit this task's {name} config.\n"
-        + "\n".join(lines)
-        + "\nUse a checkpoint of this task, or the network config "
-        f"(--agent.{name}.) and the observations of the training run."
-    )
+        raise CheckpointError(
+            f"Checkpoint {path!r}: its {name} does not fit this task's {name} config.\n"
+            + "\n".join(lines)
+            + "\nUse a checkpoint of this task, or the network config "
+            f"(--agent.{name}.) and the observations of the training run."
+        )
+    for key, value in own.items():
+        if fault := misfit(value, saved[key], f"{name}_state_dict.{key}"):
+            raise unusable(path, fault)
 
 
 def check_optimizer_fits(
-    optimizer: torch.optim.Optimizer, saved: Mapping[str, Any] | None, *, path: str
+    optimizer: torch.optim.Optimizer, checkpoint: Mapping[str, Any], name: str, path: str
 ) -> None:
-    """Check that the state `saved` has the number of parameters and the shapes of `optimizer`.
+    """Check that the entry `name` of `checkpoint` is a state that `optimizer` continues from.
 
-    torch compares only the numbers of parameters, and would fail at the next update.
+    torch compares only numbers of parameters, would fail at the next update, and starts with new
+    moments for an empty state. Here the state of a copy after one step, under the saved settings and
+    with gradients of 0, says what a state consists of.
 
     Raises:
         CheckpointError: the state does not fit.
     """
-    states: Any = saved
-    fits = True
+
+    def stepped(groups: Any) -> dict[int, Any]:
+        probe = copy.deepcopy(optimizer)
+        probe.load_state_dict({"state": {}, "param_groups": groups})
+        for parameter in (p for group in probe.param_groups for p in group["params"]):
+            parameter.grad = torch.zeros_like(parameter)
+        probe.step()
+        return probe.state_dict()["state"]
+
+    groups = optimizer.state_dict()["param_groups"]
     try:
-        for group, own in zip(states["param_groups"], optimizer.param_groups, strict=True):
-            fits &= isinstance(group["lr"], float)
-            # Boolean settings of torch's optimizers differ between releases.
-            switches = [name for name, value in own.items() if isinstance(value, bool)]
-            fits &= all(isinstance(group.get(name, False), bool) for name in switches)
-            for number, parameter in zip(group["params"], own["params"], strict=True):
-                state = states["state"].get(number)
-                # torch would start with new moments for an empty state, without a warning.
-                fits &= state is None or len(state) > 0
-                for value in (state or {}).values():
-                    is_moment = isinstance(value, torch.Tensor) and value.dim() > 0
-                    fits &= not is_moment or value.shape == parameter.shape
-    except (KeyError, TypeError, AttributeError, ValueError):
-        fits = False
-    if not fits:
-        raise CheckpointError(
-            f"Checkpoint {path!r}: expected an optimizer state that fits these networks. To load only "
-            "its policy, use load_cfg={'actor': True}. Nothing was changed."
+        stepped(groups)
+    except Exception:
+        # Optimizers of packages may keep what a copy lacks.
+        return
+    saved: Any = checkpoint.get(name)
+    try:
+        fault = None
+        for number, (own, group) in enumerate(zip(groups, saved["param_groups"], strict=True)):
+            # Settings differ between releases of torch.
+            own = {key: value for key, value in own.items() if key in group}
+            group = {key: group[key] for key in own}
+            fault = fault or misfit(own, group, f"{name}.param_groups.{number}")
+            if group["params"] != own["params"]:
+                raise ValueError(f"params {group['params']}")
+        if fault is None:
+            like = stepped(saved["param_groups"])
+            new = like.keys() - saved["state"].keys()
+            if new and (saved["state"] or "sac_state_dict" not in checkpoint):
+                logger.warning(
+                    "%s of %r has no moments of %d of %d parameters: they start at 0.",
+                    name, path, len(new), len(like),
+                )  # fmt: skip
+            for number, state in saved["state"].items():
+                # Written by earlier releases of torch for SGD without momentum.
+                state = {key: value for key, value in state.items() if value is not None}
+                own = like.get(number, {})
+                fault = fault or misfit(own, state, f"{name}.state.{number}")
+    except Exception as error:
+        fault = (
+            f"{name}: expected a state that fits these networks ({type(error).__name__}: {error})"
         )
+    if fault is not None:
+        raise unusable(path, fault)
+
+
+def misfit(own: Any, saved: Any, name: str, *, same_rows: bool = True) -> str | None:
+    """Return the first difference in structure of `saved` from `own`, or None.
+
+    Expected are the same keys, lengths, types, and shapes, and numbers that are finite if those of
+    `own` are, and not negative where they never are.
+
+    Args:
+        own: State of a new object.
+        saved: State of the same object, from a file.
+        name: Name of the entry, for the result.
+        same_rows: Compare the first size of tensors, too.
+    """
+    expected = found = ""
+    parts: Iterable[tuple[Any, Any, Any]] = ()
+    if isinstance(own, torch.Tensor):
+        return _tensor_misfit(own, saved, name, same_rows)
+    if isinstance(own, Mapping):
+        if not isinstance(saved, Mapping):
+            expected = "a dict"
+        elif own.keys() != saved.keys():
+            expected, found = f"the entries {list(own)}", str(list(saved))
+        else:
+            parts = ((own[key], saved[key], key) for key in own)
+    elif isinstance(own, (list, tuple)):
+        if not isinstance(saved, (list, tuple)) or len(own) != len(saved):
+            expected = f"{len(own)} values"
+        else:
+            parts = zip(own, saved, range(len(own)), strict=True)
+    elif isinstance(own, bool):
+        if not isinstance(saved, bool | None):
+            expected = "True, False or None"
+    elif isinstance(own, int | float):
+        limit = 1.0 if ".betas." in name else 2.0**63
+        if isinstance(saved, bool) or not isinstance(saved, int | float) or not 0 <= saved < limit:
+            expected = f"a number in [0, {limit:g})"
+    if expected:
+        return f"{name}: expected {expected}, got {found or _described(saved)}"
+    faults = (misfit(a, b, f"{name}.{key}", same_rows=same_rows) for a, b, key in parts)
+    return next((fault for fault in faults if fault), None)
+
+
+def _tensor_misfit(own: torch.Tensor, saved: Any, name: str, same_rows: bool) -> str | None:
+    if own.dim() == 0 and type(saved) is float:
+        # Earlier releases of torch count steps by numbers.
+        saved = torch.tensor(saved)
+    skipped = 0 if same_rows else 1
+    expected, found = "", _described(saved)
+    if not isinstance(saved, torch.Tensor) or not _is_dense(saved):
+        expected = "a dense tensor"
+    elif saved.dim() != own.dim() or saved.shape[skipped:] != own.shape[skipped:]:
+        expected, found = f"shape {tuple(own.shape)}", f"{tuple(saved.shape)}"
+    elif (saved.is_floating_point(), saved.is_complex(), saved.dtype == torch.bool) != (
+        own.is_floating_point(), own.is_complex(), own.dtype == torch.bool,
+    ):  # fmt: skip
+        expected, found = f"numbers like {own.dtype}", str(saved.dtype)
+    # Conversions of doubles may overflow.
+    elif not (values := saved.to(own.dtype)).isfinite().all() and own.isfinite().all():
+        expected, found = "finite values", "NaN or infinite ones"
+    elif name.rpartition(".")[2] in _NEVER_NEGATIVE and bool((values < 0).any()):
+        expected, found = "values >= 0", f"{float(values.min()):g}"
+    return f"{name}: expected {expected}, got {found}" if expected else None
+
+
+def _is_dense(value: torch.Tensor) -> bool:
+    """Return True for tensors that are arrays of numbers in the memory of the CPU."""
+    is_array = value.layout == torch.strided and value.device.type == "cpu"
+    return is_array and not value.is_nested and not value.is_quantized
+
+
+def _described(value: Any) -> str:
+    if not isinstance(value, torch.Tensor):
+        text = repr(value)
+        return f"{type(value).__name__} {text}" if len(text) <= 20 else f"a {type(value).__name__}"
+    kind = "nested" if value.is_nested else "quantized" if value.is_quantized else str(value.layout)
+    return f"a tensor ({kind.removeprefix('torch.')}, {value.device.type})"
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values in nested dicts and sequences, with their positions."""
+    if not isinstance(value, (dict, list, tuple, set)):
+        yield name, value
+        return
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+        yield from _leaves(item, f"{name}.{key}" if name else str(key))
 
 
 # A setting that no other kind of torch's optimizers has.
@@ -503,22 +616,6 @@ def _other_kind(optimizer: torch.optim.Optimizer, saved: Any) -> str | None:
         return None
     is_unknown = _IS_ADAMW not in group or _IS_ADAMW not in own
     return None if is_unknown and "betas" in group and "betas" in own else found
-
-
-def not_finite(value: Any, name: str = "") -> list[str]:
-    """Return the names of tensors in `value` with NaN, and of learning rates that are not finite."""
-    if isinstance(value, torch.Tensor):
-        return [name] if bool(value.isnan().any()) else []
-    if isinstance(value, float):
-        return [name] if name.endswith(".lr") and not math.isfinite(value) else []
-    if isinstance(value, dict):
-        items = value.items()
-    elif isinstance(value, (list, tuple)):
-        items = enumerate(value)
-    else:
-        return []
-    prefix = f"{name}." if name else ""
-    return [found for key, item in items for found in not_finite(item, f"{prefix}{key}")]
 
 
 # Terms of observations and actions.
@@ -630,35 +727,45 @@ def curricula_of(content: Mapping[str, Any]) -> dict[str, Any] | None:
     return curricula_in(env) if is_ours else None
 
 
+@contextlib.contextmanager
+def naming_checkpoint(path: str | os.PathLike[str], *passing: type[Exception]) -> Generator[None]:
+    """Convert errors of the block, which restores a training state, to `CheckpointError`.
+
+    Args:
+        path: Checkpoint file.
+        passing: Types of errors that are not converted.
+    """
+    try:
+        yield
+    except (CheckpointError, torch.OutOfMemoryError, MemoryError, *passing):
+        raise
+    except Exception as error:
+        # A state of the wrong form raises any error.
+        text = f"training_state is malformed ({type(error).__name__}: {error})"
+        raise unusable(path, text) from error
+
+
 def restore_lasting_state(state: dict[str, Any], env: VecEnv, algorithm: Any = None) -> list[str]:
     """Restore what outlives episodes in a training state, mainly curricula, and start new episodes.
 
     Returns the names of parts left out.
-
-    Raises:
-        CheckpointError: the state is malformed.
     """
     rnd = getattr(algorithm, "rnd", None)
     if rnd is not None and state.get("rnd") is not None:
         # Its weight follows a schedule.
-        rnd.update_counter = state["rnd"]["update_counter"]
+        rnd.update_counter = index(state["rnd"]["update_counter"])
     curricula = curricula_of({"training_state": state})
     unwrapped: Any = getattr(env, "unwrapped", env)
     if not hasattr(unwrapped, "load_curriculum_state"):
         return []
     if curricula is None:
         return ["curricula"]
-    try:
-        # Tensors created in the rollout can only be written to in inference mode.
-        with torch.inference_mode():
-            left_out = unwrapped.load_curriculum_state(curricula)
-            with unwrapped.curriculum_manager.held():
-                env.reset()  # ty: ignore[missing-attribute]
-        return left_out
-    except torch.OutOfMemoryError:
-        raise
-    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-        raise _malformed(error) from error
+    # Tensors created in the rollout can only be written to in inference mode.
+    with torch.inference_mode():
+        left_out = unwrapped.load_curriculum_state(curricula)
+        with unwrapped.curriculum_manager.held():
+            env.reset()  # ty: ignore[missing-attribute]
+    return left_out
 
 
 def restore_training_state(
@@ -679,42 +786,29 @@ def restore_training_state(
 
     Raises:
         ValueError: the state is of different environments. Nothing was changed.
-        CheckpointError: the state is malformed.
     """
-    try:
-        observations = _matching_observations(state, env)
-        unwrapped: Any = getattr(env, "unwrapped", env)
-        if "env" in state and hasattr(unwrapped, "load_state_dict"):
-            # Tensors created in the rollout can only be written to in inference mode.
-            with torch.inference_mode():
-                unwrapped.load_state_dict(to_device(state["env"], env.device))
-        load_logger(state["logger"])
-        for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
-            hidden = to_device(hidden, device)
-            model.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
-        if hasattr(algorithm, "last_hidden_states"):
-            # rsl_rl's distillation starts an update with the hidden states before the iteration.
-            algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
-        rnd = getattr(algorithm, "rnd", None)
-        if rnd is not None and state["rnd"] is not None:
-            rnd.update_counter = state["rnd"]["update_counter"]
-            if (average := getattr(rnd.reward_normalizer, "disc_avg", None)) is not None:
-                average.avg = to_device(state["rnd"]["discounted_average"], device)
-        observations = observations.to(device)
-        # Last, because restoring may draw random numbers.
-        set_rng_state(state["rng"])
-        return observations
-    except torch.OutOfMemoryError:
-        raise
-    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-        raise _malformed(error) from error
-
-
-def _malformed(error: Exception) -> CheckpointError:
-    return CheckpointError(
-        f"Checkpoint training_state is malformed ({type(error).__name__}: {error}); use an earlier "
-        "checkpoint, or load only its networks with load_cfg={'actor': True, 'critic': True}."
-    )
+    observations = _matching_observations(state, env)
+    unwrapped: Any = getattr(env, "unwrapped", env)
+    if "env" in state and hasattr(unwrapped, "load_state_dict"):
+        # Tensors created in the rollout can only be written to in inference mode.
+        with torch.inference_mode():
+            unwrapped.load_state_dict(to_device(state["env"], env.device))
+    load_logger(state["logger"])
+    for model, hidden in zip(_models(algorithm), state["hidden_states"], strict=True):
+        hidden = to_device(hidden, device)
+        model.reset(hidden_state=tuple(hidden) if isinstance(hidden, list) else hidden)
+    if hasattr(algorithm, "last_hidden_states"):
+        # rsl_rl's distillation starts an update with the hidden states before the iteration.
+        algorithm.last_hidden_states = (algorithm.student.get_hidden_state(), None)
+    rnd = getattr(algorithm, "rnd", None)
+    if rnd is not None and state["rnd"] is not None:
+        rnd.update_counter = index(state["rnd"]["update_counter"])
+        if (average := getattr(rnd.reward_normalizer, "disc_avg", None)) is not None:
+            average.avg = to_device(state["rnd"]["discounted_average"], device)
+    observations = observations.to(device)
+    # Last, because restoring may draw random numbers.
+    set_rng_state(state["rng"])
+    return observations
 
 
 def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
@@ -732,12 +826,9 @@ def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
     observations = state.get("observations")
     if observations is None:
         raise ValueError("The run failed within an iteration, so the checkpoint has no episodes.")
-    found, expected = (
-        {key: tuple(value.shape) for key, value in one.items()}
-        for one in (observations, env.get_observations().flatten_keys("\n"))
-    )
-    if found != expected:
-        raise ValueError(f"training_state observations: expected {expected}, got {found}.")
+    own = dict(env.get_observations().flatten_keys("\n").items())
+    if fault := misfit(own, observations, "training_state.observations"):
+        raise ValueError(f"{fault}.")
     return TensorDict(observations, batch_size=[env.num_envs]).unflatten_keys("\n")
 
 
@@ -772,17 +863,26 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
             if not isinstance(value, dict | None):
                 raise ValueError(f"{name}: expected a dict, got a {type(value).__name__}.")
         for name, value in counts.items():
+            if isinstance(value, bool):
+                raise ValueError(f"{name}: expected an integer, got {value}.")
             check_count(name, value, _COUNT_ENTRIES.get(name, 0))
+            check_in_range(name, value, -1, 2**63)
+        for name, terms in parts.items():
+            for term, shape in (terms or {}).items():
+                if not isinstance(shape, (list, tuple)) or any(type(n) is not int for n in shape):
+                    raise ValueError(f"{name}.{term}: expected a shape, got {_described(shape)}.")
+        for name in ("task", "identity"):
+            if not isinstance(value := checkpoint.get(name), str | None):
+                raise ValueError(f"{name}: expected a text, got {_described(value)}.")
         if not isinstance(owes := checkpoint.get("owes_evaluation", False), bool):
-            raise ValueError(f"owes_evaluation: expected True or False, got {owes!r}.")
+            raise ValueError(f"owes_evaluation: expected True or False, got {_described(owes)}.")
     except ValueError as error:
-        raise CheckpointError(
-            f"Checkpoint {path!r} is malformed: {error} Use another checkpoint. Nothing was changed."
-        ) from error
+        raise unusable(path, str(error).rstrip(".")) from error
     migrated = dict(checkpoint)
     if migrated.get("model_state_dict") is not None:
         parts: dict[str, dict[str, Any]] = {"actor_state_dict": {}, "critic_state_dict": {}}
         for name, value in migrated.pop("model_state_dict").items():
+            name = str(name)
             if name in _STD_NAMES:
                 parts["actor_state_dict"][name] = value
             for prefix, (part, current) in _SINGLE_MODEL_PREFIXES.items():
@@ -798,6 +898,21 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 
 # Plain data.
+
+
+def copied(value: Any) -> Any:
+    """Return a copy of nested plain data, in which no two tensors share memory."""
+    if isinstance(value, torch.Tensor):
+        return value.detach().clone(memory_format=torch.contiguous_format)
+    if isinstance(value, (list, tuple)):
+        return type(value)(copied(item) for item in value)
+    if not isinstance(value, dict):
+        return value
+    # State dicts of modules carry versions as an attribute.
+    new = copy.copy(value)
+    for key, item in value.items():
+        new[key] = copied(item)
+    return new
 
 
 def as_plain_data(value: Any, path: str = "") -> Any:

@@ -17,10 +17,14 @@ from mjlab.utils.string import counted
 _MIN_BROKEN_STEPS = 16
 # With few environments, a single one may diverge.
 _MIN_DIVERGED_EPISODES = 4
+# Texts in errors about numbers that are not finite.
+_ABOUT_NAN = ("elements of std >= 0", "NaN")
+# Observations whose squares, or the sums of these, may overflow.
+_TOO_LARGE = 1e10
 
 
 class DivergedError(MjlabError, RuntimeError):
-    """Training failure caused by diverged physics of a joint."""
+    """Training failure: the physics of a joint diverged, or the weights are NaN or infinite."""
 
 
 class BrokenTermError(MjlabError, ValueError):
@@ -90,28 +94,60 @@ class RolloutWatch:
                     )
 
     @contextmanager
-    def explaining(self, policy: torch.nn.Module) -> Generator[None]:
-        """Raise `DivergedError` instead of errors about NaN and infinite numbers.
+    def explaining(self, algorithm: Any) -> Generator[None]:
+        """Raise `DivergedError` instead of errors about NaN, and after a block that left weights of NaN.
 
-        Only if a joint was too fast for the physics timestep; other errors pass.
+        The cause is a joint that was too fast for the physics timestep, or else the learning. Errors of
+        a network with finite weights pass if no joint was too fast.
+
+        Args:
+            algorithm: An rsl_rl algorithm, or one with its methods.
         """
+        error: Exception | None = None
         try:
             yield
         except (DivergedError, BrokenTermError):
             raise
-        except (RuntimeError, ValueError) as error:
-            # NaN in the action distribution, in a step or in the policy.
-            tensors = (
-                t for t in (*policy.parameters(), *policy.buffers()) if t.is_floating_point()
-            )
-            comes_from_nan = any(text in str(error) for text in ("elements of std >= 0", "NaN"))
-            comes_from_nan = comes_from_nan or any(not t.isfinite().all() for t in tensors)
-            message = self._explanation() if comes_from_nan else None
-            if message is None:
-                raise
+        except (RuntimeError, ValueError) as raised:
+            error = raised
+        learned = [p for group in algorithm.optimizer.param_groups for p in group["params"]]
+        # Infinite weights may be meant, such as the logarithm of a standard deviation of 0.
+        is_broken = bool(torch.stack([p.isnan().any() for p in learned]).any())
+        policy = algorithm.get_policy()
+        if error is not None:
+            tensors = (*policy.parameters(), *policy.buffers())
+            is_broken = is_broken or any(not t.isfinite().all() for t in tensors)
+            if not is_broken and not any(text in str(error) for text in _ABOUT_NAN):
+                raise error
+        if not is_broken and error is None:
+            return
+        if (message := self._explanation()) is not None:
             raise DivergedError(
                 f"The physics diverged, and the policy learned from it: {message}"
             ) from error
+        if error is not None and not is_broken:
+            raise error
+        rate = getattr(algorithm, "learning_rate", None)
+        raise DivergedError(
+            "The policy diverged: its weights are NaN or infinite."
+            + "".join(f" {text}" for text in self._large_observations())
+            + " Use a smaller learning rate"
+            + ("." if rate is None else f" (now {rate:g}).")
+        ) from error
+
+    def _large_observations(self) -> list[str]:
+        """Return sentences about the groups of observations that no network can learn from."""
+        buffers = getattr(self._env, "obs_buf", None) or {}
+        largest = {
+            name: float(value.abs().max())
+            for name, value in buffers.items()
+            if isinstance(value, torch.Tensor) and value.numel() > 0
+        }
+        return [
+            f"Observations of group {name!r} reach {value:.3g}: scale or clip them."
+            for name, value in largest.items()
+            if not value < _TOO_LARGE
+        ]
 
     def _speeds(self) -> torch.Tensor:
         # Environments whose state is not finite were reset within the step.

@@ -394,18 +394,17 @@ class RunLogger(Logger):
 
     def load_totals(self, state: dict[str, Any]) -> None:
         """Restore the entries of `state_dict` that do not depend on the number of environments."""
-        self.tot_timesteps = state["total_steps"]
-        self.tot_time = state["total_time"]
+        self.tot_timesteps, self.tot_time = int(state["total_steps"]), float(state["total_time"])
         if self._uses_rnd:
             if "extrinsic_rewards" not in state:
                 # State of an earlier version, or without RND. rsl_rl averages the reward and its
                 # parts together, so all of them start with the next episodes.
                 return
-            self.erewbuffer.extend(state["extrinsic_rewards"])
-            self.irewbuffer.extend(state["intrinsic_rewards"])
+            self.erewbuffer.extend(map(float, state["extrinsic_rewards"]))
+            self.irewbuffer.extend(map(float, state["intrinsic_rewards"]))
         for buffer, name in ((self.rewbuffer, "rewards"), (self.lenbuffer, "lengths")):
             buffer.clear()
-            buffer.extend(state[name])
+            buffer.extend(map(float, state[name]))
 
     def drop_iteration(self) -> None:
         """Forget the steps since the last `finish_iteration`."""

@@ -32,9 +32,11 @@ from mjlab.rl.checkpoint import (
     capture_training_state,
     check_fits,
     check_terms,
+    copied,
     load_algorithm,
     load_checkpoint,
     migrate,
+    naming_checkpoint,
     override_algorithm,
     restore_lasting_state,
     restore_training_state,
@@ -139,6 +141,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         # Part of the identity of checkpoints: which states are of the same training.
         self._token = secrets.token_hex(4)
         self._state_to_resume: dict[str, Any] | None = None
+        self._resumed_from = ""
         # Seed of the numbers drawn after a resume. None: the generators are restored.
         self._new_seed: int | None = None
         # True if an evaluation is due after the last iteration, and not finished.
@@ -175,7 +178,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             RunFolderError: the run folder is not writable, raised before any training; or it was
                 deleted or moved, and the run was saved next to it.
             CheckpointError: a checkpoint could not be written.
-            DivergedError: the physics diverged in most environments, or training failed because of it.
+            DivergedError: the physics diverged in most environments, or weights became NaN.
             Interrupted: with several processes, the running iteration was given up.
             BrokenTermError: a reward or a termination stayed NaN in every environment.
             ValueError: the environment returned NaN, Weights & Biases did not start a run, a student
@@ -213,7 +216,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 try:
                     with (
                         stop.interruptible(self._is_main_process),
-                        self._watch.explaining(self.alg.get_policy()),
+                        self._watch.explaining(self.alg),
                     ):
                         with torch.inference_mode():
                             with using_torch_threads(self._num_collecting_threads):
@@ -346,15 +349,17 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         reason = "several processes share the run." if self.is_distributed else ""
         if not reason:
             try:
-                return restore_training_state(
-                    state, self.env, self.alg, self.logger.load_state_dict, self.device
-                )
+                with naming_checkpoint(self._resumed_from, ValueError):
+                    return restore_training_state(
+                        state, self.env, self.alg, self.logger.load_state_dict, self.device
+                    )
             except ValueError as error:
                 reason = f"the saved state does not fit. {error}"
         # Otherwise every session would repeat the random numbers of the first.
         seed_rng(session_seed(int(self.cfg.get("seed", 0)), self.current_learning_iteration))
-        left_out = restore_lasting_state(state, self.env, self.alg)
-        self.logger.load_totals(state["logger"])
+        with naming_checkpoint(self._resumed_from):
+            left_out = restore_lasting_state(state, self.env, self.alg)
+            self.logger.load_totals(state["logger"])
         logger.warning(
             "Weights, optimizer, iteration and curricula are resumed, but episodes and random numbers "
             "restart, because %s%s", reason, f" Not resumed: {', '.join(left_out)}." * bool(left_out),
@@ -568,7 +573,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             strict: Require every parameter to fit.
         """
         # torch's optimizers keep the loaded tensors, and write to them.
-        checkpoint = migrate(copy.deepcopy(content), str(path))
+        checkpoint = migrate(copied(content), str(path))
         groups = self.cfg.get("obs_groups") or {}
         networks = [name for name in groups if load_cfg is None or load_cfg.get(name)]
         check_terms(checkpoint.get("sizes"), term_shapes(self.env, groups), networks, str(path))
@@ -587,6 +592,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
+        self._resumed_from = str(path)
         if replay is not None:
             storage.load_state_dict(replay)
         self._observations = self._written = None

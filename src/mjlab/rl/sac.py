@@ -29,6 +29,7 @@ from rsl_rl.utils import (
 from tensordict import TensorDict
 from torch import nn
 
+from mjlab.rl.checkpoint import misfit
 from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
@@ -220,6 +221,8 @@ class SAC:
     def update(self) -> dict[str, float]:
         """Return the mean metrics over the updates finished since the last call."""
         metrics, self._finished = self._finished, []
+        # The runner checks the weights.
+        self._wait()
         return {
             name: torch.stack([one[name] for one in metrics if name in one]).mean().item()
             for name in sorted(set().union(*metrics))
@@ -403,9 +406,17 @@ class SAC:
         """
         self._wait()
         cfg = dict.fromkeys(_PARTS, True) if load_cfg is None else load_cfg
+        state: Any = loaded_dict.get("sac_state_dict")
         if load_cfg is None:
+            own = self.save()["sac_state_dict"]
+            if isinstance(state, dict) and state.get("reward_scale") is None:
+                # Saved by a run with a `value_range`.
+                own["reward_scale"] = None
+            # Noise and running returns may be of another number of environments.
+            if fault := misfit(own, state, "sac_state_dict", same_rows=False):
+                raise ValueError(fault)
             for name in ("num_steps", "num_updates"):
-                check_count(f"sac_state_dict {name}", loaded_dict["sac_state_dict"][name], 0)
+                check_count(f"sac_state_dict.{name}", state[name], 0)
         if cfg.get("actor"):
             for model in (self.actor, self._policy):
                 model.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
@@ -416,7 +427,6 @@ class SAC:
             self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
             self.learning_rate = self.optimizer.param_groups[1]["lr"]
         if load_cfg is None:
-            state = loaded_dict["sac_state_dict"]
             self.actor.load_state_dict(state["actor"])
             self._target.load_state_dict(state["target"])
             with torch.no_grad():
@@ -424,7 +434,6 @@ class SAC:
             self._generator.set_state(state["generator"].cpu())
             self._num_steps, self._num_updates_made = state["num_steps"], state["num_updates"]
             self._noise.load_state_dict(state["noise"])
-            # None in runs with a `value_range`.
             if self._reward_scale is not None and state["reward_scale"] is not None:
                 self._reward_scale.load_state_dict(state["reward_scale"])
         return cfg.get("iteration", False)
@@ -479,7 +488,7 @@ class _HeldNoise:
         return {"noise": self._noise, "steps_left": self._steps_left}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        if state["noise"].shape == self._noise.shape:
+        if all(state[n].shape == value.shape for n, value in self.state_dict().items()):
             self._noise = state["noise"].to(self._noise.device).clone()
             self._steps_left = state["steps_left"].to(self._noise.device).clone()
 

@@ -23,7 +23,7 @@ from mjlab.runs.settings import Difference, Settings, apply_settings, difference
 from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import WANDB_CACHE, checkpoint_names, checkpoint_number, is_locked, to_plain
+from mjlab.utils.os import WANDB_CACHE, checkpoint_number, checkpoints_in, is_locked, to_plain
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -206,8 +206,7 @@ class Run:
     @property
     def checkpoints(self) -> list[Checkpoint]:
         """Checkpoints `model_<number>.pt`, in the order of their numbers."""
-        files = self.folder.iterdir() if self.folder.is_dir() else ()
-        return [Checkpoint(self.folder / name) for name in checkpoint_names(f.name for f in files)]
+        return [Checkpoint(path) for path in checkpoints_in(self.folder)]
 
     @property
     def newest(self) -> Checkpoint | None:

@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mjlab.rl.checkpoint import CheckpointError, curricula_of
+from mjlab.rl.checkpoint import curricula_of, naming_checkpoint
 from mjlab.runs import Checkpoint
 from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.cli import run_alias
@@ -127,13 +127,8 @@ def _load_curricula(task: str, env: Any, checkpoint: Checkpoint) -> None:
 
     is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
     state = curricula_of(checkpoint.content) if is_ours else None
-    try:
+    with naming_checkpoint(checkpoint):
         left_out = [] if state is None else load_curricula(env, state)
-    except (KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
-        raise CheckpointError(
-            f"{checkpoint}: the state of its curricula is malformed ({type(error).__name__}: {error}); use "
-            "an earlier checkpoint, or its export (.onnx)."
-        ) from error
     unwrapped = env.unwrapped
     if not unwrapped.curriculum_manager.active_terms:
         return

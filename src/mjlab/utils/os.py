@@ -122,6 +122,15 @@ def checkpoint_names(names: Iterable[str]) -> list[str]:
     return [name for _, name in sorted(numbered)]
 
 
+def checkpoints_in(folder: Path) -> list[Path]:
+    """Return the checkpoints in `folder`, in the order of their numbers; empty without the folder.
+
+    Other things of such a name do not count: folders, and links that lead to no file.
+    """
+    names = checkpoint_names(p.name for p in folder.iterdir()) if folder.is_dir() else []
+    return [folder / name for name in names if os.path.isfile(folder / name)]
+
+
 def get_checkpoint_path(
     log_path: Path, run_dir: str = ".*", checkpoint: str = ".*", sort_alpha: bool = True
 ) -> Path:

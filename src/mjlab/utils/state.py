@@ -178,7 +178,8 @@ def _with_rows(
 
 
 def shape_differences(saved: Any, current: Any, path: str = "") -> list[str]:
-    """Return descriptions of tensors whose shapes differ between two captured states.
+    """Return descriptions of tensors whose shapes differ between two captured states, and of values
+    in place of objects.
 
     Values in only one of the states are not differences, because some state is created at the first
     call.
@@ -195,6 +196,8 @@ def shape_differences(saved: Any, current: Any, path: str = "") -> list[str]:
         pairs = enumerate(zip(saved, current, strict=False))
         parts = [shape_differences(a, b, f"{path}[{i}]") for i, (a, b) in pairs]
         return [difference for part in parts for difference in part]
+    if isinstance(current, dict) and CLASS_KEY in current and saved is not None:
+        return [f"{path}: expected a {current[CLASS_KEY]}, got a {type(saved).__name__}"]
     return []
 
 
