@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import html
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
-from mjlab.scripts.view import ModelPage, ViewConfig, load_model, run_view
+from mjlab.scripts.view import ModelPage, ViewConfig, describe_model, load_model, run_view
 from mjlab.utils.errors import UserError
 
 MJCF = """
@@ -187,3 +188,17 @@ def test_sliders_follow_the_physics(viser_server) -> None:
         page.advance(0.03)
     # Updated some times per second.
     assert 0.05 < page.joints["hinge"].value <= page.data.qpos[0]
+
+
+@pytest.mark.parametrize("name", ['<iframe srcdoc="<script>">', "a|b", "[x](javascript:y)", "*"])
+def test_names_of_a_model_are_text(viser_server, name: str) -> None:
+    spec = mujoco.MjSpec.from_string(MJCF)
+    spec.joint("elbow").name = name
+    spec.actuators[0].target = name
+    description = describe_model(name, spec.compile())
+    assert not set(description) & set("<>[]{}")
+    rows = [line for line in description.splitlines() if line.startswith("|")]
+    assert {row.count("|") for row in rows} == {4}
+    assert name in html.unescape(description)
+    # Labels of controls are text.
+    assert name in ModelPage(viser_server, name, spec.compile(), spec.compile).joints

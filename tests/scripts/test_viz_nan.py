@@ -71,6 +71,17 @@ def test_the_page_opens_at_the_state_that_led_to_the_nan(viser_server, dump_file
     assert page.data.body("hand").xpos[2] == pytest.approx(1.0 - np.sin(0.3))
 
 
+def test_names_in_a_dump_are_text(viser_server, dump_file: Path) -> None:
+    tag = "<script>"
+    dump, model = load_dump(str(dump_file))
+    dump.metadata |= {"nan_env_ids": [tag], "dumped_env_ids": [tag, tag]}
+    spec = mujoco.MjSpec.from_string(XML)
+    spec.joint("wrist").name = tag
+    page = NanPage(viser_server, dump, spec.compile())
+    assert "<" not in page.status
+    assert page.status.count("&lt;script&gt;") == 3
+
+
 def test_sliders_choose_substep_and_environment(viser_server, dump_file: Path) -> None:
     page = page_of(viser_server, dump_file)
     assert page.model.geom("arm").size[0] == pytest.approx(0.1)

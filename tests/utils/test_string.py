@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import logging
+import re
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjlab.utils.string import counted, filter_exp, resolve_expr, resolve_field
+from mjlab.utils.string import counted, escaped, filter_exp, resolve_expr, resolve_field
 
 NAMES = ("hip_a", "hip_b", "knee")
 
@@ -78,3 +80,24 @@ def test_one_of_a_kind_is_singular():
     assert [counted(n, "environment") for n in (0, 1, 2)] == [
         "0 environments", "1 environment", "2 environments",
     ]  # fmt: skip
+
+
+HOSTILE = [
+    '<iframe srcdoc="<script>">', "<img src=x onerror=f()>", "`</code><i>`", "[a](javascript:f())",
+    "a\n\n<b>", "a|b", "{x}", "left_hip*", "_a_", "__init__", "&lt;b&gt;", "\\*", "$x$", "~~s~~",
+    "<https://a.b>", "www.a.b<x>", "a@b.c", "\ud800", "\0", "'\"", "!--", "]]>",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_escaped_text_is_shown_as_it_is(text):
+    shown = escaped(text)
+    assert not set(shown) & set("<>\"'`[]{}|\\*~!$@^\n\0\ud800")
+    assert not re.search(r"&(?!#?\w+;)|\b_|_\b|://|www\.", shown)
+    # Python and browsers replace what is no character.
+    assert html.unescape(shown) == re.sub("[\ud800\0]", "\ufffd", text)
+
+
+@pytest.mark.parametrize("text", ["left_hip_2", "FR.calf-1 (rad)", "Größe: 0.5, 10 %", "a/b c"])
+def test_ordinary_names_are_left_as_they_are(text):
+    assert escaped(text) == text

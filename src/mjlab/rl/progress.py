@@ -7,7 +7,6 @@ output of a notebook; `mjlab.scripts.display` shows it in terminals.
 
 from __future__ import annotations
 
-import html
 import io
 import math
 import sys
@@ -23,7 +22,7 @@ from rich.text import Text
 
 from mjlab.rl.evaluation import Bound, EvaluationResult, curricula_text, trigger_return
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
-from mjlab.utils.string import clock, counted, duration, number
+from mjlab.utils.string import clock, counted, duration, escaped, number
 
 if TYPE_CHECKING:
     from mjlab.rl.runner import MjlabOnPolicyRunner
@@ -405,7 +404,7 @@ class NotebookProgress(TrainingProgress):
         style = "line-height:1.25;white-space:pre-wrap"
         return {
             "text/plain": plain,
-            "text/html": f'<pre style="{style}">{html.escape(plain)}</pre>',
+            "text/html": f'<pre style="{style}">{escaped(plain)}</pre>',
         }
 
 

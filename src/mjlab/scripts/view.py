@@ -16,6 +16,7 @@ import viser
 from mjlab.scripts.export_scene import ROBOTS, scene_and_options
 from mjlab.scripts.flags import parse_flags
 from mjlab.utils.errors import MjlabError, UserError
+from mjlab.utils.string import escaped
 from mjlab.utils.urdf import read_urdf
 from mjlab.viewer.camera import whole_model_view
 from mjlab.viewer.page_server import check_address, open_browser, page_url, serve_page
@@ -245,7 +246,7 @@ class ModelPage:
         try:
             self._next = self._reload()
         except MjlabError as error:
-            self.message.content = f"**Not reloaded.** {error}"
+            self.message.content = f"**Not reloaded.** {escaped(error)}"
 
     def set_pose(self, name: str) -> None:
         """Set a keyframe by name, or the `initial` pose of the model."""
@@ -324,7 +325,7 @@ def describe_model(title: str, model: mujoco.MjModel) -> str:
     """Return sizes, mass and joints of a model as Markdown."""
     kinds = {0: "free", 1: "ball", _SLIDE: "slide", _HINGE: "hinge"}
     lines = [
-        f"**{title}**",
+        f"**{escaped(title)}**",
         "",
         f"{model.nbody - 1} bodies, {model.ngeom} geoms, {model.nu} actuators, {model.nsensor} sensors; "
         f"nq {model.nq}, nv {model.nv}. Mass {model.body_mass.sum():.3g} kg, timestep "
@@ -338,7 +339,7 @@ def describe_model(title: str, model: mujoco.MjModel) -> str:
         low, high = model.jnt_range[joint]
         unit = "rad" if kind == _HINGE else "m"
         limits = f"{low:.3g} to {high:.3g} {unit}" if model.jnt_limited[joint] else "unlimited"
-        lines.append(f"| {_name(model, _JOINT, joint)} | {kinds[kind]} | {limits} |")
+        lines.append(f"| {escaped(_name(model, _JOINT, joint))} | {kinds[kind]} | {limits} |")
     if model.njnt > _MAX_LISTED:
         lines.append(f"| ... {model.njnt - _MAX_LISTED} more | | |")
     return "\n".join(lines)

@@ -20,6 +20,7 @@ from mjlab.scripts.cli import run_alias
 from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 from mjlab.utils.errors import check_count, check_exists, check_in_range
+from mjlab.utils.string import escaped
 from mjlab.viewer.camera import CameraView
 from mjlab.viewer.page_server import check_address, page_url, serve_page
 from mjlab.viewer.viser.scene import MjlabViserScene
@@ -149,7 +150,7 @@ class TerrainPage:
                 self._robot.value,
             )  # fmt: skip
         except ValueError as error:
-            self._status.content = f"**This terrain cannot be built.** {error}"
+            self._status.content = f"**This terrain cannot be built.** {escaped(error)}"
             return
         self.scene = scene
         self._draw(scene)

@@ -16,6 +16,7 @@ from mjlab.scripts.cli import run_alias
 from mjlab.scripts.flags import parse_flags
 from mjlab.utils.errors import UserError
 from mjlab.utils.nan_guard import NanDump
+from mjlab.utils.string import escaped
 from mjlab.viewer.camera import whole_model_view
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS, host_model
 from mjlab.viewer.page_server import check_address, page_url, serve_page
@@ -181,7 +182,9 @@ class NanPage:
     def _describe(self, index: int, row: int) -> str:
         metadata, env = self.dump.metadata, self._envs[row]
         ids = metadata["nan_env_ids"]
-        shown = ", ".join(map(str, ids[:_SHOWN_ENVS])) + (" ..." if len(ids) > _SHOWN_ENVS else "")
+        shown = ", ".join(map(escaped, ids[:_SHOWN_ENVS])) + (
+            " ..." if len(ids) > _SHOWN_ENVS else ""
+        )
         # Non-finite fields, or the largest values.
         bad = [name for name in _FIELDS if not np.isfinite(getattr(self.data, name)).all()]
         findings = [f"Not finite here: {', '.join(bad)}"]
@@ -192,7 +195,7 @@ class NanPage:
         lines = [
             f"**Substep {self.dump.steps[index]}** ({index + 1} of {len(self.dump.steps)} recorded; "
             f"NaN found after substep {metadata['detection_step'] - 1})",
-            f"**Environment {env}**: {'went NaN' if env in ids else 'clean'}",
+            f"**Environment {escaped(env)}**: {'went NaN' if env in ids else 'clean'}",
             f"Environments with NaN: {shown} ({len(ids)} of {metadata['num_envs_total']})",
             *findings,
         ]
@@ -203,7 +206,7 @@ def _largest(model: mujoco.MjModel, values: Any) -> str:
     dof = int(np.abs(values).argmax())
     joint = int(model.dof_jntid[dof])
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
-    return f"{abs(values[dof]):.3g} ({name})"
+    return f"{abs(values[dof]):.3g} ({escaped(name)})"
 
 
 def main() -> None:

@@ -7,12 +7,19 @@ whole names: see `mjlab.utils.lab_api.string.resolve_matching_names`.
 from __future__ import annotations
 
 import difflib
+import html
 import logging
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 logger = logging.getLogger(__name__)
+
+# Characters of escaped HTML that may have a meaning within a line of Markdown: all but these few, also `_`
+# at the ends of a word, and those that make an address a link.
+_MARKUP = re.compile(
+    r"[^\w .,:;/()+=%&#-]|(?<![^\W_])_|_(?![^\W_])|:(?=//)|(?<=www)\.", re.IGNORECASE
+)
 
 # Maximum number of names listed in full; of longer lists, number of close names per query.
 _FEW = 12
@@ -97,6 +104,16 @@ def name_list(names: Sequence[str], near: Iterable[str]) -> str:
     close = [name for one in near for name in difflib.get_close_matches(one, names, n=_SHOWN)]
     shown = list(dict.fromkeys(close))[:_FEW] or list(names[:_SHOWN])
     return f"{shown} and {len(names) - len(shown)} others"
+
+
+def escaped(text: object) -> str:
+    """Return text that is shown as it is within a line of Markdown or HTML.
+
+    Characters that could begin a tag, markup or a line become character references. For all names
+    and messages shown in a page, which may come from the files of others.
+    """
+
+    return _MARKUP.sub(lambda found: f"&#{ord(found[0])};", html.escape(str(text)))
 
 
 def is_number(text: str) -> bool:

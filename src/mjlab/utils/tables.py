@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import enum
 import functools
-import html
 import io
 import math
 import re
@@ -19,6 +18,7 @@ from numbers import Real
 from typing import Any
 
 from mjlab.utils.os import to_plain
+from mjlab.utils.string import escaped
 
 WIDTH = 100
 """Width of tables as text (characters)."""
@@ -108,15 +108,15 @@ class Table:
         """Return the table in HTML, folded by a click on its title."""
 
         def row(cells: Iterable[str], tag: str) -> str:
-            inner = (f'<{tag} style="{_CELL_STYLE}">{html.escape(cell)}</{tag}>' for cell in cells)
+            inner = (f'<{tag} style="{_CELL_STYLE}">{escaped(cell)}</{tag}>' for cell in cells)
             return f"<tr>{''.join(inner)}</tr>"
 
         shown = self._shown()
         body = [row(cells, "td") for cells in zip(*(c.cells for c in shown), strict=True)]
         return (
-            f"<details open><summary><b>{html.escape(self.title)}</b></summary><table>"
+            f"<details open><summary><b>{escaped(self.title)}</b></summary><table>"
             f"<thead>{row((c.name for c in shown), 'th')}</thead><tbody>{''.join(body)}</tbody>"
-            f"</table>{''.join(self._unset())}</details>"
+            f"</table>{escaped(''.join(self._unset()))}</details>"
         )
 
     def _shown(self) -> list[_Column]:
@@ -172,7 +172,7 @@ class Tabular:
     def _repr_html_(self) -> str:
         """Return all tables as HTML, shown by notebooks."""
         tables = "".join(table.html() for table in self.tables() if table.rows)
-        return f"<div><code>{html.escape(repr(self))}</code>{tables}</div>"
+        return f"<div><code>{escaped(repr(self))}</code>{tables}</div>"
 
 
 def tables_text(tables: Sequence[Table], width: int = WIDTH) -> str:
@@ -289,6 +289,7 @@ def _ascii(text: str) -> str:
 
 def _markdown(cell: str) -> str:
     """Return a cell as Markdown, as code if it has special characters."""
+    cell = " ".join(cell.splitlines())
     if _SPECIAL.search(cell):
         cell = f"`{cell.replace('`', chr(39))}`"
     return cell.replace("|", r"\|")

@@ -102,7 +102,9 @@ class PageServer(viser.ViserServer):
         Viser answers one request per connection, so that none follows unchecked.
         """
         with contextlib.ExitStack() as stack:
-            stack.enter_context(contextlib.suppress(OSError, EOFError, asyncio.LimitOverrunError))
+            # Ended by the other side, too much before the end of the request, or stopped.
+            expected = (OSError, EOFError, asyncio.LimitOverrunError, asyncio.CancelledError)
+            stack.enter_context(contextlib.suppress(*expected))
             stack.callback(writer.close)
             # The loop keeps weak references only.
             self._connections.add(task := asyncio.current_task())

@@ -272,6 +272,20 @@ class TestCheckpoints:
         assert loaded == ["model_100.pt"]
         assert manager.current_name == "model_100.pt"
 
+    def test_names_of_a_tracker_are_text(self, viser_server) -> None:
+        tag = "<img src=x onerror=y>`]()"
+        manager = CheckpointManager(
+            current_name=tag, fetch_available=lambda: [(tag, tag)],
+            load_checkpoint=lambda name: (_ for _ in ()).throw(ValueError(name)),
+            run_name=tag, run_status=tag,
+        )  # fmt: skip
+        for manager.run_url in (None, f"https://example.com/{tag}"):
+            panel = make(viser_server, manager=manager)._checkpoint_panel
+            panel.load(tag)
+            assert not set(panel._about.content) & set("<>`")
+            assert panel._about.content.count("]") == (manager.run_url is not None)
+            assert "<img" not in panel._message.content
+
     def test_use_latest_looks_for_new_files(self, viser_server, folder) -> None:
         loaded = []
         source = local_checkpoints(folder, lambda path: loaded.append(path.name) or push())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from viser import uplot
 
+from mjlab.utils.string import escaped
 from mjlab.viewer.viser.viewer import ViserPlayViewer
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def progress_html(title: str, progress: Progress | None, age: float) -> str:
         progress: Progress; None until it is read.
         age: Age of the policy (s).
     """
-    name = f"<div><strong>{html.escape(title)}</strong></div>"
+    name = f"<div><strong>{escaped(title)}</strong></div>"
     style = "padding:0.25em 1em;font-size:0.85em;line-height:1.5"
     if progress is None:
         return f'<div style="{style}">{name}Waiting for the policy …</div>'
@@ -183,10 +183,10 @@ def progress_html(title: str, progress: Progress | None, age: float) -> str:
         ("policy", f"{age:.0f} s old"),
     ]
     lines = "".join(
-        f"<div><strong>{html.escape(row).capitalize()}:</strong> {html.escape(value)}</div>"
+        f"<div><strong>{escaped(row.capitalize())}:</strong> {escaped(value)}</div>"
         for row, value in rows
     )
-    legend = [(_EXPLORING, f"— {progress['unit']}, exploring")]
+    legend = [(_EXPLORING, f"— {escaped(progress['unit'])}, exploring")]
     if progress["evaluations"]:
         legend.append((_EVALUATED, "● evaluated"))
     if progress["goal"] is not None:

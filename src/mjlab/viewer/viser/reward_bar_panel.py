@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import html
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Sequence
 
 import viser
 
+from mjlab.utils.string import escaped
 from mjlab.viewer.base import TermHistory
 
 log = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ def _row(name: str, value: float, largest: float) -> str:
     return (
         '<div style="margin-top:0.35em">'
         '<div style="display:flex;justify-content:space-between;gap:0.5em">'
-        f'<span style="overflow-wrap:anywhere">{html.escape(name)}</span>'
+        f'<span style="overflow-wrap:anywhere">{escaped(name)}</span>'
         f"<span>{value:+.4f}</span></div>"
         '<div style="background:rgba(128,128,128,0.2);border-radius:2px">'
         f'<div style="width:{width:.1f}%;height:6px;background:{color};border-radius:2px">'

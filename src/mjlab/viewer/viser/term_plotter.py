@@ -9,6 +9,7 @@ import numpy as np
 import viser
 from viser import uplot
 
+from mjlab.utils.string import escaped
 from mjlab.viewer.base import TermHistory
 
 _SHOWN_AT_FIRST = 6
@@ -89,7 +90,7 @@ class ViserTermPlotter:
 
     def update_env_idx(self, env_idx: int) -> None:
         """Switch to the values of another environment and clear the recorded points."""
-        self._label.content = f"<small>{self._name} terms of environment {env_idx}</small>"
+        self._label.content = f"<small>{escaped(self._name)} terms of environment {env_idx}</small>"
         self.clear_histories()
 
     def clear_histories(self) -> None:

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import enum
-import html
 import logging
 import re
 import threading
@@ -16,11 +15,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import torch
 import viser
 
 from mjlab.utils.errors import WrongStateError
+from mjlab.utils.string import escaped
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, reset_policy
 from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
@@ -378,7 +379,7 @@ def legend_html(legend: Mapping[str, Color]) -> str:
     squares = " ".join(
         f'<span style="margin-right:1em;white-space:nowrap"><span style="color:rgba'
         f'({",".join(str(round(255 * part)) for part in color[:3])},{color[3]:.3g})">\u25a0</span> '
-        f"{html.escape(meaning)}</span>"
+        f"{escaped(meaning)}</span>"
         for meaning, color in legend.items()
     )
     return f'<div style="padding:0 1em;font-size:0.85em">{squares}</div>' if legend else ""
@@ -397,7 +398,7 @@ def status_html(status: ViewerStatus) -> str:
         ("Real time", f"{actual} of {status.target_realtime:g}x ({status.smoothed_fps:.0f} FPS)"),
     ]
     if status.last_error is not None:
-        error = html.escape(status.last_error)
+        error = escaped(status.last_error)
         rows.append(("Error", f'<span style="color:#e03131">{error}</span>'))
     lines = "".join(f"<div><strong>{name}:</strong> {value}</div>" for name, value in rows)
     return f'<div style="padding:0.25em 1em;font-size:0.85em;line-height:1.5">{lines}</div>'
@@ -446,8 +447,12 @@ class CheckpointPanel:
         self._about.content = "**Local checkpoints**"
         run, url, state = self._manager.run_name, self._manager.run_url, self._manager.run_status
         if run is not None:
-            name = f"`{run}`" if url is None else f"[{run}]({url})"
-            status = "" if state is None else f" ({state})"
+            name = (
+                escaped(run)
+                if url is None
+                else f"[{escaped(run)}]({quote(url, safe=':/?#&=%~@+,;')})"
+            )
+            status = "" if state is None else f" ({escaped(state)})"
             self._about.content = f"**Run:** {name}{status}"
         chosen = self._labels.get(self._choice.value)
         # Newest first: users usually want the latest checkpoint.
@@ -487,8 +492,7 @@ class CheckpointPanel:
 
     def _show(self, message: str, color: str = "inherit") -> None:
         self._message.content = (
-            f'<div style="padding:0 1em;font-size:0.85em;color:{color}">'
-            f"{html.escape(message)}</div>"
+            f'<div style="padding:0 1em;font-size:0.85em;color:{color}">{escaped(message)}</div>'
         )
 
     def _set_silently(self, attribute: str, value: Any) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.utils.lab_api.math import quat_error_magnitude
+from mjlab.utils.string import escaped
 
 if TYPE_CHECKING:
     import numpy as np
@@ -146,7 +147,8 @@ class MotionPanel:
         )
         lines = ["| body | m | in the world (m) | rad |", "| --- | --- | --- | --- |"]
         lines += [
-            f"| {name} | {near:.3f} | {far:.3f} | {turn:.3f} |" for name, near, far, turn in rows
+            f"| {escaped(name)} | {near:.3f} | {far:.3f} | {turn:.3f} |"
+            for name, near, far, turn in rows
         ]
         return "\n".join(lines)
 
