@@ -139,6 +139,46 @@ def test_an_interrupt_ends_with_its_customary_status_and_no_message(failing):
     assert failing(Interrupted(signal.SIGTERM)) == (143, "", "")
 
 
+_INTERRUPTED = "import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(30)\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals")
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("-m", "mjlab.scripts.train"),
+        ("-m", "mjlab.scripts.cli", "train"),
+        ("-c", "from mjlab.scripts.cli import train; train()"),
+    ],
+)
+def test_ctrl_c_while_modules_load_is_quiet(tmp_path, command):
+    for name in ("torch", "mujoco"):
+        (tmp_path / f"{name}.py").write_text(_INTERRUPTED)
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, *command, TASK],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    # 130 in a shell.
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals")
+def test_ctrl_c_while_python_ends_is_quiet():
+    program = (
+        "import atexit\nfrom mjlab.scripts.cli import run_command\n"
+        f"run_command(lambda argv: atexit.register(exec, {_INTERRUPTED!r}, {{}}))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, b"")
+
+
 def test_a_reader_that_has_seen_enough_causes_no_message():
     command = f"{sys.executable} -m mjlab.scripts.train --help | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)

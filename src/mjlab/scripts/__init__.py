@@ -6,6 +6,8 @@ Commands also run as `python -m mjlab.scripts.<name>`.
 import os
 import sys
 
+from mjlab.utils.signals import end_by_interrupt
+
 
 def prepare_threads() -> None:
     """Let idle torch threads sleep: spinning threads take cores from the physics threads.
@@ -17,4 +19,5 @@ def prepare_threads() -> None:
 
 # argv[0] is "-m" while `python -m` locates the module, whose imports may load torch.
 if sys.argv[:1] == ["-m"]:
+    end_by_interrupt(True)
     prepare_threads()

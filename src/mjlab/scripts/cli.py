@@ -6,6 +6,7 @@ imported before a command runs, so that `--help` and a mistyped task name answer
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import importlib
 import io
@@ -21,7 +22,7 @@ from mjlab.scripts import prepare_threads
 from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
-from mjlab.utils.signals import Interrupted
+from mjlab.utils.signals import Interrupted, end_by_interrupt
 from mjlab.utils.tracebacks import users_lines
 
 TRACEBACK_VARIABLE = "MJLAB_TRACEBACK"
@@ -393,7 +394,10 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
             error.exit_status = command.unknown_task_status
             raise
     module, _, function = command.function.partition(":")
-    getattr(importlib.import_module(module), function)(argv, prog)
+    end_by_interrupt(True)
+    run = getattr(importlib.import_module(module), function)
+    end_by_interrupt(False)
+    run(argv, prog)
 
 
 def run_alias(name: str) -> None:
@@ -493,6 +497,8 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     such as a reward. The exit status is `MjlabError.exit_status`, else 1. A command that a signal ended
     exits with 128 + its number.
     """
+    # `python -m` loaded modules before.
+    end_by_interrupt(False)
     prepare_threads()
     # Plain library messages.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[_StderrHandler()])
@@ -519,6 +525,9 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     except Exception as error:
         _report(error)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
+    finally:
+        # Before the callbacks that modules registered in the meantime.
+        atexit.register(end_by_interrupt, True)
 
 
 def _report(error: Exception) -> None:

@@ -36,6 +36,18 @@ NEW_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 `start_new_session=True` does that."""
 
 
+def end_by_interrupt(enabled: bool) -> None:
+    """Let Ctrl-C end the process at once, as SIGTERM does, instead of raising KeyboardInterrupt, or not.
+
+    KeyboardInterrupt would be printed with a traceback, or lost, while modules load and while Python
+    shuts down. Other handlers are kept, and so are all outside the main thread.
+    """
+    actions = (signal.default_int_handler, signal.SIG_DFL)
+    is_main = threading.current_thread() is threading.main_thread()
+    if is_main and signal.getsignal(signal.SIGINT) == actions[not enabled]:
+        signal.signal(signal.SIGINT, actions[enabled])
+
+
 class Interrupted(KeyboardInterrupt):
     """Stop signal that ended what was asked for. Commands exit with `exit_status`, without a message."""
 
