@@ -406,7 +406,7 @@ def test_an_upload_that_fails_is_one_message_and_keeps_the_motion(csv, tmp_path,
 
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
-    with pytest.raises(UserError, match="dance.npz: upload .*No API key"):
+    with pytest.raises(ConnectionError, match="Upload of .*dance.npz: .*No API key.*wandb login"):
         converted(csv, tmp_path, upload=True)
     assert read_motion(tmp_path / "out" / "dance.npz").num_frames == 150
 

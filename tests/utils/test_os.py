@@ -19,10 +19,12 @@ import pytest
 import torch
 import yaml
 
+from mjlab.utils.errors import UserError
 from mjlab.utils.os import (
     dump_yaml,
     get_checkpoint_path,
     get_wandb_checkpoint_path,
+    inside,
     own_folder,
     remove_temporary_files,
     replacing,
@@ -219,14 +221,43 @@ class UsageError(Exception):
     """As wandb calls it."""
 
 
-def test_what_wandb_raises_is_one_error_with_what_to_do(tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [UsageError("No key.\nTraceback: ..."), OSError("No key")])
+def test_errors_of_wandb_name_the_run(tmp_path, monkeypatch, error):
     def fail():
-        raise UsageError("No API key configured. Use `wandb login` to log in.\nTraceback: ...")
+        raise error
 
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(Api=fail))
-    with pytest.raises(OSError, match=r"'me/project/abc'.*No API key configured.*wandb login"):
+    with pytest.raises(ConnectionError, match=r"'me/project/abc'.*No key; .*wandb login"):
         get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ConnectionError, match=r"'me/project/abc'.*wandb"):
+        get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
+
+
+@pytest.mark.parametrize("path", ["me/p/..", "..", "../../..", "", "/", "me/..\\..\\x", "me/p/C:x"])
+def test_run_paths_stay_in_the_cache(tmp_path, wandb_files, path):
+    log_path = tmp_path / "logs" / "cartpole"
+    with pytest.raises(UserError, match="wandb_checkpoints: expected the name of a file"):
+        get_wandb_checkpoint_path(log_path, Path(path), "model_50.pt")
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    "name", ["../model_50.pt", "model_50.pt/../x.pt", "/tmp/model_50.pt", "", ".."]
+)
+def test_checkpoint_names_stay_in_the_cache(tmp_path, wandb_files, name):
+    with pytest.raises(ValueError, match="not found"):
+        get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"), name)
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_names_inside_a_folder(tmp_path):
+    for name in ("a", "a/b.npz", "..a", "%2e%2e", "ab:c"):
+        assert inside(tmp_path, name) == tmp_path / name
+    for name in ("", ".", "..", "/a", "a/", "a//b", "a/../b", "\\a", "a\\..\\b", "C:\\a", "C:"):
+        with pytest.raises(UserError, match="expected the name"):
+            inside(tmp_path, name)
 
 
 def test_the_highest_wandb_checkpoint_is_downloaded_once(tmp_path, wandb_files):

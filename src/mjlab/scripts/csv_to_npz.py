@@ -25,7 +25,7 @@ from mjlab.tasks.tracking.motion_recording import (
 )
 from mjlab.utils.errors import UserError, check_positive
 from mjlab.utils.logging import print_notice
-from mjlab.utils.wandb import check_wandb_login
+from mjlab.utils.wandb import asking_wandb, check_wandb_login
 from mjlab.viewer.page_server import check_address, page_url, serve_page
 
 if TYPE_CHECKING:
@@ -186,11 +186,9 @@ def _upload(path: Path, name: str) -> None:
     """Upload a motion as an artifact, and link the artifact into the registry of motions.
 
     Raises:
-        UserError: the upload failed.
+        ConnectionError: the upload failed.
     """
-    import wandb
-
-    try:
+    with asking_wandb(f"Upload of {path}") as wandb:
         run = wandb.init(project=_WANDB_PROJECT, name=name)
         try:
             artifact = wandb.Artifact(name=name, type=_ARTIFACT_TYPE)
@@ -199,9 +197,6 @@ def _upload(path: Path, name: str) -> None:
             run.link_artifact(logged, target_path=f"wandb-registry-{_ARTIFACT_TYPE}/{name}")
         finally:
             run.finish()
-    except Exception as error:
-        # wandb raises errors of many types, including those of its dependencies.
-        raise UserError(f"{path}: upload to Weights & Biases failed: {error}") from error
     print_notice(f"Uploaded as wandb-registry-{_ARTIFACT_TYPE}/{name}.")
 
 

@@ -15,12 +15,13 @@ import stat
 import tempfile
 import time
 from collections.abc import Generator, Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import IO, Any
 
 from mjlab.compat import older_names
+from mjlab.utils.errors import UserError
 from mjlab.utils.string import qualified_name
-from mjlab.utils.wandb import check_wandb_login
+from mjlab.utils.wandb import asking_wandb
 
 try:
     import fcntl
@@ -185,20 +186,19 @@ def get_wandb_checkpoint_path(
         checkpoint_name: File name such as "model_100.pt". None: highest number.
 
     Cached files are not downloaded again. Raises `ValueError`, listing the available checkpoints, if
-    the checkpoint is not found, `UserError` without a login, and `ConnectionError` if the download
-    fails.
+    the checkpoint is not found, `UserError` without a login or if the run path does not end in a
+    name, and `ConnectionError` if the download fails.
     """
-    cache = Path(log_path) / WANDB_CACHE / Path(run_path).name
+    cache = inside(Path(log_path) / WANDB_CACHE, Path(run_path).name)
     if checkpoint_name is not None and checkpoint_number(checkpoint_name) is not None:
         cached = cache / checkpoint_name
         if cached.is_file():
             return cached, True
-    check_wandb_login(f"Weights & Biases run {str(run_path)!r}")
-    import wandb
-
-    with _asking_wandb(run_path):
+    request = f"Run {str(run_path)!r}"
+    with asking_wandb(request) as wandb:
         run = wandb.Api().run(str(run_path))
         names = checkpoint_names(file.name for file in run.files())
+        recorded = dict(getattr(run, "config", {}))
     if not names or (checkpoint_name is not None and checkpoint_name not in names):
         raise ValueError(
             f"Checkpoint {checkpoint_name or 'model_<n>.pt'!r} not found in run {str(run_path)!r}. "
@@ -210,32 +210,26 @@ def get_wandb_checkpoint_path(
         return target, True
     cache.mkdir(parents=True, exist_ok=True)
     # The configs, as in a run folder.
-    recorded = getattr(run, "config", {})
     for entry, file in (("env_cfg", "env.yaml"), ("train_cfg", "agent.yaml")):
         if isinstance(recorded.get(entry), dict):
             dump_yaml(cache / "params" / file, recorded[entry])
     # Download to a temporary file and rename it, so that a failed download leaves no partial file.
-    with tempfile.TemporaryDirectory(dir=cache) as folder, _asking_wandb(run_path):
+    with tempfile.TemporaryDirectory(dir=cache) as folder, asking_wandb(request):
         run.file(name).download(folder, replace=True)
         os.replace(Path(folder) / name, target)
     return target, False
 
 
-@contextlib.contextmanager
-def _asking_wandb(run_path: Path) -> Generator[None]:
-    """Convert wandb errors within the block to a `ConnectionError` with instructions."""
-    try:
-        yield
-    except OSError:
-        # Disk and network errors already have clear messages.
-        raise
-    except Exception as error:
-        # wandb raises many error types, including those of its dependencies.
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ConnectionError(
-            f"Cannot read the Weights & Biases run {str(run_path)!r}: {reason} Use `wandb login`, and "
-            "a path entity/project/run."
-        ) from error
+def inside(folder: Path, name: str) -> Path:
+    """Return the path below `folder` of a file or folder that a user or a server names.
+
+    Raises:
+        UserError: the name is empty, absolute, or has empty parts, "." or "..".
+    """
+    parts = name.replace("\\", "/").split("/")
+    if PureWindowsPath(name).drive or any(part in ("", ".", "..") for part in parts):
+        raise UserError(f"{folder}: expected the name of a file in this folder, got {name!r}.")
+    return folder / name
 
 
 def write_atomically(path: Path, content: bytes) -> None:

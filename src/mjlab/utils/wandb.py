@@ -1,14 +1,44 @@
-"""Weights & Biases: login check, run tags."""
+"""Weights & Biases: requests and their errors, login check, run tags."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from typing import Any
 
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import MjlabError, UserError
 
 _VARIABLE = "WANDB_TAGS"
+
+
+@contextlib.contextmanager
+def asking_wandb(request: str) -> Generator[Any]:
+    """Yield the module `wandb` for `request`, such as "Run 'a/b/c'", and name it in errors.
+
+    Raises:
+        UserError: no login at Weights & Biases.
+        ConnectionError: wandb is not installed, or raised an error within the block.
+    """
+    try:
+        import wandb
+
+        check_wandb_login(request)
+        yield wandb
+    except MjlabError:
+        raise
+    except Exception as error:
+        # Errors of the disk are not those of the service. Errors of connections name no file.
+        if isinstance(error, OSError) and (error.filename or error.errno == errno.ENOSPC):
+            raise
+        # wandb raises many error types, including those of its dependencies.
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+        raise ConnectionError(
+            f"{request}: Weights & Biases failed: {reason}; check the name, the network and the login "
+            "(`wandb login`), or use files of this machine."
+        ) from error
 
 
 def check_wandb_login(purpose: str, *, records: bool = False) -> None:

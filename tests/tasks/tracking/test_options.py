@@ -15,6 +15,7 @@ from mjlab.tasks.tracking import motion_sources as wandb_motions
 from mjlab.tasks.tracking.motion_file import MotionFileError
 from mjlab.tasks.tracking.motion_sources import find_motions, record_motions, shipped_motions
 from mjlab.tasks.tracking.options import MotionOptions
+from mjlab.utils.errors import UserError
 
 SQUAT, WALK = (shipped_motions()[name] for name in ("squat", "slow_walk"))
 CPU_ONLY = PolicyOrigin(G1)
@@ -144,15 +145,50 @@ def test_an_artifact_of_another_tool_has_its_motion_beside_other_files(wandb, tm
     assert artifact.type == "motions"
 
 
-def test_not_being_logged_in_is_told(wandb, monkeypatch):
+class CommError(Exception):
+    """Error of wandb, with the response of the server below the message."""
+
+
+@pytest.mark.parametrize(
+    "error", [CommError("No API key.\n{...}"), KeyError(), TimeoutError("slow"), OSError("reset")]
+)
+def test_errors_of_wandb_name_the_request(wandb, monkeypatch, error):
     def api():
-        raise RuntimeError("No API key configured")
+        raise error
 
     monkeypatch.setattr(sys.modules["wandb"], "Api", api)
-    with pytest.raises(MotionFileError, match="Cannot fetch .*No API key"):
-        prepared(MotionOptions(registry_name="org/a"))
-    with pytest.raises(MotionFileError, match="Cannot read .*No API key"):
+    for options, origin, name in (
+        (MotionOptions(registry_name="org/a"), CPU_ONLY, "Motion 'org/a:latest'"),
+        (MotionOptions(), PolicyOrigin(G1, Path("m.pt"), "org/p/1"), "Run 'org/p/1'"),
+    ):
+        with pytest.raises(ConnectionError, match=f"^{name}: .*wandb login[^\n]*$"):
+            prepared(options, origin)
+
+
+@pytest.mark.parametrize(
+    "path", ["org/p/..", "..", "../../x/..", "", "/", "org/p/..\\..\\x", "C:x"]
+)
+def test_runs_of_wandb_are_kept_in_their_folder(wandb, tmp_path, path):
+    wandb.runs[path] = a_run(files=[listed("motion/motions.json")])
+    with pytest.raises(UserError, match="mjlab-motions: expected the name of a file"):
+        prepared(MotionOptions(), PolicyOrigin(G1, Path("m.pt"), path))
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize("name", ["motion/../../x", "motion//x", "motion/..\\..\\x", "motion/."])
+def test_files_of_wandb_runs_are_kept_in_their_folder(wandb, tmp_path, name):
+    wandb.runs["org/p/1"] = a_run(files=[listed("motion/motions.json"), listed(name)])
+    with pytest.raises(UserError, match="expected the name of a file"):
         prepared(MotionOptions(), PolicyOrigin(G1, Path("m.pt"), "org/p/1"))
+    assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
+
+
+def listed(name: str) -> SimpleNamespace:
+    def download(folder: str, replace: bool) -> None:
+        (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
+        (Path(folder) / name).write_text("[]")
+
+    return SimpleNamespace(name=name, download=download)
 
 
 def test_a_policy_of_wandb_comes_with_the_motion_that_its_run_used(wandb, tmp_path):
@@ -178,7 +214,7 @@ def test_a_policy_of_wandb_comes_with_the_motion_that_its_run_uploaded(wandb, tm
         (
             MotionOptions(registry_name="org/none"),
             CPU_ONLY,
-            "Cannot fetch .*'org/none:latest'.*404",
+            "'org/none:latest'.*404",
         ),
         (
             MotionOptions(registry_name="org/empty"),
@@ -188,7 +224,7 @@ def test_a_policy_of_wandb_comes_with_the_motion_that_its_run_uploaded(wandb, tm
         (
             MotionOptions(),
             PolicyOrigin(G1, Path("m.pt"), "org/p/none"),
-            "Cannot read .*'org/p/none'",
+            "'org/p/none'",
         ),
         (
             MotionOptions(),
@@ -200,7 +236,7 @@ def test_a_policy_of_wandb_comes_with_the_motion_that_its_run_uploaded(wandb, tm
 def test_what_is_not_there_is_told(wandb, tmp_path, options, origin, message):
     wandb.artifacts["org/empty:latest"] = Artifact(tmp_path / "empty")
     wandb.runs["org/p/bare"] = a_run()
-    with pytest.raises(MotionFileError, match=message):
+    with pytest.raises((MotionFileError, ConnectionError), match=message):
         prepared(options, origin)
 
 

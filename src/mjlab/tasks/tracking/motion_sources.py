@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from mjlab.tasks.tracking.motion_file import MotionFileError, motion_hash
-from mjlab.utils.os import own_folder, replacing
+from mjlab.utils.os import inside, own_folder, replacing
 from mjlab.utils.string import suggest
-from mjlab.utils.wandb import check_wandb_login
+from mjlab.utils.wandb import asking_wandb
 
 FOLDER = "motion"
 """Name of the motion folder in the run folder."""
@@ -157,22 +157,12 @@ def fetch_artifact(registry_name: str) -> list[Path]:
 
     Raises:
         UserError: no login at Weights & Biases.
-        MotionFileError: the artifact cannot be fetched, or contains no motion.
+        ConnectionError: the artifact cannot be fetched.
+        MotionFileError: the artifact contains no motion.
     """
-    import wandb
-
     name = full_artifact_name(registry_name)
-    check_wandb_login(f"Motion {name!r}")
-    try:
-        artifact = wandb.Api().artifact(name)
-        return _motions_in(artifact, name)
-    except MotionFileError:
-        raise
-    except Exception as error:
-        # wandb raises its own errors and those of its dependencies.
-        raise MotionFileError(
-            f"Cannot fetch motion {name!r} from Weights & Biases: {error}"
-        ) from error
+    with asking_wandb(f"Motion {name!r}") as wandb:
+        return _motions_in(wandb.Api().artifact(name), name)
 
 
 def full_artifact_name(registry_name: str) -> str:
@@ -190,30 +180,25 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
         run_path: entity/project/run.
 
     Raises:
-        UserError: no login at Weights & Biases.
-        MotionFileError: the run cannot be read, or has neither.
+        UserError: no login at Weights & Biases, the run path does not end in a name, or the name of a
+            file leads out of its folder.
+        ConnectionError: the run cannot be read.
+        MotionFileError: the run has neither.
     """
-    import wandb
-
-    check_wandb_login(f"Run {run_path!r}")
-    try:
+    folder = inside(Path(tempfile.gettempdir()) / "mjlab-motions", Path(run_path).name)
+    with asking_wandb(f"Run {run_path!r}") as wandb:
         run = wandb.Api().run(run_path)
-        files = [file for file in run.files() if file.name.startswith(f"{FOLDER}/")]
-        if any(file.name == f"{FOLDER}/{INDEX}" for file in files):
-            folder = Path(tempfile.gettempdir()) / "mjlab-motions" / Path(run_path).name
+        files = {f.name: f for f in run.files() if f.name.startswith(f"{FOLDER}/")}
+        if f"{FOLDER}/{INDEX}" in files:
             folder = own_folder(folder)
-            for file in files:
+            for name in files:
+                inside(folder, name)
+            for file in files.values():
                 file.download(str(folder), replace=True)
             return recorded_motions(folder)
         used = [a for a in run.used_artifacts() if a.type == _ARTIFACT_TYPE]
         if used:
             return _motions_in(used[0], used[0].name)
-    except MotionFileError:
-        raise
-    except Exception as error:
-        raise MotionFileError(
-            f"Cannot read run {run_path!r} at Weights & Biases: {error}"
-        ) from error
     raise MotionFileError(
         f"Run {run_path!r} has neither recorded motions nor an artifact of type "
         f"{_ARTIFACT_TYPE!r}; select the motion with --motion-file or --registry-name."
