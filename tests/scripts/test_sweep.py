@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import os
 import re
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -79,7 +81,7 @@ class Machine:
         run_dir = Path(flags["--log-root"], flags["--agent.experiment-name"])
         run_dir /= f"2026-01-01_{len(self.commands)}_{flags['--agent.run-name']}"
         if self.writes:
-            write_run(run_dir, ended, self.results(flags))
+            write_run(run_dir, ended, self.results(flags), command)
         output.write(b"error: the pole broke\n" if ended == "failed" else b"[3/3] 0:03\n")
         status = {"failed": 1, "interrupted": self.status_of_interrupted}
         process.returncode = status.get(ended, 0)
@@ -93,14 +95,14 @@ def flags_of(command: list[str]) -> dict[str, str]:
     return dict(pairs)
 
 
-def write_run(run_dir: Path, ended: str, results: dict[str, float]) -> None:
+def write_run(run_dir: Path, ended: str, results: dict[str, float], command: list[str]) -> None:
     """Write a run folder as training does."""
     from torch.utils.tensorboard import SummaryWriter
 
     run_dir.mkdir(parents=True)
     agent = TrainConfig.from_task(TASK).agent
     write_params(run_dir, agent, agent)
-    write_info(run_dir, task=TASK, learner="ppo", ended=ended, iterations=3)
+    write_info(run_dir, task=TASK, learner="ppo", command=command, ended=ended, iterations=3)
     (run_dir / "model_2.pt").touch()
     with SummaryWriter(str(run_dir)) as writer:
         for i in range(3):
@@ -539,6 +541,110 @@ def test_a_sweep_runs_once_at_a_time_and_keeps_its_flags(sweep, machine, folder)
     outcome = sweep(*LEARNING, *argv, "--objective", "Evaluation/mean_retrun")
     assert "'Evaluation/mean_return'" in outcome.message
     assert len(machine.commands) == 2
+
+
+def test_tables_that_cannot_be_written_are_warnings(sweep, machine, folder):
+    for name in ("table.csv", "table.md", "curves.png"):
+        (folder / name).mkdir()
+    outcome = sweep(*LEARNING, "--folder", str(folder))
+    assert outcome.status == 0
+    assert "Best:" in outcome.out or "Highest:" in outcome.out
+    for name in ("table.csv", "table.md", "curves.png"):
+        assert f"No {name}: " in outcome.err
+
+
+SAMPLED = ("--over", f"{RATE}=1e-5..1e-2:log", "--trials", "2")
+MIXED = (*SAMPLED[:2], "--over", "agent.algorithm.num-learning-epochs=1..9", "--trials", "3")
+
+
+@pytest.mark.parametrize(
+    ("over", "damage"),
+    [
+        (LEARNING, b""), (LEARNING, b"garbage" * 99), (LEARNING, "flip"), (LEARNING, None),
+        (SAMPLED, "flip"), (MIXED, None), (MIXED, b"garbage"),
+    ],
+)  # fmt: skip
+def test_damaged_studies_are_rebuilt_from_the_folders(sweep, machine, folder, over, damage):
+    argv = (*over, "--folder", str(folder))
+    assert sweep(*argv).status == 0
+    rows, trained = rows_of(folder), len(machine.commands)
+    study = folder / "study.db"
+    if damage == "flip":
+        content = study.read_bytes()
+        study.write_bytes(content.replace(b"learning-rate", b"learnimg-rate"))
+    else:
+        study.unlink() if damage is None else study.write_bytes(damage)
+    outcome = sweep(*argv)
+    if damage:
+        assert outcome.status == 1
+        assert f"{study} is damaged" in outcome.message
+        assert "delete it; the next call rebuilds it from the folders" in outcome.message
+        study.unlink()
+        outcome = sweep(*argv)
+    assert outcome.status == 0
+    assert rows_of(folder) == rows
+    assert len(machine.commands) == trained
+
+
+def test_a_lost_definition_keeps_the_trials(sweep, machine, folder):
+    argv = (*LEARNING, "--folder", str(folder))
+    assert sweep(*argv).status == 0
+    rows = rows_of(folder)
+    (folder / "sweep.json").unlink()
+    assert sweep(*argv).status == 0
+    assert rows_of(folder) == rows
+    assert len(machine.commands) == 2
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[" * 50_000, "null", "[1]", '{"id": 3}', "{}", b"\xff"]
+)
+def test_a_damaged_definition_is_named_with_its_cure(sweep, machine, folder, content):
+    argv = (*LEARNING, "--folder", str(folder))
+    path = folder / "sweep.json"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert f"{path} is damaged" in (message := sweep(*argv).message)
+    assert "delete it" in message
+    path.unlink()
+    assert sweep(*argv).status == 0
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "garbage"])
+@pytest.mark.parametrize("name", ["lock.db", "study.db", "sweep.json"])
+def test_what_stands_in_the_place_of_a_file_is_named(sweep, machine, folder, name, kind):
+    path = folder / name
+    path.unlink(missing_ok=True)
+    if kind == "garbage":
+        path.write_bytes(b"garbage" * 99)
+    else:
+        path.mkdir() if kind == "folder" else os.mkfifo(path)
+    message = sweep(*LEARNING, "--folder", str(folder)).message
+    assert str(path) in message
+    assert "delete it" in message
+    assert not machine.commands
+
+
+def test_a_locked_study_is_not_called_damaged(sweep, machine, folder):
+    study = folder / "study.db"
+    with contextlib.closing(sqlite3.connect(study, isolation_level=None)) as base:
+        base.execute("BEGIN EXCLUSIVE")
+        message = sweep(*LEARNING, "--folder", str(folder)).message
+    assert f"{study}: cannot be read and written: database is locked" in message
+    assert "delete" not in message
+
+
+def test_runs_without_values_are_named_with_the_cure(sweep, machine, folder):
+    argv = (*LEARNING, "--folder", str(folder))
+    assert sweep(*argv).status == 0
+    events = next(folder.glob("runs/*1e-4/*/events*"))
+    for content in (b"", None):
+        events.unlink() if content is None else events.write_bytes(content)
+        message = sweep(*argv).message
+        assert str(events.parent) in message
+        assert "elete " in message
+    shutil.rmtree(events.parent)
+    assert sweep(*argv).status == 0
+    assert len(machine.commands) == 3
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from mjlab.scripts.record import VideoCfg, record_policy
 from mjlab.scripts.reference import parts_of
 from mjlab.sim.warning_log import mujoco_warnings
 from mjlab.tasks.registry import load_rl_cfg
+from mjlab.utils.logging import beside_results
 from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
@@ -59,20 +60,16 @@ def write_results(
     from mjlab.rl.plot import plot_run
 
     # A run solved at resume has no iterations.
-    with contextlib.suppress(ValueError):
+    with beside_results("learning curve"), contextlib.suppress(ValueError):
         plot_run(parts_of(run_dir), title=task, evaluation=vars(cfg.agent.evaluation))
     run = Run(run_dir, task)
     checkpoint = run.newest
     if cfg.result_video and checkpoint is not None:
-        from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
-
-        env_cfg = run.cfg("play").env
-        prepare_env_cfg(task, cfg, env_cfg, checkpoint.path)
-        try:
+        with beside_results("video"):
+            env_cfg = run.cfg("play").env
+            prepare_env_cfg(task, cfg, env_cfg, checkpoint.path)
             video = VideoCfg(profile=cfg.profile)
             record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
-        except RenderingUnavailableError as error:
-            print(f"No video: {error}")
     print(f"Saved in {_short(run_dir)}:")
     for pattern in ("model_*.pt", "*.onnx", "*.png", "videos/**/*.mp4"):
         files = sorted(run_dir.glob(pattern), key=lambda path: path.stat().st_mtime)

@@ -69,9 +69,9 @@ def command(argv: list[str], prog: str) -> None:
     # Imports Optuna; flags are checked before.
     from mjlab.scripts.sweep_results import Comparison
     from mjlab.scripts.sweep_runs import Runs
-    from mjlab.scripts.sweep_study import Study, only_process
+    from mjlab.scripts.sweep_study import DATABASE_ERRORS, Study, naming_database, only_process
 
-    with only_process(sweep.folder):
+    with only_process(sweep.folder), naming_database(sweep, *DATABASE_ERRORS):
         study = Study(sweep)
         runs = Runs(sweep, study)
         runs.train()

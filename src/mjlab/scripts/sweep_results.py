@@ -21,6 +21,7 @@ from mjlab.rl.evaluation import mean_and_interval, wilson_interval
 from mjlab.rl.plot import LABELS, plot_curves
 from mjlab.scripts.sweep_settings import train_config
 from mjlab.scripts.sweep_study import Study, TrainedRun, setting_of, trained_run
+from mjlab.utils.logging import beside_results
 from mjlab.utils.os import write_atomically
 from mjlab.utils.string import counted
 from mjlab.utils.tables import Table
@@ -191,15 +192,19 @@ class Comparison:
             return
         lines = io.StringIO()
         csv.writer(lines, lineterminator="\n").writerows([table.columns, *table.rows])
-        write_atomically(sweep.folder / "table.csv", lines.getvalue().encode())
-        write_atomically(sweep.folder / "table.md", f"{table.markdown()}\n".encode())
-        self.plot()
+        with beside_results("table.csv"):
+            write_atomically(sweep.folder / "table.csv", lines.getvalue().encode())
+        with beside_results("table.md"):
+            write_atomically(sweep.folder / "table.md", f"{table.markdown()}\n".encode())
+        with beside_results("curves.png"):
+            self.plot()
         print(f"\n{table.text()}\n")
         if "low" in table.columns:
             print("low, high: 95 % confidence interval of the mean over seeds")
         if sweep.objective.is_ranked and sweep.objective.reason:
             print(f"Settings: {sweep.objective.reason}")
-        print(f"{self.verdict()}\nSaved in {sweep.folder}:\n    table.csv, table.md, curves.png")
+        files = [n for n in ("table.csv", "table.md", "curves.png") if (sweep.folder / n).is_file()]
+        print(f"{self.verdict()}\nSaved in {sweep.folder}:\n    {', '.join(files)}")
         if not sweep.objective.is_ranked:
             return
         first = self._rows[0]

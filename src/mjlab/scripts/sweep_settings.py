@@ -8,6 +8,7 @@ import itertools
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,6 +73,14 @@ class Axis:
             )
         return cls(name, text, tuple(dict.fromkeys(values)))
 
+    def has(self, value: str) -> bool:
+        """Return True if the axis has this value."""
+        if not self.is_range:
+            return value in self.values
+        low, high = map(float, self.values)
+        is_typed = not self.is_integer or value.removeprefix("-").isdecimal()
+        return is_number(value) and is_typed and low <= float(value) <= high
+
 
 def _split(text: str) -> Iterator[str]:
     """Yield the parts of `text` between commas outside brackets."""
@@ -115,6 +124,20 @@ class Sweep:
         names = [axis.name for axis in self.axes]
         products = itertools.product(*(axis.values for axis in self.axes))
         return [dict(zip(names, values, strict=True)) for values in products]
+
+    @property
+    def begun(self) -> list[Setting]:
+        """Settings that runs of the folder record, the first started first."""
+        runs = [run for path in (self.folder / "runs").glob("*/") for run in runs_in(path)]
+        found = []
+        for run in sorted(runs, key=lambda run: run.started or datetime.min):
+            words = run.info.get("command")
+            words = [w for w in words if isinstance(w, str)] if isinstance(words, list) else []
+            flags = dict(word[2:].split("=", 1) for word in words if re.match("--.*=", word))
+            setting = {axis.name: flags.get(axis.name, "") for axis in self.axes}
+            if all(axis.has(setting[axis.name]) for axis in self.axes) and setting not in found:
+                found.append(setting)
+        return found
 
     @property
     def num_settings(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import socket
 import sqlite3
 import statistics
@@ -29,14 +30,20 @@ from mjlab.runs import Run
 from mjlab.scripts.reference import read_scalars_of_sessions
 from mjlab.scripts.sweep_objective import Objective
 from mjlab.scripts.sweep_settings import Axis, Setting, Sweep
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import MjlabError, UserError
 from mjlab.utils.os import write_atomically
 from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.rl.plot import Curve
 
-_FILE = "sweep.json"
+_FILE, _DATABASE = "sweep.json", "study.db"
+DATABASE_ERRORS = (optuna.exceptions.OptunaError, sqlalchemy.exc.SQLAlchemyError, sqlite3.Error)
+# SQLite's errors of files that are not damaged.
+_BLOCKED = (
+    sqlite3.SQLITE_PERM, sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN,
+)  # fmt: skip
 # User attributes of trials.
 _SETTING, _OWNER = "setting", "folder"
 # Fraction of the iterations that the objective averages, unless it is that of evaluations.
@@ -51,17 +58,55 @@ def only_process(folder: Path) -> Generator[None]:
         UserError: another process holds the lock.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    # Portable, unlike fcntl.
-    lock = sqlite3.connect(folder / "lock.db", timeout=0.0, isolation_level=None)
-    with contextlib.closing(lock):
-        try:
-            lock.execute("BEGIN EXCLUSIVE")
-        except sqlite3.OperationalError as error:
+    path = folder / "lock.db"
+    try:
+        # Portable, unlike fcntl.
+        lock = sqlite3.connect(path, timeout=0.0, isolation_level=None)
+        lock.execute("BEGIN EXCLUSIVE")
+    except sqlite3.Error as error:
+        if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:
             raise UserError(
                 f"{folder}: expected a sweep that is not running, got one in another process "
                 f"({error}); wait for it, or use --folder for another sweep."
             ) from error
+        raise UserError(
+            f"{path}: expected a file that can be written and locked, got: {error}; delete it, which loses "
+            "nothing, or use --folder in another place."
+        ) from error
+    with contextlib.closing(lock):
         yield
+
+
+@contextlib.contextmanager
+def naming_database(sweep: Sweep, *kinds: type[Exception]) -> Generator[None]:
+    """Turn errors of these kinds within the block into a `UserError` with the database and the cure."""
+    try:
+        yield
+    except (MjlabError, MemoryError):
+        raise
+    except kinds as error:
+        causes: list[BaseException] = [error]
+        while (cause := getattr(causes[-1], "orig", None) or causes[-1].__cause__) is not None:
+            causes.append(cause)
+        reason = (str(causes[-1]).strip() or type(causes[-1]).__name__).splitlines()[0]
+        path = sweep.folder / _DATABASE
+        is_blocked = getattr(causes[-1], "sqlite_errorcode", 0) & 0xFF in _BLOCKED
+        if sweep.storage is not None:
+            text = (
+                f"--storage: cannot use the database: {reason}; use a URL such as "
+                "postgresql://user@host/database with its driver installed, or leave out --storage."
+            )
+        elif is_blocked and (path.is_file() or not os.path.lexists(path)):
+            text = (
+                f"{path}: cannot be read and written: {reason}; free it, or the disk, and "
+                "repeat the command, which continues the sweep."
+            )
+        else:
+            text = (
+                f"{path} is damaged ({reason}); delete it; the next call rebuilds it from the folders of the "
+                "runs."
+            )
+        raise UserError(text) from error
 
 
 class Study:
@@ -71,15 +116,19 @@ class Study:
         """Create or load the study.
 
         Raises:
-            UserError: the database cannot be opened, or the study has other flags.
+            UserError: the database cannot be opened or is damaged, or the study has other flags.
         """
         self._sweep = sweep
         # Trials belong to the folder with their runs: other machines do not continue them.
         self._owner = _check_definition(sweep)
-        self._study = _open(sweep)
         self._distributions = {axis.name: _distribution(axis) for axis in sweep.axes}
         self._failed_now = 0
-        self._enqueue_missing()
+        # Optuna and its parsers raise many types of errors for a damaged database.
+        with naming_database(sweep, Exception):
+            self._study = _open(sweep)
+            for trial in self.trials:
+                self._check(trial)
+            self._enqueue_missing()
 
     @property
     def trials(self) -> list[FrozenTrial]:
@@ -89,7 +138,7 @@ class Study:
 
     def is_own(self, trial: FrozenTrial) -> bool:
         """Return True if the runs of a trial are in the folder of this sweep."""
-        return trial.user_attrs.get(_OWNER) == self._owner
+        return self._sweep.storage is None or trial.user_attrs.get(_OWNER) == self._owner
 
     def own(self) -> list[FrozenTrial]:
         """Return the trials begun here, by earlier commands as well, that did not fail."""
@@ -141,16 +190,37 @@ class Study:
             trial for trial in self.trials if trial.state in states and setting_of(trial) == setting
         ]
 
+    def _check(self, trial: FrozenTrial) -> None:
+        """Raise ValueError if a trial that was begun has not the setting of its parameters."""
+        setting = setting_of(trial)
+        sampled = {name: _text(value) for name, value in trial.params.items()}
+        if trial.state != TrialState.WAITING and setting != sampled:
+            raise ValueError(f"trial {trial.number} has the setting {setting}, and {sampled}")
+
     def _enqueue_missing(self) -> None:
-        """Enqueue the combinations, and the failed settings, without a trial that did not fail."""
-        failed = [trial for trial in self.trials if trial.state == TrialState.FAIL]
+        """Enqueue the settings to train that have no trial, unless it failed: combinations; else those
+        of failed trials, and of run folders, which outlive a database.
+        """
         if self._sweep.trials is None:
             missing = [(setting, dict(setting)) for setting in self._sweep.combinations]
         else:
+            failed = [trial for trial in self.trials if trial.state == TrialState.FAIL]
             missing = [(setting_of(trial), trial.params) for trial in failed]
+            missing += [(setting, self._params(setting)) for setting in self._sweep.begun]
         for setting, params in missing:
             if not self._with_setting(setting):
                 self._study.enqueue_trial(params, user_attrs={_SETTING: setting})
+
+    def _params(self, setting: Setting) -> dict[str, Any]:
+        """Return the parameters of a setting."""
+        return {
+            axis.name: value
+            if not axis.is_range
+            else int(value)
+            if axis.is_integer
+            else float(value)
+            for axis, value in zip(self._sweep.axes, setting.values(), strict=True)
+        }
 
     def _has_more(self) -> bool:
         trials = self._study.get_trials(deepcopy=False)
@@ -187,25 +257,36 @@ def _check_definition(sweep: Sweep) -> str:
         UserError: the folder is of a sweep with other flags.
     """
     path = sweep.folder / _FILE
-    if not path.is_file():
+    if not os.path.lexists(path):
         content = {**sweep.definition, "id": f"{socket.gethostname()}-{uuid.uuid4().hex[:8]}"}
         write_atomically(path, f"{json.dumps(content, indent=2)}\n".encode())
-    content = json.loads(path.read_text(encoding="utf-8"))
-    _check_same(f"--folder {sweep.folder}", content, sweep)
-    return content["id"]
+    try:
+        # Reading a pipe would wait.
+        content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        owner = content["id"]
+        if not isinstance(owner, str):
+            raise TypeError(f"id is {owner!r}")
+    except (ValueError, TypeError, LookupError, RecursionError) as error:
+        raise UserError(
+            f"{path} is damaged ({type(error).__name__}: {error}); delete it; the next call rebuilds it from "
+            "the flags and keeps the runs."
+        ) from error
+    if (text := _mismatch(content, sweep)) is not None:
+        raise UserError(f"--folder {sweep.folder}: {text}; use another --folder.")
+    return owner
 
 
-def _check_same(owner: str, content: dict[str, Any], sweep: Sweep) -> None:
+def _mismatch(content: dict[str, Any], sweep: Sweep) -> str | None:
+    """Return how a recorded definition differs from that of the sweep; None if it does not."""
     for name, new in sweep.definition.items():
         if (old := content.get(name, new)) != new:
-            raise UserError(
-                f"{owner}: expected the {name} of its sweep, {old}, got {new}; use another --folder."
-            )
+            return f"expected the {name} of its sweep, {old}, got {new}"
+    return None
 
 
 def _open(sweep: Sweep) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    url = sweep.storage or f"sqlite:///{(sweep.folder / 'study.db').as_posix()}"
+    url = sweep.storage or f"sqlite:///{(sweep.folder / _DATABASE).as_posix()}"
     minimize = sweep.objective.minimize
     sampler: optuna.samplers.BaseSampler = optuna.samplers.RandomSampler()
     # Without a ranking, there are no good values to stay near.
@@ -214,30 +295,22 @@ def _open(sweep: Sweep) -> optuna.Study:
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
             # Running trials count as bad, so that samples next to them are not drawn.
             sampler = optuna.samplers.TPESampler(constant_liar=True)
-    try:
-        study = optuna.create_study(
-            storage=url,
-            # The runs can be compared by several objectives.
-            study_name=f"{sweep.folder.resolve().name} {'-' if minimize else '+'}{sweep.objective.tag}",
-            direction="minimize" if minimize else "maximize",
-            sampler=sampler,
-            load_if_exists=True,
-        )
-        for name, value in sweep.definition.items():
-            if name not in study.user_attrs:
-                study.set_user_attr(name, value)
-    except (
-        ImportError,
-        ValueError,
-        optuna.exceptions.OptunaError,
-        sqlalchemy.exc.SQLAlchemyError,
-    ) as error:
-        where = "study.db" if sweep.storage is None else "--storage"
-        raise UserError(
-            f"{where}: cannot open the database: {str(error).splitlines()[0]}; use a URL such as "
-            "postgresql://user@host/database with its driver installed, or leave out --storage."
-        ) from error
-    _check_same(f"Study {study.study_name!r}", study.user_attrs, sweep)
+    study = optuna.create_study(
+        storage=url,
+        # The runs can be compared by several objectives.
+        study_name=f"{sweep.folder.resolve().name} {'-' if minimize else '+'}{sweep.objective.tag}",
+        direction="minimize" if minimize else "maximize",
+        sampler=sampler,
+        load_if_exists=True,
+    )
+    for name, value in sweep.definition.items():
+        if name not in study.user_attrs:
+            study.set_user_attr(name, value)
+    if (text := _mismatch(study.user_attrs, sweep)) is not None:
+        if sweep.storage is None:
+            # The definition in the folder is another.
+            raise ValueError(text)
+        raise UserError(f"Study {study.study_name!r}: {text}; use another --folder.")
     return study
 
 
@@ -248,16 +321,20 @@ class TrainedRun:
         """Read the event files of the last session `run` and of those before.
 
         Raises:
-            UserError: the run did not log the objective.
+            UserError: the run did not log the objective, or its event files are missing or damaged.
         """
         self.run = run
         """Last session."""
         self._objective = objective
-        self._scalars = read_scalars_of_sessions(run.folder)
+        try:
+            self._scalars = read_scalars_of_sessions(run.folder)
+        except (UserError, ValueError) as error:
+            raise UserError(f"{error} Or delete {run.folder}; the next call repeats it.") from error
         if objective.tag not in self._scalars:
             raise UserError(
                 f"--objective: unknown tag {objective.tag!r} in {run.folder}; "
-                f"{suggest(objective.tag, sorted(self._scalars))}"
+                f"{suggest(objective.tag, sorted(self._scalars))} If its event file is damaged, delete this "
+                "folder; the next call repeats the run."
             )
 
     @property

@@ -64,7 +64,7 @@ from mjlab.scripts.train_config import (
     report_moved_goal,
 )
 from mjlab.tasks.registry import load_rl_cfg
-from mjlab.utils.logging import print_list, print_notice
+from mjlab.utils.logging import beside_results, print_list, print_notice
 from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
 from mjlab.utils.signals import Interrupted
@@ -391,7 +391,7 @@ def _learn(
         iterations = getattr(runner, "current_learning_iteration", total)
         if not is_shared:
             # On a full disk, do not mask the error that names the intact checkpoint.
-            with contextlib.suppress(OSError):
+            with beside_results("end in run.json"):
                 write_info(folder.path, ended=ended, iterations=iterations)
     return ended
 

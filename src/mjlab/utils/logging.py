@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import sys
+from collections.abc import Generator
 
 from mjlab.utils.errors import check_one_of
+
+logger = logging.getLogger(__name__)
 
 _CODES = {
     "red": 31,
@@ -42,6 +47,15 @@ def print_list(title: str, lines: list[str]) -> None:
         more = len(lines) - _MOST_LINES
         shown = [*lines[:_MOST_LINES], *([f"and {more} more"] if more > 0 else [])]
         print_notice("\n    ".join([title, *shown]))
+
+
+@contextlib.contextmanager
+def beside_results(what: str) -> Generator[None]:
+    """Turn an error within the block, which makes `what` after the results were saved, into a warning."""
+    try:
+        yield
+    except Exception as error:
+        logger.warning("No %s: %s", what, shorten(str(error).strip() or type(error).__name__))
 
 
 def shorten(text: str) -> str:

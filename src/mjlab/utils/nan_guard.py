@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.utils.errors import check_in_range, check_one_of
 from mjlab.utils.memory import check_memory
-from mjlab.utils.os import own_folder, replacing, write_atomically
+from mjlab.utils.os import check_archive, own_folder, replacing, write_atomically
 
 if TYPE_CHECKING:
     import mujoco
@@ -332,6 +332,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
 
     arrays = {}
     with np.load(path, allow_pickle=False) as file:
+        check_archive(path)
         for name in file.files:
             try:
                 arrays[name] = file[name]

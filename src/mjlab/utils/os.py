@@ -12,8 +12,10 @@ import re
 import secrets
 import socket
 import stat
+import struct
 import tempfile
 import time
+import zipfile
 from collections.abc import Generator, Iterable, Mapping
 from pathlib import Path, PureWindowsPath
 from typing import IO, Any
@@ -37,6 +39,9 @@ WANDB_CACHE = "wandb_checkpoints"
 _TEMPORARY = re.compile(r"\.(.+)\.\d+-[0-9a-f]{8}\.tmp")
 # Age for removal of files of other machines, because their locks may not be visible here.
 _SECONDS_TO_KEEP = 86400.0
+# Record at the end of a ZIP archive, and its count in archives that have another one.
+_END_OF_ARCHIVE = struct.Struct("<4s4H2LH")
+_MANY_ENTRIES = 0xFFFF
 _CHECKPOINT = re.compile(r"model_(\d+)\.pt")
 
 
@@ -230,6 +235,21 @@ def inside(folder: Path, name: str) -> Path:
     if PureWindowsPath(name).drive or any(part in ("", ".", "..") for part in parts):
         raise UserError(f"{folder}: expected the name of a file in this folder, got {name!r}.")
     return folder / name
+
+
+def check_archive(path: Path) -> None:
+    """Raise an error unless a ZIP archive has all its entries, which match their names and checksums.
+
+    Of damage in the directory at its end, `zipfile` may notice nothing.
+    """
+    with zipfile.ZipFile(path) as archive, open(path, "rb") as file:
+        if (damaged := archive.testzip()) is not None:
+            raise zipfile.BadZipFile(f"{damaged} does not match its checksum")
+        file.seek(-_END_OF_ARCHIVE.size, os.SEEK_END)
+        signature, *_, count, _, _, _ = _END_OF_ARCHIVE.unpack(file.read())
+        # Archives with a comment end otherwise.
+        if signature == b"PK\5\6" and count not in (len(archive.infolist()), _MANY_ENTRIES):
+            raise zipfile.BadZipFile(f"it has {len(archive.infolist())} of {count} entries")
 
 
 def write_atomically(path: Path, content: bytes) -> None:

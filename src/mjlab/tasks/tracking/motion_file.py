@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from mjlab.utils.errors import MjlabError
-from mjlab.utils.os import replacing
+from mjlab.utils.os import check_archive, replacing
 
 _ARRAYS: dict[str, tuple[str | int, ...]] = {
     "joint_pos": ("frames", "joints"),
@@ -189,6 +189,8 @@ def _load(path: Path) -> dict[str, np.ndarray]:
                 raise MotionFileError(
                     f"Motion {path}: expected an .npz archive, got a single array."
                 )
+            # Missing or damaged optional entries would be ignored.
+            check_archive(path)
             keys = set(archive.files)
             content = {key: archive[key] for key in _ARRAYS if key in keys}
             for key in _OPTIONAL & keys:
@@ -201,7 +203,10 @@ def _load(path: Path) -> dict[str, np.ndarray]:
     except Exception as error:
         # Damaged or hostile files make zipfile and NumPy raise many types of errors.
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise MotionFileError(f"{path} cannot be read as a motion (.npz): {reason}") from error
+        raise MotionFileError(
+            f"{path} cannot be read as a motion (.npz): {reason}; copy it from its source, or make it again by "
+            "`mjlab csv-to-npz`."
+        ) from error
 
 
 def _names(key: str, value: np.ndarray | None, count: int) -> tuple[tuple[str, ...], list[str]]:
