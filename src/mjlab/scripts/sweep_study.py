@@ -263,13 +263,12 @@ def _check_definition(sweep: Sweep) -> str:
     try:
         # Reading a pipe would wait.
         content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
-        owner = content["id"]
-        if not isinstance(owner, str):
-            raise TypeError(f"id is {owner!r}")
-    except (ValueError, TypeError, LookupError, RecursionError) as error:
+        if not isinstance(content, dict) or not isinstance(owner := content.get("id"), str):
+            raise ValueError("expected a JSON file with an id")
+    except (ValueError, RecursionError) as error:
         raise UserError(
-            f"{path} is damaged ({type(error).__name__}: {error}); delete it; the next call rebuilds it from "
-            "the flags and keeps the runs."
+            f"{path} is damaged ({error}); delete it; the next call rebuilds it from the flags and keeps the "
+            "runs."
         ) from error
     if (text := _mismatch(content, sweep)) is not None:
         raise UserError(f"--folder {sweep.folder}: {text}; use another --folder.")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -229,3 +232,20 @@ def test_motions_that_are_not_there_are_told(text, message):
 def test_a_folder_without_motions_is_told(tmp_path):
     with pytest.raises(MotionFileError, match=r"Folder .*expected motions \(.npz\), got none"):
         find_motions(str(tmp_path))
+
+
+@pytest.mark.parametrize("field", [28, 30, 32, 46])
+def test_damage_to_the_directory_of_an_archive_is_found(tmp_path, field):
+    """The directory at the end names each entry, and has the lengths of three texts."""
+    path = write_motion(tmp_path / "motion.npz", SQUAT)
+    good = path.read_bytes()
+    entries = [match.start() for match in re.finditer(rb"PK\x01\x02", good)]
+    assert len(entries) == 9
+    for entry in entries:
+        damaged = bytearray(good)
+        damaged[entry + field] ^= 64
+        path.write_bytes(damaged)
+        with contextlib.suppress(MotionFileError):
+            read = read_motion(path)
+            assert (read.joint_names, read.body_names) == (SQUAT.joint_names, SQUAT.body_names)
+            assert read.fps == SQUAT.fps
