@@ -135,12 +135,14 @@ def test_contents_survive_a_file(tmp_path):
 
 
 def test_only_the_newest_checkpoint_keeps_its_replay(tmp_path):
+    (tmp_path / "replay_model_0.pt" / "mine").mkdir(parents=True)
     storage = History(2, [[GOES_ON] * NUM_ENVS]).storage
     for number in (1, 2):
         files = ReplayFiles(tmp_path / f"model_{number}.pt")
         files.write(storage)
         files.remove_others()
-    assert [path.name for path in tmp_path.iterdir()] == ["replay_model_2.pt"]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["replay_model_0.pt", "replay_model_2.pt"]
 
 
 def test_a_replay_of_other_environments_is_left_out(tmp_path, caplog):
@@ -189,6 +191,13 @@ DAMAGES: dict[str, tuple[str, Damage]] = {
     "wider ends": ("ends/actor", set_tensor("ends/actor", lambda x: x.repeat(1, 2))),
     "one dimension": ("rewards", set_tensor("rewards", torch.Tensor.flatten)),
     "nothing": ("rewards", set_tensor("rewards", lambda x: x[:, :0])),
+    "more ends than there are numbers": ("ends", set_entry("num_ends_stored", 10**30)),
+    "a number among the tensors": ("more", lambda state: state["tensors"].update(more=3)),
+    "a number as name": ("tensors", lambda state: state["tensors"].update({5: torch.ones(2)})),
+    "sparse": ("rewards", set_tensor("rewards", torch.Tensor.to_sparse)),
+    "no memory": ("actions", set_tensor("actions", lambda x: x.to("meta"))),
+    "complex": ("actions", set_tensor("actions", lambda x: x + 1j)),
+    "truth values": ("rewards", set_tensor("rewards", torch.Tensor.bool)),
 }
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from mjlab.rl.checkpoint import latest_checkpoint
 from mjlab.runs import Run, newest_run, resolve_checkpoint, runs_in
 from mjlab.runs.folder import NewRunFolder, write_info
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import UserError
+from mjlab.utils.os import get_checkpoint_path
 
 TASK = "Mjlab-Cartpole-Swingup"
 SCORE = {"evaluations": [{"iteration": 3, "mean_return": 960.0, "solved": True}]}
@@ -66,6 +69,22 @@ def test_checkpoints_are_in_the_order_of_numbers(tmp_path):
     assert [checkpoint.number for checkpoint in run.checkpoints] == [3, 20, 100]
     assert run.newest.number == 100
     assert make_run(tmp_path, "empty").newest is None
+
+
+def test_folders_and_broken_links_are_no_checkpoints(tmp_path):
+    run = make_run(tmp_path, "run", 3)
+    for number, target in ((7, "nowhere"), (8, "model_8.pt"), (9, "model_8.pt")):
+        (run.folder / f"model_{number}.pt").symlink_to(target)
+    (run.folder / "model_99.pt").mkdir()
+    os.mkfifo(run.folder / "model_100.pt")
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "file").write_bytes(b"")
+    assert run.newest.number == 3
+    assert latest_checkpoint(run.folder) == run.newest.path
+    assert newest_run(runs_in(tmp_path)).newest.number == 3
+    assert get_checkpoint_path(tmp_path) == run.newest.path
+    with pytest.raises(UserError, match=r"Available: .*model_3\.pt"):
+        resolve_checkpoint(run.folder / "model_99.pt", TASK)
 
 
 def test_a_policy_is_used_in_the_task_asked_for(tmp_path):

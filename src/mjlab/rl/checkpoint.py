@@ -31,7 +31,7 @@ import torch
 
 from mjlab.envs.env_state import curricula_in
 from mjlab.utils.errors import MjlabError, UserError, check_count, check_in_range, check_positive
-from mjlab.utils.os import checkpoint_number, checkpoints_in, replacing
+from mjlab.utils.os import checkpoint_number, checkpoints_in, files_in, replacing
 from mjlab.utils.random import rng_state, set_rng_state
 from mjlab.utils.torch import to_device
 
@@ -150,7 +150,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         folder = path if path.is_dir() else path.parent
-        found = sorted(other.name for other in folder.glob("*.pt"))
+        found = sorted(other.name for other in files_in(folder, "*.pt"))
         raise CheckpointError(
             f"Checkpoint {str(path)!r}: expected a file, found {'a folder' if path == folder else 'none'}. "
             f"Available in {str(folder)!r}: {found}."

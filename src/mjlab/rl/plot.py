@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjlab.utils.os import files_in
 from mjlab.utils.string import counted, suggest
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def read_all_scalars(run: Run) -> dict[str, Curve]:
         ValueError: no event files.
     """
     folders = _folders(run)
-    paths = [path for part in folders for path in sorted(part.glob("events.out.tfevents.*"))]
+    paths = [path for part in folders for path in sorted(files_in(part, "events.out.tfevents.*"))]
     if not paths:
         raise ValueError(
             f"run: no TensorBoard event files in '{folders[-1]}'; use the folder of a run, such as "

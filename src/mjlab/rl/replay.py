@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 from collections.abc import Mapping, Sequence
@@ -263,6 +264,8 @@ def check_contents(state: Mapping[str, Any]) -> None:
     dtypes = dict.fromkeys(("actions", "rewards"), torch.float32)
     dtypes |= {"kinds": torch.int8, "end_numbers": torch.int64}
     dtypes |= {f"{part}/{name}": torch.float32 for name in groups for part in _PER_GROUP}
+    if unknown := [name for name in tensors if name not in dtypes]:
+        raise ValueError(f"Replay tensors: expected {list(dtypes)}, got also {unknown}.")
     for name, dtype in dtypes.items():
         tensor = tensors.get(name)
         found = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
@@ -296,7 +299,7 @@ def check_contents(state: Mapping[str, Any]) -> None:
     first, last = (0, rows - 1) if is_full else (state["num_filled"],) * 2
     check_in_range("Replay row", state["row"], first, last)
     stored = state["num_ends_stored"]
-    check_count("Replay num_ends_stored", stored, minimum=0)
+    check_in_range("Replay num_ends_stored", stored, 0, 2**62)
     for name, low, high in (
         ("kinds", _CONTINUES, _CUT_OFF),
         ("end_numbers", 0, max(stored - 1, 0)),
@@ -347,7 +350,7 @@ class ReplayFiles:
             state = load_checkpoint(self.path)
             check_contents(state)
         except (CheckpointError, ValueError) as error:
-            reason = str(error.__cause__ or error).partition("\n")[0]
+            reason = str(error.__cause__ or error).partition("\n")[0].partition("; use ")[0]
             raise CheckpointError(
                 f"Replay {str(self.path)!r} is damaged ({reason}); {cure}"
             ) from error
@@ -366,5 +369,7 @@ class ReplayFiles:
     def remove_others(self) -> None:
         """Delete the replay files of the folder's other checkpoints."""
         for other in self.path.parent.glob("replay_model_*.pt"):
-            if other != self.path:
-                other.unlink(missing_ok=True)
+            # A folder of that name, or a file of another user, is no reason to end a run.
+            with contextlib.suppress(OSError):
+                if other != self.path:
+                    other.unlink()

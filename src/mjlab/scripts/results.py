@@ -18,6 +18,7 @@ from mjlab.scripts.reference import parts_of
 from mjlab.sim.warning_log import mujoco_warnings
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.logging import beside_results
+from mjlab.utils.os import files_in
 from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def write_results(
             record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
     print(f"Saved in {_short(run_dir)}:")
     for pattern in ("model_*.pt", "*.onnx", "*.png", "videos/**/*.mp4"):
-        files = sorted(run_dir.glob(pattern), key=lambda path: path.stat().st_mtime)
+        files = sorted(files_in(run_dir, pattern), key=lambda path: path.stat().st_mtime)
         if files:
             print(f"    {files[-1].relative_to(run_dir)}")
     print("Next:")

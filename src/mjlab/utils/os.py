@@ -128,13 +128,16 @@ def checkpoint_names(names: Iterable[str]) -> list[str]:
     return [name for _, name in sorted(numbered)]
 
 
-def checkpoints_in(folder: Path) -> list[Path]:
-    """Return the checkpoints in `folder`, in the order of their numbers; empty without the folder.
+def files_in(folder: Path, pattern: str) -> list[Path]:
+    """Return the files in `folder` that match a glob pattern, without folders, and links to no file."""
+    # Unlike `Path.is_file`, False for links and folders that cannot be followed.
+    return [path for path in folder.glob(pattern) if os.path.isfile(path)]
 
-    Other things of such a name do not count: folders, and links that lead to no file.
-    """
-    names = checkpoint_names(p.name for p in folder.iterdir()) if folder.is_dir() else []
-    return [folder / name for name in names if os.path.isfile(folder / name)]
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """Return the checkpoint files in `folder`, in the order of their numbers."""
+    names = checkpoint_names(path.name for path in files_in(folder, "model_*.pt"))
+    return [folder / name for name in names]
 
 
 def get_checkpoint_path(
@@ -165,7 +168,7 @@ def get_checkpoint_path(
             f"Available: {[p.name for p in folders]}."
         )
     for run in reversed(runs):
-        files = [p for p in run.iterdir() if p.is_file() and re.fullmatch(checkpoint, p.name)]
+        files = [p for p in files_in(run, "*") if re.fullmatch(checkpoint, p.name)]
         if files:
             return max(files, key=_checkpoint_age)
     raise ValueError(

@@ -21,6 +21,7 @@ import torch
 import viser
 
 from mjlab.utils.errors import WrongStateError
+from mjlab.utils.os import files_in
 from mjlab.utils.string import escaped
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, reset_policy
 from mjlab.viewer.camera import resolve_camera
@@ -515,7 +516,7 @@ def local_checkpoints(
 
     def fetch_available() -> list[tuple[str, str]]:
         # replay_*.pt files contain a replay buffer, not a policy.
-        files = [path for path in folder.glob("*.pt") if not path.name.startswith("replay_")]
+        files = [path for path in files_in(folder, "*.pt") if not path.name.startswith("replay_")]
         files.sort(key=lambda path: checkpoint_number(path.name))
         now = time.time()
         return [(file.name, format_time_ago(int(now - file.stat().st_mtime))) for file in files]
