@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -263,3 +267,70 @@ def test_an_environment_with_other_observations_or_actions_is_refused(
     assert "action_scale: the policy has 0.5, the environment 0.25" in message
     assert "actions: the policy has 3, not 4" in message
     assert "step_dt" not in message
+
+
+@pytest.fixture
+def endless_policy(tmp_path: Path) -> OnnxPolicy:
+    """Return a policy that loops for ever if its observations are not zero."""
+    types = {"i": TensorProto.INT64, "go": TensorProto.BOOL, "x": TensorProto.FLOAT}
+    kinds = {"i": [], "go": [], "x": [None, 1]}
+    values = {name: helper.make_tensor_value_info(name, types[name], kinds[name]) for name in types}
+    outputs = [
+        helper.make_tensor_value_info("go_out", TensorProto.BOOL, []),
+        helper.make_tensor_value_info("x_out", TensorProto.FLOAT, [None, 1]),
+    ]
+    nodes = [
+        helper.make_node("Identity", ["go"], ["go_out"]),
+        helper.make_node("Identity", ["x"], ["x_out"]),
+    ]
+    body = helper.make_graph(nodes, "body", list(values.values()), outputs)
+    zero = helper.make_tensor("zero", TensorProto.FLOAT, [], [0.0])
+    nodes = [
+        helper.make_node("ReduceMax", ["obs"], ["most"], keepdims=0),
+        helper.make_node("Greater", ["most", "zero"], ["begin"]),
+        helper.make_node("Loop", ["", "begin", "obs"], ["actions"], body=body),
+    ]
+    inputs = [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", 1])]
+    results = [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["n", 1])]
+    whole = helper.make_graph(nodes, "policy", inputs, results, [zero])
+    opset = [helper.make_opsetid("", 18)]
+    onnx.save(helper.make_model(whole, opset_imports=opset, ir_version=8), tmp_path / "loop.onnx")
+    return OnnxPolicy(tmp_path / "loop.onnx")
+
+
+def send_soon(number: signal.Signals) -> None:
+    threading.Timer(0.2, os.kill, (os.getpid(), number)).start()
+
+
+@pytest.mark.parametrize("handler", [signal.default_int_handler, lambda *_: None])
+def test_an_endless_loop_ends_at_ctrl_c(endless_policy, handler) -> None:
+    previous = signal.signal(signal.SIGINT, handler)
+    try:
+        for _ in range(2):
+            send_soon(signal.SIGINT)
+            with pytest.raises(KeyboardInterrupt):
+                endless_policy(torch.ones(2, 1))
+            assert endless_policy(torch.zeros(2, 1)).tolist() == [[0.0], [0.0]]
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_calls_after_a_signal_are_not_ended(endless_policy) -> None:
+    previous = signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        send_soon(signal.SIGINT)
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:
+            endless_policy(torch.zeros(2, 1))
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def test_a_policy_leaves_no_thread(tmp_path: Path) -> None:
+    before = set(threading.enumerate())
+    policy = OnnxPolicy(export(tmp_path / "policy.onnx"))
+    (thread,) = set(threading.enumerate()) - before
+    del policy
+    thread.join(10.0)
+    assert not thread.is_alive()

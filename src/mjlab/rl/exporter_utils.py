@@ -40,6 +40,10 @@ import hashlib
 import io
 import logging
 import math
+import signal
+import socket
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -80,6 +84,7 @@ _INTERFACE = (
 _CLOCK = ("clock_frequency", "clock_fade_s", "clock_standing_threshold", "clock_starts")
 _RELATIVE_TOLERANCE = 0.01
 _ABSOLUTE_TOLERANCE = 6e-4
+_SECONDS_AFTER_SIGNAL = 1.0
 
 
 # Export.
@@ -504,6 +509,11 @@ class OnnxPolicy:
         self._session = onnxruntime.InferenceSession(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
+        # Options of the running call.
+        self._call = [onnxruntime.RunOptions()]
+        woken, self._signals = socket.socketpair()
+        self._signals.setblocking(False)
+        threading.Thread(target=_end_call, args=(woken, self._call), daemon=True).start()
 
     def __call__(self, observations: Any) -> torch.Tensor:
         """Return actions (N, num_actions).
@@ -533,13 +543,32 @@ class OnnxPolicy:
             rows = slice(None) if row is None else slice(row, row + 1)
             feed = {name: value[rows] for name, value in inputs.items()}
             feed |= {name: value[:, rows] for name, value in self._memory.items()}
-            results.append(self._session.run(self._outputs, feed))
+            results.append(self._run(feed))
         actions, *memories = (
             np.concatenate(parts, axis=0 if k == 0 else 1)
             for k, parts in enumerate(zip(*results, strict=True))
         )
         self._memory = dict(zip(self._memories, memories, strict=True))
         return torch.from_numpy(actions).to(self.device)
+
+    def _run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """Run the graph once.
+
+        A graph may have an endless loop, and Python handles a signal only once the graph has ended:
+        `_end_call` ends it.
+        """
+        self._call[0] = options = type(self._call[0])()
+        is_main = threading.current_thread() is threading.main_thread()
+        previous = signal.set_wakeup_fd(self._signals.fileno()) if is_main else -1
+        try:
+            return self._session.run(self._outputs, feed, options)
+        except Exception:
+            if options.terminate:
+                raise KeyboardInterrupt from None
+            raise
+        finally:
+            if is_main:
+                signal.set_wakeup_fd(previous)
 
     def reset(self, dones: torch.Tensor | None = None) -> None:
         """Clear the hidden state of environments with nonzero `dones` (N,). None: all."""
@@ -603,6 +632,19 @@ class OnnxPolicy:
             )
         # The size of a dynamic dimension reads 0.
         self._is_for_one = max(batches) == 1
+
+
+def _end_call(woken: socket.socket, call: list[Any]) -> None:
+    """End a call of onnxruntime that lasts longer than a second after a signal.
+
+    Args:
+        woken: Socket that receives a byte at every signal, closed with the policy.
+        call: Options of the running call, one for each call.
+    """
+    while woken.recv(1):
+        options = call[0]
+        time.sleep(_SECONDS_AFTER_SIGNAL)
+        options.terminate = True
 
 
 def _read_model(path: Path) -> Any:
