@@ -551,7 +551,7 @@ class OnnxPolicy:
         self._memory = dict(zip(self._memories, memories, strict=True))
         return torch.from_numpy(actions).to(self.device)
 
-    def _run(self, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
+    def _run(self, feed: dict[str, np.ndarray]) -> Any:
         """Run the graph once.
 
         A graph may have an endless loop, and Python handles a signal only once the graph has ended:
