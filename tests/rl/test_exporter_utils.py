@@ -15,7 +15,13 @@ import onnxruntime
 import pytest
 import torch
 
-from mjlab.rl.exporter_utils import attach_metadata_to_onnx, get_base_metadata, list_to_csv_str
+from mjlab.rl.exporter_utils import (
+    OnnxPolicyError,
+    attach_metadata_to_onnx,
+    get_base_metadata,
+    list_to_csv_str,
+    load_onnx_policy,
+)
 
 _LEG = """
 <mujoco>
@@ -73,7 +79,9 @@ def leg_env():
         spec_fn=lambda: mujoco.MjSpec.from_string(_LEG),
         articulation=EntityArticulationInfoCfg(
             actuators=(
-                IdealPdActuatorCfg(target_names_expr=("knee",), stiffness=30.37, damping=1.13),
+                IdealPdActuatorCfg(
+                    target_names_expr=("knee",), stiffness=30.37, damping=1.13, delay_max_lag=3
+                ),
                 BuiltinPositionActuatorCfg(
                     target_names_expr=("hip",), stiffness=20.12345, damping=0.7
                 ),
@@ -180,6 +188,7 @@ def test_metadata_of_position_actions_have_full_precision_and_the_actuators_gain
     assert metadata["observation_terms_history_length"] == [3, 0]
     assert metadata["observation_dims"] == [9, 3]
     assert metadata["observation_delay"] == [[0, 0], [0, 2]]
+    assert metadata["actuator_delay"] == [[0, 3], [0, 0]]
     env.close()
 
 
@@ -267,3 +276,36 @@ def test_an_exported_policy_obeys_the_umask(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_other_physics_and_delays_are_one_warning(tmp_path: Path, caplog):
+    from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
+    from mjlab.tasks.cartpole.cartpole_env_cfg import cartpole_ppo_runner_cfg
+
+    env = RslRlVecEnvWrapper(cartpole_env())
+    runner = MjlabOnPolicyRunner(env, asdict(cartpole_ppo_runner_cfg()), str(tmp_path / "run"))
+    path = tmp_path / "run.onnx"
+    runner.export_policy_to_onnx(str(tmp_path), "run.onnx")
+    attach_metadata_to_onnx(str(path), get_base_metadata(env.unwrapped, "run"))
+    load_onnx_policy(path, env, "cpu")
+    assert not caplog.records
+    changes = {
+        "decimation": "10", "physics_dt": "0.005", "observation_delay": "0;0,0;2,0;0,0;0",
+        "actuator_delay": "0;1", "joint_stiffness": "3.0", "action_clip": "-1;1",
+        "observation_terms_clip": "-1;1,-inf;inf,-inf;inf,-inf;inf", "joint_names": "hinge_1,slider",
+    }  # fmt: skip
+    for number in range(2):
+        attach_metadata_to_onnx(str(path), {**changes} if number else {"decimation": "10"})
+        caplog.clear()
+        load_onnx_policy(path, env, "cpu")
+        (warning,) = caplog.records
+        for key in changes if number else ("decimation",):
+            assert f"{key}: the policy has" in warning.getMessage()
+    # Control steps and what enters or leaves the network are errors.
+    for key, value in {"step_dt": "0.1", "action_scale": "2.0", "action_offset": "1.0"}.items():
+        good = properties(path)[key]
+        attach_metadata_to_onnx(str(path), {key: value})
+        with pytest.raises(OnnxPolicyError, match=f"different environment.*{key}: the policy has"):
+            load_onnx_policy(path, env, "cpu")
+        attach_metadata_to_onnx(str(path), {key: good})
+    env.close()

@@ -19,6 +19,7 @@ mjlab 1.6 come first, in its order and layout; numbers have full precision, and 
 | initializers_sha256 | digest of the weights in the file, see `initializers_digest` |
 | graph_batch_size | "any": the graph computes more rows than its inputs declare |
 | step_dt, physics_dt, decimation | control timestep (s), physics timestep (s), their ratio |
+| actuator_delay | minimum and maximum lag of each actuator config of the entity, in physics steps |
 
 The target of an action term is `action * action_scale + action_offset`, clipped to `action_clip`.
 Commands generated on the robot, such as the gait clock, export their parameters
@@ -80,6 +81,8 @@ _INTERFACE = (
     "default_joint_pos",
     "step_dt",
 )
+# Names, not settings.
+_UNCOMPARED = ("run_path", "observation_group")
 # Missing in files of policies that do not observe a gait clock.
 _CLOCK = ("clock_frequency", "clock_fade_s", "clock_standing_threshold", "clock_starts")
 _RELATIVE_TOLERANCE = 0.01
@@ -233,6 +236,9 @@ def get_base_metadata(
     metadata["step_dt"] = _shortest(env.step_dt)
     metadata["physics_dt"] = _shortest(env.physics_dt)
     metadata["decimation"] = env.cfg.decimation
+    if entities:
+        cfgs = [actuator.cfg for actuator in entity.actuators]
+        metadata["actuator_delay"] = [[cfg.delay_min_lag, cfg.delay_max_lag] for cfg in cfgs]
     return metadata
 
 
@@ -582,9 +588,12 @@ class OnnxPolicy:
     def check_fits(self, env: ManagerBasedRlEnv) -> None:
         """Check that observations and actions of `env` are those of the training.
 
+        Other differences from what the file records are one warning: physics, delays, gains, ...
+
         Raises:
             OnnxPolicyError: observations or actions differ; the message lists all differences.
         """
+        others: list[str] = []
         shapes: dict[str, Any] = env.observation_manager.group_obs_dim
         differences = [
             f"observations {name!r}: the policy has {shape or 'a flat group'}, the environment "
@@ -594,13 +603,14 @@ class OnnxPolicy:
         ]
         if not differences:
             expected = metadata_texts(get_base_metadata(env, "", self._named_groups))
-            own = {key: self.metadata[key] for key in _INTERFACE if key in self.metadata}
-            own |= {key: self.metadata.get(key, "") for key in _CLOCK}
-            differences = [
-                f"{key}: the policy has {value or 'none'}, the environment {expected.get(key) or 'none'}"
-                for key, value in own.items()
-                if not _alike(value, expected.get(key, ""))
-            ]
+            known = {*expected, *_INTERFACE}.intersection(self.metadata).difference(_UNCOMPARED)
+            for key in sorted({*known, *_CLOCK}):
+                value, now = self.metadata.get(key, ""), expected.get(key, "")
+                if not _alike(value, now):
+                    kind = differences if key in (*_INTERFACE, *_CLOCK) else others
+                    kind.append(
+                        f"{key}: the policy has {value or 'none'}, the environment {now or 'none'}"
+                    )
         sizes = env.action_manager.total_action_dim
         if sizes != self.num_actions:
             differences.append(f"actions: the policy has {self.num_actions}, not {sizes}")
@@ -609,6 +619,10 @@ class OnnxPolicy:
                 f"Policy {self.path} was trained in a different environment. "
                 + "; ".join(differences)
                 + "."
+            )
+        if others:
+            logger.warning(
+                "Policy %s was trained with other settings. %s.", self.path, "; ".join(others)
             )
 
     def _read_inputs(self, graph: Any) -> None:
@@ -699,6 +713,8 @@ def _first_line(error: Exception) -> str:
 
 def _alike(one: str, other: str) -> bool:
     """Return True if two properties agree: words exactly, numbers within a tolerance."""
+    if one == other:
+        return True
     ours, theirs = one.replace(";", ",").split(","), other.replace(";", ",").split(",")
     if len(ours) == 1 and len(theirs) > 1:
         # A scalar applies to all components.
