@@ -107,6 +107,13 @@ def test_what_cannot_be_loaded_is_named(tmp_path: Path, name: str, text, message
         run_view(str(path), ViewConfig(port=18124, open_browser=False))
 
 
+def test_names_in_another_encoding_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "latin.xml"
+    path.write_text(MJCF.replace("elbow", "elboé"), encoding="latin-1")
+    with pytest.raises(UserError, match=r"latin.xml: MuJoCo cannot load .*utf-8"):
+        load_model(str(path))
+
+
 def test_an_unknown_name_lists_what_can_be_shown() -> None:
     with pytest.raises(UserError, match="g1, go1, yam.*Mjlab-Cartpole"):
         load_model("Mjlab-Cartpole-Swingupp")

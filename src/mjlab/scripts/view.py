@@ -130,7 +130,10 @@ def _load_file(path: Path) -> mujoco.MjModel:
         if is_free and not spec.worldbody.geoms:
             floor = spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE)
             floor.size = (10.0, 10.0, 0.1)
-        return spec.compile()
+        model = spec.compile()
+        # Names in another encoding cannot be shown.
+        model.names.decode()
+        return model
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{path}: MuJoCo cannot load the model: {reason}") from error

@@ -273,7 +273,7 @@ class TestCheckpoints:
         assert manager.current_name == "model_100.pt"
 
     def test_names_of_a_tracker_are_text(self, viser_server) -> None:
-        tag = "<img src=x onerror=y>`]()"
+        tag = "<img src=x onerror=y>`]()\udcff"
         manager = CheckpointManager(
             current_name=tag, fetch_available=lambda: [(tag, tag)],
             load_checkpoint=lambda name: (_ for _ in ()).throw(ValueError(name)),
@@ -285,6 +285,8 @@ class TestCheckpoints:
             assert not set(panel._about.content) & set("<>`")
             assert panel._about.content.count("]") == (manager.run_url is not None)
             assert "<img" not in panel._message.content
+            # Sent as UTF-8.
+            assert panel._choice.value.encode()
 
     def test_use_latest_looks_for_new_files(self, viser_server, folder) -> None:
         loaded = []

@@ -448,16 +448,16 @@ class CheckpointPanel:
         self._about.content = "**Local checkpoints**"
         run, url, state = self._manager.run_name, self._manager.run_url, self._manager.run_status
         if run is not None:
-            name = (
-                escaped(run)
-                if url is None
-                else f"[{escaped(run)}]({quote(url, safe=':/?#&=%~@+,;')})"
-            )
+            name = escaped(run)
+            if url is not None:
+                name = f"[{name}]({quote(url, safe=':/?#&=%~@+,;', errors='replace')})"
             status = "" if state is None else f" ({escaped(state)})"
             self._about.content = f"**Run:** {name}{status}"
         chosen = self._labels.get(self._choice.value)
         # Newest first: users usually want the latest checkpoint.
-        self._labels = {f"{name} ({age})" if age else name: name for name, age in checkpoints[::-1]}
+        labels = {f"{name} ({age})" if age else name: name for name, age in checkpoints[::-1]}
+        # Viser sends UTF-8, but names of files are bytes.
+        self._labels = {k.encode(errors="replace").decode(): name for k, name in labels.items()}
         self._set_silently("options", list(self._labels) or [_NONE_FOUND])
         self.select(chosen or self._manager.current_name)
         self._show(f"{len(checkpoints)} found.")
