@@ -24,7 +24,7 @@ def algorithm(parts: int) -> dict:
 def test_more_mini_batches_than_data_warn(make_runner, networks, most, recwarn):
     make_runner(num_envs=8, algorithm=algorithm(most), **networks).learn(1)
     assert not [one for one in recwarn if "num_mini_batches" in str(one.message)]
-    with pytest.warns(UserWarning, match=rf"num_mini_batches.*1 to {most}.*got {most + 1}"):
+    with pytest.warns(UserWarning, match=rf"num_mini_batches.*at most {most}.*got {most + 1}"):
         runner = make_runner(num_envs=8, algorithm=algorithm(most + 1), **networks)
         runner.learn(1)
     assert runner.current_learning_iteration == 1

@@ -142,7 +142,7 @@ def test_without_terminations_no_episode_ends(run, monkeypatch):
     [
         (("--viewer", "none"), "--num-steps"),
         (("--viewer", "none", "--num-steps", "0"), "--num-steps: expected an integer >= 1, got 0"),
-        ((*HEADLESS, "--num-envs", "0"), "num_envs: expected an integer >= 1, got 0"),
+        ((*HEADLESS, "--num-envs", "0"), "--num-envs: expected an integer >= 1, got 0"),
         ((*HEADLESS, "--device", "gpu"), "'gpu'"),
     ],
 )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from unittest.mock import Mock
 
 import pytest
 from commands import SMALL, TASK
 
+from mjlab.rl.config import RslRlPpoAlgorithmCfg
 from mjlab.scripts.train import parse_train_flags
 from mjlab.scripts.train_config import report_moved_goal
 from mjlab.tasks import registry
@@ -108,14 +110,58 @@ def test_defaults_that_have_no_effect_are_silent(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("gamma", "nan"), ("learning-rate", "inf"), ("entropy-coef", "nan")]
+    ("flag", "value", "expected"),
+    [
+        ("--agent.algorithm.gamma", "nan", "a number in [0, 1]"),
+        ("--agent.algorithm.learning-rate", "inf", "a finite number > 0"),
+        ("--agent.algorithm.max-grad-norm", "0", "a number > 0"),
+        ("--agent.algorithm.clip_param", "-0.2", "a number > 0"),
+        ("--agent.actor.hidden-dims", "[0,64]", "an integer >= 1, or -1"),
+        ("--agent.actor.distribution-cfg.init-std", "0", "a finite number > 0"),
+        ("--agent.evaluation.solved-return", "nan", "a number"),
+        ("--agent.max-iterations", "-1", "an integer >= 0"),
+        ("--env.sim.mujoco.iterations", "-1", "an integer >= 0"),
+        ("--video-interval", "0", "an integer >= 1"),
+        ("--grace", "nan", "a number in [0, 9223372036]"),
+    ],
 )
-def test_settings_that_are_not_finite_are_refused(run, tmp_path, name, value):
-    flag = f"--agent.algorithm.{name}"
+def test_typed_numbers_out_of_range_raise(run, tmp_path, flag, value, expected):
     outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path / "logs"), flag, value)
     assert outcome.status == 1
-    assert f"{flag}: expected a finite number, got {value}" in outcome.message
+    assert f"{flag.replace('_', '-')}: expected {expected}, got" in outcome.message
     assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "status"),
+    [([], 0), (["--agent.algorithm.gamma", "0.9"], 0), (["--agent.algorithm.gamma=1.5"], 1)],
+)
+def test_numbers_of_a_task_out_of_range_warn(run, tmp_path, monkeypatch, flags, status):
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
+    cfg = registry.load_rl_cfg(TASK)
+    cfg.algorithm = _Undiscounted(num_mini_batches=1)
+    registry.register_mjlab_task("Test-Ranges", registry.load_env_cfg(TASK), rl_cfg=cfg)
+    small = (*SMALL, "--agent.max-iterations", "1", "--log-root", str(tmp_path))
+    outcome = run("train", "Test-Ranges", *small, *flags)
+    assert outcome.status == status
+    told = "agent.algorithm.gamma: expected a number in [0, 1], got 1.5"
+    assert outcome.err.count(told) == (flags == []) + status
+
+
+def test_zero_of_a_count_raises_also_in_a_task(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
+    cfg = registry.load_rl_cfg(TASK)
+    cfg.save_interval = 0
+    registry.register_mjlab_task("Test-Ranges", registry.load_env_cfg(TASK), rl_cfg=cfg)
+    outcome = run("train", "Test-Ranges", "--device", "cpu", "--log-root", str(tmp_path / "logs"))
+    assert outcome.status == 1
+    assert "agent.save_interval: expected an integer >= 1, got 0" in outcome.message
+    assert not (tmp_path / "logs").exists()
+
+
+@dataclasses.dataclass
+class _Undiscounted(RslRlPpoAlgorithmCfg):
+    gamma: float = 1.5
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])

@@ -95,7 +95,7 @@ def test_a_terrain_that_cannot_be_built_is_told_on_the_page_and_the_last_one_sta
     ("fields", "message"),
     [
         ({"terrain": "stair"}, "'stair'; did you mean .*'pyramid_stairs'"),
-        ({"num_levels": 0}, "num_levels: .* got 0"),
+        ({"num_levels": 0}, "--num-levels: .* got 0"),
         ({"size": 100.0}, "size: .* got 100.0"),
     ],
 )

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from mjlab.compat import accepts_older_fields
+from mjlab.utils.ranges import (
+    Count,
+    CountOrZero,
+    Fraction,
+    Limit,
+    Number,
+    Positive,
+    Range,
+    Weight,
+)
 
 TorchCompileMode = Literal["default", "max-autotune-no-cudagraphs"]
 """Modes of `torch.compile` supported by rsl_rl's algorithms."""
@@ -31,22 +41,22 @@ def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[
 class RslRlModelCfg:
     """Network config: actor or critic."""
 
-    hidden_dims: tuple[int, ...] = (128, 128, 128)
-    """Width of each hidden layer."""
+    hidden_dims: Annotated[tuple[int, ...], Range(1, also=-1)] = (128, 128, 128)
+    """Width of each hidden layer; -1: that of the input."""
     activation: str = "elu"
     """Activation function between layers (rsl_rl's name: `elu`, `relu`, `tanh`, ...)."""
     obs_normalization: bool = False
     """Normalize observations by their running mean and standard deviation."""
     cnn_cfg: dict[str, Any] | None = None
     """Image encoder settings, for models with an encoder."""
-    distribution_cfg: dict[str, Any] | None = None
+    distribution_cfg: Annotated[dict[str, Any] | None, Range(0.0, ends="()", key="init_std")] = None
     """Output distribution, e.g. `{"class_name": "GaussianDistribution", "init_std": 1.0,
     "std_type": "scalar"}`. None: deterministic output."""
     rnn_type: str | None = None
     """RNN type, `lstm` or `gru` (with `class_name="RNNModel"`)."""
-    rnn_hidden_dim: int = 256
+    rnn_hidden_dim: CountOrZero = 256
     """Size of the hidden state."""
-    rnn_num_layers: int = 1
+    rnn_num_layers: CountOrZero = 1
     """Number of recurrent layers."""
     class_name: str = "MLPModel"
     """rsl_rl class name, or `module:Class`."""
@@ -56,29 +66,29 @@ class RslRlModelCfg:
 class RslRlPpoAlgorithmCfg:
     """Proximal policy optimization."""
 
-    num_learning_epochs: int = 5
+    num_learning_epochs: Count = 5
     """Number of epochs per iteration."""
-    num_mini_batches: int = 4
+    num_mini_batches: Count = 4
     """Number of mini-batches per epoch."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """Learning rate; the initial value under the adaptive schedule."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """Learning rate schedule: `adaptive` keeps the KL divergence of updates near `desired_kl`."""
-    gamma: float = 0.99
+    gamma: Fraction = 0.99
     """Discount factor per environment step."""
-    lam: float = 0.95
+    lam: Fraction = 0.95
     """Parameter lambda of generalized advantage estimation (GAE)."""
-    entropy_coef: float = 0.005
+    entropy_coef: Weight = 0.005
     """Weight of the entropy bonus."""
-    desired_kl: float = 0.01
+    desired_kl: Limit = 0.01
     """Target KL divergence per update, for the adaptive schedule."""
-    max_grad_norm: float = 1.0
+    max_grad_norm: Limit = 1.0
     """Maximum gradient norm; larger gradients are rescaled."""
-    value_loss_coef: float = 1.0
+    value_loss_coef: Weight = 1.0
     """Weight of the value loss."""
     use_clipped_value_loss: bool = True
     """Clip the value loss, as the policy loss."""
-    clip_param: float = 0.2
+    clip_param: Limit = 0.2
     """Clipping range of the probability ratio in the policy loss."""
     normalize_advantage_per_mini_batch: bool = False
     """Normalize advantages per mini-batch instead of over all data."""
@@ -103,59 +113,59 @@ class RslRlSacAlgorithmCfg:
     The defaults are FastSAC's (Seo et al., arXiv 2512.01996), reduced for a few CPU cores.
     """
 
-    batch_size: int = 2048
+    batch_size: Count = 2048
     """Number of transitions per update, mirrored ones included."""
-    num_updates: int = 4
+    num_updates: Count = 4
     """Number of updates per step of all environments. Times `batch_size`, divided by the number of
     environments, this is the replay ratio: the number of times a transition is used."""
-    replay_steps: int = 500
+    replay_steps: Count = 500
     """Capacity of the replay buffer, in steps per environment."""
-    learning_starts: int = 10
+    learning_starts: CountOrZero = 10
     """Number of environment steps before the first update."""
-    gamma: float = 0.97
+    gamma: Fraction = 0.97
     """Discount factor per environment step."""
-    num_steps_return: int = 1
+    num_steps_return: Count = 1
     """Number n of rewards in n-step returns."""
-    value_range: tuple[float, float] | None = None
+    value_range: Annotated[tuple[float, float] | None, Range(ends="()")] = None
     """Range (low, high) of discounted returns that the critics represent. None: rewards are divided
     by the scale of the returns seen so far."""
-    num_atoms: int = 101
+    num_atoms: Annotated[int, Range(2)] = 101
     """Number of atoms of a critic's return distribution."""
-    tau: float = 0.05
+    tau: Annotated[float, Range(0.0, 1.0, "(]")] = 0.05
     """Polyak coefficient of the target critics per update."""
     pessimistic: bool = False
     """Use the minimum of both critics instead of their mean."""
-    policy_delay: int = 4
+    policy_delay: Count = 4
     """Number of critic updates per policy update."""
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: Positive = 3e-4
     """Learning rate of the policy."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Positive = 3e-4
     """Learning rate of the critics."""
-    weight_decay: float = 1e-3
+    weight_decay: Weight = 1e-3
     """Weight decay (AdamW)."""
-    init_alpha: float = 1e-3
+    init_alpha: Positive = 1e-3
     """Initial entropy coefficient alpha."""
-    alpha_learning_rate: float = 3e-4
+    alpha_learning_rate: Weight = 3e-4
     """Learning rate of log(alpha)."""
-    alpha_range: tuple[float, float] = (1e-5, 1.0)
+    alpha_range: Annotated[tuple[float, float], Range(0.0, ends="(]")] = (1e-5, 1.0)
     """Range (low, high) of alpha."""
-    target_std: float = 0.15
+    target_std: Positive = 0.15
     """Standard deviation per action, before tanh, that defines the target entropy."""
-    mean_penalty: float = 0.01
+    mean_penalty: Weight = 0.01
     """Weight of the squared mean of each action, before tanh, in the policy loss. Keeps actions with
     little effect from drifting to their bounds."""
     teacher: str | None = None
     """Observation group with the actions of a controller for the policy to imitate, (N, actions), e.g.
     those of `stepping_action`. Values outside (-1, 1) leave an action free."""
-    teacher_steps: int = 0
+    teacher_steps: CountOrZero = 0
     """Number of initial environment steps controlled by the teacher, with the policy's exploration."""
-    imitation: tuple[tuple[int, float], ...] = ((0, 0.0),)
+    imitation: Annotated[tuple[tuple[int, float], ...], Range(0.0, ends="[)")] = ((0, 0.0),)
     """Weight of the squared distance from the teacher's action in the policy loss: points
     (environment step, weight), interpolated linearly."""
-    policy_average: float = 1.0
+    policy_average: Annotated[float, Range(0.0, 1.0, "(]")] = 1.0
     """Averaging coefficient per environment step, from the learned weights to those of the acting
     policy; 1: no averaging. An averaged policy falls less often than the newest one."""
-    noise_hold: int = 1
+    noise_hold: Count = 1
     """Maximum number of steps an environment keeps its exploration noise; 1: resample every step."""
     symmetry_cfg: dict[str, Any] | None = None
     """Symmetry augmentation, as for PPO: `{"data_augmentation_func": "module:function"}`. Half of
@@ -174,14 +184,14 @@ class RslRlSacAlgorithmCfg:
 class RslRlDistillationAlgorithmCfg:
     """Imitation of a teacher on the states that the student visits (DAgger; arXiv 1011.0686)."""
 
-    num_learning_epochs: int = 1
+    num_learning_epochs: Count = 1
     """Number of epochs per iteration."""
-    gradient_length: int = 8
+    gradient_length: Count = 8
     """Number of environment steps per update, and of backpropagation through time of a recurrent
     student. Should divide epochs times steps of an iteration: remaining steps are not used."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """Learning rate."""
-    max_grad_norm: float | None = 1.0
+    max_grad_norm: Limit | None = 1.0
     """Maximum gradient norm; larger gradients are rescaled. None: unlimited."""
     loss_type: Literal["mse", "huber"] = "mse"
     """Loss between the actions of student and teacher."""
@@ -201,15 +211,15 @@ class EvaluationCfg:
     environment step: with rewards in [0, 1], an episode of 1000 steps has at most 1000.
     """
 
-    solved_return: float | None = None
+    solved_return: Number | None = None
     """Mean evaluation return required for a solved task. None without other conditions: evaluations
     with `trigger_return` only."""
-    solved_below: dict[str, float] = field(default_factory=dict)
+    solved_below: Annotated[dict[str, float], Range()] = field(default_factory=dict)
     """Upper bounds of metrics by name; all must hold for the task to be solved, and `solved_return`
     may then be None. Names: those of `metrics`, `failure_rate`, `success_rate`, `mean_length`. Rates
     are judged by the center of their 95 % Wilson interval, so that few episodes prove little: 8
     failures in 200 count as 4.9 %, 0 in 4 as 24 %."""
-    solved_above: dict[str, float] = field(default_factory=dict)
+    solved_above: Annotated[dict[str, float], Range()] = field(default_factory=dict)
     """Lower bounds of metrics by name, as `solved_below`."""
     metrics: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
     """Metrics besides the return: `func(env) -> (num_envs,)` by name, averaged over the steps of an
@@ -219,19 +229,19 @@ class EvaluationCfg:
     stop_when_solved: bool = True
     """Stop training once the task is solved and a second evaluation, on unused episodes, confirms
     it."""
-    num_episodes: int = 256
+    num_episodes: Count = 256
     """Number of episodes of an evaluation and of its confirmation; one per environment, with the
     deterministic policy."""
-    trigger_fraction: float = 0.8
+    trigger_fraction: Weight = 0.8
     """Fraction of `solved_return` that the mean reward of the training data, times the episode
     length, must reach before an evaluation. Saves time; below 1, because training explores."""
-    trigger_return: float | None = None
+    trigger_return: Number | None = None
     """Return of the training data that triggers an evaluation, instead of `trigger_fraction`."""
-    min_interval: int = 3
+    min_interval: CountOrZero = 3
     """Minimum number of iterations between evaluations."""
-    first_iteration: int = 0
+    first_iteration: CountOrZero = 0
     """Minimum number of iterations before the first evaluation."""
-    success_return: float | None = None
+    success_return: Number | None = None
     """Minimum return of a successful episode. None: `solved_return`."""
     success_func: Callable[[Any], Any] | None = None
     """Success function, instead of a return: `func(env) -> (num_envs,) bool`, read one step before
@@ -250,18 +260,18 @@ class EvaluationCfg:
 class RslRlBaseRunnerCfg:
     """Training run config."""
 
-    seed: int = 42
+    seed: Annotated[int, Range(-1, 2**32 - 1)] = 42
     """Seed of the run and its environments; -1 draws a seed, printed and recorded. Other processes
     of the run derive their seeds from it."""
-    num_steps_per_env: int = 24
+    num_steps_per_env: Count = 24
     """Number of steps per environment and iteration."""
-    max_iterations: int = 300
+    max_iterations: CountOrZero = 300
     """Total number of iterations; those before a resume count."""
     obs_groups: dict[str, tuple[str, ...]] = field(
         default_factory=lambda: {"actor": ("actor",), "critic": ("critic",)}
     )
     """Observation groups of each model, concatenated in this order."""
-    save_interval: int = 50
+    save_interval: Count = 50
     """Number of iterations between checkpoints."""
     experiment_name: str = "exp1"
     """Folder of the experiment, under the log root."""
@@ -280,7 +290,7 @@ class RslRlBaseRunnerCfg:
     """Run folder to resume from: regular expression; the newest match is used."""
     load_checkpoint: str = "model_.*.pt"
     """Checkpoint to resume from: regular expression; the newest match is used."""
-    clip_actions: float | None = None
+    clip_actions: Limit | None = None
     """Bound c: actions are clipped to [-c, c] before the environment. SAC's actions are in (-1, 1);
     the scale of the action term sets their range."""
     upload_model: bool = True

@@ -180,7 +180,7 @@ def check_sizes(env: Any, cfg: Mapping[str, Any], device: str) -> None:
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
-    """Warn if PPO's mini-batches are empty: the loss is NaN, or no update is made."""
+    """Warn if PPO's mini-batches outnumber samples: the loss is NaN, or no update is made."""
     algorithm = cfg["algorithm"]
     # Algorithms of other packages may divide their data differently.
     if resolve_callable(algorithm["class_name"]) is not PPO:
@@ -191,11 +191,11 @@ def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
     steps = cfg["num_steps_per_env"]
     most = num_envs if is_recurrent else num_envs * steps
     parts = algorithm.get("num_mini_batches", 1)
-    if not 1 <= parts <= most:
+    if parts > most:
         of = counted(num_envs, "environment") + ("" if is_recurrent else f" times {steps} steps")
         why = ", which recurrent networks learn from as a whole" if is_recurrent else ""
         warnings.warn(
-            f"agent.algorithm num_mini_batches: expected 1 to {most} ({of}{why}), got {parts}; use "
+            f"agent.algorithm num_mini_batches: expected at most {most} ({of}{why}), got {parts}; use "
             "fewer mini-batches, or more environments.",
             UserWarning,
             stacklevel=3,

@@ -36,8 +36,7 @@ class RslRlVecEnvWrapper(VecEnv):
         """
         if clip_actions is not None and not clip_actions > 0.0:
             warnings.warn(
-                f"clip_actions: expected a number > 0, got {clip_actions}; all actions are the same. "
-                "None disables clipping.",
+                f"agent.clip_actions: expected a number > 0, got {clip_actions}.",
                 UserWarning,
                 stacklevel=2,
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import mujoco
 from mjviser import ViserMujocoScene
@@ -23,8 +23,9 @@ from mjlab.tasks.tracking.motion_recording import (
     recording_of,
     resampled,
 )
-from mjlab.utils.errors import UserError, check_positive
+from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
+from mjlab.utils.ranges import Positive, Range, check_ranges
 from mjlab.utils.wandb import asking_wandb, check_wandb_login
 from mjlab.viewer.page_server import check_address, page_url, serve_page
 
@@ -52,11 +53,11 @@ class CsvToNpzConfig:
     """Path of the motion. None: `output_name` in the working folder."""
     output_name: str | None = None
     """Name of the motion and of the uploaded artifact. None: name of the input."""
-    input_fps: float = 30.0
+    input_fps: Positive = 30.0
     """Frame rate of a .csv (Hz); an .npz contains its frame rate."""
-    output_fps: float = 50.0
+    output_fps: Positive = 50.0
     """Frame rate of the motion (Hz): the control rate of the task."""
-    line_range: tuple[int, int] | None = None
+    line_range: Annotated[tuple[int, int] | None, Range(1)] = None
     """First and last line (or frame), counted from 1, inclusive. None: all."""
     robot: str = "g1"
     """Robot: g1, go1, or `module:function` that returns an EntityCfg."""
@@ -88,8 +89,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     """
     if not cfg.input_file:
         raise UserError("--input-file: expected a recording (.csv or .npz), got none.")
-    for name in ("input_fps", "output_fps"):
-        check_positive(f"--{name.replace('_', '-')}", getattr(cfg, name))
+    check_ranges(cfg, ())
     if cfg.upload:
         check_wandb_login("--upload")
     if cfg.view:

@@ -28,8 +28,8 @@ from mjlab.scripts.policy import (
     parse_policy_flags,
     report_policy,
 )
-from mjlab.utils.errors import check_count
 from mjlab.utils.logging import print_notice
+from mjlab.utils.ranges import Count, Seed, check_ranges
 from mjlab.utils.string import counted
 
 _SECONDS_BETWEEN_DRAWINGS = 0.25
@@ -41,15 +41,15 @@ _SECONDS_BETWEEN_LINES = 10.0
 class EvaluateConfig(PolicyFlags):
     """Flags of `evaluate`."""
 
-    num_episodes: int = 256
+    num_episodes: Count = 256
     """Number of episodes; in rounds if --num-envs is lower."""
-    num_envs: int | None = None
+    num_envs: Count | None = None
     """Number of environments: episodes at once; short for --env.scene.num-envs. None: one environment
     per episode."""
-    max_steps: int | None = None
+    max_steps: Count | None = None
     """Maximum episode length in steps; longer episodes are truncated and not a success. None: episode
     length of evaluations."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the evaluation."""
     json: bool = False
     """Print only JSON."""
@@ -72,9 +72,6 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     """
     from mjlab.rl.evaluation import evaluate_policy, required_return, success_definition
 
-    check_count("--num-episodes", cfg.num_episodes)
-    if cfg.num_envs is not None:
-        check_count("--num-envs", cfg.num_envs)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
@@ -84,6 +81,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     num_envs = cfg.num_envs or (None if is_chosen else cfg.num_episodes)
     agent = agent_cfg_of(task, checkpoint, cfg.profile)
     solved = agent.evaluation
+    check_ranges(solved, (), "agent.evaluation")
     env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, agent=agent)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)

@@ -32,6 +32,7 @@ from mjlab.tasks.registry import (
     load_rl_cfg,
 )
 from mjlab.utils.logging import print_notice
+from mjlab.utils.ranges import check_ranges
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -51,7 +52,16 @@ def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -
 
     `--env.rewards.<term> None` removes the term (same for all other kinds of terms). `None` also
     removes a nested config if the field may be None, such as the noise of a term.
+
+    Raises:
+        ValueError: a typed number is out of its range.
     """
+    config = _parsed(config_type, default, flags, prog)
+    check_ranges(config, typed_names(flags))
+    return config
+
+
+def _parsed(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
     topic = requested_topic(flags)
     if topic is not None:
         print_help(default, topic, prog)
@@ -92,6 +102,12 @@ def is_given(flag: str, flags: list[str]) -> bool:
     return any(word.partition("=")[0].replace("_", "-") == flag for word in flags)
 
 
+def typed_names(flags: list[str]) -> set[str]:
+    """Return the names of the settings in the command line `flags`, such as `agent.seed`."""
+    names = (word.partition("=")[0].replace("-", "_") for word in flags)
+    return {name.removeprefix("__") for name in names if name.startswith("__")}
+
+
 # Profile and learner.
 
 
@@ -117,14 +133,14 @@ def parse_for_run(
     requested = requested_choices(flags)
     default = make_default(run=None, **requested)
     if requested_topic(flags) is not None:
-        return parse_flags(type(default), default, flags, prog)
+        return _parsed(type(default), default, flags, prog)
     # The learner of the selected run may have flags that the task's learner lacks.
     cfg, unknown = parse_known_flags(type(default), default, flags, prog)
     run = select(cfg)
     if run is None and not unknown:
         return cfg
     default = make_default(run=run, **requested)
-    return parse_flags(type(default), default, flags, prog)
+    return _parsed(type(default), default, flags, prog)
 
 
 def requested_choices(flags: list[str]) -> dict[str, str | None]:

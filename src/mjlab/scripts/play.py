@@ -23,8 +23,9 @@ from mjlab.scripts.policy import (
     run_of,
 )
 from mjlab.scripts.record import VideoCfg, record_policy
-from mjlab.utils.errors import UserError, check_count
+from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
+from mjlab.utils.ranges import Count, CountOrZero
 from mjlab.utils.torch import threads_for_policy
 from mjlab.viewer.base import run_headless
 from mjlab.viewer.page_server import check_address, open_browser
@@ -36,24 +37,24 @@ __getattr__ = older_names(__name__)
 class PlayConfig(PolicyFlags):
     """Flags of `play`."""
 
-    num_envs: int | None = None
+    num_envs: Count | None = None
     """Number of environments. None: number of the task."""
     video: bool = False
     """Record a clip instead of opening a viewer."""
-    video_length: int = 200
+    video_length: CountOrZero = 200
     """Frames of the clip."""
     video_format: Literal["mp4", "gif"] = "mp4"
     """Format of the clip."""
-    video_height: int | None = None
+    video_height: Count | None = None
     """Height of the clip, in pixels."""
-    video_width: int | None = None
+    video_width: Count | None = None
     """Width of the clip, in pixels."""
     camera: int | str | None = None
     """Model camera to record from, name or index. None: viewer camera of the task."""
     viewer: Literal["auto", "native", "viser", "none"] = "auto"
     """Viewer: `viser` (page in the browser; also `auto`), `native` (MuJoCo's window) or `none`
     (headless)."""
-    num_steps: int | None = None
+    num_steps: Count | None = None
     """Number of environment steps. None: play until stopped."""
     host: str = "127.0.0.1"
     """Address of the page. 0.0.0.0: all interfaces."""
@@ -78,8 +79,6 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         UserError, ValueError, OSError, CheckpointError, EngineUnavailableError,
         RenderingUnavailableError: the request cannot be fulfilled.
     """
-    if cfg.num_steps is not None:
-        check_count("--num-steps", cfg.num_steps)
     if cfg.viewer == "none" and cfg.num_steps is None and not cfg.video:
         raise UserError(
             "--viewer none: expected --num-steps, because nothing else would end playing, got none."

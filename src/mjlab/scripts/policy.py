@@ -20,12 +20,14 @@ from mjlab.scripts.flags import (
     is_given,
     parse_for_run,
     prepare_env_cfg,
+    typed_names,
     with_task_options,
 )
 from mjlab.tasks.registry import load_rl_cfg, load_runner_cls
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_list, print_notice
 from mjlab.utils.os import get_wandb_checkpoint_path
+from mjlab.utils.ranges import check_ranges
 
 
 @dataclass
@@ -74,6 +76,7 @@ def parse_policy_flags(
 
     Raises:
         UnknownProfileError: unknown profile.
+        ValueError: a typed number is out of its range.
     """
 
     def make_default(run: Run | None, **choices: Any) -> F:
@@ -89,6 +92,7 @@ def parse_policy_flags(
     cfg = parse_for_run(
         make_default, lambda cfg: _run_of_policy(task, cfg), flags, f"{command} {task}"
     )
+    check_ranges(cfg, typed_names(flags))
     # --wandb-run-path has a use with any agent: a task may read other files from the run.
     for flag in ("--checkpoint-file", "--wandb-checkpoint-name"):
         if cfg.agent != "trained" and is_given(flag, flags):

@@ -24,7 +24,7 @@ from mjlab.scripts.policy import (
     parse_policy_flags,
     report_policy,
 )
-from mjlab.utils.errors import check_count
+from mjlab.utils.ranges import Count, CountOrZero, Seed
 from mjlab.utils.string import counted
 from mjlab.utils.torch import threads_for_policy
 
@@ -71,13 +71,13 @@ class ProfileConfig(PolicyFlags):
 
     agent: Literal["zero", "random", "trained"] = "random"
     """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
-    num_envs: int = 1024
+    num_envs: Count = 1024
     """Number of environments."""
-    steps: int = 100
+    steps: Count = 100
     """Environment steps to time."""
-    warm_up: int = 20
+    warm_up: CountOrZero = 20
     """Environment steps before timing."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of states and actions."""
     json: bool = False
     """Print only JSON."""
@@ -96,8 +96,6 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
     Environments use the training config and start at random episode times, so that resets are as
     frequent as in training.
     """
-    for name, minimum in (("num_envs", 1), ("steps", 1), ("warm_up", 0)):
-        check_count(f"--{name.replace('_', '-')}", getattr(cfg, name), minimum)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="train")

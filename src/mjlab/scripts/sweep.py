@@ -22,7 +22,7 @@ import shlex
 import subprocess
 from pathlib import Path
 
-from mjlab.scripts.flags import is_given
+from mjlab.scripts.flags import is_given, typed_names
 from mjlab.scripts.help import lookup
 from mjlab.scripts.sweep_objective import choose_objective
 from mjlab.scripts.sweep_settings import (
@@ -178,7 +178,7 @@ def check_settings(sweep: Sweep) -> list[TrainConfig]:
         try:
             cfg = train_config(sweep, setting)
             check_typed_flags(cfg, flags)
-            check_flags(cfg)
+            check_flags(cfg, typed_names(flags))
         except (UserError, ValueError) as error:
             raise BadCallError(f"{error} (In the setting {sweep.describe(setting)}.)") from error
         cfgs.append(cfg)

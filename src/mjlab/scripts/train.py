@@ -45,6 +45,7 @@ from mjlab.scripts.flags import (
     prepare_env_cfg,
     report_untuned_learner,
     suggest_profile,
+    typed_names,
     with_task_options,
 )
 from mjlab.scripts.policy import has_foreign_runner, prepare_teacher
@@ -67,6 +68,7 @@ from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.logging import beside_results, print_list, print_notice
 from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
+from mjlab.utils.ranges import check_ranges
 from mjlab.utils.signals import Interrupted
 
 if TYPE_CHECKING:
@@ -85,7 +87,7 @@ def command(argv: list[str], prog: str) -> None:
         if (stopped := train_until_stopped(task, cfg, flags)[1]) is not None:
             raise Interrupted(stopped)
         return
-    check_flags(cfg)
+    check_flags(cfg, typed_names(flags))
     # CUDA_VISIBLE_DEVICES restricts the workers to the selected GPUs.
     workers = [sys.executable, "-m", "mjlab.scripts.train", task, *flags, "--gpu-ids", "all"]
     launch_workers(workers, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
@@ -155,14 +157,16 @@ def train_until_stopped(
         device = training_device(cfg, rank)
     with joined_processes(device), output_of(rank) as output:
         with fail_together():
-            check_flags(cfg)
-        return _train(task, cfg, flags, device, rank, output)
+            typed = _typed(task, cfg, flags)
+            check_flags(cfg, typed if flags is None else typed_names(flags))
+        return _train(task, cfg, flags, typed, device, rank, output)
 
 
 def _train(
     task: str,
     cfg: TrainConfig,
     flags: list[str] | None,
+    typed: Settings,
     device: str,
     rank: ProcessRank,
     output: ProcessOutput | None,
@@ -179,12 +183,12 @@ def _train(
     if run is not None and run.state == "running" and rank.is_first:
         print_notice(f"{run.folder} is still running; its last checkpoint is resumed.")
     like = None if cfg.like is None else run_to_continue(task, cfg)
-    typed = _typed(task, cfg, flags)
     source = run or like
     # A command line was parsed with the settings of the run, unless the run was unknown.
     is_parsed = flags is not None and cfg.wandb_run_path is None
     if source is not None and not is_parsed and not cfg.as_registered:
         with_settings_of(source, cfg, typed)
+        check_ranges(cfg, ())
     if run is not None and run.seed is not None and "agent.seed" not in typed:
         cfg.agent.seed = run.seed
     if cfg.agent.seed == -1:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import threading
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import EvaluationCfg, RslRlBaseRunnerCfg
@@ -16,27 +17,16 @@ from mjlab.rl.learners import Learner, learner_of
 from mjlab.runs.settings import differences
 from mjlab.scripts.flags import is_given
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
-from mjlab.utils.errors import BadCallError, UserError, check_count, check_in_range
+from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.logging import print_notice
 from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, process_rank
 from mjlab.utils.random import process_seed
+from mjlab.utils.ranges import Count, CountOrZero, Range, check_ranges
 from mjlab.utils.wandb import check_wandb_login
 from mjlab.viewer.page_server import check_address
 
-_AGENT_COUNTS = ("num_steps_per_env", "save_interval")
-_ALGORITHM_COUNTS = (
-    "num_learning_epochs",
-    "num_mini_batches",
-    "batch_size",
-    "num_updates",
-    "replay_steps",
-    "num_steps_return",
-    "policy_delay",
-    "noise_hold",
-    "gradient_length",
-)
 # Fields of an environment config that enter the return of an episode: terms, and number and scale
 # of the rewards. Curricula may change the weights of rewards.
 _OF_RETURNS = (
@@ -60,7 +50,7 @@ class TrainConfig:
     """Learner: `ppo`, `sac` (soft actor-critic with a replay buffer) or `distillation` (a student of
     --agent.teacher-checkpoint). Determines the flags under --agent. None: learner of the resumed run, or
     of the profile or task."""
-    num_envs: int | None = None
+    num_envs: Count | None = None
     """Number of environments per process; short for --env.scene.num-envs."""
     device: str | None = None
     """Torch device: cpu, cuda:0, ... None: a GPU if available; one GPU per process in multi-GPU runs."""
@@ -68,9 +58,9 @@ class TrainConfig:
     """Physics engine; short for --env.sim.engine."""
     video: bool = False
     """Record clips while training."""
-    video_length: int = 200
+    video_length: CountOrZero = 200
     """Number of frames per clip."""
-    video_interval: int = 2000
+    video_interval: Count = 2000
     """Number of environment steps between the starts of clips."""
     result_video: bool = False
     """Record a clip of the trained policy at the end."""
@@ -89,7 +79,9 @@ class TrainConfig:
     """Weights & Biases run to resume, as entity/project/run. Requires --agent.resume True."""
     wandb_checkpoint_name: str | None = None
     """Checkpoint of the Weights & Biases run. None: newest."""
-    grace: float | None = field(default=None, kw_only=True)
+    grace: Annotated[float, Range(0.0, threading.TIMEOUT_MAX)] | None = field(
+        default=None, kw_only=True
+    )
     """Seconds after Ctrl-C or SIGTERM in which the running iteration may finish; after them, or at a second
     signal, training stops with the one before. None: as long as it takes. For job queues that kill what
     still runs some time after a signal."""
@@ -140,9 +132,13 @@ class TrainConfig:
         self.env.seed = self.agent.seed
 
 
-def check_flags(cfg: TrainConfig) -> None:
-    """Raise UserError or ValueError for flags that are invalid before anything is built."""
-    _check_numbers(cfg)
+def check_flags(cfg: TrainConfig, typed: Collection[str]) -> None:
+    """Raise UserError or ValueError for flags that are invalid before anything is built.
+
+    `typed` are the paths of the settings that the user typed, such as `agent.algorithm.gamma`.
+    """
+    check_ranges(cfg, typed)
+    _check_relations(cfg)
     run_name = cfg.agent.run_name
     if "/" in run_name or "\\" in run_name:
         print_notice(
@@ -218,36 +214,19 @@ def return_differences(env: ManagerBasedRlEnvCfg, other: ManagerBasedRlEnvCfg) -
     return [name for name in found if name.startswith(_OF_RETURNS)]
 
 
-def _check_numbers(cfg: TrainConfig) -> None:
-    """Check numbers that would otherwise fail during training. The environment checks its config."""
+def _check_relations(cfg: TrainConfig) -> None:
+    """Check numbers of mjlab's learners against each other: the policy would never be updated."""
     agent: Any = cfg.agent
     algorithm = vars(agent.algorithm)
-    # Each algorithm has a subset of the counts.
-    counts = {f"--agent.{name}": getattr(agent, name) for name in _AGENT_COUNTS}
-    counts |= {f"--agent.algorithm.{n}": algorithm[n] for n in _ALGORITHM_COUNTS if n in algorithm}
-    if cfg.video:
-        counts["--video-interval"] = cfg.video_interval
-    check_count("--agent.max-iterations", agent.max_iterations, minimum=0)
-    if cfg.grace is not None:
-        check_in_range("--grace", cfg.grace, 0.0, threading.TIMEOUT_MAX)
-    for flag, value in counts.items():
-        check_count(flag.replace("_", "-"), value)
     steps = agent.num_steps_per_env * algorithm.get("num_learning_epochs", 1)
-    if (length := algorithm.get("gradient_length", 1)) > steps:
+    if (length := algorithm.get("gradient_length", -math.inf)) > steps:
         raise UserError(
             f"--agent.algorithm.gradient-length: expected at most {steps}, the steps of an iteration "
             f"times its epochs, got {length}; otherwise the policy is never updated."
         )
     total = agent.num_steps_per_env * agent.max_iterations
-    if (first := algorithm.get("learning_starts", 0)) > total:
+    if (first := algorithm.get("learning_starts", -math.inf)) > total:
         raise UserError(
             f"--agent.algorithm.learning-starts: expected at most {total}, the environment steps of "
             f"the run, got {first}; otherwise learning never starts."
         )
-    # Infinite bounds are valid: e.g. no gradient clipping.
-    for name, value in algorithm.items():
-        if isinstance(value, float) and (
-            math.isnan(value) or (name.endswith("learning_rate") and math.isinf(value))
-        ):
-            flag = f"--agent.algorithm.{name.replace('_', '-')}"
-            raise UserError(f"{flag}: expected a finite number, got {value}.")

@@ -29,6 +29,7 @@ from mjlab.scripts.reference import (
 )
 from mjlab.scripts.resume import resume_flags
 from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.ranges import Seed
 from mjlab.utils.signals import Interrupted
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ _ROWS = 5
 class VerifyConfig:
     """Flags of `verify`."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Training seed. References use seeds >= 1, so 0 is a new seed."""
     device: str | None = None
     """Torch device: cpu, cuda:0, ... None: a GPU if available."""

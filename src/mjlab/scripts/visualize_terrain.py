@@ -19,7 +19,8 @@ from mjlab.scene import Scene, SceneCfg
 from mjlab.scripts.cli import run_alias
 from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
-from mjlab.utils.errors import check_count, check_exists, check_in_range
+from mjlab.utils.errors import check_exists
+from mjlab.utils.ranges import Range, Seed, check_ranges
 from mjlab.utils.string import escaped
 from mjlab.viewer.camera import CameraView
 from mjlab.viewer.page_server import check_address, page_url, serve_page
@@ -40,11 +41,11 @@ class VisualizeTerrainConfig:
 
     terrain: Annotated[str, tyro.conf.Positional] = "pyramid_stairs"
     """A preset of `mjlab.terrains.config`, or `all`."""
-    num_levels: int = 5
+    num_levels: Annotated[int, Range(1, 10)] = 5
     """Number of difficulty levels in [0, 1]."""
-    size: float = 8.0
+    size: Annotated[float, Range(4.0, 16.0)] = 8.0
     """Extent of each terrain along x and y (m)."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the terrain."""
     robot: RobotName = "unitree_go1"
     """Robot placed at each origin, for scale."""
@@ -68,9 +69,7 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
     """
     check_address(cfg.host, cfg.port, "--")
     check_exists("terrain preset", cfg.terrain, (ALL, *ALL_TERRAIN_PRESETS))
-    check_in_range("num_levels", cfg.num_levels, 1, 10)
-    check_in_range("size", cfg.size, 4.0, 16.0)
-    check_count("seed", cfg.seed, 0)
+    check_ranges(cfg, ())
     server = serve_page(cfg.host, cfg.port)
     page = TerrainPage(server, cfg.terrain, cfg.num_levels, cfg.size, cfg.seed, cfg.robot)
     print(f"Serving the terrain on {page_url(server)} (Ctrl-C stops).", flush=True)

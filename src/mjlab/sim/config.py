@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mjlab.compat import ALWAYS_ENABLED_FLAGS, accepts_older_fields
 from mjlab.utils.nan_guard import NanGuardCfg
+from mjlab.utils.ranges import CountOrZero, Positive, Range, Weight
 
 if TYPE_CHECKING:
     import mujoco
@@ -21,7 +22,7 @@ class MujocoCfg:
     """Physics timestep (s)."""
     integrator: Literal["euler", "implicitfast"] = "implicitfast"
     """Numerical integrator."""
-    impratio: float = 1.0
+    impratio: Positive = 1.0
     """Ratio of frictional to normal constraint impedance, for elliptic cones."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
     """Type of contact friction cone."""
@@ -29,17 +30,17 @@ class MujocoCfg:
     """Type of constraint Jacobian."""
     solver: Literal["newton", "cg", "pgs"] = "newton"
     """Constraint solver."""
-    iterations: int = 100
+    iterations: CountOrZero = 100
     """Maximum number of solver iterations."""
-    tolerance: float = 1e-8
+    tolerance: Weight = 1e-8
     """Solver tolerance for early termination."""
-    ls_iterations: int = 50
+    ls_iterations: CountOrZero = 50
     """Maximum number of line-search iterations."""
-    ls_tolerance: float = 0.01
+    ls_tolerance: Weight = 0.01
     """Line-search tolerance."""
-    ccd_iterations: int = 50
+    ccd_iterations: CountOrZero = 50
     """Maximum number of convex-collision iterations."""
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    gravity: Annotated[tuple[float, float, float], Range(ends="()")] = (0.0, 0.0, -9.81)
     """Gravitational acceleration in the world frame (m/s^2)."""
     disableflags: tuple[str, ...] = ()
     """MuJoCo features to disable, by lower-case flag name, such as `contact`. Flags that the XML of
