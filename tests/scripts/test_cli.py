@@ -14,6 +14,7 @@ import sys
 from importlib.metadata import entry_points
 
 import pytest
+from commands import SMALL
 
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.scripts import cli
@@ -121,6 +122,15 @@ def test_an_error_of_any_kind_that_this_package_raises_on_purpose_is_a_message(c
     assert status == 1
     assert "\nerror: Unknown entity or sensor 'robot'." in err
     assert "no_such_field" in ended(wrong_arguments, capsys)[2]
+
+
+def test_text_that_cannot_be_encoded_is_named(failing, run, tmp_path):
+    path = f"{tmp_path}/log\udcff"
+    status, _, err = failing(UnicodeEncodeError("utf-8", path, 0, 1, "surrogates not allowed"))
+    assert (status, "Traceback" in err) == (1, False)
+    for text in (err, run("train", TASK, *SMALL, "--log-root", path).message):
+        assert ascii(path)[1:-1] in text
+        assert "LC_ALL=C.UTF-8" in text
 
 
 def test_an_error_without_a_text_is_called_by_its_name(failing):

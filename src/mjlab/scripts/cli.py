@@ -538,6 +538,12 @@ def _report(error: Exception) -> None:
         # The original message names the failed call, not the lack of memory.
         text = f"Out of memory or threads ({text}). Use fewer environments, or raise the limits (ulimit)."
         is_expected = True
+    elif isinstance(error, UnicodeEncodeError):
+        # The original message does not name the text, nearly always a path.
+        text = (
+            f"Expected text that can be written as {error.encoding}, got {shorten(ascii(error.object))}; rename "
+            "the file or folder, or set LC_ALL=C.UTF-8."
+        )
     elif not is_expected and text != type(error).__name__:
         text = f"{type(error).__name__}: {text}"
     rank = os.environ.get("RANK", "0")
@@ -557,8 +563,13 @@ def _report(error: Exception) -> None:
         with (
             contextlib.suppress(OSError),
             tempfile.NamedTemporaryFile(
-                "w", encoding="utf-8", prefix="mjlab_error_", suffix=".txt", delete=False
-            ) as file,
+                "w",
+                encoding="utf-8",
+                errors="backslashreplace",
+                prefix="mjlab_error_",
+                suffix=".txt",
+                delete=False,
+            ) as file,  # fmt: skip
         ):
             traceback.print_exc(file=file)
             hint = f"The traceback is in {file.name}."
