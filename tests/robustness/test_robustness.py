@@ -25,7 +25,7 @@ pytestmark = pytest.mark.robustness
 
 FAMILIES = (
     "kills", "evaluations", "resumes", "damage", "limits", "command_lines", "config_files",
-    "physics", "page", "origins", "names", "own_code", "sweeps",
+    "physics", "page", "origins", "names", "own_code", "sweeps", "sizes",
 )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from mjlab.managers.term_checks import check_real
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.errors import WrongTypeError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
+from mjlab.utils.memory import check_memory
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
@@ -466,6 +467,10 @@ class ObservationTerm:
             self._delay = self._build_delay()
             self._history = None
             if cfg.history_length > 0:
+                check_memory(
+                    "history_length", cfg.history_length, 4 * self._raw_shape.numel(), env.device,
+                    "a shorter history",
+                )  # fmt: skip
                 self._history = CircularBuffer(cfg.history_length, env.num_envs, env.device)
         self.shape: tuple[int, ...] = tuple(self._raw_shape[1:])
         if self._history is not None:

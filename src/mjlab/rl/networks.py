@@ -174,9 +174,7 @@ def check_sizes(env: Any, cfg: Mapping[str, Any], device: str) -> None:
         part for parts in stored if isinstance(parts, (dict, TensorDict)) for part in parts.values()
     ]
     size = sum(value.nbytes for value in stored if torch.is_tensor(value))
-    check_memory(
-        name, steps, size // rows, device, f"fewer steps, or fewer than {env.num_envs} environments"
-    )
+    check_memory(name, steps, size // rows, device, "fewer steps or environments")
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:

@@ -77,8 +77,7 @@ class SAC:
         self._target = copy.deepcopy(self.critic).requires_grad_(False)
         self._log_alpha = nn.Parameter(torch.tensor(math.log(cfg.init_alpha), device=device))
         # The meta device, on which sizes are measured, has neither a fused optimizer nor generators.
-        kind = torch.device(device).type
-        is_real = kind != "meta"
+        is_real = torch.device(device).type != "meta"
         # The fused optimizer takes a quarter of the time. The decay of second moments is faster than
         # usual, because targets move (arXiv 2512.01996).
         self.optimizer = torch.optim.AdamW(
@@ -472,6 +471,7 @@ class _HeldNoise:
     """
 
     def __init__(self, num_envs: int, num_actions: int, longest: int, device: str) -> None:
+        check_memory("SAC noise_hold", longest, 8, device, "a shorter one")
         self._noise = torch.zeros(num_envs, num_actions, device=device)
         self._steps_left = torch.zeros(num_envs, dtype=torch.int64, device=device)
         self._chances = 1.0 / torch.arange(1, longest + 1, device=device).square()

@@ -34,6 +34,7 @@ _OUT_OF_MEMORY = (
     "can't allocate memory",
     "Could not allocate memory",
     "out of memory. Tried to allocate",
+    "Failed to alloc",
 )
 
 

@@ -188,7 +188,8 @@ class CameraSensor(Sensor[CameraSensorData]):
                 f"prefix); {suggest(parent, names)}"
             )
         camera = body.add_camera(name=cfg.name, pos=cfg.pos, quat=cfg.quat)
-        camera.resolution = [cfg.width, cfg.height]
+        # Integers of 32 bits. Larger images exceed the memory, an error of `initialize`.
+        camera.resolution = [min(side, 2**31 - 1) for side in (cfg.width, cfg.height)]
         return camera
 
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:

@@ -499,10 +499,11 @@ class _SubstepHistory:
 
     def __init__(self, length: int, num_envs: int, width: int, device: str) -> None:
         # `_head` is the newest block; older ones follow it cyclically.
+        # Values, and two views a slot (1 kB).
         check_memory(
             "ContactSensorCfg history_length",
             length,
-            4 * num_envs * width,
+            4 * num_envs * width + 1000,
             device,
             "a shorter history",
         )

@@ -78,7 +78,11 @@ def _limits(device: str) -> Iterator[tuple[int, int]]:
     Those of the CPU are the machine and the control groups, both with swap space and shared equally
     by the processes of the run on this machine, and the address space (`ulimit -v`).
     """
-    if torch.device(device).type == "cuda":
+    kind = torch.device(device).type
+    # Tensors on the meta device have no values.
+    if kind == "meta":
+        return
+    if kind == "cuda":
         # A device that torch cannot use raises later, where it is used.
         with suppress(RuntimeError, AssertionError):
             free, total = torch.cuda.mem_get_info(device)

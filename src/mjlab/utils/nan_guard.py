@@ -16,7 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjlab.utils.errors import check_in_range, check_one_of
+from mjlab.utils.errors import check_count, check_in_range, check_one_of
 from mjlab.utils.memory import check_memory
 from mjlab.utils.os import check_archive, own_folder, replacing, write_atomically
 
@@ -112,6 +112,7 @@ class NanGuard:
         self._state_fields = [n for n in (*_PHYSICS_STATE, *mocap) if sizes.get(n, 1)]
         self._input_fields = [n for n in _INPUTS if n != "ctrl" or mj_model.nu]
         if cfg.enabled:
+            check_count("NanGuardCfg buffer_size", cfg.buffer_size, 0)
             numbers = mj_model.nq + mj_model.nv + mj_model.nu + 6 * mj_model.nbody
             cure = "a smaller buffer_size, or fewer environments"
             check_memory(

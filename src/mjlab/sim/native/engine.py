@@ -128,6 +128,8 @@ class NativeEngine(Engine):
         try:
             self._batch = self._make_batch(self._model, num_envs, threads)
         except (ValueError, RuntimeError) as error:
+            if "bad_alloc" in str(error):
+                raise MemoryError(f"{num_envs} environments") from error
             raise EngineUnavailableError(
                 f"The native engine does not support this model: {error}; use --engine warp."
             ) from error

@@ -44,6 +44,7 @@ from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
 from mjlab.sim.warp.render import WarpRenderer
 from mjlab.utils.errors import UnknownAttributeError
+from mjlab.utils.memory import check_memory
 from mjlab.utils.mujoco import flag_names
 from mjlab.utils.string import name_list
 
@@ -170,6 +171,12 @@ class WarpEngine(Engine):
             mujoco.mj_forward(model, self._host)
             model.opt.disableflags = flags
         sizes = {"nconmax": cfg.nconmax, "njmax": cfg.njmax}
+        # Minimum bytes of a contact and of a constraint row. All arrays are measured below, in one
+        # environment.
+        for (name, size), least in zip(sizes.items(), (64, 32), strict=True):
+            count = (size or 0) * self.num_envs
+            name = f"SimulationCfg {name} times num_envs"
+            check_memory(name, count, least, str(self.device), "a smaller one", warns=False)
         try:
             self.wp_model = mjwarp.put_model(model)
             one = mjwarp.put_data(model, self._host, 1, **sizes)
