@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import importlib
+import logging
 import os
 import re
 import select
@@ -249,6 +250,8 @@ def _become(script: str, argv: list[str], before: Callable[[], None], is_fresh: 
         sys.stdin = open(os.devnull)  # noqa: SIM115
         sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
         sys.stderr = open(2, "w", closefd=False, buffering=1)  # noqa: SIM115
+        # Those of pytest would take the messages.
+        logging.root.handlers.clear()
         before()
         if is_fresh:
             os.execv(sys.executable, [sys.executable, "-m", "mjlab.scripts.cli", script, *argv])

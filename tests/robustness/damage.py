@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from .commands import TASK, Command, Ended, check_end, command, free_port
-from .runs import check_loadable, learned, same, train_flags, trained
+from .runs import SAC, check_loadable, learned, same, train_flags, trained
 from .trials import Broken, Trial, name_of
 
 WHAT = "one flipped bit, cut, emptied, overwritten and absurdly nested files of all kinds"
@@ -22,17 +22,13 @@ TRIALS = 280
 LIMIT = 90.0
 
 _ITERATIONS = 2
-_SAC = (
-    "--learner", "sac", "--agent.algorithm.batch-size", "64", "--agent.algorithm.num-updates", "1",
-    "--agent.algorithm.learning-starts", "2", "--agent.algorithm.replay-steps", "40",
-)  # fmt: skip
 _DEEP = 100_000
 
 
 def prepare(folder: Path) -> dict[str, Any]:
     """Make one good file of each kind, with the result of its reader."""
     run = trained(folder / "logs", _ITERATIONS)
-    of_sac = trained(folder / "sac", _ITERATIONS, *_SAC)
+    of_sac = trained(folder / "sac", _ITERATIONS, *SAC)
     files = {
         "replay": of_sac / "replay_model_1.pt",
         "checkpoint": next(run.glob("model_1.pt")),
@@ -266,48 +262,6 @@ def _absurd_archive(data: bytes, rng: random.Random) -> tuple[bytes, str]:
     return buffer.getvalue(), f"{name} of an absurd shape"
 
 
-def _misfit(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """Replace one part of a checkpoint by a value that does not fit; the file stays readable."""
-    import torch
-
-    content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    holder: Any = content
-    way: list[Any] = []
-    while True:
-        # Parts of all depths with equal frequency, the whole included.
-        way.append(rng.choice(list(holder) if isinstance(holder, dict) else range(len(holder))))
-        value = holder[way[-1]]
-        if not (isinstance(value, (dict, list)) and value) or rng.random() < 0.25:
-            break
-        holder = value
-    misfits: dict[str, Any] = {
-        "None": None, "a text": "text", "-1": -1, "1e30": 1e30, "nan": float("nan"), "{}": {},
-        "[[[]]]": [[[]]], "a tensor (2, 3)": torch.ones(2, 3),
-    }  # fmt: skip
-    if isinstance(value, torch.Tensor) and value.is_floating_point():
-        misfits["all nan"] = torch.full_like(value, torch.nan)
-        misfits["all inf"] = torch.full_like(value, torch.inf)
-    choice = rng.choice(["nothing", *misfits])
-    if choice != "nothing":
-        holder[way[-1]] = misfits[choice]
-    elif isinstance(holder, dict):
-        del holder[way[-1]]
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    return buffer.getvalue(), f"{'/'.join(map(str, way))} replaced by {choice}"
-
-
-def _of_another(data: bytes, rng: random.Random) -> tuple[bytes, str]:
-    """Give a replay the identity of another checkpoint, or none."""
-    import torch
-
-    content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    content["identity"] = rng.choice((None, "00000000-1", content["identity"].replace("-2", "-1")))
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    return buffer.getvalue(), f"identity {content['identity']}"
-
-
 _DAMAGES = (_flip, _flip, _flip, _flip, _cut, _cut, _zeros, _hole, _empty, _garbage, _absurd)
 
 
@@ -319,10 +273,6 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
     good = Path(prepared["files"][kind])
     path = _copied(good, prepared["runs"])
     damage = rng.choice(_DAMAGES)
-    if kind == "replay":
-        damage = rng.choice((damage, _misfit, _misfit, _of_another))
-    elif kind == "checkpoint" and rng.random() < 0.25:
-        damage, reader = _misfit, rng.choice((_read_by_resume, _read_by_resume, _read_by_evaluate))
     damaged, how = damage(good.read_bytes(), rng)
     trial.trying(f"{kind}, {how}, {name_of(reader)}")
     # Read the undamaged file first, from a separate copy.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .commands import TASK, check_end, command
-from .runs import check_loadable, learned, same, trained
+from .runs import SAC, check_loadable, learned, same, trained
 from .trials import Broken, Trial
 
 WHAT = "runs of PPO and SAC resumed under other flags of learner and environment, or under the same"
@@ -15,10 +15,6 @@ TRIALS = 60
 LIMIT = 120.0
 
 _ITERATIONS = 2
-_SAC = (
-    "--learner", "sac", "--agent.algorithm.batch-size", "64", "--agent.algorithm.num-updates", "1",
-    "--agent.algorithm.learning-starts", "2", "--agent.algorithm.replay-steps", "40",
-)  # fmt: skip
 
 # Flags with values that differ from those of the run. Each changes the weights of the next iteration.
 _ENV: dict[str, tuple[Any, ...]] = {
@@ -92,7 +88,7 @@ _FIXED: dict[str, dict[str, tuple[Any, ...]]] = {
 def prepare(folder: Path) -> dict[str, Any]:
     """Train with both learners, and resume without flags."""
     runs = {name: trained(folder / name, _ITERATIONS, *flags) for name, flags in (
-        ("ppo", ()), ("sac", _SAC),
+        ("ppo", ()), ("sac", SAC),
     )}  # fmt: skip
     plain = {name: _resumed(run, folder / f"{name}-resumed", []) for name, run in runs.items()}
     return {name: (str(run), str(plain[name])) for name, run in runs.items()}

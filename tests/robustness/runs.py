@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from .commands import SMALL, TASK, Command
 from .trials import Broken
+
+SAC = (
+    "--learner", "sac", "--agent.algorithm.batch-size", "64", "--agent.algorithm.num-updates", "1",
+    "--agent.algorithm.learning-starts", "2", "--agent.algorithm.replay-steps", "40",
+)  # fmt: skip
+"""Flags of a small run of SAC."""
 
 
 def train_flags(log_root: Path, iterations: int, *flags: str) -> tuple[str, ...]:
@@ -26,6 +33,13 @@ def trained(log_root: Path, iterations: int, *flags: str) -> Path:
     if ended.status != 0:
         raise RuntimeError(ended.said)
     return max((log_root / "cartpole").iterdir())
+
+
+def copied(run: Path, name: str) -> Path:
+    """Return a copy of a run below the folder `name`, the only one of its experiment."""
+    folder = Path(name).resolve() / "cartpole" / run.name
+    shutil.copytree(run, folder)
+    return folder
 
 
 def checkpoints(log_root: Path) -> list[Path]:

@@ -25,7 +25,8 @@ pytestmark = pytest.mark.robustness
 
 FAMILIES = (
     "kills", "evaluations", "resumes", "damage", "limits", "command_lines", "config_files",
-    "physics", "page", "origins", "names", "own_code", "sweeps", "sizes",
+    "physics", "page", "origins", "names", "own_code", "sweeps", "sizes", "checkpoints",
+    "replays",
 )  # fmt: skip
 
 
