@@ -9,7 +9,7 @@ import pytest
 from commands import SMALL, TASK
 
 from mjlab.rl.config import RslRlPpoAlgorithmCfg
-from mjlab.scripts.train import parse_train_flags
+from mjlab.scripts.train import TrainConfig, launch_training, parse_train_flags
 from mjlab.scripts.train_config import report_moved_goal
 from mjlab.tasks import registry
 
@@ -146,6 +146,15 @@ def test_numbers_of_a_task_out_of_range_warn(run, tmp_path, monkeypatch, flags, 
     assert outcome.status == status
     told = "agent.algorithm.gamma: expected a number in [0, 1], got 1.5"
     assert outcome.err.count(told) == (flags == []) + status
+
+
+def test_numbers_of_a_program_out_of_range_warn(tmp_path):
+    cfg = TrainConfig.from_task(TASK)
+    cfg.device, cfg.num_envs, cfg.log_root = "cpu", 4, str(tmp_path)
+    cfg.agent.max_iterations, cfg.agent.num_steps_per_env = 1, 4
+    cfg.agent.algorithm.lam = 3.0
+    with pytest.warns(UserWarning, match=r"agent\.algorithm\.lam: expected a number in \[0, 1\]"):
+        launch_training(TASK, cfg)
 
 
 def test_zero_of_a_count_raises_also_in_a_task(run, tmp_path, monkeypatch):

@@ -78,8 +78,8 @@ class RslRlPpoAlgorithmCfg:
     """Discount factor per environment step."""
     lam: Fraction = 0.95
     """Parameter lambda of generalized advantage estimation (GAE)."""
-    entropy_coef: Weight = 0.005
-    """Weight of the entropy bonus."""
+    entropy_coef: Annotated[float, Range(ends="()")] = 0.005
+    """Weight of the entropy bonus; negative: a penalty."""
     desired_kl: Limit = 0.01
     """Target KL divergence per update, for the adaptive schedule."""
     max_grad_norm: Limit = 1.0

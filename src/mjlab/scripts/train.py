@@ -157,16 +157,15 @@ def train_until_stopped(
         device = training_device(cfg, rank)
     with joined_processes(device), output_of(rank) as output:
         with fail_together():
-            typed = _typed(task, cfg, flags)
-            check_flags(cfg, typed if flags is None else typed_names(flags))
-        return _train(task, cfg, flags, typed, device, rank, output)
+            # What a program of a package says counts as a package's config.
+            check_flags(cfg, typed_names(flags or []))
+        return _train(task, cfg, flags, device, rank, output)
 
 
 def _train(
     task: str,
     cfg: TrainConfig,
     flags: list[str] | None,
-    typed: Settings,
     device: str,
     rank: ProcessRank,
     output: ProcessOutput | None,
@@ -183,6 +182,7 @@ def _train(
     if run is not None and run.state == "running" and rank.is_first:
         print_notice(f"{run.folder} is still running; its last checkpoint is resumed.")
     like = None if cfg.like is None else run_to_continue(task, cfg)
+    typed = _typed(task, cfg, flags)
     source = run or like
     # A command line was parsed with the settings of the run, unless the run was unknown.
     is_parsed = flags is not None and cfg.wandb_run_path is None
