@@ -170,7 +170,7 @@ def _motion(server: Any, names: list[str]) -> list[str]:
         body_quat_relative_w=turns, robot_body_quat_w=turns,
     )  # fmt: skip
     MotionPanel(
-        names[0], server, SimpleNamespace(names=names[2:], lengths=[5, 5]), 1, np.zeros(3), get_env_idx=lambda: 0,
+        names[0], server, SimpleNamespace(names=[*names[2:], "\udcff"], lengths=[5, 5, 5]), 1, np.zeros(3), get_env_idx=lambda: 0,
         get_frame=lambda index: (0, 1), set_frame=print, get_matching=lambda: frame, get_current=lambda: frame,
     ).update()  # fmt: skip
     return names[:2]

@@ -13,6 +13,7 @@ from tracking_tasks import task_cfg, unperturbed
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.tracking.mdp.commands import ghost_model
+from mjlab.tasks.tracking.mdp.motion_panel import MotionPanel
 from mjlab.viewer.viser.viewer import ViserPlayViewer
 
 
@@ -233,3 +234,21 @@ def test_without_a_page_nothing_is_asked_for(env):
     command = command_of(env)
     command.on_viewer_pause(True)
     assert not command.apply_gui_reset(torch.arange(3))
+
+
+def test_names_of_motions_and_bodies_are_text():
+    bodies, turns = torch.zeros(1, 1, 3), torch.tensor([[[1.0, 0.0, 0.0, 0.0]]])
+    frame = SimpleNamespace(
+        body_names=["<b>|"], robot_body_pos_w=bodies, body_pos_relative_w=bodies, body_pos_w=bodies,
+        body_quat_relative_w=turns, robot_body_quat_w=turns,
+    )  # fmt: skip
+    page, library = Page(), SimpleNamespace(names=["walk", "\udcff"], lengths=[9, 9])
+    panel = MotionPanel(
+        "motion", page, library, 1, np.zeros(3), get_env_idx=lambda: 0, get_frame=lambda _: (1, 2),
+        set_frame=lambda *_: None, get_matching=lambda: frame, get_current=lambda: frame,
+    )  # fmt: skip
+    panel.update()
+    # Sent as UTF-8.
+    assert page.widgets["Motion"].value.encode()
+    row = page.widgets["table"].content.splitlines()[-1]
+    assert row.startswith("| &lt;b&gt;&#124; |")

@@ -72,7 +72,9 @@ class MotionPanel:
         # True if the user moved the reference, which then is not one frame ahead of the robot.
         self._was_moved = False
         self._next_table = 0.0
-        gui, names = server.gui, list(motion.names)
+        # Viser sends UTF-8, but names of files are bytes.
+        names = [name.encode(errors="replace").decode() for name in motion.names]
+        gui, self._names = server.gui, names
         with gui.add_folder(name.capitalize()):
             self._motion = gui.add_dropdown(
                 "Motion", names, initial_value=names[0], disabled=True, visible=len(names) > 1
@@ -126,8 +128,8 @@ class MotionPanel:
             self._frame.max = last
         if self._frame.value != frame:
             self._frame.value = frame
-        if self._motion.value != self._library.names[motion]:
-            self._motion.value = self._library.names[motion]
+        if self._motion.value != self._names[motion]:
+            self._motion.value = self._names[motion]
         now = time.perf_counter()
         if now >= self._next_table or requested is not None:
             self._next_table = now + _TABLE_PERIOD_S
@@ -156,13 +158,13 @@ class MotionPanel:
         # Updates by the panel itself have no client.
         if event.client is None or not self._paused:
             return
-        motion = self._library.names.index(self._motion.value)
+        motion = self._names.index(self._motion.value)
         last = int(self._library.lengths[motion]) - 1
         self._requested = motion, min(int(self._frame.value), last)
         self._on_change()
 
     def _start_here(self, _event: Any) -> None:
-        motion = self._library.names.index(self._motion.value)
+        motion = self._names.index(self._motion.value)
         self._start = motion, int(self._frame.value)
         if self._request_action is not None:
             payload = {"type": "gui_reset", "all_envs": bool(self._all_envs.value)}
