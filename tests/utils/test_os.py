@@ -228,7 +228,7 @@ def test_errors_of_wandb_name_the_run(tmp_path, monkeypatch, error):
 
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(Api=fail))
-    with pytest.raises(ConnectionError, match=r"'me/project/abc'.*No key; .*wandb login"):
+    with pytest.raises(ConnectionError, match=r"'me/project/abc'.*No key.*wandb login"):
         get_wandb_checkpoint_path(tmp_path, Path("me/project/abc"))
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ConnectionError, match=r"'me/project/abc'.*wandb"):

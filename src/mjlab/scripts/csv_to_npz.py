@@ -186,7 +186,7 @@ def _upload(path: Path, name: str) -> None:
     """Upload a motion as an artifact, and link the artifact into the registry of motions.
 
     Raises:
-        ConnectionError: the upload failed.
+        WandbError: the upload failed.
     """
     with asking_wandb(f"Upload of {path}") as wandb:
         run = wandb.init(project=_WANDB_PROJECT, name=name)

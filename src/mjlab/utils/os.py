@@ -195,7 +195,7 @@ def get_wandb_checkpoint_path(
 
     Cached files are not downloaded again. Raises `ValueError`, listing the available checkpoints, if
     the checkpoint is not found, `UserError` without a login or if the run path does not end in a
-    name, and `ConnectionError` if the download fails.
+    name, and `WandbError` if the download fails.
     """
     cache = inside(Path(log_path) / WANDB_CACHE, Path(run_path).name)
     if checkpoint_name is not None and checkpoint_number(checkpoint_name) is not None:
@@ -236,7 +236,10 @@ def inside(folder: Path, name: str) -> Path:
     """
     parts = name.replace("\\", "/").split("/")
     if PureWindowsPath(name).drive or any(part in ("", ".", "..") for part in parts):
-        raise UserError(f"{folder}: expected the name of a file in this folder, got {name!r}.")
+        raise UserError(
+            f"{folder}: expected the name of a file in this folder, got {name!r}; use one "
+            "without '..', empty parts, and '/' at its start."
+        )
     return folder / name
 
 

@@ -12,20 +12,38 @@ from typing import Any
 from mjlab.utils.errors import MjlabError, UserError
 
 _VARIABLE = "WANDB_TAGS"
+# Characters of an error of wandb in a message.
+_LONGEST = 400
+
+
+class WandbError(MjlabError, ConnectionError):
+    """Error that wandb raised, or lack of its package."""
 
 
 @contextlib.contextmanager
-def asking_wandb(request: str) -> Generator[Any]:
-    """Yield the module `wandb` for `request`, such as "Run 'a/b/c'", and name it in errors.
+def asking_wandb(request: str, *, records: bool = False) -> Generator[Any]:
+    """Yield the module `wandb` for a request, such as "Run 'a/b/c'", and name it in errors.
+
+    Args:
+        request: Request, for messages.
+        records: The request records a run, also possible offline.
 
     Raises:
-        UserError: no login at Weights & Biases.
-        ConnectionError: wandb is not installed, or raised an error within the block.
+        UserError: no login, where wandb would prompt for a key or fail later.
+        WandbError: wandb is not installed, or raised an error, also within the block.
     """
     try:
         import wandb
 
-        check_wandb_login(request)
+        if not _has_login(wandb):
+            otherwise = (
+                "; WANDB_MODE=offline records without an account, and --agent.logger tensorboard does "
+                "without Weights & Biases"
+            )
+            raise UserError(
+                f"{request}: expected a login at Weights & Biases, found none; run `wandb login` or set "
+                f"WANDB_API_KEY{otherwise if records else ''}."
+            )
         yield wandb
     except MjlabError:
         raise
@@ -34,42 +52,32 @@ def asking_wandb(request: str) -> Generator[Any]:
         if isinstance(error, OSError) and (error.filename or error.errno == errno.ENOSPC):
             raise
         # wandb raises many error types, including those of its dependencies.
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-        raise ConnectionError(
+        reason = " ".join(str(error).split())[:_LONGEST].rstrip(".") or type(error).__name__
+        raise WandbError(
             f"{request}: Weights & Biases failed: {reason}; check the name, the network and the login "
             "(`wandb login`), or use files of this machine."
         ) from error
 
 
 def check_wandb_login(purpose: str, *, records: bool = False) -> None:
-    """Raise UserError without a login, where wandb would prompt for a key or fail later.
+    """Raise the errors of `asking_wandb` that need no request."""
+    if not os.environ.get("WANDB_API_KEY"):
+        with asking_wandb(purpose, records=records):
+            pass
 
-    Args:
-        purpose: Request that needs the login, for the message.
-        records: The request records a run, also possible offline.
-    """
+
+def _has_login(wandb: Any) -> bool:
     if os.environ.get("WANDB_API_KEY"):
-        return
-    import wandb
-
+        return True
     # Tests of packages replace wandb by a few of its functions.
     if not hasattr(wandb, "setup") or wandb.setup().settings.mode != "online":
-        return
+        return True
     try:
         # Credentials in ~/.netrc, in settings files or as identity token.
-        has_login = wandb.login(prompt=False, verify=False)
+        return bool(wandb.login(prompt=False, verify=False))
     except TypeError:
         # Versions of wandb that always prompt.
-        return
-    if not has_login:
-        otherwise = (
-            "; WANDB_MODE=offline records without an account, and --agent.logger tensorboard does "
-            "without Weights & Biases"
-        )
-        raise UserError(
-            f"{purpose}: expected a login at Weights & Biases, found none; run `wandb login` or set "
-            f"WANDB_API_KEY{otherwise if records else ''}."
-        )
+        return True
 
 
 def add_wandb_tags(tags: Sequence[str]) -> None:

@@ -157,7 +157,7 @@ def fetch_artifact(registry_name: str) -> list[Path]:
 
     Raises:
         UserError: no login at Weights & Biases.
-        ConnectionError: the artifact cannot be fetched.
+        WandbError: the artifact cannot be fetched.
         MotionFileError: the artifact contains no motion.
     """
     name = full_artifact_name(registry_name)
@@ -182,7 +182,7 @@ def fetch_motions_of_run(run_path: str) -> list[Path]:
     Raises:
         UserError: no login at Weights & Biases, the run path does not end in a name, or the name of a
             file leads out of its folder.
-        ConnectionError: the run cannot be read.
+        WandbError: the run cannot be read.
         MotionFileError: the run has neither.
     """
     folder = inside(Path(tempfile.gettempdir()) / "mjlab-motions", Path(run_path).name)
