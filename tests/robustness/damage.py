@@ -38,13 +38,14 @@ def prepare(folder: Path) -> dict[str, Any]:
         "agent.yaml": run / "params/agent.yaml",
         "env.yaml": run / "params/env.yaml",
         "motion": _make_motion(folder / "motion.npz"),
+        "motions.json": _record_motion(folder / "recorded", folder / "motion.npz"),
         "dump": _make_dump(folder / "dumps"),
     }
     files["model of a dump"] = next((folder / "dumps").glob("model_2*.mjb"))
     for one in (run, of_sac):
         shutil.rmtree(one / "git", ignore_errors=True)
     return {
-        "runs": [str(run), str(of_sac)],
+        "runs": [str(run), str(of_sac), str(folder / "recorded")],
         "files": {kind: str(path) for kind, path in files.items()},
     }
 
@@ -88,6 +89,16 @@ def _read_motion(path: Path) -> Any:
 
     try:
         return dict(vars(read_motion(path)))
+    except MotionFileError as error:
+        raise Rejected(str(error)) from error
+
+
+def _read_recorded_motions(path: Path) -> Any:
+    from mjlab.tasks.tracking.motion_file import MotionFileError
+    from mjlab.tasks.tracking.motion_sources import recorded_motions
+
+    try:
+        return [name.name for name in recorded_motions(path.parents[1])]
     except MotionFileError as error:
         raise Rejected(str(error)) from error
 
@@ -190,13 +201,14 @@ _READERS: dict[str, tuple[Callable[[Path], Any], ...]] = {
     "agent.yaml": (_read_by_evaluate, _read_by_resume),
     "env.yaml": (_read_by_resume,),
     "motion": (_read_motion,),
+    "motions.json": (_read_recorded_motions,),
     "dump": (*[_read_dump] * 5, _read_by_page),
     "model of a dump": (_read_model_of_dump, _read_model_of_dump, _read_by_page),
 }
 # One turn of trials: kinds with their frequencies.
 _KINDS = (
     *["checkpoint"] * 8, *["replay"] * 4, *["onnx"] * 3, "events", "run.json", "agent.yaml", "env.yaml",
-    *["motion"] * 3, *["dump"] * 2, "model of a dump",
+    *["motion"] * 3, "motions.json", *["dump"] * 2, "model of a dump",
 )  # fmt: skip
 
 
@@ -348,6 +360,13 @@ def _make_motion(path: Path) -> Path:
         joint_names=("a", "b", "c"), body_names=("u", "v", "w", "x"),
     )  # fmt: skip
     return write_motion(path, motion)
+
+
+def _record_motion(run: Path, motion: Path) -> Path:
+    """Record a motion as training does; return the index."""
+    from mjlab.tasks.tracking.motion_sources import record_motions
+
+    return record_motions([motion], run)[-1]
 
 
 def _make_dump(folder: Path) -> Path:
