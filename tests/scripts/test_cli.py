@@ -188,6 +188,23 @@ def test_ctrl_c_while_python_ends_is_quiet():
     assert (done.returncode, done.stderr) == (-signal.SIGINT, b"")
 
 
+def test_a_thread_without_memory_ends_the_command():
+    """Its starter would wait for ever."""
+    program = (
+        "import _thread, threading, time\nfrom mjlab.scripts.cli import run_command\n"
+        "class Starved(threading.Thread):\n"
+        "    def fail(self):\n        raise MemoryError\n"
+        "def command(argv):\n"
+        "    _thread.start_new_thread(Starved().fail, ())\n    time.sleep(30)\n"
+        "run_command(command)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=20, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: Out of memory: a thread did not start.")
+
+
 def test_a_reader_that_has_seen_enough_causes_no_message():
     command = f"{sys.executable} -m mjlab.scripts.train --help | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)

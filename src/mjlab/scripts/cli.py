@@ -13,6 +13,7 @@ import io
 import logging
 import os
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Callable
@@ -36,6 +37,7 @@ _OUT_OF_MEMORY = (
     "out of memory. Tried to allocate",
     "Failed to alloc",
 )
+_NO_THREAD = b"error: Out of memory: a thread did not start. Use fewer environments, or raise the limits (ulimit).\n"
 
 
 @dataclass(frozen=True)
@@ -512,6 +514,7 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     # Paths may have characters that the terminal's encoding lacks.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
+    previous, sys.unraisablehook = sys.unraisablehook, _end_without_threads
     try:
         command(sys.argv[1:])
     except Interrupted as stopped:
@@ -527,15 +530,29 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         _report(error)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     finally:
+        sys.unraisablehook = previous
         # Before the callbacks that modules registered in the meantime.
         atexit.register(end_by_interrupt, True)
+
+
+def _end_without_threads(error: sys.UnraisableHookArgs) -> None:
+    """End the process if memory is too short for a thread to start; else report `error` as Python does.
+
+    `threading.Thread.start` would wait for ever for the thread.
+    """
+    thread = getattr(error.object, "__self__", None)
+    if error.exc_type is MemoryError and isinstance(thread, threading.Thread):
+        os.write(2, _NO_THREAD)
+        os._exit(1)
+    sys.__unraisablehook__(error)
 
 
 def _report(error: Exception) -> None:
     """Print an error as one message, after the lines of the user's code that it passed through."""
     text = shorten(str(error).strip() or type(error).__name__)
     is_expected = isinstance(error, (MjlabError, ValueError, OSError))
-    if isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY):
+    is_memory = isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY)
+    if is_memory:
         # The original message names the failed call, not the lack of memory.
         text = f"Out of memory or threads ({text}). Use fewer environments, or raise the limits (ulimit)."
         is_expected = True
@@ -555,7 +572,7 @@ def _report(error: Exception) -> None:
     hint = f"Set {TRACEBACK_VARIABLE}=1 for the traceback."
     if os.environ.get(TRACEBACK_VARIABLE):
         traceback.print_exc()
-    elif not is_elsewhere and (lines := users_lines(error)):
+    elif not is_elsewhere and not is_memory and (lines := users_lines(error)):
         print(lines, end="", file=sys.stderr)
     elif not is_expected:
         import tempfile
