@@ -24,7 +24,7 @@ from .trials import RESULTS, run_family
 pytestmark = pytest.mark.robustness
 
 FAMILIES = (
-    "kills", "evaluations", "resumes", "damage", "limits", "command_lines", "config_files",
+    "kills", "signals", "store", "resumes", "damage", "limits", "command_lines", "config_files",
     "physics", "page", "origins", "names", "own_code", "sweeps", "sizes", "checkpoints",
     "replays",
 )  # fmt: skip

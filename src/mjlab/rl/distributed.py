@@ -96,6 +96,8 @@ def launch_workers(
             shared = dict.fromkeys(_INTERFACE_VARIABLES, name) | shared
     shared |= {PARENT_VARIABLE: str(os.getpid())}
     shared |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
+    # Left by a torchrun, it would lead to a store of that one.
+    shared.pop("TORCHELASTIC_USE_AGENT_STORE", None)
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
     workers: list[subprocess.Popen[bytes]] = []
     received: list[int] = []
