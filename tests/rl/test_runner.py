@@ -727,6 +727,25 @@ def test_nothing_is_printed(make_runner, tmp_path: Path, capsys):
     assert capsys.readouterr().out == ""
 
 
+def test_failed_uploads_are_warnings(make_runner, tmp_path: Path, monkeypatch, caplog):
+    def fail(*args, **kwargs):
+        raise RuntimeError("the service is down")
+
+    client = types.ModuleType("wandb")
+    for name in ("init", "log"):
+        setattr(client, name, lambda *args, **kwargs: None)
+    client.config = types.SimpleNamespace(update=lambda values: None)
+    client.save = client.finish = fail
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
+    monkeypatch.setitem(sys.modules, "wandb", client)
+    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", client)
+    make_runner(tmp_path / "run", logger="wandb").learn(1)
+    assert (tmp_path / "run" / "model_0.pt").is_file()
+    for name in ("upload of", "last upload"):
+        assert f"No {name}" in caplog.text
+    assert caplog.text.count("the service is down") == 3
+
+
 def test_weights_and_biases_gets_figures_and_files_only_on_request(
     make_runner, tmp_path: Path, monkeypatch
 ):

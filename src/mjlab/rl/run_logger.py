@@ -19,6 +19,7 @@ import torch
 from rsl_rl.utils.logger import Logger
 
 from mjlab.rl.checkpoint import ensure_writable_folder
+from mjlab.utils.logging import beside_results
 from mjlab.utils.os import replacing
 from mjlab.utils.wandb import check_wandb_login
 
@@ -351,9 +352,15 @@ class RunLogger(Logger):
         scalars[f"Perf/{group.lower()}_time"] = result.duration
         self.write_scalars(scalars, iteration)
 
+    def save_model(self, path: str, it: int) -> None:
+        """Upload a file to the logging service, if it takes files. Failures are logged."""
+        with beside_results(f"upload of {path}"):
+            super().save_model(path, it)
+
     def stop_logging_writer(self) -> None:
         """Flush and close the event file."""
-        super().stop_logging_writer()
+        with beside_results("last upload"):
+            super().stop_logging_writer()
         if threading.excepthook == self._on_thread_error:
             threading.excepthook = self._thread_hook
         close = getattr(self.writer, "close", None)

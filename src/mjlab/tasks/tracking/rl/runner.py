@@ -19,6 +19,7 @@ from mjlab.tasks.tracking.mdp.motion_sampling import HardSegmentSampler
 from mjlab.tasks.tracking.motion_sources import full_artifact_name, record_motions
 from mjlab.tasks.tracking.rl.reference_actor import ReferenceActor
 from mjlab.utils.errors import check_exists
+from mjlab.utils.logging import beside_results
 
 if TYPE_CHECKING:
     from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary
@@ -100,10 +101,8 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         if not self._is_main_process:
             return
         folder = Path(path).resolve().parent
-        try:
+        with beside_results(f"record of the motions in {folder}"):
             self._save_motions(folder)
-        except Exception as error:
-            logger.warning("Motions not recorded in %s: %s", folder, error)
 
     def load_content(
         self,
