@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import resource
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -132,34 +135,40 @@ def test_address_space_limits(machine, monkeypatch):
 # Estimates are lower bounds.
 
 
-def bytes_of(*holders: object) -> int:
-    """Return the size of the arrays and tensors among the attributes of the holders."""
-    values = [value for holder in holders for value in vars(holder).values()]
-    return sum(getattr(value, "nbytes", None) or getattr(value, "capacity", 0) for value in values)
+TAKEN = """
+import sys
+import torch
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.tasks.registry import load_env_cfg
 
-
-@pytest.mark.parametrize("task", [CARTPOLE, "Mjlab-Velocity-Flat-Unitree-Go1"])
-@pytest.mark.parametrize("engine", ["native", "warp"])
-def test_environments_take_what_is_reserved(task, engine):
-    cfg = load_env_cfg(task)
-    cfg.scene.num_envs, cfg.sim.engine = 32, engine
+def taken(num_envs):
+    cfg = load_env_cfg(sys.argv[1])
+    cfg.scene.num_envs, cfg.sim.engine = num_envs, sys.argv[2]
     env = ManagerBasedRlEnv(cfg, device="cpu")
-    reserved = 32 * env.sim._engine.bytes_each
-    if engine == "warp":
-        data, model = env.sim.wp_data, env.sim.wp_model
-        expanded = [value for value in vars(model).values() if getattr(value, "_is_batched", False)]
-        taken = bytes_of(data, data.efc, data.contact) + sum(value.capacity for value in expanded)
-    else:
-        own = env.sim._engine
-        fields = [*own._inputs.values(), *own._outputs.values(), *own._model_copies.values()]
-        copies = sum(2 * field.values.nbytes for field in own._inputs.values())
-        copies += sum(field.values.nbytes for field in own._outputs.values())
-        copies += sum(2 * field.values.nbytes for field in own._model_copies.values())
-        sources = {
-            field.source.data_ptr(): field.source.nbytes for field in fields[len(own._inputs) :]
-        }
-        taken = 2 * own._batch.state.nbytes + copies + sum(sources.values())
-    assert 0.5 * taken < reserved <= 1.001 * taken
+    env.reset()
+    env.step(torch.zeros(num_envs, env.action_manager.total_action_dim))
+    return env, int(open("/proc/self/statm").read().split()[1]) * 4096
+
+small, before = taken(2)
+large, after = taken(int(sys.argv[3]))
+print((after - before) / large.num_envs, large.sim._engine.bytes_each)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is unknown")
+@pytest.mark.parametrize(
+    ("task", "engine", "num_envs"),
+    [
+        (CARTPOLE, "native", 32_768),
+        ("Mjlab-Velocity-Flat-Unitree-Go1", "native", 2048),
+        (CARTPOLE, "warp", 2048),
+    ],
+)
+def test_environments_take_what_is_reserved(task, engine, num_envs):
+    command = [sys.executable, "-c", TAKEN, task, engine, str(num_envs)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    taken, reserved = map(float, said.splitlines()[-1].split())
+    assert 0.5 * taken < reserved < taken
 
 
 @pytest.mark.parametrize(

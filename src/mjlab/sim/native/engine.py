@@ -436,13 +436,18 @@ class NativeEngine(Engine):
         MuJoCo does this in mj_setConst. That would also replace the constants that only
         `recompute_constants` updates, so a second batch computes the boxes.
         """
+        written = self._model_copies.keys() & _BOUNDED
+        volumes = {*_BOUNDING_VOLUMES, "geom_rbound"} - self.model_fields.keys()
         if self._bounds is None:
+            # States and written fields of the second batch, volumes of both.
+            sizes = [getattr(self._model, name).nbytes for name in (*written, *volumes, *volumes)]
+            self.reserve(self._batch.state[0].nbytes + sum(sizes))
             self._bounds = self._make_batch(self._model, self.num_envs)
-        for name in self._model_copies.keys() & _BOUNDED:
+        for name in written:
             self._bounds.expand(name)[:] = self._batch.expand(name)
         self._call(self._bounds.set_const, env_ids)
         # Bounding spheres too, unless expanded: ray casting in MuJoCo 4 uses them.
-        for name in {*_BOUNDING_VOLUMES, "geom_rbound"} - self.model_fields.keys():
+        for name in volumes:
             self._batch.expand(name)[:] = self._bounds.expand(name)
 
     def constants_written_by(self, level: int) -> tuple[str, ...]:
