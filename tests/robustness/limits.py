@@ -104,7 +104,7 @@ def _file_for_folder(trial: Trial, root: Path) -> None:
 
 def _special_folder(trial: Trial, root: Path) -> None:
     place = trial.rng.choice(
-        ("/dev/null", "/proc/logs", "/sys/logs", "x" * 300, "\U0001f916 ä", "a\nb")
+        ("/dev/null", "/proc/logs", "/sys/logs", "x" * 300, "\U0001f916 ä", "a\nb", "r\udcff")
     )
     trial.trying(f"--log-root {place[:20]!r}")
     check_end(_train(Path(place)).end())
