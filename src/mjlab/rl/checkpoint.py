@@ -31,7 +31,7 @@ import torch
 
 from mjlab.envs.env_state import curricula_in
 from mjlab.utils.errors import MjlabError, UserError, check_count, check_in_range, check_positive
-from mjlab.utils.os import checkpoint_number, checkpoints_in, files_in, replacing
+from mjlab.utils.os import check_archive, checkpoint_number, checkpoints_in, files_in, replacing
 from mjlab.utils.random import rng_state, set_rng_state
 from mjlab.utils.torch import to_device
 
@@ -161,9 +161,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             warnings.simplefilter("ignore", UserWarning)
             # torch does not verify the checksums of an archive.
             if zipfile.is_zipfile(path):
-                with zipfile.ZipFile(path) as archive:
-                    if (damaged := archive.testzip()) is not None:
-                        raise zipfile.BadZipFile(f"the checksum of {damaged} is wrong")
+                check_archive(path)
             data = torch.load(path, map_location="cpu", weights_only=True)
         tensors = [(name, x) for name, x in _leaves(data) if isinstance(x, torch.Tensor)]
     except pickle.UnpicklingError as error:
