@@ -477,6 +477,21 @@ def test_a_failed_run_is_named_and_retried_by_the_same_command(sweep, machine, f
     assert len(rows_of(folder)) == 2
 
 
+def test_a_log_may_be_deleted(sweep, machine, folder, monkeypatch):
+    start = machine.start
+
+    def start_without_log(command, environment, output):
+        Path(output.name).unlink()
+        return start(command, environment, output)
+
+    monkeypatch.setattr("mjlab.scripts.sweep_runs.start_in_background", start_without_log)
+    monkeypatch.setattr("mjlab.scripts.sweep_runs._FIRST_REPORT_S", 0.0)
+    machine.fails = ("1e-3",)
+    outcome = sweep(*LEARNING, "--folder", str(folder))
+    assert "Failed   learning-rate=1e-3, seed 1: no output" in outcome.out
+    assert "Finished learning-rate=1e-4" in outcome.out
+
+
 def test_a_run_whose_resumption_fails_is_not_called_saved(sweep, machine, folder):
     argv = ("--over", f"{RATE}=1e-4,1e-3", "--folder", str(folder), "--jobs", "1")
     machine.interrupts_after = 1

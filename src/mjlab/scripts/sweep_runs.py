@@ -64,7 +64,9 @@ class _Run:
     @property
     def iteration(self) -> int:
         """Number of finished iterations, as in the output of the run."""
-        with open(self.log.name, "rb") as log:
+        lines: list[bytes] = []
+        # Users may delete it meanwhile.
+        with contextlib.suppress(OSError), open(self.log.name, "rb") as log:
             size = log.seek(0, os.SEEK_END)
             log.seek(max(self.offset, size - 4096))
             lines = _ITERATION.findall(log.read())
@@ -310,8 +312,7 @@ def _evaluations(sweep: Sweep, setting: Setting) -> list[str]:
 
 def _last_error(path: Path) -> str:
     """Return the last error message in the output of a run."""
-    lines = [
-        line for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if line
-    ]
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    lines = [line for line in text.splitlines() if line]
     errors = [line for line in lines if line.startswith("error")]
     return (errors or lines or ["no output"])[-1]
