@@ -123,14 +123,24 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
         raise Broken("the weights are not those of the resume without flags")
     if rng.random() < 0.3 and not same(found, learned(_resumed(Path(folder), Path("two"), flags))):
         raise Broken("the same flags gave other weights")
+    if rng.random() < 0.4:
+        # A session more, which needs no flags.
+        last = _ITERATIONS + 2
+        chained = _resumed(None, Path("one"), [], last)
+        if not same(learned(chained), learned(_resumed(Path(folder), Path("long"), flags, last))):
+            raise Broken("resumed twice, the weights are those of other settings")
 
 
-def _resume(run: Path, root: Path, flags: list[str]) -> Any:
+def _resume(
+    run: Path | None, root: Path, flags: list[str], iterations: int = _ITERATIONS + 1
+) -> Any:
+    """Resume a copy of `run` in `root`, or the newest run there, up to a number of iterations."""
     experiment = (root / "cartpole").resolve()
-    shutil.copytree(run, experiment / run.name)
+    if run is not None:
+        shutil.copytree(run, experiment / run.name)
     ended = command(
         "train", TASK, "--device", "cpu", "--log-root", str(experiment.parent),
-        "--agent.resume", "True", "--agent.max-iterations", str(_ITERATIONS + 1), *flags,
+        "--agent.resume", "True", "--agent.max-iterations", str(iterations), *flags,
         patience=60.0,
     )  # fmt: skip
     check_end(ended)
@@ -138,10 +148,12 @@ def _resume(run: Path, root: Path, flags: list[str]) -> Any:
     return ended
 
 
-def _resumed(run: Path, root: Path, flags: list[str]) -> Path:
-    """Return the last checkpoint of a copy of `run` resumed under `flags`."""
-    ended = _resume(run, root, flags)
-    found = list((root / "cartpole").resolve().glob(f"*/model_{_ITERATIONS}.pt"))
+def _resumed(
+    run: Path | None, root: Path, flags: list[str], iterations: int = _ITERATIONS + 1
+) -> Path:
+    """Return the last checkpoint of a run resumed under `flags`; see `_resume`."""
+    ended = _resume(run, root, flags, iterations)
+    found = list((root / "cartpole").resolve().glob(f"*/model_{iterations - 1}.pt"))
     if ended.status != 0 or len(found) != 1:
         raise Broken(f"exit status {ended.status}: {ended.err[-200:]}")
     return found[0]
