@@ -19,7 +19,14 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from mjlab.rl.learners import Learner
 from mjlab.runs.checkpoint import Checkpoint
-from mjlab.runs.settings import Difference, Settings, apply_settings, differences, read_yaml
+from mjlab.runs.settings import (
+    Difference,
+    Settings,
+    apply_settings,
+    differences,
+    read_yaml,
+    warn_unreadable,
+)
 from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
@@ -98,9 +105,14 @@ class Run:
         """Metadata of the run (`run.json`); empty if missing or unreadable."""
         try:
             info = json.loads((self.folder / INFO_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            if not isinstance(info, dict):
+                raise ValueError(f"expected entries, got {type(info).__name__}")
+            return info
+        except (FileNotFoundError, NotADirectoryError):
             return {}
-        return info if isinstance(info, dict) else {}
+        except (OSError, ValueError, RecursionError) as error:
+            warn_unreadable(self.folder / INFO_FILE, error)
+            return {}
 
     @cached_property
     def params(self) -> dict[Literal["env", "agent"], dict[str, Any]]:

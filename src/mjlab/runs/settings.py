@@ -10,6 +10,7 @@ import copy
 import dataclasses
 import enum
 import importlib
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
 from pathlib import Path
@@ -146,9 +147,21 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         # A subclass of the safe loader.
         params = yaml.load(path.read_text(encoding="utf-8"), Loader)
-    except (OSError, ValueError, RecursionError, yaml.YAMLError):
+        if not isinstance(params, dict):
+            raise ValueError(f"expected entries, got {type(params).__name__}")
+        return params
+    except (FileNotFoundError, NotADirectoryError):
         return {}
-    return params if isinstance(params, dict) else {}
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        warn_unreadable(path, error)
+        return {}
+
+
+def warn_unreadable(path: Path, error: Exception) -> None:
+    """Warn that a file of a run folder was left out."""
+    reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:100]
+    message = f"{path} cannot be read ({reason}); using the rest of the run folder."
+    warnings.warn(message, UserWarning, stacklevel=3)
 
 
 # Application.
