@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import subprocess
 import sys
@@ -301,6 +302,12 @@ def test_other_physics_and_delays_are_one_warning(tmp_path: Path, caplog):
         (warning,) = caplog.records
         for key in changes if number else ("decimation",):
             assert f"{key}: the policy has" in warning.getMessage()
+    # Physics that the task trains with is expected.
+    trained = copy.deepcopy(env.unwrapped.cfg)
+    trained.decimation, trained.sim.mujoco.timestep = 10, 0.005
+    load_onnx_policy(path, env, "cpu", trained)
+    assert "decimation" not in caplog.records[-1].getMessage()
+    assert "joint_stiffness" in caplog.records[-1].getMessage()
     # Control steps and what enters or leaves the network are errors.
     for key, value in {"step_dt": "0.1", "action_scale": "2.0", "action_offset": "1.0"}.items():
         good = properties(path)[key]

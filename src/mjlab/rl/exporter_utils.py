@@ -59,7 +59,7 @@ from mjlab.utils.torch import torch_threads
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
-    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
 Metadata = dict[str, list | str | float]
 logger = logging.getLogger(__name__)
@@ -415,15 +415,23 @@ class OnnxPolicyError(CheckpointError):
     """ONNX file that is not a policy, or not one for this environment; the message has the reason."""
 
 
-def load_onnx_policy(path: Path, env: Any, device: str) -> OnnxPolicy:
+def load_onnx_policy(
+    path: Path, env: Any, device: str, trained: ManagerBasedRlEnvCfg | None = None
+) -> OnnxPolicy:
     """Load the policy in `path` and check that it fits the wrapped environment `env`.
+
+    Args:
+        path: ONNX file.
+        env: Wrapped environment.
+        device: Torch device of the policy.
+        trained: Training config of the task, whose physics may be another. None: that of `env`.
 
     Raises:
         OnnxPolicyError: the policy cannot be run, or not in this environment.
     """
     try:
         policy = OnnxPolicy(path, device, env.unwrapped.num_envs)
-        policy.check_fits(env.unwrapped)
+        policy.check_fits(env.unwrapped, trained)
         if not policy.metadata.keys() & set(_INTERFACE):
             logger.warning(
                 "The policy %s has no metadata of observations and actions: their order and scale are "
@@ -585,10 +593,13 @@ class OnnxPolicy:
         for value in self._memory.values():
             value[:, ended] = 0.0
 
-    def check_fits(self, env: ManagerBasedRlEnv) -> None:
+    def check_fits(
+        self, env: ManagerBasedRlEnv, trained: ManagerBasedRlEnvCfg | None = None
+    ) -> None:
         """Check that observations and actions of `env` are those of the training.
 
         Other differences from what the file records are one warning: physics, delays, gains, ...
+        Timesteps of the physics that `trained`, the training config of the task, prescribes are expected.
 
         Raises:
             OnnxPolicyError: observations or actions differ; the message lists all differences.
@@ -603,6 +614,11 @@ class OnnxPolicy:
         ]
         if not differences:
             expected = metadata_texts(get_base_metadata(env, "", self._named_groups))
+            if trained is not None:
+                cfg = trained.sim.mujoco
+                usual = {"physics_dt": _shortest(cfg.timestep), "decimation": trained.decimation}
+                alike = all(_alike(self.metadata.get(k, ""), str(v)) for k, v in usual.items())
+                expected |= {k: self.metadata[k] for k in usual} if alike else {}
             known = {*expected, *_INTERFACE}.intersection(self.metadata).difference(_UNCOMPARED)
             for key in sorted({*known, *_CLOCK}):
                 value, now = self.metadata.get(key, ""), expected.get(key, "")

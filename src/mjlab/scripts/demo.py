@@ -46,6 +46,7 @@ def demo_cfg(demo: Demo) -> PlayConfig:
             sensor.debug_vis = False
     return PlayConfig(
         env=env,
+        profile=demo.profile,
         checkpoint_file=str(demo.policy),
         num_envs=1,
         device="cpu",

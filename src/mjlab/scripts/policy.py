@@ -283,7 +283,9 @@ def load_policy(
     if checkpoint.path.suffix == ".onnx":
         from mjlab.rl.exporter_utils import load_onnx_policy
 
-        return load_onnx_policy(checkpoint.path, env, device)
+        # Environments to evaluate and play undo what a profile simplifies.
+        trained = registered_env_cfg(task, profile, "train")
+        return load_onnx_policy(checkpoint.path, env, device, trained)
     from mjlab.rl import MjlabOnPolicyRunner
 
     agent_cfg = agent_cfg_of(task, checkpoint, profile)
