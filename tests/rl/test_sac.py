@@ -99,6 +99,11 @@ def test_same_seed_gives_the_same_weights(variant):
     assert_same_bits(*results)
 
 
+def test_a_reversed_range_of_alpha_raises():
+    with pytest.raises(ValueError, match="alpha_range: expected low <= high"):
+        make_runner(alpha_range=(1.0, 0.1))
+
+
 def test_to_learn_beside_the_physics_changes_no_bit():
     results = []
     for beside in (True, False):

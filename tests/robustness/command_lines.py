@@ -56,8 +56,14 @@ _CALLS: dict[str, tuple[str, ...]] = {
 }
 # Deterministic calls that would fail silently.
 _MISTAKES: tuple[tuple[str, ...], ...] = (
-    ("train", *_TRAIN, "--agent.algorithm.num-mini-batches", "1000"),
-    ("train", *_TRAIN, "--agent.algorithm.num-mini-batches", "1000000000"),
+    (
+        "train",
+        *_TRAIN,
+        "--agent.algorithm.num-learning-epochs",
+        "1",
+        "--agent.algorithm.num-mini-batches",
+        "129",
+    ),
     ("train", *_TRAIN, "--agent.class-name", "Foo"),
     ("train", *_TRAIN, "--agent.algorithm.class-name", "Foo"),
     ("train", *_TRAIN, "--wandb-run-path", "a/b/c"),

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.robustness
 FAMILIES = (
     "kills", "signals", "store", "resumes", "damage", "limits", "command_lines", "config_files",
     "physics", "page", "origins", "names", "own_code", "sweeps", "sizes", "checkpoints",
-    "replays",
+    "replays", "ranges",
 )  # fmt: skip
 
 

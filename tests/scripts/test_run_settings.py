@@ -231,6 +231,13 @@ def test_python_callers_record_and_resume_their_changes(tmp_path):
     assert trained_with(resumed)["agent.algorithm.gamma"] == 0.7
 
 
+def test_recorded_numbers_out_of_range_warn(train_more, first):
+    write_info(first, settings={**Run(first).settings, "agent.algorithm.gamma": 1.25})
+    resumed, outcome = train_more("--agent.resume", "True")
+    assert outcome.err.count("agent.algorithm.gamma: expected a number in [0, 1], got 1.25") == 1
+    assert resumed.params["agent"]["algorithm"]["gamma"] == 1.25
+
+
 # Changes of the task since.
 
 

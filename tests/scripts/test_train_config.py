@@ -137,8 +137,8 @@ def test_typed_numbers_out_of_range_raise(run, tmp_path, flag, value, expected):
     [([], 0), (["--agent.algorithm.gamma", "0.9"], 0), (["--agent.algorithm.gamma=1.5"], 1)],
 )
 def test_numbers_of_a_task_out_of_range_warn(run, tmp_path, monkeypatch, flags, status):
-    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
     cfg = registry.load_rl_cfg(TASK)
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
     cfg.algorithm = _Undiscounted(num_mini_batches=1)
     registry.register_mjlab_task("Test-Ranges", registry.load_env_cfg(TASK), rl_cfg=cfg)
     small = (*SMALL, "--agent.max-iterations", "1", "--log-root", str(tmp_path))
@@ -158,8 +158,8 @@ def test_numbers_of_a_program_out_of_range_warn(tmp_path):
 
 
 def test_zero_of_a_count_raises_also_in_a_task(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
     cfg = registry.load_rl_cfg(TASK)
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
     cfg.save_interval = 0
     registry.register_mjlab_task("Test-Ranges", registry.load_env_cfg(TASK), rl_cfg=cfg)
     outcome = run("train", "Test-Ranges", "--device", "cpu", "--log-root", str(tmp_path / "logs"))

@@ -30,7 +30,7 @@ import numpy as np
 import torch
 
 from mjlab.envs.env_state import curricula_in
-from mjlab.utils.errors import MjlabError, UserError, check_count, check_in_range, check_positive
+from mjlab.utils.errors import MjlabError, UserError, check_count, check_in_range
 from mjlab.utils.os import check_archive, checkpoint_number, checkpoints_in, files_in, replacing
 from mjlab.utils.random import rng_state, set_rng_state
 from mjlab.utils.torch import to_device
@@ -398,7 +398,6 @@ def set_deviation(model: torch.nn.Module, name: str, value: float) -> None:
     Raises:
         UserError: the standard deviation depends on observations.
     """
-    check_positive(f"agent.{name}.distribution_cfg.init_std", value)
     distribution = getattr(model, "distribution", None)
     for attribute, scaled in (("std_param", value), ("log_std_param", math.log(value))):
         if (parameter := getattr(distribution, attribute, None)) is not None:

@@ -99,6 +99,8 @@ class SAC:
             "SAC batch_size times num_updates", cfg.batch_size * cfg.num_updates, transition, device,
             "a smaller batch_size",
         )  # fmt: skip
+        lowest, highest = cfg.alpha_range
+        check_field(cfg, "alpha_range", lowest <= highest, "low <= high")
         is_whole = not symmetry or cfg.batch_size % 2 == 0
         check_field(cfg, "batch_size", is_whole, "an even number, because half is mirrored")
         self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb

@@ -179,15 +179,12 @@ class TwinCriticModel(MLPModel):
         """Build with the observations, as rsl_rl's `MLPModel`.
 
         Raises:
-            ValueError: `value_range` is empty, or `num_atoms` < 2.
+            ValueError: `value_range` is empty.
         """
         super().__init__(obs, obs_groups, obs_set, 1, (1,), activation, obs_normalization)
         low, high = value_range
-        if not (low < high and num_atoms > 1):
-            raise ValueError(
-                f"SAC value_range, num_atoms: expected (low, high) with low < high and an integer >= 2, "
-                f"got {value_range} and {num_atoms}."
-            )
+        if not low < high:
+            raise ValueError(f"SAC value_range: expected low < high, got {value_range}.")
         del self.mlp
         input_dim = self._get_latent_dim() + num_actions
         self.critics = nn.ModuleList(

@@ -73,11 +73,11 @@ class MujocoCfg:
 class SimulationCfg:
     """Physics engine and its settings."""
 
-    nconmax: int | None = None
+    nconmax: CountOrZero | None = None
     """Maximum number of contacts per environment on Warp; None: estimated. Ignored by native."""
-    njmax: int | None = None
+    njmax: CountOrZero | None = None
     """Maximum number of constraint rows per environment on Warp; None: estimated. Native ignores it."""
-    contact_sensor_maxmatch: int = 64
+    contact_sensor_maxmatch: CountOrZero = 64
     """Maximum number of matches per contact sensor on Warp. Unlimited on native."""
     broadphase: Literal["nxn", "sap_tile", "sap_segmented"] | None = None
     """Broad-phase collision method of Warp; None: Warp's default."""
