@@ -432,7 +432,9 @@ class SAC:
             self._target.load_state_dict(state["target"])
             with torch.no_grad():
                 self._log_alpha.copy_(state["log_alpha"])
-            self._generator.set_state(state["generator"].cpu())
+            # Generators of CPUs and GPUs have states of other sizes.
+            if state["generator"].shape == own["generator"].shape:
+                self._generator.set_state(state["generator"].cpu())
             self._num_steps, self._num_updates_made = state["num_steps"], state["num_updates"]
             self._noise.load_state_dict(state["noise"])
             if self._reward_scale is not None and state["reward_scale"] is not None:
