@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+import os
+import signal
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -42,23 +46,24 @@ def make_runner(log_dir: Path | None = None, num_envs: int = 8, **changes: Any) 
     return MjlabOnPolicyRunner(env, asdict(cfg), None if log_dir is None else str(log_dir))
 
 
+def flat(value: Any, name: str = "") -> dict[str, torch.Tensor]:
+    """Return copies of the tensors and numbers in nested dicts, by name."""
+    if isinstance(value, dict):
+        return {k: v for key, item in value.items() for k, v in flat(item, f"{name}/{key}").items()}
+    if isinstance(value, torch.Tensor):
+        return {name: value.clone()}
+    return {name: torch.tensor(value)} if isinstance(value, int | float) else {}
+
+
 def everything(runner: Any) -> dict[str, torch.Tensor]:
     """Return all that decides how training goes on, by name."""
-    found: dict[str, torch.Tensor] = {}
-
-    def collect(name: str, value: Any) -> None:
-        if isinstance(value, torch.Tensor):
-            found[name] = value.clone()
-        elif isinstance(value, dict):
-            for key, item in value.items():
-                collect(f"{name}/{key}", item)
-        elif isinstance(value, int | float):
-            found[name] = torch.tensor(value)
-
-    collect("algorithm", runner.alg.save())
-    collect("replay", runner.alg.storage.state_dict())
-    collect("env", runner.env.unwrapped.state_dict())
-    return found
+    return flat(
+        {
+            "algorithm": runner.alg.save(),
+            "replay": runner.alg.storage.state_dict(),
+            "env": runner.env.unwrapped.state_dict(),
+        }
+    )
 
 
 def assert_same_bits(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
@@ -221,6 +226,27 @@ def test_a_state_saved_again_keeps_its_identity(tmp_path):
     runner.load(str(path))
     runner.save(str(tmp_path / "again.pt"))
     assert load_checkpoint(tmp_path / "again.pt")["identity"] != before
+
+
+def test_an_iteration_given_up_leaves_no_update():
+    runner = make_runner()
+    runner.learn(2)
+    before = copy.deepcopy(runner.alg.save())
+    runner.alg.cfg.num_updates = 400
+    made = []
+
+    def interrupt(*_: Any) -> None:
+        made.append(None)
+        for _ in range(2 if len(made) == 5 else 0):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.3)
+
+    runner.alg.optimizer.register_step_post_hook(interrupt)
+    runner.learn(3)
+    assert runner.stop_reason == "interrupted"
+    assert len(made) < 10
+    for name in ("actor_state_dict", "critic_state_dict", "optimizer_state_dict", "sac_state_dict"):
+        assert_same_bits(flat(before[name]), flat(runner.alg.save()[name]))
 
 
 def test_what_goes_wrong_while_learning_ends_the_run():

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 import math
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import fields
 from typing import Any
 
@@ -118,6 +118,7 @@ class SAC:
         self._finished: list[dict[str, torch.Tensor]] = []
         self._thread: ThreadPoolExecutor | None = None
         self._running: Future[None] | None = None
+        self._is_ending = False
         self._is_concurrent = multi_gpu_cfg is None and torch.device(device).type == "cpu"
         # For the acting thread. More threads would wait for those of the physics.
         self.num_threads = 1 if self._is_concurrent else None
@@ -263,6 +264,8 @@ class SAC:
         for rows in torch.arange(size * parts, device=self.device).view(
             parts, cfg.num_updates, -1
         ).transpose(0, 1).flatten(1):  # fmt: skip
+            if self._is_ending:
+                break
             self._update({name: value[rows] for name, value in inputs.items()})
 
     def _update(self, inputs: dict[str, torch.Tensor]) -> None:
@@ -351,11 +354,22 @@ class SAC:
 
     def _wait(self) -> None:
         """Wait for the updates in progress; raise their errors."""
-        running, self._running = self._running, None
-        if running is not None:
-            running.result()
+        if self._running is not None:
+            try:
+                self._running.result()
+            finally:
+                # A signal may have ended the waiting instead.
+                if self._running.done():
+                    self._running = None
         self._finished += self._metrics
         self._metrics = []
+
+    def _end_updates(self) -> None:
+        """End the updates in progress early, for a state that replaces theirs."""
+        if self._running is not None:
+            self._is_ending = True
+            wait([self._running])
+            self._running, self._is_ending = None, False
 
     # Modes, files, processes.
 
@@ -371,8 +385,8 @@ class SAC:
         self.critic.eval()
 
     def close(self) -> None:
-        """Finish the updates and end their thread; the next step starts a new thread."""
-        self._wait()
+        """End the updates and their thread; the next step starts a new thread."""
+        self._end_updates()
         if self._thread is not None:
             self._thread.shutdown()
             self._thread = None
@@ -405,7 +419,7 @@ class SAC:
 
         Returns True if the iteration count is to be loaded.
         """
-        self._wait()
+        self._end_updates()
         cfg = dict.fromkeys(_PARTS, True) if load_cfg is None else load_cfg
         state: Any = loaded_dict.get("sac_state_dict")
         if load_cfg is None:
