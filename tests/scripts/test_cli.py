@@ -23,6 +23,7 @@ from mjlab.sim.engine import EngineUnavailableError
 from mjlab.tasks.registry import UnknownTaskError
 from mjlab.utils.errors import UserError
 from mjlab.utils.signals import Interrupted
+from mjlab.utils.tracebacks import users_lines
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -80,6 +81,21 @@ def test_an_error_shows_only_lines_of_users_code(failing, capsys):
     assert "\nerror: AttributeError: oops\n" in err
 
 
+@pytest.mark.parametrize(
+    "place",
+    ["lib/python3.11/site-packages/torch/nn.py", "lib/python3/dist-packages/numpy/core.py", "t.py"],
+)
+def test_installed_packages_are_not_users_code(tmp_path, place):
+    file = tmp_path / place
+    file.parent.mkdir(parents=True, exist_ok=True)
+    code = compile("raise KeyError('x')", str(file), "exec")
+    with pytest.raises(KeyError) as caught:
+        exec(code)
+    # The frame of this test is dropped.
+    error = caught.value.with_traceback(caught.tb.tb_next)
+    assert ("t.py" in users_lines(error)) == (place == "t.py")
+
+
 def test_the_first_cause_in_users_code_is_shown(capsys):
     def term(argv):
         raise KeyError("height")
@@ -126,10 +142,12 @@ def test_an_error_of_any_kind_that_this_package_raises_on_purpose_is_a_message(c
 
 def test_text_that_cannot_be_encoded_is_named(failing, run, tmp_path):
     path = f"{tmp_path}/log\udcff"
-    _, _, err = failing(UnicodeEncodeError("utf-8", path, 0, 1, "surrogates not allowed"))
-    for text in (err, run("train", TASK, *SMALL, "--log-root", path).message):
-        assert ascii(path)[1:-1] in text
-        assert "LC_ALL=C.UTF-8" in text
+    message = run("train", TASK, *SMALL, "--log-root", path).message
+    assert ascii(path)[1:-1] in message
+    assert "LC_ALL=C.UTF-8" in message
+    # Text of the user's own code is no path.
+    _, _, err = failing(UnicodeEncodeError("ascii", "\xe4", 0, 1, "ordinal not in range(128)"))
+    assert "\nerror: 'ascii' codec can't encode" in err
 
 
 def test_an_error_without_a_text_is_called_by_its_name(failing):

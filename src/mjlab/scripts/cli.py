@@ -7,7 +7,6 @@ imported before a command runs, so that `--help` and a mistyped task name answer
 from __future__ import annotations
 
 import atexit
-import contextlib
 import importlib
 import io
 import logging
@@ -549,14 +548,25 @@ def _end_without_threads(error: sys.UnraisableHookArgs) -> None:
 
 def _report(error: Exception) -> None:
     """Print an error as one message, after the lines of the user's code that it passed through."""
+    rank = os.environ.get("RANK", "0")
+    is_elsewhere = isinstance(error, OtherProcessError)
+    # Only the failed process and rank 0 report.
+    if rank != "0" and is_elsewhere:
+        return
+    lines = "" if is_elsewhere else users_lines(error)
+    is_expected = isinstance(error, (MjlabError, ValueError, OSError)) or _lacks_memory(error)
+    hint = f"Set {TRACEBACK_VARIABLE}=1 for the traceback."
+    if os.environ.get(TRACEBACK_VARIABLE):
+        traceback.print_exc()
+    elif lines:
+        print(lines, end="", file=sys.stderr)
+    elif not is_expected:
+        hint = _keep_traceback() or hint
     text = shorten(str(error).strip() or type(error).__name__)
-    is_expected = isinstance(error, (MjlabError, ValueError, OSError))
-    is_memory = isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY)
-    if is_memory:
+    if _lacks_memory(error):
         # The original message names the failed call, not the lack of memory.
         text = f"Out of memory or threads ({text}). Use fewer environments, or raise the limits (ulimit)."
-        is_expected = True
-    elif isinstance(error, UnicodeEncodeError):
+    elif isinstance(error, UnicodeEncodeError) and not lines:
         # The original message does not name the text, nearly always a path.
         text = (
             f"Expected text that can be written as {error.encoding}, got {shorten(ascii(error.object))}; rename "
@@ -564,35 +574,27 @@ def _report(error: Exception) -> None:
         )
     elif not is_expected and text != type(error).__name__:
         text = f"{type(error).__name__}: {text}"
-    rank = os.environ.get("RANK", "0")
-    is_elsewhere = isinstance(error, OtherProcessError)
-    # Only the failed process and rank 0 report.
-    if rank != "0" and is_elsewhere:
-        return
-    hint = f"Set {TRACEBACK_VARIABLE}=1 for the traceback."
-    if os.environ.get(TRACEBACK_VARIABLE):
-        traceback.print_exc()
-    elif not is_elsewhere and not is_memory and (lines := users_lines(error)):
-        print(lines, end="", file=sys.stderr)
-    elif not is_expected:
-        import tempfile
-
-        # The only trace of a defect, at times after hours.
-        with (
-            contextlib.suppress(OSError),
-            tempfile.NamedTemporaryFile(
-                "w",
-                encoding="utf-8",
-                errors="backslashreplace",
-                prefix="mjlab_error_",
-                suffix=".txt",
-                delete=False,
-            ) as file,  # fmt: skip
-        ):
-            traceback.print_exc(file=file)
-            hint = f"The traceback is in {file.name}."
     process = "" if rank == "0" else f" in process {rank}"
     print(f"error{process}: {text}\n({hint})", file=sys.stderr)
+
+
+def _lacks_memory(error: Exception) -> bool:
+    return isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY)
+
+
+def _keep_traceback() -> str | None:
+    """Write the present traceback to a temporary file, because it may be of a defect that took hours to
+    appear; return a sentence with its name. None: not written.
+    """
+    import tempfile
+
+    try:
+        number, path = tempfile.mkstemp(prefix="mjlab_error_", suffix=".txt")
+        with open(number, "w", encoding="utf-8", errors="backslashreplace") as file:
+            traceback.print_exc(file=file)
+    except OSError:
+        return None
+    return f"The traceback is in {path}."
 
 
 if __name__ == "__main__":

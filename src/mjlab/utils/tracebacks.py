@@ -10,6 +10,8 @@ TASK_PACKAGES = "mjlab.tasks"
 """Group of the entry points of packages that register tasks."""
 
 _OWN = Path(__file__).parents[1]
+# Folders of installed packages.
+_INSTALLED = ("site-packages", "dist-packages")
 
 
 def users_lines(error: BaseException) -> str:
@@ -39,14 +41,15 @@ def _is_users(filename: str) -> bool:
     # Code without a file, such as `<string>` of dataclasses.
     if not path.is_absolute() or path.is_relative_to(_OWN):
         return False
-    places = sysconfig.get_paths()
-    for name in ("purelib", "platlib"):
-        if path.is_relative_to(places[name]):
-            from importlib.metadata import entry_points
+    folders = [i for i, part in enumerate(path.parts) if part in _INSTALLED]
+    if folders:
+        from importlib.metadata import entry_points
 
-            package = path.relative_to(places[name]).parts[0].removesuffix(".py")
-            tasks = entry_points(group=TASK_PACKAGES)
-            return package in {one.module.partition(".")[0] for one in tasks}
+        package = path.parts[folders[-1] + 1].removesuffix(".py")
+        return package in {
+            one.module.partition(".")[0] for one in entry_points(group=TASK_PACKAGES)
+        }
+    places = sysconfig.get_paths()
     return not any(
         path.is_relative_to(places[name]) for name in ("stdlib", "platstdlib", "scripts")
     )
