@@ -35,7 +35,7 @@ def attempt(run, tmp_path):
     [
         ("--agent.algorithm.learning-rate", "nan", "learning-rate"),
         ("--agent.actor.activation", "unheard-of", "unheard-of"),
-        ("--num-envs", "0", "num_envs"),
+        ("--num-envs", "0", "num-envs"),
     ],
 )
 def test_a_run_that_cannot_begin_leaves_no_folder(attempt, flag, value, told):

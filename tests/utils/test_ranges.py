@@ -119,7 +119,7 @@ def test_other_numbers_warn():
 
 def test_flags_of_a_command_raise():
     with pytest.raises(ValueError, match="--steps: expected an integer >= 1, got -1"):
-        check_ranges(Inner(steps=-1), ())
+        check_ranges(Inner(steps=-1), {"steps"})
 
 
 @pytest.mark.parametrize(

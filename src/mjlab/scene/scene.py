@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 import mujoco
 import numpy as np
@@ -38,6 +38,7 @@ from mjlab.terrains.terrain_entity import TerrainEntity, TerrainEntityCfg
 from mjlab.utils.errors import UnknownNameError, check_count
 from mjlab.utils.indexing import EnvIds, as_index
 from mjlab.utils.mujoco import OPTION_ENUMS, flag_names
+from mjlab.utils.ranges import Range
 from mjlab.utils.spec import (
     attach,
     compile_composed,
@@ -68,7 +69,7 @@ class SceneCfg:
 
     num_envs: int = 1
     """Number of environments."""
-    env_spacing: float = 2.0
+    env_spacing: Annotated[float, Range(ends="()")] = 2.0
     """Distance between environment origins on a plane (m)."""
     terrain: TerrainEntityCfg | None = None
     """Terrain. None: no ground, and all environments share the world's origin."""

@@ -89,7 +89,7 @@ def convert(cfg: CsvToNpzConfig) -> Path:
     """
     if not cfg.input_file:
         raise UserError("--input-file: expected a recording (.csv or .npz), got none.")
-    check_ranges(cfg, ())
+    check_ranges(cfg, vars(cfg))
     if cfg.upload:
         check_wandb_login("--upload")
     if cfg.view:

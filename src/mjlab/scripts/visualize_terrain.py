@@ -69,7 +69,7 @@ def run_visualize_terrain(cfg: VisualizeTerrainConfig) -> None:
     """
     check_address(cfg.host, cfg.port, "--")
     check_exists("terrain preset", cfg.terrain, (ALL, *ALL_TERRAIN_PRESETS))
-    check_ranges(cfg, ())
+    check_ranges(cfg, vars(cfg))
     server = serve_page(cfg.host, cfg.port)
     page = TerrainPage(server, cfg.terrain, cfg.num_levels, cfg.size, cfg.seed, cfg.robot)
     print(f"Serving the terrain on {page_url(server)} (Ctrl-C stops).", flush=True)

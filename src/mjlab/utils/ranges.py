@@ -43,16 +43,16 @@ class Range:
         return bool(is_kind and is_above and is_below)
 
     def __str__(self) -> str:
-        text = "an integer" if isinstance(self.low, int) else "a number"
+        bounds = f"{self.low:.10g}, {self.high:.10g}"
         if self.high != math.inf:
-            text += f" in {self.ends[0]}{self.low:.10g}, {self.high:.10g}{self.ends[1]}"
+            limits = f" in {self.ends[0]}{bounds}{self.ends[1]}"
         else:
-            text = text.replace(
-                "a number", "a finite number" if self.ends[1] == ")" else "a number"
-            )
-            if self.low != -math.inf:
-                text += f" {'>' if self.ends[0] == '(' else '>='} {self.low:.10g}"
-        return text if self.also is None else f"{text}, or {self.also}"
+            limits = f" {'>' if self.ends[0] == '(' else '>='} {self.low:.10g}"
+            limits = "" if self.low == -math.inf else limits
+        is_finite = self.high == math.inf and self.ends[1] == ")"
+        kind = "an integer" if isinstance(self.low, int) else "a number"
+        kind = "a finite number" if is_finite and kind == "a number" else kind
+        return f"{kind}{limits}" + ("" if self.also is None else f", or {self.also}")
 
 
 Count = Annotated[int, Range(1)]
@@ -80,22 +80,22 @@ def check_ranges(cfg: Any, typed: Collection[str], path: str = "") -> None:
 
     Args:
         cfg: Config, or flags of a command.
-        typed: Paths of the settings that were typed, such as `agent.algorithm.gamma`.
+        typed: Paths of the settings that were typed, such as `agent.algorithm.gamma`, or of configs that
+            hold them.
         path: Path of `cfg`; empty for the flags of a command.
 
     Raises:
-        ValueError: a number out of its range was typed, or is a flag without a dot.
+        ValueError: a number out of its range was typed, or is 0 where a count is expected.
     """
     found = list(out_of_range(cfg, path))
     for name, limits, value in found:
-        text = f"{name}: expected {limits}, got {value}."
+        problem = f"expected {limits}, got {value}."
         parts = name.removeprefix("options.").split(".")
-        if "." not in name or any(".".join(parts[:n]) in typed for n in range(1, len(parts) + 1)):
-            flag = "--" + ".".join(parts).replace("_", "-")
-            raise ValueError(text.replace(name, flag, 1))
+        if any(".".join(parts[:n]) in typed for n in range(1, len(parts) + 1)):
+            raise ValueError(f"--{'.'.join(parts).replace('_', '-')}: {problem}")
         # Releases 1.x raise during training.
         if limits == Range(1) and value == 0:
-            raise ValueError(text)
+            raise ValueError(f"{name}: {problem}")
     for name, limits, value in found:
         warnings.warn(f"{name}: expected {limits}, got {value}.", UserWarning, stacklevel=2)
 
