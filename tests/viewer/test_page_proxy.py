@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import re
@@ -88,6 +89,36 @@ def test_a_named_host_is_served(page):
         assert status(own, Host="localhost:9", Origin="http://localhost:9") == (200, 101)
     finally:
         own.stop()
+
+
+def test_a_page_of_the_network_is_served_by_its_full_name(page, monkeypatch):
+    name = "Robot.Lab.Example"
+    monkeypatch.setattr(socket, "getfqdn", lambda: name)
+    assert status(page, Host=name) == (403, 403)
+    own = serve_page("0.0.0.0", port=18400)
+    try:
+        assert status(own, Host=f"{name}:8080", Origin=f"http://{name}:8080") == (200, 101)
+    finally:
+        own.stop()
+
+
+@pytest.mark.parametrize("error", [OverflowError, UnicodeError, TypeError, MemoryError])
+@pytest.mark.parametrize("name", ["start_server", "run"])
+def test_errors_of_the_start_reach_the_caller(monkeypatch, error, name):
+    def fail(*args, **kwargs):
+        for argument in args:
+            if asyncio.iscoroutine(argument):
+                argument.close()
+        raise error("odd")
+
+    with monkeypatch.context() as patch, pytest.raises(error, match="odd"):
+        patch.setattr(f"mjlab.viewer.page_proxy.asyncio.{name}", fail)
+        serve_page(port=18400)
+
+
+def test_a_share_address_is_not_handed_out(page, caplog):
+    assert page.request_share_url() is None
+    assert "ssh" in caplog.text
 
 
 @pytest.mark.parametrize("twice", ["Host: localhost\r\nHost: evil\r\n", "Origin: null\r\n" * 2, ""])

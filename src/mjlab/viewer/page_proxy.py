@@ -38,7 +38,8 @@ class PageServer(viser.ViserServer):
     listens at a random loopback address and port, which web sites cannot guess.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, names: set[str]) -> None:
+        """Start serving; browsers may also use the page by these `names`, in lower case."""
         console = rich.get_console()
         quiet, console.quiet = console.quiet, True  # Viser would print its own address.
         try:
@@ -48,18 +49,16 @@ class PageServer(viser.ViserServer):
         self._viser_address = super().get_host(), super().get_port()
         self._page_address = host, port
         own = socket.gethostname().lower()
-        self._names = {"localhost", own, f"{own}.local", host.lower()}
+        self._names = {"localhost", own, f"{own}.local", *names}
         self._has_warned = False
         self._connections: set[asyncio.Task | None] = set()
         logging.getLogger("websockets.server").addFilter(_shorten)
         started: Future[int] = Future()
-        self._proxy = threading.Thread(
-            target=lambda: asyncio.run(self._listen(started)), daemon=True
-        )
+        self._proxy = threading.Thread(target=self._run, args=(started,), daemon=True)
         self._proxy.start()
         try:
             self._page_address = host, started.result()
-        except OSError:
+        except Exception:
             super().stop()
             raise
 
@@ -79,6 +78,20 @@ class PageServer(viser.ViserServer):
         self._proxy.join(timeout=1.0)
         super().stop()
 
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Return None: viser's tunnel passes by the proxy, and does not find viser's address."""
+        log.warning("The page cannot be shared by viser's tunnel; use `ssh -L` or --host instead.")
+        return None
+
+    def _run(self, started: Future[int]) -> None:
+        """Serve until `stop`. The port, or the error of the start, is the result of `started`."""
+        try:
+            asyncio.run(self._listen(started))
+        except Exception as error:
+            if started.done():
+                raise
+            started.set_exception(error)
+
     async def _listen(self, started: Future[int]) -> None:
         """Serve connections at the wanted port, or the next free one, until `stop`."""
         self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
@@ -88,9 +101,9 @@ class PageServer(viser.ViserServer):
             try:
                 listener = await asyncio.start_server(self._serve, host, port)
                 break
-            except OSError as error:
+            except OSError:
                 if port == last:
-                    return started.set_exception(error)
+                    raise
                 port += 1
         started.set_result(port)
         await self._stopping.wait()

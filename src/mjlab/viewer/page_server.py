@@ -55,11 +55,14 @@ def serve_page(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> viser.Vise
     from mjlab.viewer.page_proxy import PageServer
 
     check_address(host, port)
+    names = {host.lower()}
     if host not in _LOOPBACK:
         log.warning(
             "The page is served on %s: anyone who can reach this machine can control it.", host
         )
-    return PageServer(host, port)
+        # On some networks this lookup is slow.
+        names.add(socket.getfqdn().lower())
+    return PageServer(host, port, names)
 
 
 def page_url(server: viser.ViserServer) -> str:
