@@ -148,6 +148,7 @@ def _make_viewer(
             current=checkpoint.path.name,
         )
     viewer = ViserPlayViewer(env, policy, checkpoint_manager=manager, host=cfg.host, port=cfg.port)
+    print(f"Open {viewer.url} in a browser. Ctrl-C ends.", flush=True)
     if cfg.open_browser:
         open_browser(viewer.url)
     return viewer

@@ -110,10 +110,17 @@ def escaped(text: object) -> str:
     """Return text that is shown as it is within a line of Markdown or HTML.
 
     Characters that could begin a tag, markup or a line become character references. For all names
-    and messages shown in a page, which may come from the files of others.
+    and messages shown in a page: they may come from the files of other people.
     """
-
     return _MARKUP.sub(lambda found: f"&#{ord(found[0])};", html.escape(str(text)))
+
+
+def encodable(text: str) -> str:
+    r"""Return text that UTF-8 can encode, for pages: odd bytes of a file's name read `\udcff`.
+
+    Not `?`, so that names that differ in such bytes still differ.
+    """
+    return text.encode(errors="backslashreplace").decode()
 
 
 def is_number(text: str) -> bool:

@@ -58,7 +58,8 @@ def test_serving_the_network_is_possible_and_warned_about(caplog, capsys) -> Non
         viewer = ViserPlayViewer(FakeEnv(1), push(), host="0.0.0.0", port=18099)
     assert viewer.server.get_host() == "0.0.0.0"
     assert "can control it" in caplog.text
-    assert viewer.url in capsys.readouterr().out
+    # Commands print the address.
+    assert capsys.readouterr().out == ""
     viewer.close()
 
 
@@ -287,6 +288,22 @@ class TestCheckpoints:
             assert "<img" not in panel._message.content
             # Sent as UTF-8.
             assert panel._choice.value.encode()
+
+    @pytest.mark.parametrize(
+        "url", ["javascript:alert(1)", "data:text/html,x", "//example.com", ""]
+    )
+    def test_only_web_addresses_become_links(self, viser_server, url) -> None:
+        manager = CheckpointManager("a", lambda: [("a", "")], lambda name: push(), "run", url)
+        content = make(viser_server, manager=manager)._checkpoint_panel._about.content
+        assert content == "**Run:** run"
+
+    def test_names_that_differ_in_odd_bytes_are_all_listed(self, viser_server) -> None:
+        names = ["model_\udcfe.pt", "model_\udcff.pt"]
+        listed = [(name, "1m ago") for name in names]
+        manager = CheckpointManager(names[0], lambda: listed, lambda name: push())
+        panel = make(viser_server, manager=manager)._checkpoint_panel
+        assert len(set(panel._choice.options)) == 2
+        assert set(panel._labels.values()) == set(names)
 
     def test_use_latest_looks_for_new_files(self, viser_server, folder) -> None:
         loaded = []

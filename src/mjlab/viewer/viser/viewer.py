@@ -22,7 +22,7 @@ import viser
 
 from mjlab.utils.errors import WrongStateError
 from mjlab.utils.os import files_in
-from mjlab.utils.string import escaped
+from mjlab.utils.string import encodable, escaped
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, reset_policy
 from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
@@ -119,8 +119,6 @@ class ViserPlayViewer(BaseViewer):
         """
         super().__init__(env, policy, frame_rate, verbosity)
         self._server = viser_server or serve_page(host, port)
-        if viser_server is None:
-            print(f"Open {self.url} in a browser. Ctrl-C ends.", flush=True)
         self._checkpoint_manager = checkpoint_manager
         self._closed = False
         self._scene: MjlabViserScene | None = None
@@ -449,15 +447,15 @@ class CheckpointPanel:
         run, url, state = self._manager.run_name, self._manager.run_url, self._manager.run_status
         if run is not None:
             name = escaped(run)
-            if url is not None:
+            # Browsers run the code in other schemes, such as `javascript:`.
+            if url is not None and url.startswith(("https://", "http://")):
                 name = f"[{name}]({quote(url, safe=':/?#&=%~@+,;', errors='replace')})"
             status = "" if state is None else f" ({escaped(state)})"
             self._about.content = f"**Run:** {name}{status}"
         chosen = self._labels.get(self._choice.value)
         # Newest first: users usually want the latest checkpoint.
         labels = {f"{name} ({age})" if age else name: name for name, age in checkpoints[::-1]}
-        # Viser sends UTF-8, but names of files are bytes.
-        self._labels = {k.encode(errors="replace").decode(): name for k, name in labels.items()}
+        self._labels = {encodable(label): name for label, name in labels.items()}
         self._set_silently("options", list(self._labels) or [_NONE_FOUND])
         self.select(chosen or self._manager.current_name)
         self._show(f"{len(checkpoints)} found.")

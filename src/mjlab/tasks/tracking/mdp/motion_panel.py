@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.utils.lab_api.math import quat_error_magnitude
-from mjlab.utils.string import escaped
+from mjlab.utils.string import encodable, escaped
 
 if TYPE_CHECKING:
     import numpy as np
@@ -72,8 +72,7 @@ class MotionPanel:
         # True if the user moved the reference, which then is not one frame ahead of the robot.
         self._was_moved = False
         self._next_table = 0.0
-        # Viser sends UTF-8, but names of files are bytes.
-        names = [name.encode(errors="replace").decode() for name in motion.names]
+        names = [encodable(name) for name in motion.names]
         gui, self._names = server.gui, names
         with gui.add_folder(name.capitalize()):
             self._motion = gui.add_dropdown(
