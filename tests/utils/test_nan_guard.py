@@ -248,10 +248,15 @@ def test_a_dump_without_states_is_refused(
     run_until_nan(guard, data, [0])
     with np.load(guard.dump_path or "") as arrays:
         kept = {name: arrays[name] for name in arrays if not name.startswith("states_step_")}
+        states = arrays["states_step_000000"]
     path = Path(guard.dump_path or "").with_name("other.npz")
     np.savez(path, **kept)
     with pytest.raises(ValueError, match="recorded states, got none"):
         NanDump.load(path)
+    for name in ("states_step_0", "states_step_0000001", "states_step_x", "states_step_00000٣"):
+        np.savez(path, **kept, **{name: states})
+        with pytest.raises(ValueError, match=f"other.npz is not .*expected arrays .*{name}"):
+            NanDump.load(path)
 
 
 @pytest.mark.parametrize("field", ["buffer_size", "max_envs_to_dump"])

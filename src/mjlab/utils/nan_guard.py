@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import os
+import re
 import tempfile
 import warnings
 from collections import deque
@@ -35,6 +36,7 @@ _MOCAP_STATE = ("mocap_pos", "mocap_quat")
 _INPUTS = ("ctrl", "xfrc_applied")
 _FORMAT = 2
 _ARCHIVE = b"PK\x03\x04"
+_STATES = re.compile(r"states_step_(\d{6}|[1-9]\d{6,})", re.ASCII)
 # Metadata entry that explains a dump to readers of the file.
 _NOTE = (
     "States are those before each substep; the last state led to the NaN. Arrays model_<field> hold "
@@ -285,9 +287,10 @@ class NanDump:
             short = [name for name, array in arrays.items() if array.shape[:1] != (rows,)]
             if short:
                 raise ValueError(f"{short}: expected {rows} rows")
-            steps = sorted(
-                int(name.rpartition("_")[2]) for name in arrays if name.startswith("states_step_")
-            )
+            states = [name for name in arrays if name.startswith("states_step_")]
+            if odd := [name for name in states if not _STATES.fullmatch(name)]:
+                raise ValueError(f"expected arrays states_step_000000, ..., got {odd[:3]}")
+            steps = sorted(int(name.rpartition("_")[2]) for name in states)
             if not steps:
                 raise ValueError("expected recorded states, got none")
         except Exception as error:
