@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import random
+import re
 import subprocess
 import sys
 import time
@@ -145,3 +147,11 @@ def test_every_family_is_registered() -> None:
     modules = {path.stem for path in Path(__file__).parent.glob("*.py")}
     helpers = {"commands", "conftest", "runs", "trials", "test_robustness", "test_trials"}
     assert modules - helpers == set(FAMILIES)
+
+
+def test_every_family_is_in_the_readme_with_its_trials() -> None:
+    text = Path(__file__).with_name("README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (\d+) \|", text, re.MULTILINE)
+    trials = {name: importlib.import_module(f".{name}", __package__).TRIALS for name in FAMILIES}
+    assert {name: int(number) for name, number in rows} == trials
+    assert len(rows) == len(trials)
