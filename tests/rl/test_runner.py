@@ -741,8 +741,8 @@ def test_failed_uploads_are_warnings(make_runner, tmp_path: Path, monkeypatch, c
     monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", client)
     make_runner(tmp_path / "run", logger="wandb").learn(1)
     assert (tmp_path / "run" / "model_0.pt").is_file()
-    for name in ("upload of", "last upload"):
-        assert f"No {name}" in caplog.text
+    for name in ("model_0.pt", "last values"):
+        assert f"{name} to the logging service: the service is down" in caplog.text
     assert caplog.text.count("the service is down") == 3
 
 

@@ -173,7 +173,7 @@ def _file(trial: Trial, kind: str, good: Path, own: Path) -> None:
     trial.trying(f"{kind}, {path.name}: {_damage(trial, path)}")
     ended = _swept(kind, good, own)
     if path.name == "table.csv" and path.is_dir():
-        if ended.status != 0 or "No table.csv" not in ended.err:
+        if ended.status != 0 or "Not written: table.csv" not in ended.err:
             raise Broken(f"exit status {ended.status}: {ended.err}")
         return
     _check_same(kind, good, own, ended)

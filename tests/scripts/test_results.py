@@ -30,13 +30,13 @@ def test_failures_beside_the_policy_are_warnings(run, tmp_path, monkeypatch):
     outcome = run("train", TASK, *SMALL, *flags)
     assert outcome.status == 0, outcome.err
     for name in ("learning curve", "video"):
-        assert f"No {name}: [Errno 28] No space left on device" in outcome.err
+        assert f"Not written: {name}: [Errno 28] No space left on device" in outcome.err
     assert len([*tmp_path.glob("cartpole/*/model_0.pt")]) == 1
     # The end of a run is one of them.
     monkeypatch.setattr("mjlab.scripts.train.write_info", fail_at_the_end)
     outcome = run("train", TASK, *SMALL, *flags[:-2])
     assert outcome.status == 0
-    assert "No end in run.json: [Errno 28]" in outcome.err
+    assert "end of the run in run.json: [Errno 28]" in outcome.err
 
 
 def fail_at_the_end(run_dir, **info):

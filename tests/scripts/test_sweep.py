@@ -565,7 +565,7 @@ def test_tables_that_cannot_be_written_are_warnings(sweep, machine, folder):
     assert outcome.status == 0
     assert "Best:" in outcome.out or "Highest:" in outcome.out
     for name in ("table.csv", "table.md", "curves.png"):
-        assert f"No {name}: " in outcome.err
+        assert f"Not written: {name}: " in outcome.err
 
 
 SAMPLED = ("--over", f"{RATE}=1e-5..1e-2:log", "--trials", "2")

@@ -354,12 +354,12 @@ class RunLogger(Logger):
 
     def save_model(self, path: str, it: int) -> None:
         """Upload a file to the logging service, if it takes files. Failures are logged."""
-        with beside_results(f"upload of {path}"):
+        with beside_results(f"{path} to the logging service"):
             super().save_model(path, it)
 
     def stop_logging_writer(self) -> None:
         """Flush and close the event file."""
-        with beside_results("last upload"):
+        with beside_results("last values to the logging service"):
             super().stop_logging_writer()
         if threading.excepthook == self._on_thread_error:
             threading.excepthook = self._thread_hook

@@ -198,8 +198,10 @@ class Study:
             raise ValueError(f"trial {trial.number} has the setting {setting}, and {sampled}")
 
     def _enqueue_missing(self) -> None:
-        """Enqueue the settings to train that have no trial, unless it failed: combinations; else those
-        of failed trials, and of run folders, which outlive a database.
+        """Enqueue the settings of the sweep that have no trial, or only failed ones.
+
+        These are all combinations. A sweep that samples has no list: its settings are those of
+        failed trials and of run folders, which outlive a database.
         """
         if self._sweep.trials is None:
             missing = [(setting, dict(setting)) for setting in self._sweep.combinations]

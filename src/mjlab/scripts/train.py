@@ -395,7 +395,7 @@ def _learn(
         iterations = getattr(runner, "current_learning_iteration", total)
         if not is_shared:
             # On a full disk, do not mask the error that names the intact checkpoint.
-            with beside_results("end in run.json"):
+            with beside_results("end of the run in run.json"):
                 write_info(folder.path, ended=ended, iterations=iterations)
     return ended
 

@@ -50,12 +50,14 @@ def print_list(title: str, lines: list[str]) -> None:
 
 
 @contextlib.contextmanager
-def beside_results(what: str) -> Generator[None]:
-    """Turn an error within the block, which makes `what` after the results were saved, into a warning."""
+def beside_results(name: str) -> Generator[None]:
+    """Turn an error within the block into a warning. The block writes `name` beside saved results."""
     try:
         yield
     except Exception as error:
-        logger.warning("No %s: %s", what, shorten(str(error).strip() or type(error).__name__))
+        logger.warning(
+            "Not written: %s: %s", name, shorten(str(error).strip() or type(error).__name__)
+        )
 
 
 def shorten(text: str) -> str:

@@ -200,7 +200,7 @@ def test_motions_that_cannot_be_recorded_cost_no_checkpoint(make_runner, tmp_pat
     runner.save(str(tmp_path / "run" / "model_0.pt"))
     assert (tmp_path / "run" / "model_0.pt").is_file()
     assert (tmp_path / "run" / "run.onnx").is_file()
-    assert "No record of the motions" in caplog.text
+    assert "Not written: record of the motions" in caplog.text
 
 
 def test_a_task_without_motion_is_refused():
