@@ -82,7 +82,10 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
         before = set(root.glob("cartpole/*"))
         if phase == "imports":
             process = Command("train", flags, is_fresh=True)
-            if not process.watch(rng.uniform(0.1, 3.0)):
+            # Before, Python itself starts.
+            maps = Path(f"/proc/{process.pid}/maps")
+            process.watch(30.0, lambda maps=maps: "libtorch" in maps.read_text())
+            if not process.watch(rng.uniform(0.0, 2.0)):
                 Path("sent").touch()
                 process.signal(number)
         else:
@@ -97,9 +100,10 @@ def run(trial: Trial, prepared: dict[str, Any]) -> None:
         check_loadable(root)
         # A solved run that is resumed would go on.
         whole = _is_finished(root, expected["iterations_finished"])
-        # Only the first SIGHUP counts, because a terminal and its shell both send it.
+        # Only the first SIGHUP counts, because a terminal and its shell both send it. The second of
+        # other signals may come when all is saved because of the first.
         end = signal.SIGKILL if is_endless and number is signal.SIGHUP else number
-        _check(ended, end if Path("sent").exists() else None, phase in _HARMLESS or whole)
+        _check(ended, end if Path("sent").exists() else None, phase in _HARMLESS or whole or twice)
         _check_files(set(root.glob("cartpole/*")) - before, ended.status == -signal.SIGKILL)
         # The replay of an iteration that SAC gave up has its first steps.
         is_exact &= not (twice and "sac" in kind)
