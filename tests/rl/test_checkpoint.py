@@ -18,6 +18,7 @@ import torch
 from mjlab.rl.checkpoint import (
     CheckpointError,
     RunFolderError,
+    check_fits,
     check_terms,
     copied,
     ensure_writable_folder,
@@ -236,6 +237,37 @@ def test_a_damaged_entry_is_an_error_with_its_cure(make_runner, tmp_path: Path, 
     after = runner.alg.save()
     for part in ("actor_state_dict", "critic_state_dict"):
         assert all(torch.equal(before[part][key], after[part][key]) for key in before[part])
+
+
+class Statistics(torch.nn.Module):
+    def __init__(self, value: float) -> None:
+        super().__init__()
+        for name in ("_std", "count", "factor", "step"):
+            self.register_parameter(name, torch.nn.Parameter(torch.full((2,), value)))
+        self.register_buffer("_var", torch.full((2,), abs(value)))
+
+
+def test_only_statistics_are_never_negative():
+    saved = Statistics(-1.0).state_dict()
+    check_fits(Statistics(1.0), saved, name="actor", path="model_0.pt")
+    saved["_var"] = -saved["_var"]
+    with pytest.raises(CheckpointError, match="_var: expected values >= 0, got -1"):
+        check_fits(Statistics(1.0), saved, name="actor", path="model_0.pt")
+
+
+def test_too_little_memory_is_no_fault_of_the_file(make_runner, tmp_path, saved, monkeypatch):
+    save_checkpoint(saved, tmp_path / "model_1.pt")
+    runner = make_runner()
+    load = runner.alg.load
+
+    def fail(content, *args):
+        # The second call restores the networks.
+        monkeypatch.setattr(runner.alg, "load", load)
+        raise MemoryError
+
+    monkeypatch.setattr(runner.alg, "load", fail)
+    with pytest.raises(MemoryError):
+        runner.load(str(tmp_path / "model_1.pt"))
 
 
 KEPT: dict[str, tuple[Any, Any]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from types import SimpleNamespace
 
 import mujoco
 import pytest
@@ -18,7 +19,7 @@ from mjlab.managers import (
     TerminationTermCfg,
 )
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg, RslRlVecEnvWrapper
-from mjlab.rl.divergence import DivergedError
+from mjlab.rl.divergence import DivergedError, RolloutWatch
 from mjlab.rl.run_logger import TrainingObserver
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
@@ -129,6 +130,35 @@ def test_a_policy_that_breaks_on_its_own_is_named(make_runner):
     with pytest.raises(DivergedError, match="weights are NaN.*learning rate") as caught:
         runner.learn(1)
     assert "joint" not in str(caught.value)
+
+
+@pytest.mark.parametrize("part", ["weight", "moment", "statistic"])
+def test_nothing_is_saved_that_cannot_be_loaded(make_runner, monkeypatch, part):
+    runner = make_runner(armature=0.01, normalized=True)
+    optimizer, update = runner.alg.optimizer, runner.alg.update
+
+    def breaks():
+        losses = update()
+        weight = next(runner.alg.critic.mlp.parameters())
+        moment = optimizer.state[weight]["exp_avg_sq"]
+        statistic = runner.alg.critic.obs_normalizer._var
+        chosen = {"weight": weight.data, "moment": moment, "statistic": statistic}[part]
+        chosen.view(-1)[0] = float("inf")
+        return losses
+
+    monkeypatch.setattr(runner.alg, "update", breaks)
+    with pytest.raises(DivergedError, match="infinite"):
+        runner.learn(1)
+
+
+def test_infinity_from_the_start_is_meant():
+    meant, learned = torch.tensor(-torch.inf), torch.tensor(0.0)
+    algorithm = SimpleNamespace(save=lambda: {"meant": meant, "learned": [learned]})
+    watch = RolloutWatch(SimpleNamespace(), algorithm)
+    with watch.explaining(algorithm):
+        pass
+    with pytest.raises(DivergedError), watch.explaining(algorithm):
+        learned.fill_(torch.inf)
 
 
 @pytest.mark.parametrize("value", [float("inf"), 1e38])

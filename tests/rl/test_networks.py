@@ -6,6 +6,7 @@ from dataclasses import asdict
 
 import pytest
 from rsl_rl.models import MLPModel
+from rsl_rl.modules import GaussianDistribution
 
 from mjlab.rl.config import RslRlModelCfg, RslRlPpoAlgorithmCfg, gaussian_distribution
 
@@ -52,6 +53,20 @@ def test_an_actor_without_distribution_is_refused_when_built(make_runner, networ
     actor = asdict(RslRlModelCfg(hidden_dims=(8,), **networks))
     with pytest.raises(ValueError, match=rf"agent.actor distribution_cfg: .*None; use.*{cure}"):
         make_runner(actor=actor)
+
+
+class NeedsValues(GaussianDistribution):
+    """Distribution of a package, which reads numbers of tensors when built."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.least = float(self.std_param.min())
+
+
+def test_a_distribution_of_a_package_may_read_its_values(make_runner):
+    cfg = {"class_name": f"{__name__}:NeedsValues", "init_std": 0.5, "std_type": "scalar"}
+    actor = asdict(RslRlModelCfg(hidden_dims=(8,), distribution_cfg=cfg))
+    assert make_runner(actor=actor).alg.actor.distribution.least == 0.5
 
 
 class OwnNoise(MLPModel):

@@ -213,6 +213,7 @@ def test_a_damaged_replay_is_an_error(tmp_path, what):
     with pytest.raises(CheckpointError, match=f"{name}.*delete this file") as caught:
         files.read(storage)
     assert str(files.path) in str(caught.value)
+    assert str(caught.value).count("; ") == 1
     assert storage.num_filled == 0
 
 

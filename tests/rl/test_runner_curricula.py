@@ -13,7 +13,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import CurriculumTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-from mjlab.rl.checkpoint import load_checkpoint, restore_lasting_state
+from mjlab.rl.checkpoint import load_checkpoint, restore_lasting_state, start_episodes
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -93,9 +93,23 @@ def test_new_episodes_begin_under_the_restored_curricula(make, tmp_path):
     second = make(tmp_path / "second", 6, edit)
     state = load_checkpoint(tmp_path / "first" / "model_0.pt")["training_state"]
     assert restore_lasting_state(state, second.env) == []
+    start_episodes(second.env)
     assert weight(second) == 4.0
     positions = second.env.unwrapped.scene["cartpole"].data.joint_pos[:, 0]
     assert (positions >= 1.0).all()
+
+
+def test_errors_of_a_reset_are_not_of_the_checkpoint(make, tmp_path):
+    make(tmp_path / "first", 4).learn(1)
+    second = make(tmp_path / "second", 6)
+    second.load(str(tmp_path / "first" / "model_0.pt"))
+
+    def divides(*args: Any, **params: Any) -> None:
+        raise ZeroDivisionError("of the task")
+
+    second.env.unwrapped.event_manager.get_term_cfg("reset_slider").func = divides
+    with pytest.raises(ZeroDivisionError, match="of the task"):
+        second.learn(2)
 
 
 def test_a_failed_run_keeps_its_curricula(make, tmp_path):

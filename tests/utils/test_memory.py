@@ -196,10 +196,13 @@ def test_learners_beyond_the_memory(machine, env, learner, change, named):
     assert time.monotonic() - begin < 10.0
 
 
-def test_training_takes_four_times_the_weights(machine, env):
+def test_training_takes_two_to_four_times_the_weights(machine, env):
     cfg = train_dict(load_rl_cfg(CARTPOLE))
     runner = MjlabOnPolicyRunner(env, cfg, device="cpu")
     machine(total=4 * 4 * 9000)
+    with pytest.warns(UserWarning, match="trained weights: expected about 8,9.*got 9,219"):
+        runner.learn(0)
+    machine(total=2 * 4 * 9000)
     with pytest.raises(ValueError, match="trained weights: expected at most 8,9.*got 9,219"):
         runner.learn(1)
 

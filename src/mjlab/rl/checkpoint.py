@@ -30,7 +30,7 @@ import numpy as np
 import torch
 
 from mjlab.envs.env_state import curricula_in
-from mjlab.utils.errors import MjlabError, UserError, check_count, check_in_range
+from mjlab.utils.errors import MjlabError, UserError
 from mjlab.utils.os import check_archive, checkpoint_number, checkpoints_in, files_in, replacing
 from mjlab.utils.random import rng_state, set_rng_state
 from mjlab.utils.torch import to_device
@@ -51,11 +51,13 @@ _DICT_ENTRIES = (
     "sac_state_dict", "infos", "training_state", "sizes",
 )  # fmt: skip
 _COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
-# Entries of networks, optimizers and SAC whose values are never negative.
-_NEVER_NEGATIVE = frozenset((
-    "step", "exp_avg_sq", "max_exp_avg_sq", "square_avg", "_var", "_std", "count", "running_var",
-    "steps_left", "_count", "_sum", "_largest", "factor",
-))  # fmt: skip
+# Entries whose values are never negative: moments of optimizers, statistics of SAC, and statistics in
+# buffers of networks. Parameters of these names may be.
+_NEVER_NEGATIVE = re.compile(
+    r"\w*optimizer_state_dict\.state\..+\.(step|exp_avg_sq|max_exp_avg_sq|square_avg)"
+    r"|sac_state_dict\.(noise|reward_scale)\.(steps_left|_count|_sum|_largest|factor)"
+    r"|\w+_state_dict\.(.+\.)?(_var|_std|count|running_var)"
+)
 
 # Legacy layouts: names of the standard deviation, and prefixes of actor and critic in one state dict.
 _STD_NAMES = {
@@ -81,6 +83,11 @@ _SEQUENCES = (list, tuple, set)
 
 class CheckpointError(MjlabError, RuntimeError):
     """Checkpoint that cannot be written, read or used; the message says what to do."""
+
+    def __init__(self, message: str, reason: str = "") -> None:
+        """Store `reason`, the part of the message that names neither the file nor what to do."""
+        super().__init__(message)
+        self.reason = reason or message
 
 
 class RunFolderError(MjlabError, OSError):
@@ -144,8 +151,8 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     corruption on disk is detected (files of torch before 1.6 have no checksums).
 
     Raises:
-        CheckpointError: the file is missing, truncated, not a checkpoint, or hostile, or contains
-            tensors other than dense ones.
+        CheckpointError: the file is missing, truncated, hostile or not a checkpoint. Other tensors than
+            dense ones are an error, too.
     """
     path = Path(path)
     if not path.is_file():
@@ -174,7 +181,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
                 "torch.save({...: state_dict()})."
             )
         raise CheckpointError(
-            f"Checkpoint {str(path)!r} was rejected: {reason}. No code in it was run.{hint}"
+            f"Checkpoint {str(path)!r} was rejected: {reason}. No code in it was run.{hint}", reason
         ) from error
     except Exception as error:
         # Damaged bytes make the reader raise arbitrary exceptions.
@@ -195,7 +202,9 @@ def unusable(path: str | os.PathLike[str], reason: str) -> CheckpointError:
     """Return the error for a checkpoint that is damaged: file, reason, and the checkpoint to use instead."""
     earlier = latest_checkpoint(Path(path).parent, before=Path(path).name)
     cure = "another checkpoint" if earlier is None else f"an earlier checkpoint, {str(earlier)!r}"
-    return CheckpointError(f"Checkpoint {str(path)!r}: {reason}; use {cure}. Nothing was changed.")
+    return CheckpointError(
+        f"Checkpoint {str(path)!r}: {reason}; use {cure}. Nothing was changed.", reason
+    )
 
 
 def latest_checkpoint(folder: Path, before: str = "") -> Path | None:
@@ -330,7 +339,7 @@ def load_algorithm(
         return load_cfg is None or bool(load_cfg.get(name))
 
     # rsl_rl loads one part after the other: an error leaves the algorithm partly loaded.
-    before = copy.deepcopy(algorithm.save())
+    before = copied(algorithm.save())
     for name in ("actor", "critic", "student", "teacher", "rnd"):
         model = getattr(algorithm, "rnd" if name == "rnd" else f"_raw_{name}", None)
         if strict and is_wanted(name) and f"{name}_state_dict" in before and model is not None:
@@ -347,7 +356,7 @@ def load_algorithm(
         loads_iteration = algorithm.load(checkpoint, load_cfg, strict)
     except Exception as error:
         algorithm.load(before, None, True)
-        if isinstance(error, torch.OutOfMemoryError):
+        if isinstance(error, (torch.OutOfMemoryError, MemoryError)):
             raise
         text = f"{type(error).__name__}: {error}" if isinstance(error, KeyError) else str(error)
         raise unusable(path, f"does not fit this algorithm: {text}") from error
@@ -423,7 +432,9 @@ def check_fits(
         raise CheckpointError(
             f"Checkpoint {path!r} holds no {name} weights; use a checkpoint of the same learner."
         )
-    own = {k: value for k, value in model.state_dict().items() if isinstance(value, torch.Tensor)}
+    # Parameters remain parameters, for `misfit`.
+    state = model.state_dict(keep_vars=True)
+    own = {key: value for key, value in state.items() if isinstance(value, torch.Tensor)}
     expected = {key: tuple(value.shape) for key, value in own.items()}
     found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
     if expected != found:
@@ -467,6 +478,8 @@ def check_optimizer_fits(
     groups = optimizer.state_dict()["param_groups"]
     try:
         stepped(groups)
+    except (torch.OutOfMemoryError, MemoryError):
+        raise
     except Exception:
         # Optimizers of packages may keep what a copy lacks.
         return
@@ -493,6 +506,8 @@ def check_optimizer_fits(
                 state = {key: value for key, value in state.items() if value is not None}
                 own = like.get(number, {})
                 fault = fault or misfit(own, state, f"{name}.state.{number}")
+    except (torch.OutOfMemoryError, MemoryError):
+        raise
     except Exception as error:
         fault = (
             f"{name}: expected a state that fits these networks ({type(error).__name__}: {error})"
@@ -508,7 +523,7 @@ def misfit(own: Any, saved: Any, name: str, *, same_rows: bool = True) -> str | 
     `own` are, and not negative where they never are.
 
     Args:
-        own: State of a new object.
+        own: State of a new object; parameters of networks are of type `Parameter`.
         saved: State of the same object, from a file.
         name: Name of the entry, for the result.
         same_rows: Compare the first size of tensors, too.
@@ -559,9 +574,28 @@ def _tensor_misfit(own: torch.Tensor, saved: Any, name: str, same_rows: bool) ->
     # Conversions of doubles may overflow.
     elif not (values := saved.to(own.dtype)).isfinite().all() and own.isfinite().all():
         expected, found = "finite values", "NaN or infinite ones"
-    elif name.rpartition(".")[2] in _NEVER_NEGATIVE and bool((values < 0).any()):
+    elif (
+        not isinstance(own, torch.nn.Parameter)
+        and _NEVER_NEGATIVE.fullmatch(name)
+        and bool((values < 0).any())
+    ):
         expected, found = "values >= 0", f"{float(values.min()):g}"
     return f"{name}: expected {expected}, got {found}" if expected else None
+
+
+def not_finite(entries: Mapping[str, Any]) -> set[str]:
+    """Return the names of the tensors in nested `entries` with values that are NaN or infinite."""
+    tensors = {
+        name: value
+        for name, value in _leaves(entries)
+        if isinstance(value, torch.Tensor) and value.is_floating_point()
+    }
+    if not tensors:
+        return set()
+    # One synchronization with the device of the networks.
+    device = next(iter(tensors.values())).device
+    finite = torch.stack([value.isfinite().all().to(device) for value in tensors.values()]).tolist()
+    return {name for name, is_finite in zip(tensors, finite, strict=True) if not is_finite}
 
 
 def _is_dense(value: torch.Tensor) -> bool:
@@ -730,11 +764,11 @@ def naming_checkpoint(path: str | os.PathLike[str], *passing: type[Exception]) -
 
     Args:
         path: Checkpoint file.
-        passing: Types of errors that are not converted.
+        passing: Types of errors that are not converted, besides those of mjlab.
     """
     try:
         yield
-    except (CheckpointError, torch.OutOfMemoryError, MemoryError, *passing):
+    except (MjlabError, torch.OutOfMemoryError, MemoryError, *passing):
         raise
     except Exception as error:
         # A state of the wrong form raises any error.
@@ -743,9 +777,9 @@ def naming_checkpoint(path: str | os.PathLike[str], *passing: type[Exception]) -
 
 
 def restore_lasting_state(state: dict[str, Any], env: VecEnv, algorithm: Any = None) -> list[str]:
-    """Restore what outlives episodes in a training state, mainly curricula, and start new episodes.
+    """Restore what outlives episodes in a training state, mainly curricula.
 
-    Returns the names of parts left out.
+    Call `start_episodes` afterwards. Returns the names of parts left out.
     """
     rnd = getattr(algorithm, "rnd", None)
     if rnd is not None and state.get("rnd") is not None:
@@ -759,10 +793,15 @@ def restore_lasting_state(state: dict[str, Any], env: VecEnv, algorithm: Any = N
         return ["curricula"]
     # Tensors created in the rollout can only be written to in inference mode.
     with torch.inference_mode():
-        left_out = unwrapped.load_curriculum_state(curricula)
-        with unwrapped.curriculum_manager.held():
+        return unwrapped.load_curriculum_state(curricula)
+
+
+def start_episodes(env: VecEnv) -> None:
+    """Start new episodes in environments with curricula, which keep their state."""
+    manager = getattr(getattr(env, "unwrapped", env), "curriculum_manager", None)
+    if manager is not None:
+        with torch.inference_mode(), manager.held():
             env.reset()  # ty: ignore[missing-attribute]
-    return left_out
 
 
 def restore_training_state(
@@ -860,10 +899,11 @@ def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
             if not isinstance(value, dict | None):
                 raise ValueError(f"{name}: expected a dict, got a {type(value).__name__}.")
         for name, value in counts.items():
-            if isinstance(value, bool):
-                raise ValueError(f"{name}: expected an integer, got {value}.")
-            check_count(name, value, _COUNT_ENTRIES.get(name, 0))
-            check_in_range(name, value, -1, 2**63)
+            least = _COUNT_ENTRIES.get(name, 0)
+            if type(value) is not int or not least <= value < 2**63:
+                raise ValueError(
+                    f"{name}: expected an integer in [{least}, 2**63), got {_described(value)}."
+                )
         for name, terms in parts.items():
             for term, shape in (terms or {}).items():
                 if not isinstance(shape, (list, tuple)) or any(type(n) is not int for n in shape):
@@ -904,7 +944,7 @@ def copied(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return type(value)(copied(item) for item in value)
     if not isinstance(value, dict):
-        return value
+        return copy.deepcopy(value)
     # State dicts of modules carry versions as an attribute.
     new = copy.copy(value)
     for key, item in value.items():

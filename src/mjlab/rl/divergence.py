@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import torch
 
+from mjlab.rl.checkpoint import not_finite
 from mjlab.sim.divergence import cure_of, describe_dof, fastest_dof
 from mjlab.utils.errors import MjlabError
 from mjlab.utils.string import counted
@@ -38,9 +39,11 @@ class RolloutWatch:
     A step costs two small operations on the device of the environments, and no synchronization.
     """
 
-    def __init__(self, env: Any) -> None:
-        """Watch `env`; environments without a simulation are not checked."""
+    def __init__(self, env: Any, algorithm: Any) -> None:
+        """Watch `env` (not checked without a simulation) and a new rsl_rl `algorithm`."""
         self._env = env
+        # May be meant, such as the logarithm of a standard deviation of 0.
+        self._not_finite_at_first = not_finite(algorithm.save())
         self._sim: Any = getattr(env, "sim", None)
         self._peak: torch.Tensor | None = None
         self._previous_peak: torch.Tensor | None = None
@@ -95,13 +98,14 @@ class RolloutWatch:
 
     @contextmanager
     def explaining(self, algorithm: Any) -> Generator[None]:
-        """Raise `DivergedError` instead of errors about NaN, and after a block that left weights of NaN.
+        """Raise `DivergedError` instead of errors about NaN, and after a block that left NaN or infinity.
 
+        Checked are weights, statistics and moments of the optimizer, as when a checkpoint is loaded.
         The cause is a joint that was too fast for the physics timestep, or else the learning. Errors of
         a network with finite weights pass if no joint was too fast.
 
         Args:
-            algorithm: An rsl_rl algorithm, or one with its methods.
+            algorithm: The algorithm, after any number of updates.
         """
         error: Exception | None = None
         try:
@@ -110,17 +114,12 @@ class RolloutWatch:
             raise
         except (RuntimeError, ValueError) as raised:
             error = raised
-        learned = [p for group in algorithm.optimizer.param_groups for p in group["params"]]
-        # Infinite weights may be meant, such as the logarithm of a standard deviation of 0.
-        is_broken = bool(torch.stack([p.isnan().any() for p in learned]).any())
-        policy = algorithm.get_policy()
-        if error is not None:
-            tensors = (*policy.parameters(), *policy.buffers())
-            is_broken = is_broken or any(not t.isfinite().all() for t in tensors)
-            if not is_broken and not any(text in str(error) for text in _ABOUT_NAN):
+        is_broken = bool(not_finite(algorithm.save()) - self._not_finite_at_first)
+        if not is_broken:
+            if error is None:
+                return
+            if not any(text in str(error) for text in _ABOUT_NAN):
                 raise error
-        if not is_broken and error is None:
-            return
         if (message := self._explanation()) is not None:
             raise DivergedError(
                 f"The physics diverged, and the policy learned from it: {message}"

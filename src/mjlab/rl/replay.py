@@ -350,7 +350,7 @@ class ReplayFiles:
             state = load_checkpoint(self.path)
             check_contents(state)
         except (CheckpointError, ValueError) as error:
-            reason = str(error.__cause__ or error).partition("\n")[0].partition("; use ")[0]
+            reason = error.reason if isinstance(error, CheckpointError) else error
             raise CheckpointError(
                 f"Replay {str(self.path)!r} is damaged ({reason}); {cure}"
             ) from error

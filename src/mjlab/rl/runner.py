@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
 import logging
 import os
@@ -42,6 +41,7 @@ from mjlab.rl.checkpoint import (
     restore_training_state,
     save_checkpoint,
     set_deviation,
+    start_episodes,
     term_shapes,
 )
 from mjlab.rl.distributed import join_processes
@@ -155,7 +155,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         # Waiting OpenMP threads slow down the threads of the physics.
         on_cpu = torch.device(self.device).type == "cpu"
         self._num_collecting_threads = 1 if on_cpu else self._num_threads
-        self._watch = RolloutWatch(self.env.unwrapped)
+        self._watch = RolloutWatch(self.env.unwrapped, self.alg)
 
     # Training loop.
 
@@ -193,8 +193,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         check_mini_batches(self.env.num_envs, self.cfg)
         groups = self.alg.optimizer.param_groups
         weights = sum(weight.numel() for group in groups for weight in group["params"])
-        # Weights, gradients, and two moments.
-        check_memory("agent trained weights", weights, 16, self.device, "smaller hidden_dims")
+        # Weights and gradients, and usually two moments.
+        check_memory(
+            "agent trained weights", weights, 8, self.device, "smaller hidden_dims", usual=2.0
+        )
         if in_notebook() and not any(observer.shows_progress for observer in self.observers):
             self.observers.append(NotebookProgress(ProgressCfg.of_runner(self)))
         first, total, reason = self.current_learning_iteration, num_learning_iterations, ""
@@ -360,6 +362,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         with naming_checkpoint(self._resumed_from):
             left_out = restore_lasting_state(state, self.env, self.alg)
             self.logger.load_totals(state["logger"])
+        start_episodes(self.env)
         logger.warning(
             "Weights, optimizer, iteration and curricula are resumed, but episodes and random numbers "
             "restart, because %s%s", reason, f" Not resumed: {', '.join(left_out)}." * bool(left_out),
@@ -414,7 +417,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
     def _snapshot(self) -> dict[str, Any]:
         """Return the entries of a checkpoint; further training does not change them."""
-        entries = {**copy.deepcopy(self.alg.save()), **self._progress()}
+        entries = {**copied(self.alg.save()), **self._progress()}
         return {**entries, "training_state": self._training_state()}
 
     def _give_up(self, last: dict[str, Any], stopped: Interrupted) -> None:

@@ -424,6 +424,9 @@ class SAC:
         state: Any = loaded_dict.get("sac_state_dict")
         if load_cfg is None:
             own = self.save()["sac_state_dict"]
+            # Parameters remain parameters, for `misfit`.
+            for name, model in (("actor", self.actor), ("target", self._target)):
+                own[name] = model.state_dict(keep_vars=True)
             if isinstance(state, dict) and state.get("reward_scale") is None:
                 # Saved by a run with a `value_range`.
                 own["reward_scale"] = None

@@ -498,7 +498,6 @@ class _SubstepHistory:
     _transient = {"_slots", "_orders"}
 
     def __init__(self, length: int, num_envs: int, width: int, device: str) -> None:
-        # `_head` is the newest block; older ones follow it cyclically.
         # Values, and two views a slot (1 kB).
         check_memory(
             "ContactSensorCfg history_length",
@@ -508,6 +507,7 @@ class _SubstepHistory:
             "a shorter history",
         )
         self._ring = torch.zeros(length, num_envs, width, dtype=torch.float32, device=device)
+        # The newest block; older ones follow it cyclically.
         self._head = 0
         self._slots = list(self._ring.unbind())
         slots = torch.arange(length, device=device).repeat(2)

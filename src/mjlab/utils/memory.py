@@ -59,7 +59,7 @@ def check_memory(
             f"{name}: expected at most {total // bytes_each:,} ({_gigabytes(total)} of memory on {device}), "
             f"got {count:,} (at least {_gigabytes(needed)}); use {cure}."
         )
-    # Floats would overflow above.
+    # Integers beyond 1e308 are errors in products with floats; those above the total ended before.
     fits = needed * usual <= available
     if warns and not fits:
         warnings.warn(
