@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -316,6 +317,22 @@ def test_an_endless_loop_ends_at_ctrl_c(endless_policy, handler) -> None:
     assert signal.set_wakeup_fd(-1) == -1
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGUSR1")
+def test_other_signals_end_no_call(endless_policy) -> None:
+    previous = signal.signal(signal.SIGUSR1, lambda *_: None)
+    interrupted = signal.signal(signal.SIGINT, signal.default_int_handler)
+    begin = time.monotonic()
+    try:
+        send_soon(signal.SIGUSR1)
+        threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            endless_policy(torch.ones(2, 1))
+    finally:
+        signal.signal(signal.SIGUSR1, previous)
+        signal.signal(signal.SIGINT, interrupted)
+    assert time.monotonic() - begin > 2.0
+
+
 def test_calls_after_a_signal_are_not_ended(endless_policy) -> None:
     previous = signal.signal(signal.SIGINT, lambda *_: None)
     try:
@@ -327,7 +344,8 @@ def test_calls_after_a_signal_are_not_ended(endless_policy) -> None:
         signal.signal(signal.SIGINT, previous)
 
 
-def test_a_policy_leaves_no_thread(tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("error")
+def test_a_policy_leaves_no_thread_and_socket(tmp_path: Path) -> None:
     before = set(threading.enumerate())
     policy = OnnxPolicy(export(tmp_path / "policy.onnx"))
     (thread,) = set(threading.enumerate()) - before

@@ -46,6 +46,7 @@ import socket
 import threading
 import time
 import warnings
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,7 @@ import torch
 
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.utils.os import write_atomically
+from mjlab.utils.signals import FORWARDED
 from mjlab.utils.torch import torch_threads
 
 if TYPE_CHECKING:
@@ -523,11 +525,10 @@ class OnnxPolicy:
         self._session = onnxruntime.InferenceSession(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
-        # Options of the running call.
-        self._call = [onnxruntime.RunOptions()]
-        woken, self._signals = socket.socketpair()
-        self._signals.setblocking(False)
-        threading.Thread(target=_end_call, args=(woken, self._call), daemon=True).start()
+        self._calls = _Calls()
+        self._calls.start()
+        # Ends the thread, which does not hold the policy.
+        weakref.finalize(self, self._calls.signals.close)
 
     def __call__(self, observations: Any) -> torch.Tensor:
         """Return actions (N, num_actions).
@@ -569,11 +570,13 @@ class OnnxPolicy:
         """Run the graph once.
 
         A graph may have an endless loop, and Python handles a signal only once the graph has ended:
-        `_end_call` ends it.
+        `_Calls` ends it.
         """
-        self._call[0] = options = type(self._call[0])()
+        import onnxruntime
+
+        self._calls.options = options = onnxruntime.RunOptions()
         is_main = threading.current_thread() is threading.main_thread()
-        previous = signal.set_wakeup_fd(self._signals.fileno()) if is_main else -1
+        previous = signal.set_wakeup_fd(self._calls.signals.fileno()) if is_main else -1
         try:
             return self._session.run(self._outputs, feed, options)
         except Exception:
@@ -664,17 +667,24 @@ class OnnxPolicy:
         self._is_for_one = max(batches) == 1
 
 
-def _end_call(woken: socket.socket, call: list[Any]) -> None:
-    """End a call of onnxruntime that lasts longer than a second after a signal.
+class _Calls(threading.Thread):
+    """Ends a call of onnxruntime that lasts longer than a second after a stop signal."""
 
-    Args:
-        woken: Socket that receives a byte at every signal, closed with the policy.
-        call: Options of the running call, one for each call.
-    """
-    while woken.recv(1):
-        options = call[0]
-        time.sleep(_SECONDS_AFTER_SIGNAL)
-        options.terminate = True
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.options: Any = None
+        """Options of the running call, separate for each call."""
+        self._woken, self.signals = socket.socketpair()
+        self.signals.setblocking(False)
+
+    def run(self) -> None:
+        """Wait for the numbers of signals, until `signals` is closed."""
+        with self._woken:
+            while number := self._woken.recv(1):
+                options = self.options
+                if number[0] in FORWARDED:
+                    time.sleep(_SECONDS_AFTER_SIGNAL)
+                    options.terminate = True
 
 
 def _read_model(path: Path) -> Any:
