@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -68,18 +69,42 @@ pathlib.Path({str(tmp_path)!r}, rank).write_text(text)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_store_at_loopback_listens_there(tmp_path):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    ports = {}
+    # In the byte order of x86 and ARM.
+    expected = {"127.0.0.1": "0100007F", "::1": f"{'0' * 24}01000000"}
+    for host in [*expected]:
+        try:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            with socket.create_server((host, 0), family=family) as free:
+                ports[host] = free.getsockname()[1]
+        except OSError:
+            # No IPv6.
+            del expected[host]
     code = f"""{LISTENING}
+import torch
 from mjlab.rl.distributed import join_processes
-os.environ.update(MASTER_ADDR='127.0.0.1', MASTER_PORT='{port}')
 del os.environ['MJLAB_PROCESS_STORE']
-join_processes('cpu')
-pathlib.Path({str(tmp_path)!r}, rank).write_text(' '.join(listening(os.getpid())))
+found = []
+for host, port in {ports}.items():
+    os.environ.update(MASTER_ADDR=host, MASTER_PORT=str(port))
+    join_processes('cpu')
+    found += listening(os.getpid())
+    torch.distributed.barrier()
+    torch.distributed.destroy_process_group()
+pathlib.Path({str(tmp_path)!r}, rank).write_text(' '.join(found))
 """
     launch(code)
-    assert set((tmp_path / "0").read_text().split()) == {"0100007F"}
+    assert set((tmp_path / "0").read_text().split()) == set(expected.values())
+
+
+def test_the_list_of_interfaces_may_be_missing(tmp_path, monkeypatch):
+    def fail() -> None:
+        raise OSError
+
+    monkeypatch.setattr(socket, "if_nameindex", fail)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    launch("pass", 1)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_killed_launch_leaves_no_store(tmp_path, monkeypatch):

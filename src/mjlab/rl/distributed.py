@@ -15,6 +15,7 @@ import contextlib
 import io
 import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -86,19 +87,21 @@ def launch_workers(
         UserError: a process failed; the message has its rank and exit status.
         Interrupted: a signal stopped the processes.
     """
-    # A file that only this user can read: torch's TCPStore listens on all interfaces. The last worker
-    # removes it, also when the launcher was killed.
-    descriptor, store = tempfile.mkstemp(prefix="mjlab-processes-")
-    os.close(descriptor)
-    shared = {**os.environ, **(environment or {}), STORE_VARIABLE: store}
-    for name in ("lo", "lo0"):
-        if name in dict(socket.if_nameindex()).values():
-            shared = dict.fromkeys(_INTERFACE_VARIABLES, name) | shared
+    shared = {**os.environ, **(environment or {})}
+    with contextlib.suppress(OSError):
+        for _, name in socket.if_nameindex():
+            if name in ("lo", "lo0"):
+                shared = dict.fromkeys(_INTERFACE_VARIABLES, name) | shared
     shared |= {PARENT_VARIABLE: str(os.getpid())}
     shared |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     # Left by a torchrun, it would lead to a store of that one.
     shared.pop("TORCHELASTIC_USE_AGENT_STORE", None)
     shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
+    # A file that only this user can read: torch's TCPStore listens on all interfaces. The last worker
+    # removes it, also when the launcher was killed.
+    descriptor, store = tempfile.mkstemp(prefix="mjlab-processes-")
+    os.close(descriptor)
+    shared[STORE_VARIABLE] = store
     workers: list[subprocess.Popen[bytes]] = []
     received: list[int] = []
     killed: set[subprocess.Popen[bytes]] = set()
@@ -356,7 +359,8 @@ def _store_at_address(
 ) -> tuple[torch.distributed.Store, str]:
     """Return the store at MASTER_ADDR and MASTER_PORT, and its address; process 0 owns it.
 
-    torch listens on all interfaces, unless the address is one of this machine only.
+    It listens on all interfaces, as torch does. On POSIX, it listens on MASTER_ADDR alone if that is `localhost`,
+    `127.*` or `::1`.
     """
     host, port = os.environ.get("MASTER_ADDR"), os.environ.get("MASTER_PORT")
     if not host or port is None or not port.isdigit() or not 0 < int(port) < 65536:
@@ -374,8 +378,10 @@ def _store_at_address(
     timer.start()
     listening = None
     try:
-        if rank.is_first and os.name == "posix" and host.startswith(("127.", "localhost")):
-            listening = socket.create_server((host, int(port))).detach()
+        is_local = re.fullmatch(r"localhost|127(\.\d+){1,3}|::1", host) is not None
+        if rank.is_first and os.name == "posix" and is_local:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            listening = socket.create_server((host, int(port)), family=family).detach()
         store = torch.distributed.TCPStore(
             host,
             int(port),
