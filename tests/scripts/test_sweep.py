@@ -545,6 +545,8 @@ def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path
     ]  # fmt: skip
 
 
+@pytest.mark.filterwarnings("error::ResourceWarning")
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
 def test_a_sweep_runs_once_at_a_time_and_keeps_its_flags(sweep, machine, folder):
     from mjlab.scripts.sweep_study import only_process
 
@@ -597,6 +599,21 @@ def test_damaged_studies_are_rebuilt_from_the_folders(sweep, machine, folder, ov
         study.unlink()
         outcome = sweep(*argv)
     assert outcome.status == 0
+    assert rows_of(folder) == rows
+    assert len(machine.commands) == trained
+
+
+@pytest.mark.parametrize("over", [LEARNING, SAMPLED])
+def test_a_trial_that_has_just_begun_is_not_damage(sweep, machine, folder, over):
+    """Optuna stores the parameters of an enqueued trial after its state."""
+    argv = (*over, "--folder", str(folder))
+    assert sweep(*argv).status == 0
+    rows, trained = rows_of(folder), len(machine.commands)
+    with contextlib.closing(sqlite3.connect(folder / "study.db")) as base, base:
+        base.execute("UPDATE trials SET state = 'RUNNING' WHERE number = 1")
+        base.execute("DELETE FROM trial_params WHERE trial_id = 2")
+        base.execute("DELETE FROM trial_values WHERE trial_id = 2")
+    assert sweep(*argv).status == 0
     assert rows_of(folder) == rows
     assert len(machine.commands) == trained
 
@@ -692,6 +709,14 @@ def test_a_misspelt_flag_is_found_before_anything_runs(sweep, machine):
     assert outcome.status == 2
     assert RATE in outcome.err
     assert not machine.commands
+
+
+def test_an_axis_reads_its_values():
+    whole = dataclasses.replace(Axis.parse("x=1..8"), is_integer=True)
+    assert [whole.value(text) for text in ("8", "9", "2.0", "")] == [8, None, None, None]
+    real = Axis.parse("x=1e-4..1e-2:log")
+    assert [real.value(text) for text in ("1e-3", "1", "nan", "b")] == [1e-3, None, None, None]
+    assert [Axis.parse("x=1,b").value(text) for text in ("1", "1.0")] == ["1", None]
 
 
 def test_values_are_split_outside_brackets():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import itertools
@@ -73,13 +74,15 @@ class Axis:
             )
         return cls(name, text, tuple(dict.fromkeys(values)))
 
-    def has(self, value: str) -> bool:
-        """Return True if the axis has this value."""
+    def value(self, text: str) -> str | int | float | None:
+        """Return the value of the axis that is `text` on the command line; None: not of this axis."""
         if not self.is_range:
-            return value in self.values
+            return text if text in self.values else None
         low, high = map(float, self.values)
-        is_typed = not self.is_integer or value.removeprefix("-").isdecimal()
-        return is_number(value) and is_typed and low <= float(value) <= high
+        with contextlib.suppress(ValueError):
+            value = int(text) if self.is_integer else float(text)
+            return value if low <= value <= high else None
+        return None
 
 
 def _split(text: str) -> Iterator[str]:
@@ -135,7 +138,8 @@ class Sweep:
             words = [w for w in words if isinstance(w, str)] if isinstance(words, list) else []
             flags = dict(word[2:].split("=", 1) for word in words if re.match("--.*=", word))
             setting = {axis.name: flags.get(axis.name, "") for axis in self.axes}
-            if all(axis.has(setting[axis.name]) for axis in self.axes) and setting not in found:
+            values = [axis.value(setting[axis.name]) for axis in self.axes]
+            if None not in values and setting not in found:
                 found.append(setting)
         return found
 

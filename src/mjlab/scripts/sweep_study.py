@@ -59,21 +59,21 @@ def only_process(folder: Path) -> Generator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "lock.db"
-    try:
-        # Portable, unlike fcntl.
-        lock = sqlite3.connect(path, timeout=0.0, isolation_level=None)
-        lock.execute("BEGIN EXCLUSIVE")
-    except sqlite3.Error as error:
-        if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:
+    with contextlib.ExitStack() as stack:
+        try:
+            # Portable, unlike fcntl.
+            lock = sqlite3.connect(path, timeout=0.0, isolation_level=None)
+            stack.enter_context(contextlib.closing(lock)).execute("BEGIN EXCLUSIVE")
+        except sqlite3.Error as error:
+            if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:
+                raise UserError(
+                    f"{folder}: expected a sweep that is not running, got one in another process "
+                    f"({error}); wait for it, or use --folder for another sweep."
+                ) from error
             raise UserError(
-                f"{folder}: expected a sweep that is not running, got one in another process "
-                f"({error}); wait for it, or use --folder for another sweep."
+                f"{path}: expected a file that can be written and locked, got: {error}; delete it, which "
+                "loses nothing, or use --folder in another place."
             ) from error
-        raise UserError(
-            f"{path}: expected a file that can be written and locked, got: {error}; delete it, which loses "
-            "nothing, or use --folder in another place."
-        ) from error
-    with contextlib.closing(lock):
         yield
 
 
@@ -191,10 +191,11 @@ class Study:
         ]
 
     def _check(self, trial: FrozenTrial) -> None:
-        """Raise ValueError if a trial that was begun has not the setting of its parameters."""
+        """Raise ValueError if a trial has not the setting of its parameters."""
         setting = setting_of(trial)
         sampled = {name: _text(value) for name, value in trial.params.items()}
-        if trial.state != TrialState.WAITING and setting != sampled:
+        # Optuna stores the parameters of an enqueued trial one by one, after it has begun.
+        if not sampled.items() <= setting.items():
             raise ValueError(f"trial {trial.number} has the setting {setting}, and {sampled}")
 
     def _enqueue_missing(self) -> None:
@@ -208,21 +209,12 @@ class Study:
         else:
             failed = [trial for trial in self.trials if trial.state == TrialState.FAIL]
             missing = [(setting_of(trial), trial.params) for trial in failed]
-            missing += [(setting, self._params(setting)) for setting in self._sweep.begun]
+            for setting in self._sweep.begun:
+                params = {axis.name: axis.value(setting[axis.name]) for axis in self._sweep.axes}
+                missing.append((setting, params))
         for setting, params in missing:
             if not self._with_setting(setting):
                 self._study.enqueue_trial(params, user_attrs={_SETTING: setting})
-
-    def _params(self, setting: Setting) -> dict[str, Any]:
-        """Return the parameters of a setting."""
-        return {
-            axis.name: value
-            if not axis.is_range
-            else int(value)
-            if axis.is_integer
-            else float(value)
-            for axis, value in zip(self._sweep.axes, setting.values(), strict=True)
-        }
 
     def _has_more(self) -> bool:
         trials = self._study.get_trials(deepcopy=False)
