@@ -18,7 +18,7 @@ from commands import SMALL
 
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.scripts import cli
-from mjlab.scripts.cli import run_command
+from mjlab.scripts.cli import Command, run_command, run_subcommand
 from mjlab.sim.engine import EngineUnavailableError
 from mjlab.tasks.registry import UnknownTaskError
 from mjlab.utils.errors import UserError
@@ -192,6 +192,41 @@ def test_ctrl_c_while_modules_load_is_quiet(tmp_path, command):
     )
     # 130 in a shell.
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no signals")
+def test_programs_of_users_keep_keyboard_interrupt(tmp_path):
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package/__init__.py").write_text("import mjlab.scripts\n")
+    (tmp_path / "package/program.py").write_text(
+        "import os, signal\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT)\n"
+        "except KeyboardInterrupt:\n    print('caught')\n"
+    )
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, "-m", "package.program", "mjlab.scripts.train"],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (0, "caught\n")
+
+
+@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_DFL])
+def test_commands_keep_the_handler_of_ctrl_c(failing, handler):
+    previous = signal.signal(signal.SIGINT, handler)
+    try:
+        command = Command("one", "", "", "module_that_is_missing:command")
+        with pytest.raises(ModuleNotFoundError):
+            run_subcommand(command, [], "one")
+        assert signal.getsignal(signal.SIGINT) == handler
+        failing(ValueError())
+        assert signal.getsignal(signal.SIGINT) == handler
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no signals")

@@ -17,7 +17,12 @@ def prepare_threads() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
+LOADS_AS_MODULE = False
+"""Ctrl-C ends the process until `run_command`: a module of mjlab is being loaded by `python -m`."""
+
 # argv[0] is "-m" while `python -m` locates the module, whose imports may load torch.
 if sys.argv[:1] == ["-m"]:
-    end_by_interrupt(True)
     prepare_threads()
+    # Without the words after it, the last is the module. Other programs keep KeyboardInterrupt.
+    if sys.orig_argv[-len(sys.argv) :][0].removeprefix("-m").split(".")[0] == "mjlab":
+        LOADS_AS_MODULE = end_by_interrupt(True)

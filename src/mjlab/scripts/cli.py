@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mjlab.scripts import prepare_threads
+from mjlab.scripts import LOADS_AS_MODULE, prepare_threads
 from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
@@ -396,9 +396,12 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
             error.exit_status = command.unknown_task_status
             raise
     module, _, function = command.function.partition(":")
-    end_by_interrupt(True)
-    run = getattr(importlib.import_module(module), function)
-    end_by_interrupt(False)
+    was_changed = end_by_interrupt(True)
+    try:
+        run = getattr(importlib.import_module(module), function)
+    finally:
+        if was_changed:
+            end_by_interrupt(False)
     run(argv, prog)
 
 
@@ -497,10 +500,11 @@ def run_command(command: Callable[[list[str]], None]) -> None:
 
     Errors are printed as one message, after the lines of the user's own code that they passed through,
     such as a reward. The exit status is `MjlabError.exit_status`, else 1. A command that a signal ended
-    exits with 128 + its number.
+    exits with 128 + its number, except while modules load and while Python shuts down, when the signal
+    itself ends the process (-2 for `subprocess`, 130 in a shell).
     """
-    # `python -m` loaded modules before.
-    end_by_interrupt(False)
+    if LOADS_AS_MODULE:
+        end_by_interrupt(False)
     prepare_threads()
     # Plain library messages.
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[_StderrHandler()])

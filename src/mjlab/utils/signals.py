@@ -1,6 +1,8 @@
 """Scoped signal handlers: stop requests, the first Ctrl+C, signals for child processes.
 
 A command that a signal ended exits with 128 + its number, as in a shell: 130 for SIGINT, 143 for SIGTERM.
+While modules load and while Python shuts down, the signal itself ends the process: a shell shows the same
+status, `subprocess` -2 and -15.
 
 SIGHUP (closed terminal) does not exist on Windows. There, Ctrl-Break (SIGBREAK) takes the place of SIGINT
 for processes of another group, which Ctrl-C does not reach.
@@ -36,16 +38,19 @@ NEW_GROUP: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 `start_new_session=True` does that."""
 
 
-def end_by_interrupt(enabled: bool) -> None:
+def end_by_interrupt(enabled: bool) -> bool:
     """Let Ctrl-C end the process at once, as SIGTERM does, instead of raising KeyboardInterrupt, or not.
 
     KeyboardInterrupt would be printed with a traceback, or lost, while modules load and while Python
-    shuts down. Other handlers are kept, and so are all outside the main thread.
+    shuts down. Other handlers are kept, and so are all outside the main thread. Returns True if the
+    handler changed: a program may choose the same by itself.
     """
     actions = (signal.default_int_handler, signal.SIG_DFL)
     is_main = threading.current_thread() is threading.main_thread()
-    if is_main and signal.getsignal(signal.SIGINT) == actions[not enabled]:
-        signal.signal(signal.SIGINT, actions[enabled])
+    if not is_main or signal.getsignal(signal.SIGINT) != actions[not enabled]:
+        return False
+    signal.signal(signal.SIGINT, actions[enabled])
+    return True
 
 
 class Interrupted(KeyboardInterrupt):
