@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from mjlab.utils.logging import print_info
+from mjlab.utils.logging import first_line, print_info
 
 
 def test_a_message_is_colored_on_a_terminal_only(capsys, monkeypatch):
@@ -15,6 +15,21 @@ def test_a_message_is_colored_on_a_terminal_only(capsys, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     print_info("hello", color="red")
     assert capsys.readouterr().out == "\033[31mhello\033[0m\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ValueError("\n odd\nmore"), "odd"),
+        (KeyError(), "KeyError"),
+        (ValueError(" \n"), "ValueError"),
+        (OSError(13, "Permission denied", "a/file"), "[Errno 13] Permission denied: 'a/file'"),
+        (OSError("reset\nby peer"), "reset"),
+        (RuntimeError("x" * 999), "x" * 160),
+    ],
+)
+def test_an_error_is_reduced_to_one_line(error, line):
+    assert first_line(error) == line
 
 
 def test_an_unknown_color_is_refused():

@@ -31,6 +31,7 @@ import torch
 
 from mjlab.envs.env_state import curricula_in
 from mjlab.utils.errors import MjlabError, UserError
+from mjlab.utils.logging import first_line
 from mjlab.utils.os import check_archive, checkpoint_number, checkpoints_in, files_in, replacing
 from mjlab.utils.random import rng_state, set_rng_state
 from mjlab.utils.torch import to_device
@@ -185,10 +186,8 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         ) from error
     except Exception as error:
         # Damaged bytes make the reader raise arbitrary exceptions.
-        text = error.strerror if isinstance(error, OSError) else str(error)
-        text = ((text or "").strip() or type(error).__name__).splitlines()[0][:160]
         raise unusable(
-            path, f"truncated or corrupt ({path.stat().st_size} bytes; {text})"
+            path, f"truncated or corrupt ({path.stat().st_size} bytes; {first_line(error)})"
         ) from error
     if not isinstance(data, dict):
         raise unusable(path, f"expected a dict, got a {type(data).__name__}")

@@ -55,6 +55,7 @@ import numpy as np
 import torch
 
 from mjlab.rl.checkpoint import CheckpointError
+from mjlab.utils.logging import first_line
 from mjlab.utils.os import write_atomically
 from mjlab.utils.signals import FORWARDED
 from mjlab.utils.torch import torch_threads
@@ -447,7 +448,7 @@ def load_onnx_policy(
         raise
     except Exception as error:
         raise OnnxPolicyError(
-            f"Policy {path} cannot be run: {_first_line(error)}. The file is damaged, not a policy of "
+            f"Policy {path} cannot be run: {first_line(error, 400)}. The file is damaged, not a policy of "
             "this environment, or not supported by onnxruntime; play the checkpoint "
             "(model_<iteration>.pt) instead."
         ) from error
@@ -696,7 +697,7 @@ def _read_model(path: Path) -> Any:
             raise ValueError("it has no graph.")
     except Exception as error:
         raise OnnxPolicyError(
-            f"Policy {path} is not an ONNX file that can be read: {_first_line(error)}"
+            f"Policy {path} is not an ONNX file that can be read: {first_line(error, 400)}"
         ) from error
     # A warning only, because users optimize graphs.
     written = {item.key: item.value for item in model.metadata_props}.get(DIGEST_KEY)
@@ -731,10 +732,6 @@ def _keep_only(graph: Any, outputs: Sequence[str]) -> None:
 
 def _dims(value: Any) -> list[int]:
     return [int(dim.dim_value) for dim in value.type.tensor_type.shape.dim]
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0] or type(error).__name__
 
 
 def _alike(one: str, other: str) -> bool:

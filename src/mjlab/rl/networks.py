@@ -24,6 +24,7 @@ from mjlab.rl.learners import drop_unchanged_additions
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.rl.spatial_softmax import SPATIAL_SOFTMAX_KEYS, cnn_cfg_by_group
 from mjlab.utils.errors import check_positive
+from mjlab.utils.logging import first_line
 from mjlab.utils.memory import check_memory
 from mjlab.utils.string import counted
 
@@ -163,7 +164,7 @@ def check_sizes(env: Any, cfg: Mapping[str, Any], device: str) -> None:
         if "overflow" not in str(error).lower():
             return
         raise ValueError(
-            f"agent networks: expected sizes below 2**63, got {str(error).splitlines()[0]}; use smaller "
+            f"agent networks: expected sizes below 2**63, got {first_line(error)}; use smaller "
             "hidden_dims."
         ) from error
     for field, module in vars(made).items():
@@ -325,5 +326,5 @@ def _check_encoders(model: str, kind: type, cnn_cfg: Any, shapes: dict[str, Any]
         except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
             raise ValueError(
                 f"{name}: expected settings of an encoder for the images {group!r} of shape {shapes[group]}, "
-                f"large enough for all layers, got {settings}: {str(error).splitlines()[0]}."
+                f"large enough for all layers, got {settings}: {first_line(error)}."
             ) from error

@@ -31,6 +31,7 @@ from mjlab.scripts.reference import read_scalars_of_sessions
 from mjlab.scripts.sweep_objective import Objective
 from mjlab.scripts.sweep_settings import Axis, Setting, Sweep
 from mjlab.utils.errors import MjlabError, UserError
+from mjlab.utils.logging import first_line
 from mjlab.utils.os import write_atomically
 from mjlab.utils.string import suggest
 
@@ -88,7 +89,7 @@ def naming_database(sweep: Sweep, *kinds: type[Exception]) -> Generator[None]:
         causes: list[BaseException] = [error]
         while (cause := getattr(causes[-1], "orig", None) or causes[-1].__cause__) is not None:
             causes.append(cause)
-        reason = (str(causes[-1]).strip() or type(causes[-1]).__name__).splitlines()[0]
+        reason = first_line(causes[-1])
         path = sweep.folder / _DATABASE
         is_blocked = getattr(causes[-1], "sqlite_errorcode", 0) & 0xFF in _BLOCKED
         if sweep.storage is not None:

@@ -60,6 +60,11 @@ def beside_results(name: str) -> Generator[None]:
         )
 
 
+def first_line(error: BaseException, longest: int = 160) -> str:
+    """Return the first line of an error's message, or its type if it has none."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:longest]
+
+
 def shorten(text: str) -> str:
     """Return `text`, shortened to both ends if longer than 8,000 characters (e.g. a damaged file)."""
     half = _LONGEST // 2

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from mjlab.utils.errors import MjlabError
+from mjlab.utils.logging import first_line
 from mjlab.utils.os import check_archive, replacing
 
 _ARRAYS: dict[str, tuple[str | int, ...]] = {
@@ -202,9 +203,8 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:
         # Damaged or hostile files make zipfile and NumPy raise many types of errors.
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise MotionFileError(
-            f"{path} cannot be read as a motion (.npz): {reason}; copy it from its source, or make it again by "
+            f"{path} cannot be read as a motion (.npz): {first_line(error)}; copy it from its source, or make it again by "
             "`mjlab csv-to-npz`."
         ) from error
 
