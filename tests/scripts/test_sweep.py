@@ -545,8 +545,6 @@ def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path
     ]  # fmt: skip
 
 
-@pytest.mark.filterwarnings("error::ResourceWarning")
-@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
 def test_a_sweep_runs_once_at_a_time_and_keeps_its_flags(sweep, machine, folder):
     from mjlab.scripts.sweep_study import only_process
 
