@@ -186,7 +186,7 @@ def test_a_dump_that_is_damaged_or_says_too_little_is_told(dump_file: Path, tmp_
         ({"states_step_000002": np.zeros((5, 4))}, "states_step_000002.* expected 2 rows"),
         ({"ctrl_step_000002": np.zeros((2, 7))}, "another simulation"),
         ({"model_no_field": np.zeros((2, 7))}, "another simulation"),
-        ({"states_step_x": np.zeros((2, 4))}, "'x'"),
+        ({"states_step_x": np.zeros((2, 4))}, "'states_step_x'"),
         ({"_metadata": np.array("[1, 2]")}, "not found"),
         ({"_metadata": np.array("[" * 100_000)}, "is not a NaN dump"),
     ],
