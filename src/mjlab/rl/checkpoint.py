@@ -582,7 +582,7 @@ def _tensor_misfit(own: torch.Tensor, saved: Any, name: str, same_rows: bool) ->
     return f"{name}: expected {expected}, got {found}" if expected else None
 
 
-def not_finite(entries: Mapping[str, Any]) -> set[str]:
+def not_finite(entries: Mapping[str, Any]) -> list[str]:
     """Return the names of the tensors in nested `entries` with values that are NaN or infinite."""
     tensors = {
         name: value
@@ -590,11 +590,11 @@ def not_finite(entries: Mapping[str, Any]) -> set[str]:
         if isinstance(value, torch.Tensor) and value.is_floating_point()
     }
     if not tensors:
-        return set()
+        return []
     # One synchronization with the device of the networks.
     device = next(iter(tensors.values())).device
     finite = torch.stack([value.isfinite().all().to(device) for value in tensors.values()]).tolist()
-    return {name for name, is_finite in zip(tensors, finite, strict=True) if not is_finite}
+    return [name for name, is_finite in zip(tensors, finite, strict=True) if not is_finite]
 
 
 def _is_dense(value: torch.Tensor) -> bool:

@@ -114,8 +114,9 @@ class RolloutWatch:
             raise
         except (RuntimeError, ValueError) as raised:
             error = raised
-        is_broken = bool(not_finite(algorithm.save()) - self._not_finite_at_first)
-        if not is_broken:
+        names = not_finite(algorithm.save())
+        broken = [name for name in names if name not in self._not_finite_at_first]
+        if not broken:
             if error is None:
                 return
             if not any(text in str(error) for text in _ABOUT_NAN):
@@ -124,11 +125,11 @@ class RolloutWatch:
             raise DivergedError(
                 f"The physics diverged, and the policy learned from it: {message}"
             ) from error
-        if error is not None and not is_broken:
+        if error is not None and not broken:
             raise error
         rate = getattr(algorithm, "learning_rate", None)
         raise DivergedError(
-            "The policy diverged: its weights are NaN or infinite."
+            f"The policy diverged: its weights are NaN or infinite, first {broken[0]}."
             + "".join(f" {text}" for text in self._large_observations())
             + " Use a smaller learning rate"
             + ("." if rate is None else f" (now {rate:g}).")
