@@ -134,7 +134,9 @@ def test_a_killed_launch_leaves_no_store(tmp_path, monkeypatch):
 
 def test_processes_that_are_many_get_few_threads_each(tmp_path, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    monkeypatch.setattr(distributed, "cores_per_process", lambda: 7)
+    monkeypatch.setattr(distributed, "available_cores", lambda: 7)
+    # Left by a torchrun.
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "9")
     code = f"pathlib.Path({str(tmp_path)!r}, rank).write_text(os.environ['OMP_NUM_THREADS'])"
     launch(code, 2)
     assert (tmp_path / "1").read_text() == "3"

@@ -36,7 +36,7 @@ from mjlab.utils.processes import (
     PARENT_VARIABLE,
     OtherProcessError,
     ProcessRank,
-    cores_per_process,
+    available_cores,
     process_rank,
 )
 from mjlab.utils.signals import (
@@ -96,7 +96,7 @@ def launch_workers(
     shared |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count)}
     # Left by a torchrun, it would lead to a store of that one.
     shared.pop("TORCHELASTIC_USE_AGENT_STORE", None)
-    shared.setdefault("OMP_NUM_THREADS", str(max(1, cores_per_process() // count)))
+    shared.setdefault("OMP_NUM_THREADS", str(max(1, available_cores() // count)))
     # A file that only this user can read: torch's TCPStore listens on all interfaces. The last worker
     # removes it, also when the launcher was killed.
     descriptor, store = tempfile.mkstemp(prefix="mjlab-processes-")
