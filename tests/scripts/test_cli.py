@@ -96,6 +96,18 @@ def test_installed_packages_are_not_users_code(tmp_path, place):
     assert ("t.py" in users_lines(error)) == (place == "t.py")
 
 
+def test_users_code_cannot_end_a_command_in_silence(failing):
+    class Silent(Exception):
+        def __str__(self):
+            raise TypeError("no text")
+
+    for error in (SystemExit(), SystemExit(0), BrokenPipeError("mine"), Silent()):
+        status, _, err = failing(error)
+        assert status == 1
+        assert __file__ in err
+        assert f"\nerror: {type(error).__name__}" in err or "\nerror: mine\n" in err
+
+
 def test_the_first_cause_in_users_code_is_shown(capsys):
     def term(argv):
         raise KeyError("height")

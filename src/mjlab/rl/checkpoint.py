@@ -598,8 +598,8 @@ def not_finite(entries: Mapping[str, Any]) -> list[str]:
 
 
 def _is_dense(value: torch.Tensor) -> bool:
-    """Return True for tensors that are arrays of numbers in the memory of the CPU."""
-    is_array = value.layout == torch.strided and value.device.type == "cpu"
+    """Return True for tensors that are arrays of numbers in memory."""
+    is_array = value.layout == torch.strided and value.device.type != "meta"
     return is_array and not value.is_nested and not value.is_quantized
 
 

@@ -524,13 +524,17 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         sys.exit(stopped.exit_status)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:
-        # The reader (`| head`) closed the pipe. Python would report unwritten buffered output at
-        # exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    except Exception as error:
-        _report(error)
+    except (Exception, SystemExit) as error:
+        is_silent = isinstance(error, (SystemExit, BrokenPipeError)) and not users_lines(error)
+        if is_silent and isinstance(error, SystemExit):
+            # Of the parser of flags.
+            raise
+        if is_silent:
+            # The reader (`| head`) closed the pipe. Python would report unwritten buffered output at
+            # exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        else:
+            _report(error)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     finally:
         sys.unraisablehook = previous
@@ -550,15 +554,17 @@ def _end_without_threads(error: sys.UnraisableHookArgs) -> None:
     sys.__unraisablehook__(error)
 
 
-def _report(error: Exception) -> None:
+def _report(error: BaseException) -> None:
     """Print an error as one message, after the lines of the user's code that it passed through."""
     rank = os.environ.get("RANK", "0")
     is_elsewhere = isinstance(error, OtherProcessError)
     # Only the failed process and rank 0 report.
     if rank != "0" and is_elsewhere:
         return
-    lines = "" if is_elsewhere else users_lines(error)
-    is_expected = isinstance(error, (MjlabError, ValueError, OSError)) or _lacks_memory(error)
+    # Looking for lines takes memory.
+    is_memory = _lacks_memory(error)
+    lines = "" if is_elsewhere or is_memory else users_lines(error)
+    is_expected = isinstance(error, (MjlabError, ValueError, OSError)) or is_memory
     hint = f"Set {TRACEBACK_VARIABLE}=1 for the traceback."
     if os.environ.get(TRACEBACK_VARIABLE):
         traceback.print_exc()
@@ -566,8 +572,8 @@ def _report(error: Exception) -> None:
         print(lines, end="", file=sys.stderr)
     elif not is_expected:
         hint = _keep_traceback() or hint
-    text = shorten(str(error).strip() or type(error).__name__)
-    if _lacks_memory(error):
+    text = shorten(_text_of(error) or type(error).__name__)
+    if is_memory:
         # The original message names the failed call, not the lack of memory.
         text = f"Out of memory or threads ({text}). Use fewer environments, or raise the limits (ulimit)."
     elif isinstance(error, UnicodeEncodeError) and not lines:
@@ -582,8 +588,16 @@ def _report(error: Exception) -> None:
     print(f"error{process}: {text}\n({hint})", file=sys.stderr)
 
 
-def _lacks_memory(error: Exception) -> bool:
-    return isinstance(error, MemoryError) or any(part in str(error) for part in _OUT_OF_MEMORY)
+def _lacks_memory(error: BaseException) -> bool:
+    return isinstance(error, MemoryError) or any(part in _text_of(error) for part in _OUT_OF_MEMORY)
+
+
+def _text_of(error: BaseException) -> str:
+    # The method of a user's class may raise itself.
+    try:
+        return str(error).strip()
+    except Exception:
+        return ""
 
 
 def _keep_traceback() -> str | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import ipaddress
 import logging
 import re
@@ -11,6 +12,7 @@ import secrets
 import socket
 import threading
 from concurrent.futures import Future
+from typing import Any
 from urllib.parse import parse_qs
 
 import rich
@@ -51,6 +53,7 @@ class PageServer(viser.ViserServer):
         own = socket.gethostname().lower()
         self._names = {"localhost", own, f"{own}.local", *names}
         self._has_warned = False
+        self._reported: set[str] = set()
         self._connections: set[asyncio.Task | None] = set()
         logging.getLogger("websockets.server").addFilter(_shorten)
         started: Future[int] = Future()
@@ -95,19 +98,27 @@ class PageServer(viser.ViserServer):
     async def _listen(self, started: Future[int]) -> None:
         """Serve connections at the wanted port, or the next free one, until `stop`."""
         self._loop, self._stopping = asyncio.get_running_loop(), asyncio.Event()
+        self._loop.set_exception_handler(self._report)
         host, port = self._page_address
         last = min(port + _MAX_PORTS, 65535)
         while True:
             try:
                 listener = await asyncio.start_server(self._serve, host, port)
                 break
-            except OSError:
-                if port == last:
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE or port == last:
                     raise
                 port += 1
         started.set_result(port)
         await self._stopping.wait()
         listener.close()
+
+    def _report(self, _: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Log an error of the loop once; a lack of open files comes with each try to accept."""
+        text = f"{context['message']} ({context.get('exception')})"
+        if text not in self._reported:
+            self._reported.add(text)
+            log.warning("Page: %s.", text)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Check the request with which a connection begins, and pass the connection on.

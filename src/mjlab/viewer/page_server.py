@@ -56,7 +56,7 @@ def serve_page(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> viser.Vise
 
     check_address(host, port)
     names = {host.lower()}
-    if host not in _LOOPBACK:
+    if host.lower() not in _LOOPBACK and not host.startswith("127."):
         log.warning(
             "The page is served on %s: anyone who can reach this machine can control it.", host
         )

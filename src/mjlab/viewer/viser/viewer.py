@@ -480,7 +480,7 @@ class CheckpointPanel:
 
     def show_error(self, message: str) -> None:
         """Show an error message, and log it."""
-        log.error("%s", message)
+        log.error("%s", encodable(message))
         self._show(message, color="#e03131")
 
     def load_latest(self) -> None:
