@@ -66,6 +66,23 @@ def test_unreadable_parameters_are_empty(tmp_path, text):
     assert Run(tmp_path, TASK).cfg().agent.max_iterations == 500
 
 
+@pytest.mark.parametrize("kind", ["fifo", "device", "folder"])
+def test_what_is_no_file_is_not_read(tmp_path, kind):
+    make = {
+        "fifo": os.mkfifo,
+        "device": lambda path: path.symlink_to("/dev/zero"),
+        "folder": Path.mkdir,
+    }
+    (tmp_path / "params").mkdir()
+    for name in ("run.json", "params/env.yaml", "params/agent.yaml"):
+        make[kind](tmp_path / name)
+    run = Run(tmp_path)
+    with pytest.warns(match=r"run.json cannot be read \(not a file\)"):
+        assert run.info == {}
+    with pytest.warns(match=r"(env|agent).yaml cannot be read \(not a file\)"):
+        assert run.params == {"env": {}, "agent": {}}
+
+
 def test_checkpoints_are_in_the_order_of_numbers(tmp_path):
     run = make_run(tmp_path, "run", 100, 20, 3)
     for name in ("model_7.pt.tmp", "model_x.pt", "xmodel_9.pt", ".model_8.pt.abc.tmp"):

@@ -30,7 +30,14 @@ from mjlab.runs.settings import (
 from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import WANDB_CACHE, checkpoint_number, checkpoints_in, is_locked, to_plain
+from mjlab.utils.os import (
+    WANDB_CACHE,
+    checkpoint_number,
+    checkpoints_in,
+    is_locked,
+    regular_file,
+    to_plain,
+)
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
@@ -104,7 +111,7 @@ class Run:
     def info(self) -> dict[str, Any]:
         """Metadata of the run (`run.json`); empty if missing or unreadable."""
         try:
-            info = json.loads((self.folder / INFO_FILE).read_text(encoding="utf-8"))
+            info = json.loads(regular_file(self.folder / INFO_FILE).read_text(encoding="utf-8"))
             if not isinstance(info, dict):
                 raise ValueError(f"expected entries, got {type(info).__name__}")
             return info

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from mjlab.utils.os import to_plain
+from mjlab.utils.os import regular_file, to_plain
 
 C = TypeVar("C")
 Settings = dict[str, Any]
@@ -146,7 +146,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Loader.add_multi_constructor("tag:yaml.org,2002:python/", construct)
     try:
         # A subclass of the safe loader.
-        params = yaml.load(path.read_text(encoding="utf-8"), Loader)
+        params = yaml.load(regular_file(path).read_text(encoding="utf-8"), Loader)
         if not isinstance(params, dict):
             raise ValueError(f"expected entries, got {type(params).__name__}")
         return params

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import enum
+import errno
 import functools
 import logging
 import os
@@ -132,6 +133,17 @@ def files_in(folder: Path, pattern: str) -> list[Path]:
     """Return the files in `folder` that match a glob pattern, without folders, and links to no file."""
     # Unlike `Path.is_file`, False for links and folders that cannot be followed.
     return [path for path in folder.glob(pattern) if os.path.isfile(path)]
+
+
+def regular_file(path: Path) -> Path:
+    """Return `path`, a file that can be read to its end.
+
+    Raises:
+        OSError: no such file; or a folder, a FIFO or a device, which may have no end.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "not a file", str(path))
+    return path
 
 
 def checkpoints_in(folder: Path) -> list[Path]:
