@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -14,6 +17,7 @@ import pytest
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.scripts.export_scene import ExportSceneConfig, run_export_scene
 from mjlab.tasks.registry import load_env_cfg
+from mjlab.utils.signals import Interrupted
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
 OPTIONS = ("timestep", "cone", "impratio", "solver", "iterations", "ls_iterations", "disableflags")
@@ -104,6 +108,44 @@ def test_overwriting_replaces_an_export_and_nothing_else(run, tmp_path: Path) ->
     assert outcome.status == 0, outcome.err
     assert {p.name for p in tmp_path.iterdir()} == {"thesis.txt", "scene.xml"}
     assert (tmp_path / "scene.xml").read_text() != "old"
+
+
+@pytest.mark.parametrize("is_zip", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, is_zip: bool
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    writes = Path.write_bytes
+
+    def write_bytes(path: Path, content: bytes) -> None:
+        writes(path, content)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    cfg = ExportSceneConfig(output_dir=str(tmp_path / "out"), zip=is_zip)
+    with pytest.raises(Interrupted) as stopped:
+        run_export_scene("go1", cfg)
+    assert stopped.value.exit_status == 128 + number
+    assert signal.getsignal(number) == signal.SIG_DFL
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_named_and_leaves_nothing(
+    run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_bytes(path: Path, content: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    outcome = run("export_scene", "go1", "--output-dir", str(tmp_path / "out"))
+    assert outcome.status == 1
+    assert "No space left on device" in outcome.message
+    assert "scene.xml" in outcome.message
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "mine").mkdir()
+    assert run("export_scene", "go1", "--output-dir", str(tmp_path / "mine")).status == 1
+    assert (tmp_path / "mine").is_dir()
 
 
 def test_a_function_of_another_module_makes_the_entity(

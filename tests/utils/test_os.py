@@ -310,6 +310,19 @@ def test_a_replaced_file_is_the_old_one_until_the_new_one_is_whole(tmp_path):
     assert os.listdir(tmp_path) == ["file"]
 
 
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path):
+    with (
+        pytest.raises(OSError, match=r"full.*result\.npz") as found,
+        replacing(tmp_path / "result.npz"),
+    ):
+        raise OSError(28, "full")
+    assert found.value.errno == 28
+    with pytest.raises(OSError, match="^own words$"), replacing(tmp_path / "result.npz"):
+        raise OSError("own words")
+    with pytest.raises(FileNotFoundError, match="other"), replacing(tmp_path / "result.npz"):
+        (tmp_path / "other").read_bytes()
+
+
 def test_a_link_is_replaced_and_not_followed(tmp_path):
     target = tmp_path / "target"
     target.write_bytes(b"another's")

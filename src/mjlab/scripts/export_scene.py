@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from mjlab.scripts.cli import run_alias
 from mjlab.scripts.flags import parse_flags
 from mjlab.utils.errors import UserError
+from mjlab.utils.signals import FORWARDED, Interrupted, handled_signals
 from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
@@ -62,10 +64,12 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
     target_options: Any = SimpleNamespace(opt=scene.spec.option)
     scene.report_overruled_options(options)
     options.apply(target_options)
-    if cfg.zip:
-        scene.write(folder, zip=True)
-    else:
-        _write_folder(scene, folder)
+    # Signals must leave no temporary files.
+    with handled_signals(_interrupt, FORWARDED):
+        if cfg.zip:
+            scene.write(folder, zip=True)
+        else:
+            _write_folder(scene, folder)
     print(f"Wrote {result if cfg.zip else folder / _XML}.")
     return result
 
@@ -141,17 +145,28 @@ def _destination(cfg: ExportSceneConfig) -> tuple[Path, Path]:
     return folder, result
 
 
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise Interrupted(number)
+
+
 def _write_folder(scene: Scene, folder: Path) -> None:
     """Write the scene into a temporary folder and rename, so that `folder` never holds half an export."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".export-") as temporary:
-        made = Path(temporary) / "scene"
-        scene.write(made)
-        if (folder / _ASSETS).exists():
-            (folder / _ASSETS).rename(Path(temporary) / "earlier")
-        for name in (_ASSETS, _XML):
-            if (made / name).exists():
-                (made / name).replace(folder / name)
+    is_new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".export-") as temporary:
+            made = Path(temporary) / "scene"
+            scene.write(made)
+            if (folder / _ASSETS).exists():
+                (folder / _ASSETS).rename(Path(temporary) / "earlier")
+            for name in (_ASSETS, _XML):
+                if (made / name).exists():
+                    (made / name).replace(folder / name)
+    finally:
+        if is_new:
+            # Only if it is empty.
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
 
 def main() -> None:

@@ -278,13 +278,25 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 @contextlib.contextmanager
+def naming(path: Path) -> Generator[None]:
+    """Name `path` in an error of the system within the block that names no file, such as a full disk."""
+    try:
+        yield
+    except OSError as error:
+        # Without a number, the message is the error's own.
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        raise
+
+
+@contextlib.contextmanager
 def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
     """Yield a binary file that replaces `path` atomically if the block succeeds.
 
     The file is written next to `path` and then renamed. Permissions follow the umask, and a link at
     `path` is replaced, not followed. `flush`: sync the content to disk before renaming.
     """
-    with create_locked(temporary_path(path)) as file:
+    with naming(path), create_locked(temporary_path(path)) as file:
         try:
             yield file
             file.flush()

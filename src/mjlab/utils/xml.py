@@ -13,6 +13,8 @@ from xml.etree import ElementTree
 
 import mujoco
 
+from mjlab.utils.os import naming, write_atomically
+
 _ASSETS = "assets"
 _XML_NAME = "scene.xml"
 _RGB_ROLE = int(mujoco.mjtTextureRole.mjTEXROLE_RGB)
@@ -37,12 +39,13 @@ def export_spec(spec: mujoco.MjSpec, output_dir: Path, *, zip: bool = False) -> 
     if not zip:
         _write_folder(spec, output_dir)
         return
-    output_dir.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         # Not named after `output_dir`, whose last part may be "..".
         folder = Path(temporary) / "scene"
         _write_folder(spec, folder)
-        shutil.make_archive(str(output_dir), "zip", root_dir=folder)
+        archive = shutil.make_archive(str(Path(temporary) / "archive"), "zip", root_dir=folder)
+        path = output_dir.with_name(f"{output_dir.name}.zip")
+        write_atomically(path, Path(archive).read_bytes())
 
 
 def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
@@ -64,7 +67,8 @@ def _write_folder(spec: mujoco.MjSpec, folder: Path) -> None:
     for name, content in (files | {_XML_NAME: xml.encode()}).items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        with naming(path):
+            path.write_bytes(content)
 
 
 def make_asset_paths_absolute(spec: mujoco.MjSpec, model_dir: str | None = None) -> None:
