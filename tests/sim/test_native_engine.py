@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import signal
+import threading
 
 import mujoco
 import numpy as np
@@ -184,6 +186,32 @@ def test_an_environment_in_which_mujoco_raises_does_not_touch_those_recorded_bes
         one_by_one.step()
         for name, values in recorded.items():
             assert torch.equal(values[k], getattr(one_by_one.data, name)), name
+
+
+@pytest.mark.parametrize("per_call", [1, 3, 8])
+@pytest.mark.parametrize("record", [(), ("qpos", "sensordata")])
+def test_substeps_in_several_calls_are_those_of_one(monkeypatch, per_call, record) -> None:
+    sims = build(), build()
+    for sim, size in zip(sims, (100, per_call), strict=True):
+        monkeypatch.setattr("mjlab.sim.native.engine._SUBSTEPS_PER_CALL", size)
+        sim.data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
+        # The second environment warns.
+        sim.data.ctrl[1] = float("nan")
+        sim.step(2)
+        recorded = sim.step(8, record)
+        # First read after the step.
+        values = [*recorded.values(), sim.data.qpos, sim.data.qvel, sim.data.xpos, sim.data.qH]
+        sim.bits = [value.clone() for value in values]  # ty: ignore
+    assert all(map(torch.equal, sims[0].bits, sims[1].bits))  # ty: ignore
+
+
+def test_a_signal_acts_between_many_substeps() -> None:
+    sim = build()
+    timer = threading.Timer(0.2, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        sim.step(10**12)
+    timer.join()
 
 
 def test_no_substeps_change_nothing() -> None:
