@@ -103,7 +103,7 @@ def test_five_seeds_are_the_default(run, commands):
     assert len(commands) == 5
 
 
-@pytest.mark.parametrize("count", ["0", "-2", "many", None])
+@pytest.mark.parametrize("count", ["0", "-2", "many", "²", "10001", "9" * 5000, None])
 def test_a_number_of_seeds_that_is_none_is_refused(run, commands, count):
     flags = ["--seeds"] if count is None else ["--seeds", count]
     outcome = run("train_seeds", TASK, *flags)

@@ -82,10 +82,11 @@ def read_count(flag: str, text: str) -> int:
     """Return the value of a flag that counts something.
 
     Raises:
-        UserError: the text is not an integer >= 1.
+        UserError: the text is not an integer from 1 to 10,000.
     """
-    if not text.isdigit() or int(text) < 1:
-        raise UserError(f"{flag}: expected an integer >= 1, got {text!r}.")
+    # `int` raises for thousands of digits.
+    if not (text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= 10_000):
+        raise UserError(f"{flag}: expected an integer in [1, 10000], got {text!r}.")
     return int(text)
 
 
