@@ -58,10 +58,14 @@ def nothing_is_built(monkeypatch):
     [
         ("decimation", 2.5, "decimation.*2.5"),
         ("decimation", "4", "decimation.*'4'"),
+        ("decimation", 10**400, r"decimation.*\[1, 2147483647\]"),
         ("scene.num_envs", "4", "scene.num_envs.*'4'"),
         ("scene.num_envs", 4.0, "scene.num_envs.*4.0"),
         ("scene.entities", {"x": None}, r"scene.entities\['x'\]: .*got None"),
         ("sim.mujoco.timestep", "0.01", "timestep.*'0.01'"),
+        ("sim.mujoco.timestep", 1e300, r"sim\.mujoco\.timestep.*e\+300"),
+        ("sim.mujoco.timestep", math.inf, r"sim\.mujoco\.timestep.*inf"),
+        ("episode_length_s", 1e300, r"episode_length_s.*1e\+300"),
         ("episode_length_s", math.inf, "episode_length_s.*finite.*inf"),
         ("episode_length_s", math.nan, "episode_length_s.*finite.*nan"),
         ("episode_length_s", None, "episode_length_s.*None"),
@@ -77,6 +81,12 @@ def test_a_config_that_cannot_work_is_refused_before_anything_is_built(path, val
     setattr(owner, field, value)
     with pytest.raises(ValueError, match=words):
         ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def test_an_episode_may_last_for_decades():
+    cfg = cartpole()
+    cfg.episode_length_s, cfg.decimation = 1e9, 1
+    env_checks.check_env_cfg(cfg)
 
 
 def test_whole_numbers_of_numpy_are_whole_numbers():

@@ -120,7 +120,8 @@ def test_defaults_that_have_no_effect_are_silent(run, tmp_path):
         ("--agent.actor.distribution-cfg.init-std", "0", "a finite number > 0"),
         ("--agent.evaluation.solved-return", "nan", "a number"),
         ("--agent.max-iterations", "-1", "an integer >= 0"),
-        ("--env.sim.mujoco.iterations", "-1", "an integer >= 0"),
+        ("--env.sim.mujoco.iterations", "-1", "an integer in [0, 2147483647]"),
+        ("--env.sim.mujoco.iterations", "3000000000", "an integer in [0, 2147483647]"),
         ("--video-interval", "0", "an integer >= 1"),
         ("--grace", "nan", "a number in [0, 9223372036]"),
     ],
@@ -146,6 +147,19 @@ def test_numbers_of_a_task_out_of_range_warn(run, tmp_path, monkeypatch, flags, 
     assert outcome.status == status
     told = "agent.algorithm.gamma: expected a number in [0, 1], got 1.5"
     assert outcome.err.count(told) == (flags == []) + status
+
+
+@pytest.mark.parametrize(("name", "told"), [("../out", 1), ("group/own", 0), ("linked", 0)])
+def test_an_experiment_outside_of_the_root_is_told(run, tmp_path, name, told):
+    root = tmp_path / "logs"
+    root.mkdir()
+    (root / "linked").symlink_to(tmp_path)
+    flags = ("--agent.max-iterations", "1", "--log-root", str(root))
+    outcome = run("train", TASK, *SMALL, *flags, "--agent.experiment-name", name)
+    assert outcome.status == 0
+    assert (outcome.out + outcome.err).count(
+        "--agent.experiment-name: expected a folder in"
+    ) == told
 
 
 def test_numbers_of_a_program_out_of_range_warn(tmp_path):

@@ -50,7 +50,7 @@ from mjlab.managers import (
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
 from mjlab.utils.config_fields import check_fields_exist
-from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count
+from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count, check_in_range
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
 from mjlab.utils.string import counted
@@ -60,6 +60,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mjlab.viewer.debug_visualizer import DebugVisualizer
+
+# Terms multiply single-precision numbers with it.
+_LONGEST_STEP = torch.finfo(torch.float32).max
+"""Longest control timestep (s)."""
 
 
 @dataclass(kw_only=True)
@@ -790,9 +794,12 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     check_fields_exist(type(cfg).__name__, cfg)
     check_count("scene.num_envs", cfg.scene.num_envs)
     check_count("decimation", cfg.decimation)
+    check_in_range("decimation", cfg.decimation, 1, 2**31 - 1)
     timestep = cfg.sim.mujoco.timestep
     if not (isinstance(timestep, Real) and timestep > 0):
         raise ValueError(f"sim.mujoco.timestep: expected a number > 0 (s), got {timestep!r}.")
+    step_dt = float(timestep) * cfg.decimation
+    check_in_range("sim.mujoco.timestep times decimation (s)", step_dt, 0.0, _LONGEST_STEP)
     for name, entity in cfg.scene.entities.items():
         if entity is None:
             raise ValueError(
@@ -802,6 +809,12 @@ def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
     length = cfg.episode_length_s
     if not (isinstance(length, Real) and math.isfinite(length)):
         raise ValueError(f"episode_length_s: expected a finite number (s), got {length!r}.")
+    # Steps of an episode are counted in 64 bits.
+    if float(length) / step_dt >= 2**63:
+        raise ValueError(
+            f"episode_length_s: expected less than 2**63 steps of {step_dt:g} s, got {length!r}; use 1e9 "
+            "for tasks without a time limit."
+        )
 
 
 def report_odd_times(env: ManagerBasedRlEnv) -> None:

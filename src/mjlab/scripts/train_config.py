@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -144,6 +145,12 @@ def check_flags(cfg: TrainConfig, typed: Collection[str]) -> None:
         print_notice(
             f"--agent.run-name: expected a name without path separators, got {run_name!r}; `play` and "
             "--agent.resume do not find this run. Use --agent.experiment-name to group runs."
+        )
+    root, folder = Path(cfg.log_root).resolve(), os.path.normpath(cfg.experiment_folder)
+    if not Path(folder).is_relative_to(root):
+        print_notice(
+            f"--agent.experiment-name: expected a folder in --log-root {root}, got {folder}; `play` does not "
+            "find this run, and --agent.resume only with this name. Use --log-root for another folder."
         )
     if cfg.agent.logger == "wandb":
         check_wandb_login("--agent.logger wandb", records=True)

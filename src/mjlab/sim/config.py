@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mjlab.compat import ALWAYS_ENABLED_FLAGS, accepts_older_fields
 from mjlab.utils.nan_guard import NanGuardCfg
-from mjlab.utils.ranges import CountOrZero, Positive, Range, Weight
+from mjlab.utils.ranges import Positive, Range, Weight
 
 if TYPE_CHECKING:
     import mujoco
+
+# Integers of MuJoCo have 32 bits.
+Int32 = Annotated[int, Range(0, 2**31 - 1)]
 
 
 @accepts_older_fields
@@ -30,15 +33,15 @@ class MujocoCfg:
     """Type of constraint Jacobian."""
     solver: Literal["newton", "cg", "pgs"] = "newton"
     """Constraint solver."""
-    iterations: CountOrZero = 100
+    iterations: Int32 = 100
     """Maximum number of solver iterations."""
     tolerance: Weight = 1e-8
     """Solver tolerance for early termination."""
-    ls_iterations: CountOrZero = 50
+    ls_iterations: Int32 = 50
     """Maximum number of line-search iterations."""
     ls_tolerance: Weight = 0.01
     """Line-search tolerance."""
-    ccd_iterations: CountOrZero = 50
+    ccd_iterations: Int32 = 50
     """Maximum number of convex-collision iterations."""
     gravity: Annotated[tuple[float, float, float], Range(ends="()")] = (0.0, 0.0, -9.81)
     """Gravitational acceleration in the world frame (m/s^2)."""
@@ -73,11 +76,11 @@ class MujocoCfg:
 class SimulationCfg:
     """Physics engine and its settings."""
 
-    nconmax: CountOrZero | None = None
+    nconmax: Int32 | None = None
     """Maximum number of contacts per environment on Warp; None: estimated. Ignored by native."""
-    njmax: CountOrZero | None = None
+    njmax: Int32 | None = None
     """Maximum number of constraint rows per environment on Warp; None: estimated. Native ignores it."""
-    contact_sensor_maxmatch: CountOrZero = 64
+    contact_sensor_maxmatch: Int32 = 64
     """Maximum number of matches per contact sensor on Warp. Unlimited on native."""
     broadphase: Literal["nxn", "sap_tile", "sap_segmented"] | None = None
     """Broad-phase collision method of Warp; None: Warp's default."""
