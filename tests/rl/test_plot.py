@@ -11,6 +11,7 @@ from mjlab.rl.plot import (
     DEFAULT_TAG,
     LABELS,
     mean_and_std,
+    picture_path,
     plot_curves,
     plot_run,
     plot_seeds,
@@ -102,6 +103,28 @@ def test_one_run_and_several_seeds_become_pngs(tmp_path: Path):
     assert (runs[0] / "learning_curve.png").is_file()
     assert is_png(plot_seeds(runs, tmp_path / "new" / "seeds.png", title="Swing-up"))
     assert is_png(plot_seeds({"a": runs, "b": runs[:1]}, tmp_path / "two.png"))
+
+
+def test_a_dollar_in_a_name_is_drawn_as_it_is(tmp_path: Path, figures):
+    group = [(np.arange(3), np.arange(3.0))]
+    for words in (r"$\nope$", "a_$x^2$"):
+        plot_curves({words: group}, tmp_path / "a.png", title=words, ylabel=words)
+        (legend,) = figures[-1].legends
+        drawn = [legend.get_texts()[0], figures[-1].axes[0].yaxis.label]
+        assert [text.get_text() for text in drawn] == [words, words]
+        assert not any(text.get_parse_math() for text in drawn)
+
+
+def test_a_picture_needs_a_name_and_a_known_ending(tmp_path: Path):
+    assert picture_path(tmp_path / "a") == tmp_path / "a.png"
+    for name in ("a.PNG", "a.pdf"):
+        assert picture_path(tmp_path / name) == tmp_path / name
+    curves = {"": [(np.arange(3), np.arange(3.0))]}
+    with pytest.raises(ValueError, match=f"folder '{tmp_path}'"):
+        plot_curves(curves, tmp_path, title="", ylabel="")
+    with pytest.raises(ValueError, match=r"a\.nope.*png"):
+        plot_curves(curves, tmp_path / "a.nope", title="", ylabel="")
+    assert not list(tmp_path.iterdir())
 
 
 def test_wrong_folders_tags_and_empty_lists_are_named(tmp_path: Path):

@@ -160,6 +160,13 @@ def test_a_group_without_runs_is_an_error(run, words, part):
     assert part in outcome.message
 
 
+@pytest.mark.parametrize("name", [".", "", "p.nope"])
+def test_an_output_that_is_no_picture_names_its_flag(run, make_run, name):
+    outcome = run("plot_seeds", str(make_run("1", 1, range(3))), "--output", name)
+    assert outcome.status != 0
+    assert "--output" in outcome.message
+
+
 def test_what_is_no_run_is_named(run, make_run, tmp_path):
     good = str(make_run("1", 1, range(3)))
     for name in ("nowhere", "empty"):

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjlab.utils.os import files_in
+from mjlab.utils.errors import check_one_of
+from mjlab.utils.os import files_in, naming
 from mjlab.utils.string import counted, suggest
 
 if TYPE_CHECKING:
@@ -387,6 +388,26 @@ def _new_figure(below: int = 0) -> tuple[Figure, Axes, list[Axes]]:
     return figure, figure.add_subplot(grid[0, :]), [figure.add_subplot(cell) for cell in cells]
 
 
+def picture_path(output: str | Path, owner: str = "output") -> Path:
+    """Return the path of a picture: `output`, with the ending `.png` if it has none.
+
+    Raises:
+        ValueError: a folder, or an ending of no format of pictures. `owner` is the argument to name.
+    """
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    path = Path(output)
+    if path.is_dir():
+        raise ValueError(
+            f"{owner}: expected a PNG file, got the folder '{path}'; use a path in it."
+        )
+    if not path.suffix:
+        return path.with_name(f"{path.name}.png")
+    formats = FigureCanvasBase.get_supported_filetypes()
+    check_one_of(f"{owner} {path}: ending", path.suffix[1:].lower(), formats)
+    return path
+
+
 def _save(figure: Figure, output: str | Path, title: str) -> Path:
     """Finish and write a figure."""
     for axes in figure.axes:
@@ -403,15 +424,20 @@ def _save(figure: Figure, output: str | Path, title: str) -> Path:
     for axes in figure.axes:
         for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(text, handle)
+    texts = [figure.suptitle(title), *(axes.yaxis.label for axes in figure.axes)]
     if handles:
-        figure.legend(
+        legend = figure.legend(
             handles.values(), handles.keys(), loc="outside lower center", frameon=False,
             ncols=max(1, min(4, _LEGEND_WIDTH // (_LEGEND_HANDLE + max(map(len, handles))))),
         )  # fmt: skip
-    figure.suptitle(title)
-    output = Path(output)
+        texts += legend.get_texts()
+    for text in texts:
+        # Names may have a "$".
+        text.set_parse_math(False)
+    output = picture_path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=150)
+    with naming(output):
+        figure.savefig(output, dpi=150)
     return output
 
 

@@ -14,6 +14,7 @@ from mjlab.rl.plot import (
     Curve,
     default_tag,
     mean_and_std,
+    picture_path,
     plot_seeds,
     read_all_scalars,
     solved_at,
@@ -84,6 +85,7 @@ def command(argv: list[str], prog: str) -> None:
     parser.add_argument("--tag", help="TensorBoard tag to plot; default: the return")
     parser.add_argument("--title", help="title of the plot")
     args = parser.parse_intermixed_args(argv)
+    output = picture_path(args.output, "--output")
     named: dict[str, list[Path]] = {"": args.runs} if args.runs else {}
     for name, *runs in args.group:
         if not runs:
@@ -96,7 +98,7 @@ def command(argv: list[str], prog: str) -> None:
     tag = args.tag or default_tag([seed.curves for seed in every])
     path = plot_seeds(
         {name: [seed.parts for seed in seeds] for name, seeds in groups.items()},
-        args.output,
+        output,
         tag=tag,
         title=args.title,
         goal=common_goal(every, tag),
