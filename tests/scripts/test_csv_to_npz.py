@@ -62,6 +62,17 @@ def motion_of(tmp_path, values: np.ndarray, header: str = ""):
     return converted(path, tmp_path)
 
 
+def test_a_byte_order_mark_is_not_a_number(tmp_path):
+    np.savetxt(tmp_path / "plain.csv", table(), delimiter=",")
+    content = (tmp_path / "plain.csv").read_bytes()
+    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbf" + content)
+    plain, marked = (
+        read_csv(tmp_path / f"{name}.csv", 30.0, JOINTS) for name in ("plain", "marked")
+    )
+    np.testing.assert_array_equal(marked.joint_pos, plain.joint_pos)
+    np.testing.assert_array_equal(marked.root_pos, plain.root_pos)
+
+
 @pytest.mark.parametrize("mark", ["", "# "])
 def test_columns_are_found_by_the_names_of_a_header(tmp_path, mark):
     root = [

@@ -328,8 +328,9 @@ def _table(path: Path) -> tuple[list[str], np.ndarray]:
     if not path.is_file():
         raise MotionFileError(f"File {path} not found.")
     try:
-        with path.open(encoding="utf-8") as file:
-            cells = file.readline().lstrip("\ufeff# ").rstrip().split(",")
+        # Some tools begin files with a byte order mark.
+        with path.open(encoding="utf-8-sig") as file:
+            cells = file.readline().lstrip("# ").rstrip().split(",")
             is_named = len(cells) > 1 and not any(map(is_number, cells))
             # Some tools number the columns of a table without names.
             is_header = is_named or cells == [str(i) for i in range(len(cells))]
