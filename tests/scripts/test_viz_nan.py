@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -159,7 +160,7 @@ def test_a_model_that_is_missing_damaged_or_another_is_told(dump_file: Path) -> 
     with pytest.raises(UserError, match="changed or damaged"):
         load_dump(str(dump_file))
     model_file.unlink()
-    with pytest.raises(FileNotFoundError, match=r"model_.*\.mjb"):
+    with pytest.raises(FileNotFoundError, match=rf"{dump_file}.*model_.*\.mjb"):
         load_dump(str(dump_file))
 
 
@@ -182,7 +183,10 @@ def test_a_dump_that_is_damaged_or_says_too_little_is_told(dump_file: Path, tmp_
             {"ctrl_step_000002": np.array([{}], dtype=object)},
             "ctrl_step_000002: Python objects",
         ),
-        ({"states_step_000002": np.zeros((2, 3))}, "another simulation"),
+        ({"states_step_000002": np.zeros((2, 3))}, r"states_step_000002.*shape \(2, 4\)"),
+        ({"states_step_000002": np.zeros((2, 2, 2))}, r"states_step_000002.*shape \(2, 4\)"),
+        ({"states_step_000002": np.zeros((2, 4), complex)}, "states_step_000002.*real numbers"),
+        ({"ctrl_step_000002": np.full((2, 1), "1.0")}, "ctrl_step_000002.*real numbers"),
         ({"states_step_000002": np.zeros((5, 4))}, "states_step_000002.* expected 2 rows"),
         ({"ctrl_step_000002": np.zeros((2, 7))}, "another simulation"),
         ({"model_no_field": np.zeros((2, 7))}, "another simulation"),
@@ -199,6 +203,24 @@ def test_what_is_wrong_in_a_dump_is_named(dump_file: Path, change, words: str) -
         load_dump(str(dump_file))
     assert "allow_pickle" not in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "ids"),
+    [("nan_env_ids", [4]), ("nan_env_ids", ["<b>"]), ("dumped_env_ids", [-1, 3])],
+)
+def test_environments_that_are_not_simulated_are_named(dump_file: Path, field, ids) -> None:
+    dump, _ = load_dump(str(dump_file))
+    metadata = {"_metadata": np.array(json.dumps({**dump.metadata, field: ids}))}
+    np.savez(dump_file, **dump.arrays, **metadata)
+    with pytest.raises(ValueError, match=rf"is not a NaN dump.*{field}: expected 0 to 3"):
+        load_dump(str(dump_file))
+
+
+def test_a_dump_that_is_no_file_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "dump.npz")
+    with pytest.raises(OSError, match="not a file.*dump.npz"):
+        load_dump(str(tmp_path / "dump.npz"))
 
 
 def test_a_dump_with_spoilt_bytes_is_an_error_or_a_dump(dump_file: Path) -> None:

@@ -69,6 +69,10 @@ def load_dump(path: str) -> tuple[NanDump, mujoco.MjModel]:
         UserError: the model is damaged, or of another dump.
     """
     dump = NanDump.load(path)
+    if not dump.model_file.is_file():
+        raise FileNotFoundError(
+            f"Dump {path}: model {dump.model_file} not found; copy it to the folder of the dump."
+        )
     digest = hashlib.sha256(dump.model_file.read_bytes()).hexdigest()
     # MuJoCo loads most damaged models without an error. Older dumps lack the digest.
     if dump.metadata.get("model_sha256", digest) != digest:

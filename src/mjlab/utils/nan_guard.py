@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjlab.utils.errors import check_count, check_in_range, check_one_of
 from mjlab.utils.memory import check_memory
-from mjlab.utils.os import check_archive, own_folder, replacing, write_atomically
+from mjlab.utils.os import check_archive, own_folder, regular_file, replacing, write_atomically
 
 if TYPE_CHECKING:
     import mujoco
@@ -264,10 +264,11 @@ class NanDump:
 
         Raises:
             FileNotFoundError: `path` does not exist.
+            OSError: `path` is a folder, or another kind of path without an end.
             ValueError: the file is not a valid dump.
         """
         path = Path(path).resolve()
-        with path.open("rb") as file:
+        with regular_file(path).open("rb") as file:
             is_archive = file.read(len(_ARCHIVE)) == _ARCHIVE
         try:
             if not is_archive:
@@ -284,12 +285,21 @@ class NanDump:
             rows = metadata["num_envs_dumped"]
             if rows != len(metadata["dumped_env_ids"]) or rows < 1:
                 raise ValueError(f"num_envs_dumped={rows} does not match dumped_env_ids")
+            number = metadata["num_envs_total"]
+            for name in ("nan_env_ids", "dumped_env_ids"):
+                if any(type(env) is not int or not 0 <= env < number for env in metadata[name]):
+                    raise ValueError(f"{name}: expected 0 to {number - 1}, got {metadata[name]}")
+            if odd := [name for name, array in arrays.items() if array.dtype.kind not in "fiub"]:
+                raise ValueError(f"{odd}: expected real numbers")
             short = [name for name, array in arrays.items() if array.shape[:1] != (rows,)]
             if short:
                 raise ValueError(f"{short}: expected {rows} rows")
             states = [name for name in arrays if name.startswith("states_step_")]
             if odd := [name for name in states if not _STATES.fullmatch(name)]:
                 raise ValueError(f"expected arrays states_step_000000, ..., got {odd[:3]}")
+            size = metadata["state_size"]
+            if odd := [name for name in states if arrays[name].shape != (rows, size)]:
+                raise ValueError(f"{odd}: expected shape ({rows}, {size})")
             steps = sorted(int(name.rpartition("_")[2]) for name in states)
             if not steps:
                 raise ValueError("expected recorded states, got none")
