@@ -208,8 +208,10 @@ def check_end(ended: Ended, *, statuses: Sequence[int] = (0, 1, 2, *_BY_SIGNAL))
     """Raise Broken unless a command succeeded or reported an error message."""
     if ended.stuck:
         raise Broken(ended.stuck)
-    if "Traceback (most recent call last)" in ended.said:
-        raise Broken(f"raw traceback: {last_error(ended.said)}")
+    # Lines of torch's own log begin with a letter and a date: `W1126 03:29:24`.
+    said = re.sub(r"^[IWE]\d{4} .*\n?", "", ended.said, flags=re.M)
+    if "Traceback (most recent call last)" in said:
+        raise Broken(f"raw traceback: {last_error(said)}")
     if ended.status < 0:
         name = signal.Signals(-ended.status).name
         raise Broken(f"died of {name}: {last_line(ended.said)}")

@@ -525,11 +525,11 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except (Exception, SystemExit) as error:
-        is_silent = isinstance(error, (SystemExit, BrokenPipeError)) and not users_lines(error)
-        if is_silent and isinstance(error, SystemExit):
-            # Of the parser of flags.
+        is_users = bool(users_lines(error))
+        if isinstance(error, SystemExit) and (error.code or not is_users):
+            # Of the parser of flags, of a signal, or with a status that a user chose.
             raise
-        if is_silent:
+        if isinstance(error, BrokenPipeError) and not is_users:
             # The reader (`| head`) closed the pipe. Python would report unwritten buffered output at
             # exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
