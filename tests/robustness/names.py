@@ -143,7 +143,8 @@ def _viewer(server: Any, names: list[str]) -> list[str]:
     viewer._checkpoint_panel.load(names[2])
     # A notebook shows the tables of the environment, in ASCII.
     tables = env._repr_html_()
-    if _words(ascii(names[0])[1:-1]) not in _words(_text_of(tables)):
+    name = names[0].encode("ascii", "backslashreplace").decode()
+    if _words(name) not in _words(_text_of(tables)):
         raise Broken(f"{names[0]!r} is not in the table: {tables[:1000]!r}")
     return [names[0], names[2], names[3]]
 
