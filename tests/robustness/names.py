@@ -102,7 +102,7 @@ def _dump(server: Any, names: list[str]) -> list[str]:
     model = _model_of(names)
     width = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)
     metadata = {
-        "dumped_env_ids": [names[0]], "nan_env_ids": [names[2]], "num_envs_total": 4, "num_envs_dumped": 1,
+        "dumped_env_ids": [2], "nan_env_ids": [2], "num_envs_total": 4, "num_envs_dumped": 1,
         "detection_step": 1, "state_spec": int(mujoco.mjtState.mjSTATE_INTEGRATION), "state_size": width,
     }  # fmt: skip
     np.savez(
@@ -111,7 +111,7 @@ def _dump(server: Any, names: list[str]) -> list[str]:
         states_step_000000=np.zeros((1, width)),
     )
     NanPage(server, NanDump.load(Path("dump.npz")), model)
-    return [names[0], names[2], names[1]]
+    return [names[1]]
 
 
 def _viewer(server: Any, names: list[str]) -> list[str]:
