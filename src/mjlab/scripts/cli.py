@@ -525,16 +525,17 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except (Exception, SystemExit) as error:
-        is_users = bool(users_lines(error))
-        if isinstance(error, SystemExit) and (error.code or not is_users):
+        # Looking for lines takes memory.
+        lines = "" if _lacks_memory(error) else users_lines(error)
+        if isinstance(error, SystemExit) and (error.code or not lines):
             # Of the parser of flags, of a signal, or with a status that a user chose.
             raise
-        if isinstance(error, BrokenPipeError) and not is_users:
+        if isinstance(error, BrokenPipeError) and not lines:
             # The reader (`| head`) closed the pipe. Python would report unwritten buffered output at
             # exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         else:
-            _report(error)
+            _report(error, lines)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     finally:
         sys.unraisablehook = previous
@@ -554,16 +555,15 @@ def _end_without_threads(error: sys.UnraisableHookArgs) -> None:
     sys.__unraisablehook__(error)
 
 
-def _report(error: BaseException) -> None:
-    """Print an error as one message, after the lines of the user's code that it passed through."""
+def _report(error: BaseException, lines: str) -> None:
+    """Print an error as one message, after the `lines` of the user's code that it passed through."""
     rank = os.environ.get("RANK", "0")
     is_elsewhere = isinstance(error, OtherProcessError)
     # Only the failed process and rank 0 report.
     if rank != "0" and is_elsewhere:
         return
-    # Looking for lines takes memory.
     is_memory = _lacks_memory(error)
-    lines = "" if is_elsewhere or is_memory else users_lines(error)
+    lines = "" if is_elsewhere else lines
     is_expected = isinstance(error, (MjlabError, ValueError, OSError)) or is_memory
     hint = f"Set {TRACEBACK_VARIABLE}=1 for the traceback."
     if os.environ.get(TRACEBACK_VARIABLE):
