@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,23 @@ PROGRAM = "import os, pathlib, signal, sys, time\nrank = os.environ['RANK']\n"
 
 def launch(code: str, count: int = 2, **environment: str) -> None:
     launch_workers([sys.executable, "-c", PROGRAM + code], count, environment)
+
+
+def launcher(child: str, is_ready: Callable[[], bool]) -> subprocess.Popen:
+    """Return a process that has launched two of `child`, once these are ready."""
+    parent = (
+        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
+        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", parent])
+    wait_until(is_ready)
+    return process
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.01)
 
 
 def test_every_process_gets_a_number_and_the_same_store(tmp_path):
@@ -116,19 +134,11 @@ def test_a_killed_launch_leaves_no_store(tmp_path, monkeypatch):
         f"    pathlib.Path({str(tmp_path)!r}, rank).write_text(str(store))\n"
         "    time.sleep(1)\n"
     )
-    parent = (
-        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
-        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", parent])
-    deadline = time.monotonic() + 60
-    while not (tmp_path / "1").exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    process = launcher(child, lambda: (tmp_path / "1").exists())
     process.kill()
     process.wait()
     store = Path((tmp_path / "1").read_text())
-    while store.exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: not store.exists())
     assert not store.exists()
 
 
@@ -169,14 +179,7 @@ def test_a_signal_goes_to_every_process_once_and_all_are_waited_for(tmp_path, na
         f"signal.signal(signal.{name}, save)\n"
         "(folder / f'ready_{rank}').touch()\ntime.sleep(30)\n"
     )
-    parent = (
-        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
-        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", parent])
-    deadline = time.monotonic() + 60
-    while len(list(tmp_path.glob("ready_*"))) < 2 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    process = launcher(child, lambda: len(list(tmp_path.glob("ready_*"))) == 2)
     process.send_signal(getattr(signal, name))
     assert process.wait(timeout=30) == 0
     assert sorted(path.name for path in tmp_path.glob("done_*")) == ["done_0", "done_1"]
@@ -191,19 +194,10 @@ def test_a_killed_launcher_ends_its_workers(tmp_path):
         "signal.signal(signal.SIGTERM, save)\nend_with_launcher()\n"
         "(folder / f'ready_{rank}').touch()\ntime.sleep(30)\n"
     )
-    parent = (
-        "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
-        f"launch_workers([sys.executable, '-c', {child!r}], 2)\n"
-    )
-    process = subprocess.Popen([sys.executable, "-c", parent])
-    deadline = time.monotonic() + 60
-    while len(list(tmp_path.glob("ready_*"))) < 2 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    process = launcher(child, lambda: len(list(tmp_path.glob("ready_*"))) == 2)
     process.kill()
     process.wait()
-    deadline = time.monotonic() + 20
-    while len(list(tmp_path.glob("saved_*"))) < 2 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: len(list(tmp_path.glob("saved_*"))) == 2, 20.0)
     assert len(list(tmp_path.glob("saved_*"))) == 2
 
 
