@@ -41,13 +41,9 @@ import hashlib
 import io
 import logging
 import math
-import signal
-import socket
-import threading
-import time
 import warnings
-import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +53,6 @@ import torch
 from mjlab.rl.checkpoint import CheckpointError
 from mjlab.utils.logging import first_line
 from mjlab.utils.os import write_atomically
-from mjlab.utils.signals import FORWARDED
 from mjlab.utils.torch import torch_threads
 
 if TYPE_CHECKING:
@@ -90,7 +85,6 @@ _UNCOMPARED = ("run_path", "observation_group")
 _CLOCK = ("clock_frequency", "clock_fade_s", "clock_standing_threshold", "clock_starts")
 _RELATIVE_TOLERANCE = 0.01
 _ABSOLUTE_TOLERANCE = 6e-4
-_SECONDS_AFTER_SIGNAL = 1.0
 
 
 # Export.
@@ -523,13 +517,12 @@ class OnnxPolicy:
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         # Fatal errors only: errors are raised as exceptions.
         options.log_severity_level = 4
+        graph = model.SerializeToString()
+        # Also within branches and functions.
+        self._may_be_endless = b"Loop" in graph
         self._session = onnxruntime.InferenceSession(
-            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+            graph, options, providers=["CPUExecutionProvider"]
         )
-        self._calls = _Calls()
-        self._calls.start()
-        # Ends the thread, which does not hold the policy.
-        weakref.finalize(self, self._calls.signals.close)
 
     def __call__(self, observations: Any) -> torch.Tensor:
         """Return actions (N, num_actions).
@@ -568,25 +561,23 @@ class OnnxPolicy:
         return torch.from_numpy(actions).to(self.device)
 
     def _run(self, feed: dict[str, np.ndarray]) -> Any:
-        """Run the graph once.
-
-        A graph may have an endless loop, and Python handles a signal only once the graph has ended:
-        `_Calls` ends it.
-        """
+        """Run the graph once. An endless loop ends when the main thread is interrupted."""
+        if not self._may_be_endless:
+            return self._session.run(self._outputs, feed)
         import onnxruntime
 
-        self._calls.options = options = onnxruntime.RunOptions()
-        is_main = threading.current_thread() is threading.main_thread()
-        previous = signal.set_wakeup_fd(self._calls.signals.fileno()) if is_main else -1
-        try:
-            return self._session.run(self._outputs, feed, options)
-        except Exception:
-            if options.terminate:
-                raise KeyboardInterrupt from None
-            raise
-        finally:
-            if is_main:
-                signal.set_wakeup_fd(previous)
+        options = onnxruntime.RunOptions()
+        # Python handles signals in the main thread only, and only between calls.
+        with ThreadPoolExecutor(1) as worker:
+            try:
+                call = worker.submit(self._session.run, self._outputs, feed, options)
+                # On Windows, Ctrl-C does not end a wait.
+                while not wait([call], timeout=0.1).done:
+                    pass
+            except BaseException:
+                options.terminate = True
+                raise
+            return call.result()
 
     def reset(self, dones: torch.Tensor | None = None) -> None:
         """Clear the hidden state of environments with nonzero `dones` (N,). None: all."""
@@ -666,26 +657,6 @@ class OnnxPolicy:
             )
         # The size of a dynamic dimension reads 0.
         self._is_for_one = max(batches) == 1
-
-
-class _Calls(threading.Thread):
-    """Ends a call of onnxruntime that lasts longer than a second after a stop signal."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.options: Any = None
-        """Options of the running call, separate for each call."""
-        self._woken, self.signals = socket.socketpair()
-        self.signals.setblocking(False)
-
-    def run(self) -> None:
-        """Wait for the numbers of signals, until `signals` is closed."""
-        with self._woken:
-            while number := self._woken.recv(1):
-                options = self.options
-                if number[0] in FORWARDED:
-                    time.sleep(_SECONDS_AFTER_SIGNAL)
-                    options.terminate = True
 
 
 def _read_model(path: Path) -> Any:
