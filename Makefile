@@ -3,7 +3,7 @@ UV := ./tools/uv
 DEV := $(UV) run --group dev
 
 .PHONY: help train test test-slow test-gpu-script test-mujoco-next check format bench reference gpu \
-	torture packages stats docs
+	torture packages docs
 
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -65,9 +65,6 @@ torture:  ## Kill, damage, limit, mistake and attack; PARTS="kills page" SEED=N 
 
 packages:  ## Try task packages: make packages DIRS="../a ../b"; without DIRS, those of the tests.
 	$(DEV) python tools/packages.py $(DIRS) $(if $(ENGINES),--engines $(ENGINES))
-
-stats:  ## Count files, functions, patterns of prose and import circles of src/mjlab.
-	$(DEV) python tools/stats.py
 
 docs:  ## Build the documentation into docs/_build/html.
 	$(UV) run --group docs sphinx-build -W --keep-going -b html docs docs/_build/html
