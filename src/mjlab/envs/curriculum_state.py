@@ -56,8 +56,8 @@ _SETTINGS = ("episode_length_s",)
 # Attributes of an environment with plain data that are no memory of curricula.
 _OWN_ATTRIBUTES = frozenset(
     {
-        *("_acts_between_substeps", "_built_settings", "_built_state", "_command_dts", "_device"),
-        *("_holds_common_steps", "_looks_ahead", "_may_not_start", "_nan_resets", "_pending_reset"),
+        *("_acts_between_substeps", "_built_settings", "_built_state", "_device"),
+        *("_holds_common_steps", "_may_not_start", "_nan_resets", "_pending_reset"),
         *("_renderer", "_renderer_is_open", "_sim_step_counter", "_stepped_to", "_steps_as_one"),
         *("_term_edits", "common_step_counter", "diverged", "episode_length_buf", "extras"),
         *("manager_visualizers", "metadata", "obs_buf", "observes_ends", "observes_failures"),

@@ -6,7 +6,6 @@ import logging
 
 import torch
 
-from mjlab.managers.lookup import Lookup
 from mjlab.sim import Simulation
 from mjlab.sim.divergence import cure_of, describe_dof, fastest_dof
 
@@ -24,22 +23,17 @@ class DivergenceLog:
         self.is_done = False
         self._sim = sim
         self._velocities = sim.data.qvel.clone()
-        self._found = Lookup()
 
     def begin_step(self) -> None:
         """Store the velocities at the start of the step."""
         if not self.is_done:
             self._velocities.copy_(self._sim.data.qvel)
 
-    def plan_lookups(self, diverged: torch.Tensor) -> list[Lookup]:
-        """Plan and return the lookups of `end_step`; a GPU performs them before it."""
-        return [] if self.is_done else [self._found.plan(diverged, diverged)]
-
     def end_step(self, diverged: torch.Tensor, step: int) -> None:
         """Log the first environment of the mask `diverged`, (N,), if any. Called before resets."""
         if self.is_done:
             return
-        ids = self._found.ids_of(diverged)
+        ids = diverged.nonzero()
         if len(ids) == 0:
             return
         self.is_done = True

@@ -27,7 +27,6 @@ from mjlab.managers import (
     CurriculumTermCfg,
     EventManager,
     EventTermCfg,
-    Lookup,
     MetricsManager,
     MetricsTermCfg,
     NullCommandManager,
@@ -45,7 +44,6 @@ from mjlab.managers import (
     Tabular,
     TerminationManager,
     TerminationTermCfg,
-    look_up,
 )
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
@@ -194,11 +192,6 @@ class ManagerBasedRlEnv(Tabular):
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._divergence_log = DivergenceLog(self.sim)
         self._placement = PlacementReport(self.scene)
-        # Elapsed time of commands in a step with resets. Allocated here, because tensors created under
-        # `inference_mode` lack the version counter that `Lookup` needs.
-        self._command_dts = torch.zeros(self.num_envs, dtype=torch.float32, device=device)
-        self._ended, self._observed = Lookup(), Lookup()
-        self._looks_ahead = torch.device(device).type == "cuda"
         self._renderer = None
         self._renderer_is_open = False
         if render_mode == "rgb_array":
@@ -454,7 +447,6 @@ class ManagerBasedRlEnv(Tabular):
             self._evaluate_step()
 
             # Events.
-            self._look_ahead()
             self._divergence_log.end_step(self.diverged, self.common_step_counter)
             for mode in ("step", "interval"):
                 if mode in self.event_manager.available_modes:
@@ -466,17 +458,15 @@ class ManagerBasedRlEnv(Tabular):
                 self._observe_ends(moved)
             reset_ids = self.reset_buf.new_empty(0, dtype=torch.long)
             if self.cfg.auto_reset:
-                reset_ids = self._ended.ids_of(self.reset_buf)
+                reset_ids = self.reset_buf.nonzero().flatten()
             command_dt: float | torch.Tensor = self.step_dt
             if len(reset_ids) > 0:
                 self.recorder_manager.record_pre_reset(reset_ids)
                 self._reset_idx(reset_ids)
                 self.scene.write_data_to_sim(reset_ids)
                 # Commands of new episodes do not advance in time.
-                command_dt = self._command_dts.fill_(command_dt).index_fill_(0, reset_ids, 0.0)
-                if self._looks_ahead:
-                    # Resets resampled the timers. Synchronizing here is shorter than after `forward`.
-                    look_up(self.command_manager.plan_lookups(command_dt))
+                command_dt = torch.full_like(self.reward_buf, self.step_dt)
+                command_dt[reset_ids] = 0.0
 
             # Commands and observations.
             self._forward(reset_ids, moved)
@@ -571,25 +561,6 @@ class ManagerBasedRlEnv(Tabular):
         self.metrics_manager.excluded = self.diverged
         self.metrics_manager.compute()
 
-    def _look_ahead(self) -> None:
-        """Look up environments that end or are due for events or commands with one GPU sync.
-
-        Does nothing on the CPU: each lookup is cheapest at its point of use.
-        """
-        if not self._looks_ahead:
-            return
-        lookups = [
-            *self.event_manager.plan_lookups(self.step_dt),
-            *self.command_manager.plan_lookups(self.step_dt),
-            *self._divergence_log.plan_lookups(self.diverged),
-        ]
-        if self.cfg.auto_reset:
-            lookups.append(self._ended.plan(self.reset_buf, self.reset_buf))
-            if self.observes_ends:
-                ended, excluded = self._observed_ends()
-                lookups.append(self._observed.plan(ended & ~excluded, ended, excluded))
-        look_up(lookups)
-
     @contextlib.contextmanager
     def _checking_terms(self, resets: bool = False) -> Generator[None]:
         """Check that terms within the block read no unused origins."""
@@ -611,10 +582,11 @@ class ManagerBasedRlEnv(Tabular):
         Args:
             moved: Environments moved by an event, (N,) bool. None: no environment.
         """
-        ended, excluded = self._observed_ends()
-        ids = self._observed.take(ended, excluded)
-        if ids is None:
-            ids = (ended & ~excluded).nonzero().flatten()
+        if self.observes_failures:
+            observed = self.reset_buf & ~self.diverged
+        else:
+            observed = self.reset_time_outs & ~self.reset_terminated
+        ids = observed.nonzero().flatten()
         if len(ids) == 0:
             return
         with self.sim.looking_ahead(ids):
@@ -629,12 +601,6 @@ class ManagerBasedRlEnv(Tabular):
             for name, value in observations.items()
         }
         self.extras["final_ids"] = ids
-
-    def _observed_ends(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return masks (ended, excluded), (N,) bool; the ends in `ended & ~excluded` are observed."""
-        if self.observes_failures:
-            return self.reset_buf, self.diverged
-        return self.reset_time_outs, self.reset_terminated
 
     def _forward(self, reset_ids: torch.Tensor, moved: torch.Tensor | None) -> None:
         """Update derived quantities to the stage described in `step`.

@@ -13,7 +13,6 @@ from mjlab.managers.curriculum_manager import (
     NullCurriculumManager,
 )
 from mjlab.managers.event_manager import EventManager, EventMode, EventTermCfg
-from mjlab.managers.lookup import Lookup, look_up
 from mjlab.managers.manager_base import (
     ManagerBase,
     ManagerTermBase,
@@ -49,7 +48,6 @@ __all__ = [
     "EventManager",
     "EventMode",
     "EventTermCfg",
-    "Lookup",
     "ManagerBase",
     "ManagerTermBase",
     "ManagerTermBaseCfg",
@@ -73,5 +71,4 @@ __all__ = [
     "Tabular",
     "TerminationManager",
     "TerminationTermCfg",
-    "look_up",
 ]

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import accept_older_methods
-from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import (
     BuiltTermsManager,
     DebugVisSwitches,
@@ -89,7 +88,6 @@ class CommandTerm(ManagerTermBase):
         self.metrics: dict[str, torch.Tensor] = {}
         self.time_left = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.command_counter = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
-        self._due_lookup = Lookup()
 
     @property
     def command(self) -> Any:
@@ -113,10 +111,8 @@ class CommandTerm(ManagerTermBase):
         """
         if env_ids is None:
             self._update_metrics()
-            due = self._due_lookup.take(self.time_left, dt)
             self.time_left -= dt
-            if due is None:
-                due = (self.time_left <= 0.0).nonzero().flatten()
+            due = (self.time_left <= 0.0).nonzero().flatten()
         else:
             # `_update_metrics` updates all environments. Metrics that accumulate would count a step
             # that the other environments have not made.
@@ -127,14 +123,6 @@ class CommandTerm(ManagerTermBase):
         if len(due) > 0:
             self._resample(due)
         self._update_command(env_ids)
-
-    def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
-        """Plan and return the lookups of `compute(dt)`. On a GPU, `env.step` performs them.
-
-        Without planned lookups, `compute` performs its own. Subclasses may add the lookups of
-        their `_update_command`.
-        """
-        return [self._due_lookup.plan(self.time_left - dt <= 0.0, self.time_left, dt)]
 
     def reset(self, env_ids: torch.Tensor | slice | None) -> dict[str, float]:
         """Resample the commands of `env_ids`; return the mean of each metric and zero the metrics.
@@ -243,10 +231,6 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         """Advance all commands by `dt` seconds; see `CommandTerm.compute`."""
         for term in self._terms.values():
             term.compute(dt, env_ids)
-
-    def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
-        """Plan the lookups of all commands; see `CommandTerm.plan_lookups`."""
-        return [lookup for term in self._terms.values() for lookup in term.plan_lookups(dt)]
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
         """Reset the commands of `env_ids` (None: all) and return `Metrics/<command>/<metric>`."""

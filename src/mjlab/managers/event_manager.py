@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes
-from mjlab.managers.lookup import Lookup
 from mjlab.managers.manager_base import (
     ManagerTermBaseCfg,
     TermFunctionSwitches,
@@ -71,14 +70,13 @@ class EventManager(TermFunctionSwitches, TermListManager):
     _cfg_type = EventTermCfg
     _shown = {"mode": "mode", "interval (s)": "interval_range_s"}
     _leading = ("env", "env_ids")
-    _transient = {"_terms_by_mode", "_lookups"}
+    _transient = {"_terms_by_mode"}
 
     def __init__(self, cfg: Mapping[str, EventTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         self._terms_by_mode: dict[str, list[tuple[str, EventTermCfg]]] = {}
         # Time left (s): (num_envs,), or a number for a global timer.
         self._timers: dict[str, torch.Tensor | float] = {}
-        self._lookups: dict[str, Lookup] = {}
         # Environment step of the last event, (num_envs,) int64.
         self._last_reset_step: dict[str, torch.Tensor] = {}
         for name, term in zip(self._term_names, self._term_cfgs, strict=True):
@@ -102,7 +100,6 @@ class EventManager(TermFunctionSwitches, TermListManager):
                         stacklevel=2,
                     )
             if term.mode == "interval":
-                self._lookups[name] = Lookup()
                 if term.is_global_time:
                     # Sampled on the host: reading a GPU sample would synchronize.
                     self._timers[name] = self._sample_interval(term, 1, "cpu").item()
@@ -181,14 +178,6 @@ class EventManager(TermFunctionSwitches, TermListManager):
         if level != RecomputeLevel.none:
             self._env.sim.recompute_constants(level, reset_ids)
 
-    def plan_lookups(self, dt: float) -> list[Lookup]:
-        """Plan the lookups of `apply("interval", dt=dt)`; see `CommandTerm.plan_lookups`."""
-        return [
-            self._lookups[name].plan(timer - dt < _TIMER_TOLERANCE, timer, dt)
-            for name, timer in self._timers.items()
-            if isinstance(timer, torch.Tensor)
-        ]
-
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
         """Reset terms of all modes and resample the timers of `env_ids`. Logs nothing."""
         super().reset(env_ids)
@@ -210,10 +199,8 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 return torch.empty(0, dtype=torch.long)
             self._timers[name] = self._sample_interval(cfg, 1, "cpu").item()
             return None
-        ids = self._lookups[name].take(timer, dt)
         timer.sub_(dt)
-        if ids is None:
-            ids = (timer < _TIMER_TOLERANCE).nonzero().flatten()
+        ids = (timer < _TIMER_TOLERANCE).nonzero().flatten()
         if len(ids) > 0:
             timer[ids] = self._sample_interval(cfg, len(ids))
         return ids

@@ -16,7 +16,6 @@ import torch
 from mjlab.compat import older_names
 from mjlab.entity.building import short_name
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.lookup import Lookup
 from mjlab.managers.term_checks import require_entity
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
@@ -218,7 +217,6 @@ class MotionCommand(MotionReader, CommandTerm):
         self._counted_at = torch.full_like(self.time_steps, -1)
         self._moved: list[torch.Tensor] = []
         self._started: list[torch.Tensor] = []
-        self._over = Lookup()
         # Lengths of the motions, encoded as shapes: loading the state of a run on motions of other
         # lengths then raises, since its frames may not exist here.
         lengths = self.motion.lengths.tolist()
@@ -387,12 +385,6 @@ class MotionCommand(MotionReader, CommandTerm):
             # Needed even if the reference is not drawn.
             self._panel.update()
 
-    def plan_lookups(self, dt: float | torch.Tensor) -> list[Lookup]:
-        """Plan the lookups of `compute(dt)`; see `CommandTerm.plan_lookups`."""
-        is_over = self.time_steps + 1 >= self.motion.lengths[self.motion_ids]
-        over = self._over.plan(is_over, self.time_steps, self.motion_ids)
-        return [*super().plan_lookups(dt), over]
-
     def _update_metrics(self) -> None:
         if self._started:
             # Relative poses of restarted environments are still from before the reset.
@@ -404,11 +396,8 @@ class MotionCommand(MotionReader, CommandTerm):
             self.metrics[name].copy_(value)
 
     def _update_command(self, env_ids: torch.Tensor | None = None) -> None:
-        over = None if env_ids is not None else self._over.take(self.time_steps, self.motion_ids)
         self.time_steps[slice(None) if env_ids is None else env_ids] += 1
-        if over is None:
-            is_over = self.time_steps >= self.motion.lengths[self.motion_ids]
-            over = is_over.nonzero().flatten()
+        over = (self.time_steps >= self.motion.lengths[self.motion_ids]).nonzero().flatten()
         if not is_empty(over):
             self._resample_command(over)
             if self.cfg.advance_after_teleport:
