@@ -16,7 +16,6 @@ import torch
 from mjlab.envs import curriculum_state, env_state
 from mjlab.envs.divergence import DivergenceLog
 from mjlab.envs.mdp.events import reset_scene_to_default
-from mjlab.envs.placement import PlacementReport
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
     ActionManager,
@@ -191,7 +190,6 @@ class ManagerBasedRlEnv(Tabular):
         self.diverged = torch.zeros(self.num_envs, dtype=torch.bool, device=device)
         self._nan_resets = torch.zeros(self.num_envs, dtype=torch.long, device=device)
         self._divergence_log = DivergenceLog(self.sim)
-        self._placement = PlacementReport(self.scene)
         self._renderer = None
         self._renderer_is_open = False
         if render_mode == "rgb_array":
@@ -205,9 +203,7 @@ class ManagerBasedRlEnv(Tabular):
                 expanded_fields=self.sim.expanded_fields,
             )
         self.metadata["render_fps"] = 1.0 / self.step_dt
-        self._placement.begin()
         self.load_managers()
-        self._placement.end_building()
         report_odd_times(self)
         moves = (e for e in self.scene.entities.values() if e is not self.scene.terrain)
         # Commands of motions place robots, so tasks with commands are checked at the first reset.
@@ -362,22 +358,21 @@ class ManagerBasedRlEnv(Tabular):
             self.seed(seed)
         if self._built_state is None:
             curriculum_state.begin(self)
-        with self._checking_terms(resets=True):
-            self._clear_extras()
-            stepped = env_ids[self.episode_length_buf[env_ids] > 0]
-            if len(stepped) > 0:
-                self.recorder_manager.record_pre_reset(stepped)
-            moved = self.scene.take_moved_envs()
-            self._reset_idx(env_ids)
-            self.curriculum_manager.after_term = None
-            self.scene.write_data_to_sim(env_ids)
-            self._forward(env_ids, moved)
-            self.command_manager.compute(dt=0.0, env_ids=env_ids)
-            self._may_not_start &= self.scene.take_moved_envs() is None
-            self._report_start()
-            self.sim.sense()
-            self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
-            self.recorder_manager.record_post_reset(env_ids)
+        self._clear_extras()
+        stepped = env_ids[self.episode_length_buf[env_ids] > 0]
+        if len(stepped) > 0:
+            self.recorder_manager.record_pre_reset(stepped)
+        moved = self.scene.take_moved_envs()
+        self._reset_idx(env_ids)
+        self.curriculum_manager.after_term = None
+        self.scene.write_data_to_sim(env_ids)
+        self._forward(env_ids, moved)
+        self.command_manager.compute(dt=0.0, env_ids=env_ids)
+        self._may_not_start &= self.scene.take_moved_envs() is None
+        self._report_start()
+        self.sim.sense()
+        self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
+        self.recorder_manager.record_post_reset(env_ids)
         return self.obs_buf, self.extras
 
     @torch.no_grad()
@@ -435,52 +430,51 @@ class ManagerBasedRlEnv(Tabular):
                 f"step: environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were "
                 "not reset; call env.reset(env_ids=...) first, or set auto_reset=True in the config."
             )
-        with self._checking_terms():
-            self._clear_extras()
-            self.action_manager.nonfinite.begin_step(self.diverged, self.common_step_counter + 1)
-            self.action_manager.process_action(action)
-            self._run_physics()
-            self.episode_length_buf += 1
-            if not self._holds_common_steps:
-                self.common_step_counter += 1
-                self._stepped_to = self.common_step_counter
-            self._evaluate_step()
+        self._clear_extras()
+        self.action_manager.nonfinite.begin_step(self.diverged, self.common_step_counter + 1)
+        self.action_manager.process_action(action)
+        self._run_physics()
+        self.episode_length_buf += 1
+        if not self._holds_common_steps:
+            self.common_step_counter += 1
+            self._stepped_to = self.common_step_counter
+        self._evaluate_step()
 
-            # Events.
-            self._divergence_log.end_step(self.diverged, self.common_step_counter)
-            for mode in ("step", "interval"):
-                if mode in self.event_manager.available_modes:
-                    self.event_manager.apply(mode=mode, dt=self.step_dt)
+        # Events.
+        self._divergence_log.end_step(self.diverged, self.common_step_counter)
+        for mode in ("step", "interval"):
+            if mode in self.event_manager.available_modes:
+                self.event_manager.apply(mode=mode, dt=self.step_dt)
 
-            # Resets.
-            moved = self.scene.take_moved_envs()
-            if self.observes_ends and self.cfg.auto_reset:
-                self._observe_ends(moved)
-            reset_ids = self.reset_buf.new_empty(0, dtype=torch.long)
-            if self.cfg.auto_reset:
-                reset_ids = self.reset_buf.nonzero().flatten()
-            command_dt: float | torch.Tensor = self.step_dt
+        # Resets.
+        moved = self.scene.take_moved_envs()
+        if self.observes_ends and self.cfg.auto_reset:
+            self._observe_ends(moved)
+        reset_ids = self.reset_buf.new_empty(0, dtype=torch.long)
+        if self.cfg.auto_reset:
+            reset_ids = self.reset_buf.nonzero().flatten()
+        command_dt: float | torch.Tensor = self.step_dt
+        if len(reset_ids) > 0:
+            self.recorder_manager.record_pre_reset(reset_ids)
+            self._reset_idx(reset_ids)
+            self.scene.write_data_to_sim(reset_ids)
+            # Commands of new episodes do not advance in time.
+            command_dt = torch.full_like(self.reward_buf, self.step_dt)
+            command_dt[reset_ids] = 0.0
+
+        # Commands and observations.
+        self._forward(reset_ids, moved)
+        self.command_manager.compute(dt=command_dt)
+        # Moves by resets are up to date after `forward`; commands update their own moves.
+        self.scene.take_moved_envs()
+        self.sim.sense()
+        self.obs_buf = self.observation_manager.compute(update_history=True)
+        if self.cfg.auto_reset:
             if len(reset_ids) > 0:
-                self.recorder_manager.record_pre_reset(reset_ids)
-                self._reset_idx(reset_ids)
-                self.scene.write_data_to_sim(reset_ids)
-                # Commands of new episodes do not advance in time.
-                command_dt = torch.full_like(self.reward_buf, self.step_dt)
-                command_dt[reset_ids] = 0.0
-
-            # Commands and observations.
-            self._forward(reset_ids, moved)
-            self.command_manager.compute(dt=command_dt)
-            # Moves by resets are up to date after `forward`; commands update their own moves.
-            self.scene.take_moved_envs()
-            self.sim.sense()
-            self.obs_buf = self.observation_manager.compute(update_history=True)
-            if self.cfg.auto_reset:
-                if len(reset_ids) > 0:
-                    self.recorder_manager.record_post_reset(reset_ids)
-            else:
-                self._pending_reset |= self.reset_buf
-            self.recorder_manager.record_post_step()
+                self.recorder_manager.record_post_reset(reset_ids)
+        else:
+            self._pending_reset |= self.reset_buf
+        self.recorder_manager.record_post_step()
         # Copies, because libraries stack the results of a rollout at its end.
         return (
             self.obs_buf,
@@ -560,13 +554,6 @@ class ManagerBasedRlEnv(Tabular):
         log["Simulation/nan_terminations"] = self.termination_manager.nonfinite.count
         self.metrics_manager.excluded = self.diverged
         self.metrics_manager.compute()
-
-    @contextlib.contextmanager
-    def _checking_terms(self, resets: bool = False) -> Generator[None]:
-        """Check that terms within the block read no unused origins."""
-        self._placement.begin(resets)
-        yield
-        self._placement.end()
 
     def _clear_extras(self) -> None:
         self.extras["log"] = {}

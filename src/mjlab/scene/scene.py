@@ -372,8 +372,7 @@ class Scene(Tabular):
         """
         if not self.world_cameras:
             return
-        # Not a read by a user.
-        origins = self._env_origins if self._terrain is None else vars(self._terrain)["env_origins"]
+        origins = self.env_origins
         rows = as_index(env_ids)
         places = torch.zeros_like(origins[rows]) if at_world else origins[rows]
         moved = places - self._camera_origins[rows]

@@ -86,9 +86,7 @@ class TerrainEntity(Entity):
     """Ground of the scene: one static body `terrain`, and the environment origins."""
 
     # The config defines the ground; checkpoints hold the levels and columns of environments.
-    _transient = {
-        *("_device", "_flat_patches", "_flat_patch_radii", "_holds_levels", "origins_were_read")
-    }
+    _transient = {"_device", "_flat_patches", "_flat_patch_radii", "_holds_levels"}
 
     cfg: TerrainEntityCfg
 
@@ -100,8 +98,7 @@ class TerrainEntity(Entity):
         """
         self._device = device
         self.env_origins = torch.zeros(cfg.num_envs, 3, dtype=torch.float32, device=device)
-        self.origins_were_read = False
-        """True after a read of `env_origins` by a user, until it is set to False."""
+        """World positions of the environment origins (m), (N, 3)."""
         self.terrain_origins: torch.Tensor | None = None
         """Spawn points of a grid of R levels and C columns (m), (R, C, 3). None on a plane."""
         self.terrain_levels: torch.Tensor | None = None
@@ -190,17 +187,6 @@ class TerrainEntity(Entity):
     def flat_patches(self) -> dict[str, torch.Tensor]:
         """World positions of flat patches by name (m), (R, C, num_patches, 3). Empty on a plane."""
         return self._flat_patches
-
-    @property
-    def env_origins(self) -> torch.Tensor:
-        """World positions of the environment origins (m), (N, 3)."""
-        self.origins_were_read = True
-        # Checkpoints hold it under this name.
-        return vars(self)["env_origins"]
-
-    @env_origins.setter
-    def env_origins(self, origins: torch.Tensor) -> None:
-        vars(self)["env_origins"] = origins
 
     @property
     def flat_patch_radii(self) -> dict[str, float]:
@@ -319,7 +305,7 @@ class TerrainEntity(Entity):
         grid, kept, types = self.terrain_origins, self.terrain_levels, self.terrain_types
         if grid is not None and kept is not None and types is not None:
             kept[env_ids] = levels
-            vars(self)["env_origins"][env_ids] = grid[levels, types[env_ids]]
+            self.env_origins[env_ids] = grid[levels, types[env_ids]]
 
 
 def grid_origins(num_envs: int, spacing: float, device: str) -> torch.Tensor:
