@@ -96,11 +96,9 @@ def both(task: str, num_envs: int, device: str) -> tuple[ManagerBasedRlEnv, Mana
 def _without_chance(cfg: ManagerBasedRlEnvCfg) -> None:
     """Remove terms that draw random numbers within a step: the devices draw different ones."""
     for group in cfg.observations.values():
-        if group is not None:
-            group.enable_corruption = False
-    for name, event in cfg.events.items():
-        if event is not None and event.mode in ("interval", "step"):
-            cfg.events[name] = None
+        group.enable_corruption = False
+    kept = {n: event for n, event in cfg.events.items() if event.mode not in ("interval", "step")}
+    cfg.events = kept
 
 
 def compare(

@@ -74,11 +74,11 @@ class ManagerBasedRlEnvCfg:
     """Number of physics substeps per environment step."""
     scene: SceneCfg
     """Entities, terrain, sensors, and number of environments."""
-    observations: dict[str, ObservationGroupCfg | None] = field(default_factory=dict)
+    observations: dict[str, ObservationGroupCfg] = field(default_factory=dict)
     """Observation groups by name, such as `actor` and `critic`."""
-    actions: dict[str, ActionTermCfg | None] = field(default_factory=dict)
+    actions: dict[str, ActionTermCfg] = field(default_factory=dict)
     """Action terms, in the order of the action vector."""
-    events: dict[str, EventTermCfg | None] = field(
+    events: dict[str, EventTermCfg] = field(
         default_factory=lambda: {
             "reset_scene_to_default": EventTermCfg(func=reset_scene_to_default, mode="reset")
         }
@@ -93,17 +93,17 @@ class ManagerBasedRlEnvCfg:
     """Camera and size of rendered images."""
     episode_length_s: float = 0.0
     """Maximum episode length (s)."""
-    rewards: dict[str, RewardTermCfg | None] = field(default_factory=dict)
+    rewards: dict[str, RewardTermCfg] = field(default_factory=dict)
     """Reward terms."""
-    terminations: dict[str, TerminationTermCfg | None] = field(default_factory=dict)
+    terminations: dict[str, TerminationTermCfg] = field(default_factory=dict)
     """Termination terms."""
-    commands: dict[str, CommandTermCfg | None] = field(default_factory=dict)
+    commands: dict[str, CommandTermCfg] = field(default_factory=dict)
     """Command terms."""
-    curriculum: dict[str, CurriculumTermCfg | None] = field(default_factory=dict)
+    curriculum: dict[str, CurriculumTermCfg] = field(default_factory=dict)
     """Curriculum terms."""
-    metrics: dict[str, MetricsTermCfg | None] = field(default_factory=dict)
+    metrics: dict[str, MetricsTermCfg] = field(default_factory=dict)
     """Metric terms: logged, not rewarded."""
-    recorders: dict[str, RecorderTermCfg | None] = field(default_factory=dict)
+    recorders: dict[str, RecorderTermCfg] = field(default_factory=dict)
     """Recorder terms."""
     is_finite_horizon: bool = False
     """Treat the time limit as part of the task: time-outs are not bootstrapped."""

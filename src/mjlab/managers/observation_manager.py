@@ -87,7 +87,7 @@ class ObservationTermCfg(ManagerTermBaseCfg):
 class ObservationGroupCfg:
     """Configuration of a named group of observation terms, such as "actor" or "critic"."""
 
-    terms: dict[str, ObservationTermCfg | None]
+    terms: dict[str, ObservationTermCfg]
     """Terms by name, in order. None disables a term."""
 
     concatenate_terms: bool = True

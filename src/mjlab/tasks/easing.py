@@ -129,9 +129,7 @@ def simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     return undo
 
 
-def replace_rewards(
-    env_cfg: ManagerBasedRlEnvCfg, rewards: dict[str, RewardTermCfg | None]
-) -> Undo:
+def replace_rewards(env_cfg: ManagerBasedRlEnvCfg, rewards: dict[str, RewardTermCfg]) -> Undo:
     """Replace the task's reward terms by `rewards`.
 
     The returned function restores the task's terms. Terms that flags have changed or removed since
@@ -146,7 +144,7 @@ def replace_rewards(
         for name in before.keys() & weights.keys():
             term = now.get(name)
             if term is None or term.weight != weights[name]:
-                eased.rewards[name] = term
+                eased.rewards[name] = term  # ty: ignore
 
     return undo
 

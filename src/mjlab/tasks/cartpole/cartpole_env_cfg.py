@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import torch
@@ -101,8 +101,7 @@ def cartpole_balance_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
 def cartpole_swingup_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the swing-up task: the pole starts hanging down."""
     cfg = cartpole_balance_env_cfg(play)
-    cartpole: Any = cfg.scene.entities["cartpole"]
-    cartpole.init_state.joint_pos["hinge_1"] = math.pi
+    cfg.scene.entities["cartpole"].init_state.joint_pos = {"slider": 0.0, "hinge_1": math.pi}
     return cfg
 
 
@@ -221,7 +220,7 @@ _CARTPOLE = EntityCfg(
     ),
 )
 
-_OBSERVATIONS: dict[str, ObservationTermCfg | None] = {
+_OBSERVATIONS: dict[str, ObservationTermCfg] = {
     "cart_pos": ObservationTermCfg(func=joint_pos_rel, params={"asset_cfg": _joint("slider")}),
     "pole_angle": ObservationTermCfg(
         func=pole_angle_cos_sin, params={"asset_cfg": _joint("hinge_1")}

@@ -102,7 +102,7 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
 
 # Config sections. `make_lift_cube_env_cfg` copies them.
 
-_TERMS: dict[str, ObservationTermCfg | None] = {
+_TERMS: dict[str, ObservationTermCfg] = {
     "joint_pos": ObservationTermCfg(
         func=mdp.joint_pos_rel, noise=UniformNoiseCfg(n_min=-0.01, n_max=0.01)
     ),
@@ -125,7 +125,7 @@ _TERMS: dict[str, ObservationTermCfg | None] = {
     "actions": ObservationTermCfg(func=mdp.last_action),
 }
 
-_COMMANDS: dict[str, CommandTermCfg | None] = {
+_COMMANDS: dict[str, CommandTermCfg] = {
     "lift_height": mdp.LiftingCommandCfg(
         entity_name="cube",
         resampling_time_range=(8.0, 12.0),
@@ -152,7 +152,7 @@ def _fingertip_friction(axis: int, ranges: tuple[float, float], distribution: st
     )
 
 
-_EVENTS: dict[str, EventTermCfg | None] = {
+_EVENTS: dict[str, EventTermCfg] = {
     "reset_base": EventTermCfg(
         func=mdp.reset_root_state_uniform,
         mode="reset",
@@ -174,7 +174,7 @@ _EVENTS: dict[str, EventTermCfg | None] = {
     "fingertip_friction_roll": _fingertip_friction(2, (1e-5, 5e-3), "log_uniform"),
 }
 
-_REWARDS: dict[str, RewardTermCfg | None] = {
+_REWARDS: dict[str, RewardTermCfg] = {
     "lift": RewardTermCfg(
         func=mdp.staged_position_reward,
         weight=1.0,
@@ -204,7 +204,7 @@ _REWARDS: dict[str, RewardTermCfg | None] = {
     ),
 }
 
-_TERMINATIONS: dict[str, TerminationTermCfg | None] = {
+_TERMINATIONS: dict[str, TerminationTermCfg] = {
     "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
     "ee_ground_collision": TerminationTermCfg(
         func=mdp.illegal_contact,
@@ -218,7 +218,7 @@ _STAGES: list[mdp.RewardCurriculumStage] = [
     {"step": 500 * 24, "weight": -0.1},
     {"step": 1000 * 24, "weight": -1.0},
 ]
-_CURRICULUM: dict[str, CurriculumTermCfg | None] = {
+_CURRICULUM: dict[str, CurriculumTermCfg] = {
     "joint_vel_hinge_weight": CurriculumTermCfg(
         func=mdp.reward_curriculum, params={"reward_name": "joint_vel_hinge", "stages": _STAGES}
     )

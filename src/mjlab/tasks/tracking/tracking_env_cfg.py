@@ -98,7 +98,7 @@ def _term(func: object, noise: float | None = None, **params: object) -> Observa
     return ObservationTermCfg(func=func, params=params, noise=uniform)
 
 
-_ACTOR_TERMS: dict[str, ObservationTermCfg | None] = {
+_ACTOR_TERMS: dict[str, ObservationTermCfg] = {
     "command": _term(mdp.generated_commands, command_name="motion"),
     "motion_anchor_pos_b": _term(mdp.motion_anchor_pos_b, 0.25, command_name="motion"),
     "motion_anchor_ori_b": _term(mdp.motion_anchor_ori_b, 0.05, command_name="motion"),
@@ -109,7 +109,7 @@ _ACTOR_TERMS: dict[str, ObservationTermCfg | None] = {
     "actions": _term(mdp.last_action),
 }
 # Privileged terms, without noise and encoder bias.
-_CRITIC_TERMS: dict[str, ObservationTermCfg | None] = {
+_CRITIC_TERMS: dict[str, ObservationTermCfg] = {
     "command": _term(mdp.generated_commands, command_name="motion"),
     "motion_anchor_pos_b": _term(mdp.motion_anchor_pos_b, command_name="motion"),
     "motion_anchor_ori_b": _term(mdp.motion_anchor_ori_b, command_name="motion"),
@@ -122,7 +122,7 @@ _CRITIC_TERMS: dict[str, ObservationTermCfg | None] = {
     "actions": _term(mdp.last_action),
 }
 
-_COMMANDS: dict[str, CommandTermCfg | None] = {
+_COMMANDS: dict[str, CommandTermCfg] = {
     "motion": mdp.MotionCommandCfg(
         entity_name="robot",
         resampling_time_range=(1.0e9, 1.0e9),
@@ -143,7 +143,7 @@ _COMMANDS: dict[str, CommandTermCfg | None] = {
     )
 }
 
-_EVENTS: dict[str, EventTermCfg | None] = {
+_EVENTS: dict[str, EventTermCfg] = {
     "push_robot": EventTermCfg(
         func=mdp.push_by_setting_velocity,
         mode="interval",
@@ -182,7 +182,7 @@ def _tracking(func: object, weight: float, std: float) -> RewardTermCfg:
     return RewardTermCfg(func=func, weight=weight, params={"command_name": "motion", "std": std})
 
 
-_REWARDS: dict[str, RewardTermCfg | None] = {
+_REWARDS: dict[str, RewardTermCfg] = {
     "motion_global_root_pos": _tracking(mdp.motion_global_anchor_position_error_exp, 0.5, 0.3),
     "motion_global_root_ori": _tracking(mdp.motion_global_anchor_orientation_error_exp, 0.5, 0.4),
     "motion_body_pos": _tracking(mdp.motion_relative_body_position_error_exp, 1.0, 0.3),
@@ -202,7 +202,7 @@ _REWARDS: dict[str, RewardTermCfg | None] = {
     ),
 }
 
-_TERMINATIONS: dict[str, TerminationTermCfg | None] = {
+_TERMINATIONS: dict[str, TerminationTermCfg] = {
     "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
     "anchor_pos": TerminationTermCfg(
         func=mdp.bad_anchor_pos_z_only, params={"command_name": "motion", "threshold": 0.25}

@@ -194,7 +194,7 @@ def _noise(size: float) -> UniformNoiseCfg:
     return UniformNoiseCfg(n_min=-size, n_max=size)
 
 
-_ACTOR_TERMS: dict[str, ObservationTermCfg | None] = {
+_ACTOR_TERMS: dict[str, ObservationTermCfg] = {
     "base_lin_vel": ObservationTermCfg(
         func=mdp.builtin_sensor,
         params={"sensor_name": "robot/imu_lin_vel"},
@@ -222,7 +222,7 @@ _ACTOR_TERMS: dict[str, ObservationTermCfg | None] = {
 }
 # The critic observes the actor's terms without noise (no corruption in its group) and without
 # encoder bias, and further foot terms.
-_CRITIC_TERMS: dict[str, ObservationTermCfg | None] = {
+_CRITIC_TERMS: dict[str, ObservationTermCfg] = {
     **copy.deepcopy(_ACTOR_TERMS),
     "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
     "height_scan": ObservationTermCfg(
@@ -242,7 +242,7 @@ _CRITIC_TERMS: dict[str, ObservationTermCfg | None] = {
     ),
 }
 
-_COMMANDS: dict[str, CommandTermCfg | None] = {
+_COMMANDS: dict[str, CommandTermCfg] = {
     "twist": mdp.UniformVelocityCommandCfg(
         entity_name="robot",
         resampling_time_range=(3.0, 8.0),
@@ -261,7 +261,7 @@ _COMMANDS: dict[str, CommandTermCfg | None] = {
     )
 }
 
-_EVENTS: dict[str, EventTermCfg | None] = {
+_EVENTS: dict[str, EventTermCfg] = {
     "reset_base": EventTermCfg(
         func=mdp.reset_root_state_uniform,
         mode="reset",
@@ -328,7 +328,7 @@ _EVENTS: dict[str, EventTermCfg | None] = {
 
 # No foot penalties for standing commands.
 _COMMANDED = {"command_name": "twist", "command_threshold": 0.05}
-_REWARDS: dict[str, RewardTermCfg | None] = {
+_REWARDS: dict[str, RewardTermCfg] = {
     # Tracking.
     "track_linear_velocity": RewardTermCfg(
         func=mdp.track_linear_velocity,
@@ -419,7 +419,7 @@ _REWARDS: dict[str, RewardTermCfg | None] = {
     ),
 }
 
-_TERMINATIONS: dict[str, TerminationTermCfg | None] = {
+_TERMINATIONS: dict[str, TerminationTermCfg] = {
     "time_out": TerminationTermCfg(func=mdp.time_out, time_out=True),
     "fell_over": TerminationTermCfg(
         func=mdp.bad_orientation, params={"limit_angle": math.radians(70.0)}
@@ -434,7 +434,7 @@ _VELOCITY_STAGES: list[mdp.VelocityStage] = [
     {"step": 5000 * 24, "lin_vel_x": (-1.5, 2.0), "ang_vel_z": (-0.7, 0.7)},
     {"step": 10000 * 24, "lin_vel_x": (-2.0, 3.0)},
 ]
-_CURRICULUM: dict[str, CurriculumTermCfg | None] = {
+_CURRICULUM: dict[str, CurriculumTermCfg] = {
     "terrain_levels": CurriculumTermCfg(
         func=mdp.terrain_levels_vel, params={"command_name": "twist"}
     ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import colorsys
 import copy
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 
@@ -19,7 +19,7 @@ from mjlab.managers import (
     ObservationTermCfg,
     SceneEntityCfg,
 )
-from mjlab.sensor import CameraSensorCfg
+from mjlab.sensor import CameraSensorCfg, ContactSensorCfg
 from mjlab.tasks.manipulation import mdp
 from mjlab.tasks.manipulation.lift_cube_env_cfg import make_lift_cube_env_cfg
 from mjlab.utils.errors import check_count, check_one_of
@@ -75,15 +75,18 @@ class _ColoredCube:
 
 def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the config of the state-based task, for training or `play`."""
-    cfg: Any = make_lift_cube_env_cfg()
+    cfg = make_lift_cube_env_cfg()
+    action = cfg.actions["joint_pos"]
+    assert isinstance(action, mdp.JointPositionActionCfg)
     cfg.scene.entities = {"robot": get_yam_robot_cfg(), "cube": EntityCfg(spec_fn=get_cube_spec)}
-    cfg.actions["joint_pos"].scale = dict(YAM_ACTION_SCALE)
+    action.scale = dict(YAM_ACTION_SCALE)
     actor, critic = cfg.observations["actor"], cfg.observations["critic"]
     for term in (actor.terms["ee_to_cube"], critic.terms["ee_to_cube"], cfg.rewards["lift"]):
         term.params["asset_cfg"].site_names = _HAND
     for name in ("slide", "spin", "roll"):
         cfg.events[f"fingertip_friction_{name}"].params["asset_cfg"].geom_names = _FINGERTIPS
     (hand_on_the_ground,) = cfg.scene.sensors
+    assert isinstance(hand_on_the_ground, ContactSensorCfg)
     hand_on_the_ground.primary.pattern = "link_6"
     cfg.viewer.body_name = "arm"
     if play:
@@ -148,7 +151,7 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
         ValueError: `num_cubes` is below 1.
     """
     check_count("num_cubes", num_cubes)
-    cfg: Any = yam_lift_cube_env_cfg(play=play)
+    cfg = yam_lift_cube_env_cfg(play=play)
     del cfg.scene.entities["cube"]
     cubes = tuple(f"cube_{index}" for index in range(num_cubes))
     for index, name in enumerate(cubes):
@@ -156,6 +159,7 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
         cfg.scene.entities[name] = EntityCfg(spec_fn=_ColoredCube(color))
     cfg.sim.nconmax = max(cfg.sim.nconmax or 0, 55 + _CONTACTS_PER_CUBE * num_cubes)
     single = cfg.commands["lift_height"]
+    assert isinstance(single, mdp.LiftingCommandCfg)
     cfg.commands["lift_height"] = mdp.MultiCubeLiftingCommandCfg(
         entity_names=cubes,
         resampling_time_range=single.resampling_time_range,
@@ -182,7 +186,7 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
     return cfg
 
 
-def _replace_cube_by_goal(cfg: Any, group: str) -> None:
+def _replace_cube_by_goal(cfg: ManagerBasedRlEnvCfg, group: str) -> None:
     """Replace the cube terms of an observation group by the goal position in the hand frame."""
     terms = cfg.observations[group].terms
     del terms["ee_to_cube"], terms["cube_to_goal"]

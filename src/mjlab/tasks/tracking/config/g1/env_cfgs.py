@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_ACTION_SCALE
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg
+from mjlab.tasks.tracking import mdp
 from mjlab.tasks.tracking.tracking_env_cfg import make_tracking_env_cfg
 
 MOTIONS = "squat,wave"
@@ -49,7 +48,10 @@ def unitree_g1_flat_tracking_env_cfg(
             reference anchor, which a real robot must estimate.
         play: Start at the first frame without perturbation; no noise, no pushes.
     """
-    cfg: Any = make_tracking_env_cfg()
+    cfg = make_tracking_env_cfg()
+    action, motion = cfg.actions["joint_pos"], cfg.commands["motion"]
+    assert isinstance(action, mdp.JointPositionActionCfg)
+    assert isinstance(motion, mdp.MotionCommandCfg)
     cfg.scene.entities = {"robot": get_g1_robot_cfg()}
     itself = ContactMatch(mode="subtree", pattern="pelvis", entity="robot")
     cfg.scene.sensors += (
@@ -63,8 +65,7 @@ def unitree_g1_flat_tracking_env_cfg(
             history_length=4,
         ),
     )
-    cfg.actions["joint_pos"].scale = dict(G1_ACTION_SCALE)
-    motion = cfg.commands["motion"]
+    action.scale = dict(G1_ACTION_SCALE)
     motion.motion_file = MOTIONS
     motion.anchor_body_name = _TORSO
     motion.body_names = _BODIES

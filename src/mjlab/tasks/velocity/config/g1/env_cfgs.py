@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_ACTION_SCALE
@@ -82,20 +81,25 @@ _SELF_COLLISION = ContactSensorCfg(
 
 def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the rough-terrain task, for training or for `play`."""
-    cfg: Any = make_velocity_env_cfg()
+    cfg = make_velocity_env_cfg()
+    terrain, action, twist = cfg.scene.terrain, cfg.actions["joint_pos"], cfg.commands["twist"]
+    assert terrain is not None
+    assert terrain.terrain_generator is not None
+    assert isinstance(action, mdp.JointPositionActionCfg)
+    assert isinstance(twist, mdp.UniformVelocityCommandCfg)
     cfg.sim.mujoco.ccd_iterations = 500
     cfg.sim.contact_sensor_maxmatch = 500
     cfg.sim.nconmax = 70
     cfg.scene.entities = {"robot": get_g1_robot_cfg()}
-    cfg.scene.terrain.terrain_generator.curriculum = True
+    terrain.terrain_generator.curriculum = True
     terrain_scan, foot_heights = (get_sensor(cfg, n) for n in ("terrain_scan", "foot_height_scan"))
     terrain_scan.frame = ObjRef(type="body", name="pelvis", entity="robot")
     foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
     foot_heights.pattern = RingPatternCfg.single_ring(radius=0.03, num_samples=6)
     cfg.scene.sensors += copy.deepcopy((_FEET_GROUND_CONTACT, _SELF_COLLISION))
-    cfg.actions["joint_pos"].scale = dict(G1_ACTION_SCALE)
+    action.scale = dict(G1_ACTION_SCALE)
     # Draw the command above the head.
-    cfg.commands["twist"].viz.z_offset = 1.15
+    twist.viz.z_offset = 1.15
     cfg.events["foot_friction"].params["asset_cfg"].geom_names = _FOOT_GEOMS
     cfg.events["base_com"].params["asset_cfg"].body_names = (_TORSO,)
     _set_rewards(cfg)
@@ -113,7 +117,7 @@ def unitree_g1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
 
 
 def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
-    terms = {name: term for name, term in cfg.rewards.items() if term is not None}
+    terms = cfg.rewards
     for name in ("upright", "body_ang_vel"):
         terms[name].params["asset_cfg"].body_names = (_TORSO,)
     for name in ("foot_clearance", "foot_slip"):

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
 
 from mjlab.asset_zoo.robots.unitree_g1.g1_constants import FULL_COLLISION
 from mjlab.envs import ManagerBasedRlEnvCfg
@@ -138,7 +137,7 @@ def cpu(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlB
     env_cfg.scene.num_envs = _NUM_ENVS
     _add_stepping(env_cfg)
     penalties = {n: term for n, term in env_cfg.rewards.items() if term and term.weight < 0.0}
-    rewards: dict[str, RewardTermCfg | None] = {
+    rewards: dict[str, RewardTermCfg] = {
         **copy.deepcopy(_GAIT_REWARDS),
         **penalties,
         "action_rate_l2": RewardTermCfg(func=envs_mdp.action_rate_l2, weight=-0.5),
@@ -172,13 +171,12 @@ def _add_stepping(env_cfg: ManagerBasedRlEnvCfg) -> None:
     env_cfg.commands[_CLOCK] = mdp.GaitClockCommandCfg(
         frequency=_STRIDES_PER_SECOND, starts=(0.0, 0.5), fade_s=0.3, velocity_command_name=None
     )
-    observations: Any = env_cfg.observations
-    for group in observations.values():
+    for group in env_cfg.observations.values():
         group.terms[_CLOCK] = ObservationTermCfg(
             func=mdp.generated_commands, params={"command_name": _CLOCK}
         )
     for name in _FILTERED:
-        observations["actor"].terms[name].history_length = _HISTORY
+        env_cfg.observations["actor"].terms[name].history_length = _HISTORY
     env_cfg.observations[_TEACHER] = ObservationGroupCfg(
         terms={"step": ObservationTermCfg(func=mdp.stepping_action)}
     )
@@ -203,7 +201,7 @@ def _reduce_collisions(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
 
 def _terminate_early(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
     """Terminate falling robots earlier: the rest of a fall teaches little."""
-    fell: Any = env_cfg.terminations["fell_over"]
+    fell = env_cfg.terminations["fell_over"]
     before, early = fell.params["limit_angle"], math.radians(60.0)
     fell.params["limit_angle"] = early
     env_cfg.terminations["sank"] = TerminationTermCfg(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal
+from typing import Literal
 
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_go1.go1_constants import GO1_ACTION_SCALE
@@ -65,19 +65,23 @@ _CONTACT_SENSORS = (
 
 def unitree_go1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the rough-terrain task, for training or for `play`."""
-    cfg: Any = make_velocity_env_cfg()
+    cfg = make_velocity_env_cfg()
+    terrain, action = cfg.scene.terrain, cfg.actions["joint_pos"]
+    assert terrain is not None
+    assert terrain.terrain_generator is not None
+    assert isinstance(action, mdp.JointPositionActionCfg)
     cfg.sim.mujoco.ccd_iterations = 500
     cfg.sim.mujoco.impratio = 10
     cfg.sim.mujoco.cone = "elliptic"
     cfg.sim.contact_sensor_maxmatch = 500
     cfg.scene.entities = {"robot": get_go1_robot_cfg()}
-    cfg.scene.terrain.terrain_generator.curriculum = True
+    terrain.terrain_generator.curriculum = True
     terrain_scan, foot_heights = (get_sensor(cfg, n) for n in ("terrain_scan", "foot_height_scan"))
     terrain_scan.frame = ObjRef(type="body", name=_TRUNK, entity="robot")
     foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
     foot_heights.pattern = RingPatternCfg.single_ring(radius=0.04, num_samples=4)
     cfg.scene.sensors += copy.deepcopy(_CONTACT_SENSORS)
-    cfg.actions["joint_pos"].scale = dict(GO1_ACTION_SCALE)
+    action.scale = dict(GO1_ACTION_SCALE)
     cfg.events["base_com"].params["asset_cfg"].body_names = (_TRUNK,)
     # Feet have condim 6; torsional and rolling friction range over orders of magnitude.
     cfg.events.pop("foot_friction")
@@ -130,7 +134,7 @@ def _foot_friction(
 
 
 def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
-    params = {name: term.params for name, term in cfg.rewards.items() if term is not None}
+    params = {name: term.params for name, term in cfg.rewards.items()}
     params["upright"]["asset_cfg"].body_names = (_TRUNK,)
     # On slopes, the trunk should be parallel to the ground.
     params["upright"]["terrain_sensor_names"] = ("terrain_scan",)
