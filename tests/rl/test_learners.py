@@ -6,8 +6,6 @@ from dataclasses import asdict, fields, replace
 from typing import Any
 
 import pytest
-import torch
-from tensordict import TensorDict
 
 from mjlab.rl.config import (
     EvaluationCfg,
@@ -17,7 +15,6 @@ from mjlab.rl.config import (
     RslRlOnPolicyRunnerCfg,
 )
 from mjlab.rl.learners import acting_cfg, learner_of, train_dict, with_learner
-from mjlab.rl.networks import check_networks
 
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 
@@ -94,16 +91,3 @@ def test_additions_are_passed_if_changed():
     assert made["evaluation"]["solved_return"] == 900.0
     assert made["algorithm"]["use_mixed_precision"] is True
     assert "symmetry_cfg" not in made["algorithm"]
-
-
-def test_sac_refuses_images_and_networks_of_others():
-    groups = {"actor": torch.zeros(2, 3), "camera": torch.zeros(2, 1, 8, 8)}
-    observations = TensorDict({**groups, "critic": groups["actor"]}, batch_size=[2])
-    cfg = asdict(RslRlOffPolicyRunnerCfg())
-    check_networks(observations, cfg)
-    images = {**cfg, "obs_groups": {"actor": ("actor", "camera"), "critic": ("critic",)}}
-    with pytest.raises(ValueError, match="'camera', which holds images .*--learner ppo"):
-        check_networks(observations, images)
-    cfg["critic"]["class_name"] = "MLPModel"
-    with pytest.raises(ValueError, match="agent.critic class_name: .*TwinCriticModel .*'MLPModel'"):
-        check_networks(observations, cfg)

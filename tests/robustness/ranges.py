@@ -101,9 +101,8 @@ def _fields(cfg: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
         if dataclasses.is_dataclass(value):
             yield from _fields(value, f"{inner}.")
         elif limits is not None and isinstance(value, dict):
-            keys = [limits.key] if limits.key in value else [*value] if limits.key is None else []
-            yield from ((f"{inner}.{key}", limits, value[key]) for key in keys)
-        elif limits is not None and limits.key is None:
+            yield from ((f"{inner}.{key}", limits, number) for key, number in value.items())
+        elif limits is not None:
             yield inner, limits, value
 
 
@@ -178,7 +177,7 @@ def _numbers(limits: Any, is_plain: bool) -> list[Any]:
 def _holds(limits: Any, number: float) -> bool:
     above = number > limits.low or (number == limits.low and limits.ends[0] == "[")
     below = number < limits.high or (number == limits.high and limits.ends[1] == "]")
-    return number == limits.also or (above and below)
+    return above and below
 
 
 def _with(value: Any, number: float) -> Any:

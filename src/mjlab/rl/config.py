@@ -41,7 +41,7 @@ def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[
 class RslRlModelCfg:
     """Network config: actor or critic."""
 
-    hidden_dims: Annotated[tuple[int, ...], Range(1, also=-1)] = (128, 128, 128)
+    hidden_dims: Annotated[tuple[int, ...], Range(-1)] = (128, 128, 128)
     """Width of each hidden layer; -1: that of the input."""
     activation: str = "elu"
     """Activation function between layers (rsl_rl's name: `elu`, `relu`, `tanh`, ...)."""
@@ -49,7 +49,7 @@ class RslRlModelCfg:
     """Normalize observations by their running mean and standard deviation."""
     cnn_cfg: dict[str, Any] | None = None
     """Image encoder settings, for models with an encoder."""
-    distribution_cfg: Annotated[dict[str, Any] | None, Range(0.0, ends="()", key="init_std")] = None
+    distribution_cfg: dict[str, Any] | None = None
     """Output distribution, e.g. `{"class_name": "GaussianDistribution", "init_std": 1.0,
     "std_type": "scalar"}`. None: deterministic output."""
     rnn_type: str | None = None

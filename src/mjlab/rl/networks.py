@@ -1,65 +1,36 @@
-"""Checks of networks against observations, completion of their settings, shared image encoders.
-
-rsl_rl also fails on most of the errors checked here, but later and without naming the setting.
-Unknown groups, and encoders without images, are errors of rsl_rl.
-"""
+"""Completion of network settings, and checks of values that rsl_rl accepts but cannot learn with."""
 
 from __future__ import annotations
 
-import contextlib
-import copy
 import warnings
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import CNNModel, MLPModel
-from rsl_rl.modules import CNN
 from rsl_rl.utils import resolve_callable
-from tensordict import TensorDict
-from torch import nn
 
 from mjlab.rl.learners import drop_unchanged_additions
-from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
-from mjlab.rl.spatial_softmax import SPATIAL_SOFTMAX_KEYS, cnn_cfg_by_group
-from mjlab.utils.errors import check_positive
-from mjlab.utils.logging import first_line
-from mjlab.utils.memory import check_memory
+from mjlab.rl.sac_models import SacActorModel
 from mjlab.utils.string import counted
 
 _MODELS = ("actor", "critic", "student", "teacher")
 _PACKAGES = ("mjlab", "rsl_rl")
-# Rows of the replay that is measured; final observations then take one more row.
-_REPLAY_ROWS = 32
-_SAC_MODELS = {"actor": SacActorModel, "critic": TwinCriticModel}
 _RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
-_CNN_EXAMPLE = (
-    "class_name='CNNModel' or 'mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel', with "
-    "cnn_cfg={'output_channels': [16, 32], 'kernel_size': [5, 3], 'stride': [2, 2], "
-    "'padding': 'zeros'}"
-)
-_SYMMETRY_FUNCTION = "data_augmentation_func"
-_SYMMETRY_KEYS = {
-    _SYMMETRY_FUNCTION, "use_data_augmentation", "use_mirror_loss", "mirror_loss_coeff"
-}  # fmt: skip
-_SYMMETRY_EXAMPLE = (
-    'Example: {"data_augmentation_func": "mjlab.tasks.velocity.symmetry:mirror_left_right", '
-    '"use_data_augmentation": True}; None disables it.'
-)
 
 
 def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
-    """Check a runner's config against the observations of `env`, and complete it in place.
+    """Complete a runner's config for the observations of `env`, in place.
 
     Args:
         env: Environments, as rsl_rl's `VecEnv`.
         cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
 
     Raises:
-        ValueError: see `check_networks` and `check_symmetry`.
+        ValueError: the policy has no distribution to explore with.
     """
     drop_unchanged_additions(cfg)
+    check_distribution(cfg)
     observations = env.get_observations()
     for name in _MODELS:
         if not isinstance(model := cfg.get(name), dict):
@@ -74,109 +45,29 @@ def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
         known = [observations[group] for group in groups if group in observations]
         if known and all(value.ndim == 4 for value in known):
             model["obs_normalization"] = False
-    check_networks(observations, cfg)
     if cfg["algorithm"].get("share_cnn_encoders"):
         # Required by rsl_rl, but without effect.
         cfg["critic"].setdefault("cnn_cfg", cfg["actor"].get("cnn_cfg"))
-    check_symmetry(env, observations, cfg)
+    if cfg["algorithm"].get("symmetry_cfg"):
+        check_symmetry(env, observations, cfg)
 
 
-def check_networks(observations: TensorDict, cfg: Mapping[str, Any]) -> None:
-    """Check that networks can process their observations.
-
-    Args:
-        observations: Observations of the environment.
-        cfg: Runner config as a dict.
-
-    Raises:
-        ValueError: a network does not fit; the message names the setting and a remedy.
-    """
-    student = cfg.get("student")
-    if isinstance(student, dict) and student.get("distribution_cfg") is None:
-        raise ValueError(
-            "agent.student distribution_cfg: expected a distribution, got None; use "
-            "gaussian_distribution(0.1), with the standard deviation of the actions in training."
-        )
-    check_actor_distribution(cfg)
-    shared = bool(cfg["algorithm"].get("share_cnn_encoders"))
-    images = {
-        model: _check_model(observations, cfg, model)
-        for model in _MODELS
-        if isinstance(cfg.get(model), dict)
-    }
-    actor, critic = images.get("actor", []), images.get("critic", [])
-    if shared and (not actor or set(actor) != set(critic)):
-        raise ValueError(
-            "algorithm.share_cnn_encoders: expected actor and critic with image encoders for the same "
-            f"groups, got {actor or 'none'} for the actor and {critic or 'none'} for the critic; use "
-            "the same image groups in obs_groups and a CNN class for both, or share_cnn_encoders=False."
-        )
-
-
-def check_actor_distribution(cfg: Mapping[str, Any]) -> None:
-    """Raise `ValueError` if rsl_rl's or mjlab's algorithms would train a deterministic actor.
+def check_distribution(cfg: Mapping[str, Any]) -> None:
+    """Raise `ValueError` if rsl_rl's or mjlab's algorithms would train a deterministic policy.
 
     Networks and algorithms of other packages may do without `distribution_cfg`.
     """
-    actor = cfg.get("actor")
-    if not isinstance(actor, dict) or actor.get("distribution_cfg") is not None:
-        return
-    model, algorithm = (resolve_callable(part["class_name"]) for part in (actor, cfg["algorithm"]))
-    if all(part.__module__.partition(".")[0] in _PACKAGES for part in (model, algorithm)):
-        example = "squashed_gaussian()" if model is SacActorModel else "gaussian_distribution()"
-        raise ValueError(
-            "agent.actor distribution_cfg: expected a distribution to explore with, got None; use "
-            f"RslRlModelCfg(distribution_cfg={example}), with the function of mjlab.rl.config."
-        )
-
-
-def check_sizes(env: Any, cfg: Mapping[str, Any], device: str) -> None:
-    """Check networks, rollouts and replay against the memory of `device`; see `check_memory`.
-
-    Measured by building the algorithm without allocating memory. Classes of other packages are not
-    checked, because they may not support it.
-
-    Raises:
-        ValueError: they do not fit.
-    """
-    parts = [cfg[name] for name in ("algorithm", *_MODELS) if isinstance(cfg.get(name), dict)]
-    kinds = [resolve_callable(part["class_name"]) for part in parts]
-    if not all(kind.__module__.partition(".")[0] in _PACKAGES for kind in kinds):
-        return
-    one: dict[str, Any] = {
-        **copy.deepcopy(dict(cfg)),
-        "multi_gpu": None,
-        "torch_compile_mode": None,
-    }
-    name, steps, rows = "agent num_steps_per_env", cfg["num_steps_per_env"], 1
-    one["num_steps_per_env"] = 1
-    if "replay_steps" in cfg["algorithm"]:
-        name, steps, rows = "SAC replay_steps", cfg["algorithm"]["replay_steps"], _REPLAY_ROWS
-        one["algorithm"]["replay_steps"] = rows - 1
-    algorithm: Any = kinds[0]
-    try:
-        # The algorithm that is built for use warns.
-        with torch.device("meta"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            made = algorithm.construct_algorithm(env.get_observations(), env, one, "meta")
-    except Exception as error:
-        # Parts of other packages may need values, which the meta device lacks.
-        if "overflow" not in str(error).lower():
-            return
-        raise ValueError(
-            f"agent networks: expected sizes below 2**63, got {first_line(error)}; use smaller "
-            "hidden_dims."
-        ) from error
-    for field, module in vars(made).items():
-        if isinstance(module, nn.Module) and not field.startswith("_"):
-            weights = sum(parameter.numel() for parameter in module.parameters())
-            check_memory(f"agent.{field} weights", weights, 4, device, "smaller hidden_dims")
-    stored = list(vars(made.storage).values())
-    stored += [
-        part for parts in stored if isinstance(parts, (dict, TensorDict)) for part in parts.values()
-    ]
-    size = sum(value.nbytes for value in stored if torch.is_tensor(value))
-    check_memory(name, steps, size // rows, device, "fewer steps or environments")
+    for name in ("actor", "student"):
+        policy = cfg.get(name)
+        if not isinstance(policy, dict) or policy.get("distribution_cfg") is not None:
+            continue
+        kinds = [resolve_callable(part["class_name"]) for part in (policy, cfg["algorithm"])]
+        if all(kind.__module__.partition(".")[0] in _PACKAGES for kind in kinds):
+            example = "squashed_gaussian" if kinds[0] is SacActorModel else "gaussian_distribution"
+            raise ValueError(
+                f"agent.{name} distribution_cfg: expected a distribution to explore with, got None; use "
+                f"RslRlModelCfg(distribution_cfg={example}()), with the function of mjlab.rl.config."
+            )
 
 
 def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
@@ -203,59 +94,24 @@ def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
 
 
 def check_symmetry(env: Any, observations: Any, cfg: Mapping[str, Any]) -> None:
-    """Check the function of `symmetry_cfg` by mirroring the observations once.
+    """Warn if the function of `symmetry_cfg` returns other rows than its input and mirrored copies.
 
     Args:
         env: Environments.
         observations: Observations, a TensorDict of batch size (N,).
-        cfg: A `RslRlOnPolicyRunnerCfg` as a dict.
-
-    Raises:
-        ValueError: a setting is missing or unknown, the function does not exist, or it does not
-            return its input rows and mirrored copies of them.
+        cfg: A `RslRlOnPolicyRunnerCfg` as a dict, with a `symmetry_cfg`.
     """
-    symmetry = cfg["algorithm"].get("symmetry_cfg")
-    if not symmetry:
-        return
-    if _SYMMETRY_FUNCTION not in symmetry or not set(symmetry) <= _SYMMETRY_KEYS:
-        raise ValueError(
-            f"symmetry_cfg: expected {_SYMMETRY_FUNCTION} and optionally "
-            f"{', '.join(sorted(_SYMMETRY_KEYS - {_SYMMETRY_FUNCTION}))}, got "
-            f"{', '.join(map(str, symmetry))}. {_SYMMETRY_EXAMPLE}"
-        )
-    try:
-        function = resolve_callable(symmetry[_SYMMETRY_FUNCTION])
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"symmetry_cfg {_SYMMETRY_FUNCTION}: {symmetry[_SYMMETRY_FUNCTION]!r} cannot be imported: "
-            f"{error}. {_SYMMETRY_EXAMPLE}"
-        ) from error
+    name = cfg["algorithm"]["symmetry_cfg"]["data_augmentation_func"]
     actions = torch.zeros(env.num_envs, env.num_actions, device=env.device)
-    mirrored, mirrored_actions = function(env=env, obs=observations, actions=actions)
-    rows, action_rows = mirrored.batch_size[0], mirrored_actions.shape[0]
-    if rows == action_rows == env.num_envs:
+    mirrored, mirrored_actions = resolve_callable(name)(env=env, obs=observations, actions=actions)
+    rows, action_rows = mirrored.batch_size[0], len(mirrored_actions)
+    if rows != action_rows or rows < 2 * env.num_envs or rows % env.num_envs:
         warnings.warn(
-            f"symmetry_cfg {_SYMMETRY_FUNCTION} {symmetry[_SYMMETRY_FUNCTION]!r} returns no mirrored rows.",
+            f"symmetry_cfg data_augmentation_func {name!r}: expected the original and the mirrored rows of "
+            f"{counted(env.num_envs, 'environment')}, got {rows} observations and {action_rows} actions.",
             UserWarning,
             stacklevel=4,
         )
-    elif rows != action_rows or rows < env.num_envs or rows % env.num_envs:
-        raise ValueError(
-            f"symmetry_cfg {_SYMMETRY_FUNCTION} {symmetry[_SYMMETRY_FUNCTION]!r}: expected the original "
-            f"and the mirrored rows of {counted(env.num_envs, 'environment')}, got {rows} observations and "
-            f"{action_rows} actions."
-        )
-
-
-@contextlib.contextmanager
-def shared_parameters_allowed() -> Generator[None]:
-    """Allow rsl_rl to pass parameters of shared encoders to its optimizer twice.
-
-    Call `deduplicate_parameters` afterwards.
-    """
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*duplicate parameters")
-        yield
 
 
 def deduplicate_parameters(optimizer: torch.optim.Optimizer) -> None:
@@ -266,65 +122,3 @@ def deduplicate_parameters(optimizer: torch.optim.Optimizer) -> None:
     """
     for group in optimizer.param_groups:
         group["params"] = list(dict.fromkeys(group["params"]))
-
-
-def _check_model(observations: TensorDict, cfg: Mapping[str, Any], model: str) -> list[str]:
-    """Check one network; return the image groups that it encodes."""
-    settings, algorithm = cfg[model], cfg["algorithm"]
-    name, is_sac = settings["class_name"], "replay_steps" in algorithm
-    kind = resolve_callable(name)
-    base = _SAC_MODELS[model] if is_sac else object
-    if isinstance(kind, type) and not issubclass(kind, base):
-        raise ValueError(
-            f"agent.{model} class_name: expected {base.__module__}:{base.__name__} or a subclass for "
-            f"the learner 'sac', got {name!r}; omit it, or use --learner ppo."
-        )
-    images = []
-    for group in (cfg.get("obs_groups") or {}).get(model, (model,)):
-        value = observations.get(group, None)
-        if value is not None and not (torch.is_tensor(value) and value.is_floating_point()):
-            got = value.dtype if torch.is_tensor(value) else f"a dict of {sorted(value.keys())}"
-            raise ValueError(
-                f"Observation group {group!r}: expected a tensor of floating-point numbers, got {got}; "
-                "use concatenate_terms=True, or convert the values in the observation term."
-            )
-        if value is not None and value.ndim == 4:
-            images.append(group)
-    if isinstance(kind, type) and issubclass(kind, CNNModel):
-        if model != "critic" or not algorithm.get("share_cnn_encoders"):
-            shapes = {group: tuple(observations[group].shape[1:]) for group in images}
-            _check_encoders(model, kind, settings.get("cnn_cfg"), shapes)
-        return images
-    # Models of other packages may accept images.
-    if images and getattr(kind, "_get_obs_dim", None) is MLPModel._get_obs_dim:
-        encoder = "--learner ppo" if is_sac else f"an image encoder ({_CNN_EXAMPLE})"
-        raise ValueError(
-            f"agent.{model} class_name {name!r}: expected flat observations, got the observation group "
-            f"{images[0]!r}, which holds images of shape {tuple(observations[images[0]].shape[1:])}; "
-            f"use {encoder}, or remove {images[0]!r} from obs_groups[{model!r}]."
-        )
-    return []
-
-
-def _check_encoders(model: str, kind: type, cnn_cfg: Any, shapes: dict[str, Any]) -> None:
-    """Check each encoder of `model` by building it once, without allocating memory."""
-    name, groups = f"agent.{model} cnn_cfg", list(shapes)
-    if not cnn_cfg or not isinstance(cnn_cfg, dict):
-        raise ValueError(
-            f"{name}: expected a dict for the images {groups}, got {cnn_cfg!r}. {_CNN_EXAMPLE}"
-        )
-    for group, settings in cnn_cfg_by_group(cnn_cfg, groups, name).items():
-        temperature = settings.get("spatial_softmax_temperature", 1.0)
-        check_positive(f"{name} spatial_softmax_temperature", temperature)
-        if kind is not CNNModel:
-            settings = {k: v for k, v in settings.items() if k not in SPATIAL_SOFTMAX_KEYS}
-        try:
-            # The meta device neither computes nor draws random numbers.
-            with torch.device("meta"):
-                channels, height, width = shapes[group]
-                CNN((height, width), channels, **settings)(torch.empty(1, *shapes[group]))
-        except (RuntimeError, TypeError, ValueError, IndexError, KeyError) as error:
-            raise ValueError(
-                f"{name}: expected settings of an encoder for the images {group!r} of shape {shapes[group]}, "
-                f"large enough for all layers, got {settings}: {first_line(error)}."
-            ) from error

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 from mjlab.rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from mjlab.utils.errors import check_count, check_in_range
+from mjlab.utils.memory import check_memory
 
 logger = logging.getLogger(__name__)
 
@@ -66,10 +67,14 @@ class ReplayStorage:
             num_actions: Number of actions A.
 
         Raises:
-            ValueError: `num_steps` is not positive.
+            ValueError: `num_steps` is not positive, or the buffer exceeds the memory.
         """
         check_count("SAC replay_steps", num_steps)
         self._num_envs = len(observations)
+        size = sum(observations[name].nbytes for name in groups)
+        size += self._num_envs * (4 * num_actions + 13)
+        device = str(observations[groups[0]].device)
+        check_memory("SAC replay_steps", num_steps, size, device, "fewer steps or environments")
         self._num_steps = num_steps
         self._device = observations[groups[0]].device
         rows, envs = num_steps + 1, self._num_envs

@@ -14,6 +14,7 @@ import os
 import secrets
 import signal
 import time
+import warnings
 from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
@@ -56,10 +57,8 @@ from mjlab.rl.evaluation import (
 from mjlab.rl.exporter_utils import export_to_onnx, export_with_metadata, get_base_metadata
 from mjlab.rl.networks import (
     check_mini_batches,
-    check_sizes,
     deduplicate_parameters,
     prepare_train_cfg,
-    shared_parameters_allowed,
 )
 from mjlab.rl.progress import NotebookProgress, ProgressCfg, in_notebook
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
@@ -109,13 +108,19 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             device: Device of the networks.
 
         Raises:
-            ValueError: a network cannot process its observation groups, or `symmetry_cfg` has no
-                valid symmetry function.
+            ValueError: the policy has no distribution to explore with, or rsl_rl cannot build the
+                networks.
         """
         prepare_train_cfg(env, train_cfg)
+        # Allocated memory is taken only when it is written to, in the first iteration.
+        check_memory(
+            "agent num_steps_per_env", train_cfg["num_steps_per_env"], env.get_observations().bytes(),
+            device, "fewer steps or environments",
+        )  # fmt: skip
         # rsl_rl prints networks and observation sets.
-        with contextlib.redirect_stdout(io.StringIO()) as printed, shared_parameters_allowed():
-            check_sizes(env, train_cfg, device)
+        with contextlib.redirect_stdout(io.StringIO()) as printed, warnings.catch_warnings():
+            # Of shared encoders.
+            warnings.filterwarnings("ignore", message=".*duplicate parameters")
             super().__init__(env, train_cfg, log_dir, device)
         logger.debug("%s", printed.getvalue().rstrip())
         deduplicate_parameters(self.alg.optimizer)

@@ -76,8 +76,6 @@ class SAC:
         self._policy = copy.deepcopy(self.actor).requires_grad_(False)
         self._target = copy.deepcopy(self.critic).requires_grad_(False)
         self._log_alpha = nn.Parameter(torch.tensor(math.log(cfg.init_alpha), device=device))
-        # The meta device, on which sizes are measured, has neither a fused optimizer nor generators.
-        is_real = torch.device(device).type != "meta"
         # The fused optimizer takes a quarter of the time. The decay of second moments is faster than
         # usual, because targets move (arXiv 2512.01996).
         self.optimizer = torch.optim.AdamW(
@@ -88,7 +86,7 @@ class SAC:
             ],
             betas=(0.9, 0.95),
             weight_decay=cfg.weight_decay,
-            fused=is_real,
+            fused=True,
         )
         self.learning_rate = cfg.actor_learning_rate
         self._teacher = _Teacher(cfg)
@@ -105,7 +103,7 @@ class SAC:
         check_field(cfg, "batch_size", is_whole, "an even number, because half is mirrored")
         self._multi_gpu, self._bucket_mb = multi_gpu_cfg, grad_reduce_bucket_mb
 
-        self._generator = torch.Generator(device=device if is_real else "cpu")
+        self._generator = torch.Generator(device=device)
         self._generator.manual_seed(torch.initial_seed() % 2**63)
         self._noise = _HeldNoise(env.num_envs, env.num_actions, cfg.noise_hold, device)
         scales = cfg.value_range is None

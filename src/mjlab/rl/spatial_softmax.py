@@ -11,8 +11,8 @@ from rsl_rl.modules import CNN
 from tensordict import TensorDict
 from torch import nn
 
-SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
-"""Keys of a CNN config that rsl_rl's CNN does not accept."""
+# Keys of a CNN config that rsl_rl's CNN does not accept.
+_SPATIAL_SOFTMAX_KEYS = ("spatial_softmax", "spatial_softmax_temperature")
 
 
 class SpatialSoftmax(nn.Module):
@@ -103,13 +103,13 @@ class SpatialSoftmaxCNNModel(CNNModel):
         """
         if cnns is None:
             self._get_obs_dim(obs, obs_groups, obs_set)
-            settings = cnn_cfg_by_group(cnn_cfg, self.obs_groups_2d)
+            settings = _cnn_cfg_by_group(cnn_cfg, self.obs_groups_2d)
             encoders: Any = {
                 group: SpatialSoftmaxCNN(
                     input_dim=self.obs_dims_2d[index],
                     input_channels=self.obs_channels_2d[index],
                     temperature=settings[group].get("spatial_softmax_temperature", 1.0),
-                    **{k: v for k, v in settings[group].items() if k not in SPATIAL_SOFTMAX_KEYS},
+                    **{k: v for k, v in settings[group].items() if k not in _SPATIAL_SOFTMAX_KEYS},
                 )
                 for index, group in enumerate(self.obs_groups_2d)
             }
@@ -128,19 +128,15 @@ class SpatialSoftmaxCNNModel(CNNModel):
         )
 
 
-def cnn_cfg_by_group(
-    cnn_cfg: Mapping[str, Any], groups: Sequence[str], name: str = "cnn_cfg"
+def _cnn_cfg_by_group(
+    cnn_cfg: Mapping[str, Any], groups: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Return the CNN config of each image group; a single config applies to all groups.
-
-    Raises:
-        ValueError: `cnn_cfg` has configs for other groups; `name` is its name in the message.
-    """
+    """Return the CNN config of each image group; a single config applies to all groups."""
     if not all(isinstance(value, dict) for value in cnn_cfg.values()):
         return {group: dict(cnn_cfg) for group in groups}
     if set(cnn_cfg) != set(groups):
         raise ValueError(
-            f"{name}: expected a config per image group {sorted(groups)}, or one config for all, got "
+            f"cnn_cfg: expected a config per image group {sorted(groups)}, or one config for all, got "
             f"configs for {sorted(cnn_cfg)}."
         )
     return {group: dict(cnn_cfg[group]) for group in groups}

@@ -29,14 +29,8 @@ class Range:
     """Upper bound."""
     ends: Literal["[]", "(]", "[)", "()"] = "[]"
     """Brackets of the interval: a round one excludes its bound."""
-    also: float | None = None
-    """Number outside the interval with a special meaning."""
-    key: str | None = None
-    """Key of the only item of a dict that is judged. None: all."""
 
     def __contains__(self, number: Any) -> bool:
-        if number == self.also:
-            return True
         is_kind = isinstance(number, Integral) or not isinstance(self.low, int)
         is_above = self.low < number if self.ends[0] == "(" else self.low <= number
         is_below = number < self.high if self.ends[1] == ")" else number <= self.high
@@ -52,7 +46,7 @@ class Range:
         is_finite = self.high == math.inf and self.ends[1] == ")"
         kind = "an integer" if isinstance(self.low, int) else "a number"
         kind = "a finite number" if is_finite and kind == "a number" else kind
-        return f"{kind}{limits}" + ("" if self.also is None else f", or {self.also}")
+        return f"{kind}{limits}"
 
 
 Count = Annotated[int, Range(1)]
@@ -116,7 +110,7 @@ def out_of_range(
             yield from out_of_range(value, inner, (*above, id(cfg)))
         elif isinstance(value, Mapping):
             for key, item in value.items():
-                if limits.key in (None, key) and not all(n in limits for n in _numbers(item)):
+                if not all(number in limits for number in _numbers(item)):
                     yield f"{inner}.{key}", limits, item
         elif not all(number in limits for number in _numbers(value)):
             yield inner, limits, value
