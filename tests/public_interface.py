@@ -92,7 +92,7 @@ def is_offered(entry: Entry) -> bool:
     name = re.match(r"\w+", member).group()
     cls = getattr(module, owner)
     # Fields that are gone are arguments of the constructor still.
-    return hasattr(cls, name) or name in compat._DROPPED_FIELDS.get(owner, {})
+    return hasattr(cls, name) or name in compat._FIELDS.get(owner, {})
 
 
 def command_line() -> dict[str, list[str]]:

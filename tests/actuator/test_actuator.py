@@ -414,4 +414,3 @@ def test_older_delayed_config_delays_the_config_it_wraps(make_world):
     assert isinstance(world.entity.actuators[0].cfg, BuiltinMotorActuatorCfg)
     assert not make_world(DelayedActuatorCfg(base_cfg=base)).entity.actuators[0].has_delay
     assert [write(world, float(k))[0] for k in range(1, 5)] == [1.0, 1.0, 1.0, 2.0]
-    assert not isinstance(make_world(motor_cfg()).entity.actuators[0], DelayedActuator)

@@ -78,15 +78,14 @@ def test_a_collision_setup_can_leave_other_geoms_alone(spec):
     assert spec.compile().geom_contype.tolist() == [2, 2, 1, 1]
 
 
-def test_geoms_that_no_pattern_names_get_the_defaults_of_earlier_releases_with_one_warning(spec):
+def test_unmatched_geoms_get_the_defaults_with_one_warning(spec):
     for geom in spec.geoms:
         geom.condim, geom.priority, geom.contype, geom.conaffinity = 6, 2, 4, 8
     partial = {"foot_left": 4}
     cfg = CollisionCfg(
         (".*",), contype=partial, conaffinity=partial, condim=partial, priority=partial
     )
-    with pytest.warns(FutureWarning, match=r"no pattern matches.*'foot_right'.*\.\*") as record:
-        cfg.edit_spec(spec)
+    with pytest.warns(UserWarning, match=r"no pattern matches.*'foot_right'.*\.\*") as record:
         cfg.edit_spec(spec)
     assert len(record) == 1
     model = spec.compile()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from abc import ABCMeta
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 
 from mjlab.actuator import Actuator, ActuatorCfg
-from mjlab.actuator.actuator import DirectActuator
+from mjlab.compat import older_function
 from mjlab.envs.mdp import dr
 from mjlab.envs.mdp.dr._core import BODY, GEOM, ROBOT, SITE, FieldRow, randomize
 from mjlab.envs.mdp.dr.actuator import selected_actuators
@@ -28,15 +27,7 @@ if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.envs.mdp.actions import DifferentialIKAction
-    from mjlab.managers import (
-        CurriculumManager,
-        EventManager,
-        MetricsManager,
-        ObservationManager,
-        RewardManager,
-        SceneEntityCfg,
-        TerminationManager,
-    )
+    from mjlab.managers import SceneEntityCfg
     from mjlab.sensor import ContactSensor
 
 
@@ -65,15 +56,6 @@ class DelayedActuatorCfg(ActuatorCfg):
         delay = {name: getattr(self, name) for name in vars(self) if name.startswith("delay_")}
         del delay["delay_target"]
         return dataclasses.replace(self.base_cfg, **delay).build(entity, target_ids, target_names)
-
-
-class _HasDelay(ABCMeta):
-    def __instancecheck__(cls, instance: Any) -> bool:
-        return isinstance(instance, Actuator) and instance.has_delay
-
-
-class DelayedActuator(Actuator, metaclass=_HasDelay):
-    """Virtual base class of all actuators with a delay."""
 
 
 @dataclass
@@ -115,6 +97,7 @@ _ROWS = {
 }
 
 
+@older_function
 def randomize_field(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -161,7 +144,16 @@ def _fields_of(params: dict[str, Any]) -> tuple[str, ...]:
 setattr(randomize_field, "model_fields", _fields_of)  # noqa: B010
 setattr(randomize_field, "recompute", lambda params: _row(params["field"]).recompute)  # noqa: B010
 
+randomize_effort_limits = older_function(
+    dr.effort_limits, "randomize_effort_limits", "mjlab.envs.mdp.dr.effort_limits"
+)
+randomize_encoder_bias = older_function(
+    dr.encoder_bias, "randomize_encoder_bias", "mjlab.envs.mdp.dr.encoder_bias"
+)
+randomize_pd_gains = older_function(dr.pd_gains, "randomize_pd_gains", "mjlab.envs.mdp.dr.pd_gains")
 
+
+@older_function
 def sync_actuator_delays(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -190,6 +182,7 @@ class RewardWeightStage(TypedDict):
     weight: float
 
 
+@older_function
 def reward_weight(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor,
@@ -207,6 +200,7 @@ def reward_weight(
     return torch.tensor([cfg.weight], dtype=torch.float32)
 
 
+@older_function
 def flat_orientation(
     env: ManagerBasedRlEnv, std: float, asset_cfg: SceneEntityCfg = ROBOT
 ) -> torch.Tensor:
@@ -217,12 +211,14 @@ def flat_orientation(
     return torch.exp(tilt_of(quat) / -(std**2))
 
 
+@older_function
 def disable_collision(geom: Any) -> None:
     """Disable collisions of a spec geom."""
     geom.contype = 0
     geom.conaffinity = 0
 
 
+@older_function
 def update_assets(
     assets: dict[str, Any],
     path: str | Path,
@@ -237,11 +233,13 @@ def update_assets(
             assets[f"{meshdir}/{file.name}" if meshdir else file.name] = file.read_bytes()
 
 
+@older_function
 def get_assets(meshdir: str) -> dict[str, bytes]:
     """Return an empty dict: the robots use primitive shapes instead of mesh files."""
     return {}
 
 
+@older_function
 def rotation_quat_from_vectors(from_vec: Any, to_vec: Any) -> Any:
     """Return the quaternion (w, x, y, z) of the shortest rotation between two vectors."""
     start = np.asarray(from_vec, dtype=float) / np.linalg.norm(from_vec)
@@ -267,6 +265,7 @@ class Timer:
         return elapsed
 
 
+@older_function
 def compute_flat_patches(
     noise: np.ndarray,
     vertical_scale: float,
@@ -290,17 +289,7 @@ def compute_flat_patches(
     }
 
 
-# Legacy instance attributes.
-
-
-def base_actuator(actuator: Actuator) -> Actuator:
-    """Return the actuator: delays are part of each actuator, not of another around it."""
-    return actuator
-
-
-def command_field(actuator: Actuator) -> str:
-    """Return the first command of an actuator: "position", "velocity" or "effort"."""
-    return actuator.command_fields[0] if isinstance(actuator, DirectActuator) else "position"
+# Attributes of instances.
 
 
 @dataclass(frozen=True)
@@ -340,84 +329,3 @@ def ik_joint_ids(action: DifferentialIKAction) -> torch.Tensor:
     """Return the ids of the joints driven by the action, (number of joints,)."""
     count = action._entity.num_joints
     return torch.arange(count, device=action.device)[action._columns]
-
-
-def generalized_force(data: Any) -> torch.Tensor:
-    """Return the applied generalized forces of the entity's joints, (N, nj)."""
-    return data._columns("qfrc_applied", data._joint_v)
-
-
-def step_count(manager: MetricsManager) -> torch.Tensor:
-    """Return the number of steps of each current episode, (N,) int64."""
-    return manager._steps.long()
-
-
-def episode_sums(manager: MetricsManager) -> dict[str, torch.Tensor]:
-    """Return the sums of metrics over current episodes, views (N,) by name."""
-    return dict(zip(manager.active_terms, manager._sum, strict=True))
-
-
-def reward_sums(manager: RewardManager) -> dict[str, torch.Tensor]:
-    """Return the sums of weighted rewards over current episodes, views (N,) by name."""
-    return {name: manager.episode_sum(name) for name in manager.active_terms}
-
-
-def curriculum_state(manager: CurriculumManager) -> dict[str, Any]:
-    """Return the last result of each term."""
-    return manager._state
-
-
-def mode_term_names(manager: EventManager) -> dict[str, list[str]]:
-    """Return the names of the events of each mode."""
-    return manager.active_terms
-
-
-def mode_term_cfgs(manager: EventManager) -> dict[str, list[Any]]:
-    """Return the live configs of the events of each mode."""
-    return {
-        mode: [manager.get_term_cfg(name) for name in names]
-        for mode, names in manager.active_terms.items()
-    }
-
-
-def group_obs_concatenate(manager: ObservationManager) -> dict[str, bool]:
-    """Return True for each group whose terms are concatenated."""
-    return manager.group_obs_concatenate
-
-
-def group_obs_dim(manager: ObservationManager) -> dict[str, Any]:
-    """Return the shape of each group, or the shapes of its terms."""
-    return manager.group_obs_dim
-
-
-def group_obs_term_dim(manager: ObservationManager) -> dict[str, list[tuple[int, ...]]]:
-    """Return the shapes of the terms of each group."""
-    return manager.group_obs_term_dim
-
-
-def group_obs_term_names(manager: ObservationManager) -> dict[str, list[str]]:
-    """Return the names of the terms of each group."""
-    return manager.active_terms
-
-
-def group_obs_term_cfgs(manager: ObservationManager) -> dict[str, list[Any]]:
-    """Return the live configs of the terms of each group."""
-    return {
-        group: [manager.get_term_cfg(group, term) for term in terms]
-        for group, terms in manager.active_terms.items()
-    }
-
-
-def truncated_buf(manager: TerminationManager) -> torch.Tensor:
-    """Return the buffer of time-outs, (N,) bool."""
-    return manager.time_outs
-
-
-def terminated_buf(manager: TerminationManager) -> torch.Tensor:
-    """Return the buffer of failures, (N,) bool."""
-    return manager.terminated
-
-
-def term_dones(manager: TerminationManager) -> dict[str, torch.Tensor]:
-    """Return the last values of the terms, buffers (N,) bool by name."""
-    return {name: manager.get_term(name) for name in manager.active_terms}

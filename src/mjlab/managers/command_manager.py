@@ -65,10 +65,6 @@ class CommandTerm(ManagerTermBase):
     Raises `ValueError` if the config's time range has min > max.
     """
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        accept_older_methods(CommandTerm, cls)
-
     def __init__(self, cfg: CommandTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(env)
         self.cfg = cfg
@@ -211,6 +207,8 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
 
     def __init__(self, cfg: Mapping[str, CommandTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
+        for term in self._terms.values():
+            accept_older_methods(term)
 
     def tables(self) -> list[Table]:
         """Return the table of the active terms."""

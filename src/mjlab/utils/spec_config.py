@@ -15,7 +15,6 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from mjlab.compat import accepts_older_fields, older_defaults, set_array_field
 from mjlab.utils.errors import check_exists, check_field, check_one_of
 from mjlab.utils.mujoco import enum_value
 from mjlab.utils.string import filter_exp, resolve_field
@@ -31,7 +30,7 @@ __all__ = [
     "TextureCfg",
     "warn_overlapping_geom_edits",
 ]
-_REQUIRED = ("contype", "conaffinity", "condim", "priority")
+_ALWAYS_WRITTEN = ("contype", "conaffinity", "condim", "priority")
 _ARRAYS = {"friction": 3, "solref": 2, "solimp": 5}
 _PATCHES = (*_ARRAYS, "margin", "gap", "solmix")
 _MAX_LISTED = 8
@@ -65,25 +64,23 @@ class SpecCfg(ABC):
         return
 
 
-@accepts_older_fields
 @dataclass
 class CollisionCfg(SpecCfg):
     """Collision setup of an entity. Values have the form of `GeomCfg`.
 
-    The four required attributes are always written, so dicts should cover every selected geom;
-    unmatched geoms get contype 1, conaffinity 1, condim 3 or priority 0, with a warning. The other
-    attributes are patches.
+    The first four attributes are always written, so dicts should cover every selected geom; unmatched
+    geoms get the default, with a warning. The other attributes are patches.
     """
 
     geom_names_expr: tuple[str, ...]
     """Patterns of geom names, matched at the start of the name."""
-    contype: int | dict[str, int]
+    contype: int | dict[str, int] = 1
     """Collision type bits."""
-    conaffinity: int | dict[str, int]
+    conaffinity: int | dict[str, int] = 1
     """Bit mask of contypes that these geoms collide with."""
-    condim: int | dict[str, int]
+    condim: int | dict[str, int] = 3
     """Contact dimension: 1, 3, 4 or 6."""
-    priority: int | dict[str, int]
+    priority: int | dict[str, int] = 0
     """Priority. The geom with the higher priority sets friction and solver parameters of a contact."""
     friction: tuple[float, ...] | dict[str, tuple[float, ...]] | None = None
     """Friction: sliding, torsional, rolling; fewer values set the first ones."""
@@ -99,22 +96,35 @@ class CollisionCfg(SpecCfg):
     """Weight in [0, 1] for averaging the contact parameters of two geoms."""
     disable_other_geoms: bool = True
     """Disable collisions of all unmatched geoms."""
-    set_array_field = staticmethod(set_array_field)
+
+    @staticmethod
+    def set_array_field(field: Any, values: Sequence[float] | None) -> None:
+        """Write `values` to the first elements of an array field of a spec. None: unchanged."""
+        if values is not None:
+            field[: len(values)] = values
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
         """Apply the setup. Raises `ValueError` for invalid values."""
         self.validate()
         geoms, others = _split_geoms(spec, self.geom_names_expr)
         names = tuple(geom.name for geom in geoms)
-        required = {field: resolve_field(getattr(self, field), names) for field in _REQUIRED}
-        missing = {
-            field: [name for name, value in zip(names, values, strict=True) if value is None]
-            for field, values in required.items()
-        }
-        defaults = older_defaults(CollisionCfg, missing)
-        for field, values in required.items():
+        filled = []
+        for field in _ALWAYS_WRITTEN:
+            default = getattr(CollisionCfg, field)
+            values = resolve_field(getattr(self, field), names)
             for geom, value in zip(geoms, values, strict=True):
-                setattr(geom, field, defaults[field] if value is None else value)
+                setattr(geom, field, default if value is None else value)
+            unmatched = [name for name, value in zip(names, values, strict=True) if value is None]
+            if unmatched:
+                more = " and others" if len(unmatched) > _MAX_LISTED else ""
+                filled.append(f"{field} of {unmatched[:_MAX_LISTED]}{more} is {default}")
+        if filled:
+            warnings.warn(
+                f"CollisionCfg: no pattern matches some geoms, so {', '.join(filled)}; add a last pattern "
+                "'.*'.",
+                UserWarning,
+                stacklevel=2,
+            )
         for field in _PATCHES:
             _patch(geoms, field, getattr(self, field))
         if self.disable_other_geoms:
@@ -123,7 +133,7 @@ class CollisionCfg(SpecCfg):
 
     def validate(self) -> None:
         """Raise `ValueError` for invalid values, with field, pattern and allowed values."""
-        for field in _REQUIRED:
+        for field in _ALWAYS_WRITTEN:
             check_field(self, field, getattr(self, field) is not None, "a value")
         _validate_collision(self)
 
@@ -165,7 +175,7 @@ class GeomCfg(SpecCfg):
         """Patch the geoms. Raises `ValueError` for invalid values."""
         self.validate()
         geoms, _ = _split_geoms(spec, self.geom_names_expr)
-        for field in ("group", *_REQUIRED, *_PATCHES):
+        for field in ("group", *_ALWAYS_WRITTEN, *_PATCHES):
             _patch(geoms, field, getattr(self, field))
 
     def validate(self) -> None:
@@ -459,8 +469,8 @@ def _edited_attributes(
     for cfg in cfgs:
         geoms, _ = _split_geoms(spec, cfg.geom_names_expr)
         names = tuple(geom.name for geom in geoms)
-        for field in (*_REQUIRED, *_PATCHES):
-            always = isinstance(cfg, CollisionCfg) and field in _REQUIRED
+        for field in (*_ALWAYS_WRITTEN, *_PATCHES):
+            always = isinstance(cfg, CollisionCfg) and field in _ALWAYS_WRITTEN
             values = names if always else resolve_field(getattr(cfg, field), names)
             edited |= {
                 (name, field)
@@ -487,7 +497,7 @@ def _patch(geoms: Sequence[mujoco.MjsGeom], field: str, value: Any) -> None:
         if entry is None:
             continue
         if field in _ARRAYS:
-            getattr(geom, field)[: len(entry)] = entry
+            CollisionCfg.set_array_field(getattr(geom, field), entry)
         else:
             setattr(geom, field, entry)
 

@@ -163,8 +163,7 @@ class TestReleases11And12:
         compat._warn_once.cache_clear()
 
     def test_a_scene_is_created_and_given_its_controls(self, viser_server, env) -> None:
-        with pytest.warns(FutureWarning, match="MjlabViserScene"):
-            scene = ViserMujocoScene.create(viser_server, env.sim.mj_model, num_envs=2)
+        scene = ViserMujocoScene.create(viser_server, env.sim.mj_model, num_envs=2)
         assert isinstance(scene, ViserMujocoScene)
         scene.create_visualization_gui(camera_distance=1.5, show_debug_viz_control=False)
         tabs = viser_server.gui.add_tab_group()

@@ -5,7 +5,7 @@ Domain randomization is in `mjlab.envs.mdp.dr`.
 
 from __future__ import annotations
 
-from mjlab.compat import older_exports, older_names
+from mjlab.compat import older_names
 from mjlab.entity import Entity
 from mjlab.envs.mdp import (
     actions,
@@ -47,7 +47,6 @@ __all__ = [
     *observations.__all__,
     *rewards.__all__,
     *terminations.__all__,
-    *older_exports(__name__),
 ]
 
-__getattr__ = older_names(__name__)
+__getattr__ = older_names(__name__, __all__)

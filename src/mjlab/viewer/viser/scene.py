@@ -21,7 +21,6 @@ import viser.transforms as vtf
 from mjviser import ViserMujocoScene
 from mjviser.conversions import group_geoms_by_visual_compat, merge_geoms
 
-from mjlab.compat import offers_older_static_methods
 from mjlab.viewer.camera import CameraView, first_moving_body, whole_model_view
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import copy_state, host_model, sync_model_fields, to_numpy
@@ -41,7 +40,6 @@ _MAX_SHAPES = 256
 _CHECK_PERIOD_S = 1.0
 
 
-@offers_older_static_methods
 class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
     """mjviser's scene of all environments, with a debug visualizer and a camera.
 
@@ -99,6 +97,11 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         self._expanded_fields = (expanded_fields or set()) if sim_model is not None else set()
         self._variants = GeomVariants(self, sim_model, self._expanded_fields)
         self._aim_initial_camera()
+
+    @classmethod
+    def create(cls, *args: Any, **kwargs: Any) -> MjlabViserScene:
+        """Construct the scene: the spelling of releases 1.1 and 1.2."""
+        return cls(*args, **kwargs)
 
     @property
     def offset(self) -> np.ndarray:

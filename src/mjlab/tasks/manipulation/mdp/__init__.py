@@ -1,6 +1,6 @@
 """Terms of the manipulation tasks and of `mjlab.envs.mdp`."""
 
-from mjlab.compat import older_exports, older_names
+from mjlab.compat import older_names
 from mjlab.envs.mdp import *  # noqa: F403
 from mjlab.envs.mdp import __all__ as _library
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
@@ -21,7 +21,6 @@ __all__ = [
     *rewards.__all__,
     *terminations.__all__,
     *_library,
-    *older_exports(__name__),
 ]
 
-__getattr__ = older_names(__name__)
+__getattr__ = older_names(__name__, __all__)

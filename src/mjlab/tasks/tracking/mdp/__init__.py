@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mjlab.compat import older_exports, older_names
+from mjlab.compat import older_names
 from mjlab.envs.mdp import *  # noqa: F403
 from mjlab.envs.mdp import __all__ as _library
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
@@ -33,16 +32,6 @@ __all__ = [
     *rewards.__all__,
     *terminations.__all__,
     *(name for name in _library if name != "DebugVisualizer"),
-    *older_exports(__name__),
 ]
 
-_older_name = older_names(__name__)
-
-# Name that mjlab 1.6 has at this path; imported on first use.
-_LAZY = {"DebugVisualizer": "mjlab.viewer.debug_visualizer"}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    return _older_name(name)
+__getattr__ = older_names(__name__, __all__)

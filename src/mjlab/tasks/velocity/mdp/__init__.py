@@ -1,6 +1,6 @@
 """MDP terms of the velocity task, and all terms of `mjlab.envs.mdp`."""
 
-from mjlab.compat import older_exports, older_names
+from mjlab.compat import older_names
 from mjlab.envs.mdp import *  # noqa: F403
 from mjlab.envs.mdp import __all__ as _library
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
@@ -39,7 +39,6 @@ __all__ = [
     *terrain_utils.__all__,
     *velocity_command.__all__,
     *(name for name in _library if name != "RayCastSensor"),
-    *older_exports(__name__),
 ]
 
-__getattr__ = older_names(__name__)
+__getattr__ = older_names(__name__, __all__)
