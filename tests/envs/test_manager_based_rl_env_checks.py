@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import warnings
 
@@ -18,8 +17,6 @@ from mjlab.managers import (
     CommandTerm,
     CommandTermCfg,
     EventTermCfg,
-    RewardTermCfg,
-    SceneEntityCfg,
     TerminationTermCfg,
 )
 from mjlab.managers.action_manager import as_action
@@ -93,61 +90,6 @@ def test_whole_numbers_of_numpy_are_whole_numbers():
     cfg = cartpole()
     cfg.decimation, cfg.scene.num_envs = True, np.int32(3)
     env_checks.check_env_cfg(cfg)
-
-
-# Selections that no manager resolves.
-
-SLIDER = SceneEntityCfg("cartpole", joint_names="slider")
-
-
-def read_own(env):
-    return env.scene["cartpole"].data.joint_pos[:, SLIDER.joint_ids].sum(dim=-1)
-
-
-def read_constant(env):
-    return mdp.joint_vel_l2(env, SLIDER)
-
-
-def read_new(env):
-    return mdp.joint_vel_l2(env, SceneEntityCfg("cartpole", joint_names=("slider",)))
-
-
-def read_resolved(env):
-    selection = copy.deepcopy(SLIDER)
-    selection.resolve(env.scene)
-    assert selection.joint_ids == [0]
-    return mdp.joint_vel_l2(env, selection)
-
-
-def read_all(env):
-    return mdp.joint_vel_l2(env, SceneEntityCfg("cartpole", joint_names=".*"))
-
-
-def warnings_of(term):
-    cfg = cartpole()
-    cfg.rewards["new"] = RewardTermCfg(func=term, weight=1.0)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("default")
-        env = ManagerBasedRlEnv(cfg, device="cpu")
-        env.reset()
-        for _ in range(3):
-            env.step(torch.zeros(NUM_ENVS, 1))
-        env.close()
-    return [str(one.message) for one in caught if "SceneEntityCfg" in str(one.message)]
-
-
-@pytest.mark.parametrize("term", [read_constant, read_new])
-def test_unresolved_selection_warns_once(term):
-    SLIDER._read = frozenset()
-    (message,) = warnings_of(term)
-    assert "'cartpole' joint_ids" in message
-    assert "slider" in message
-    assert "every joint" in message
-
-
-@pytest.mark.parametrize("term", [read_own, read_resolved, read_all])
-def test_no_warning_where_ids_are_meant(term):
-    assert warnings_of(term) == []
 
 
 # The device.

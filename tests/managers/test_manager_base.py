@@ -161,7 +161,7 @@ DEFAULT = SceneEntityCfg("robot", joint_names="joint_b")
 
 
 def by_default(env, asset_cfg=DEFAULT):
-    return with_asset(env, asset_cfg)
+    return env.value if asset_cfg.joint_ids == slice(None) else None
 
 
 class ByDefault:
@@ -169,25 +169,14 @@ class ByDefault:
         pass
 
     def __call__(self, env, *, asset_cfg=DEFAULT):
-        return with_asset(env, asset_cfg)
+        return by_default(env, asset_cfg)
 
 
 @pytest.mark.parametrize("term", [by_default, ByDefault])
-def test_selections_that_are_default_arguments_are_resolved(env, kind, term):
+def test_a_default_selection_of_elements_warns(env, kind, term):
     manager_class, make = kind
-    manager = manager_class({"a": make(term)}, env)
-    manager.compute(**({"dt": 0.1} if manager_class is RewardManager else {}))
-    assert manager.get_term_cfg("a").params["asset_cfg"].joint_ids == [1]
-    assert DEFAULT.joint_ids == slice(None), "other environments use the default too"
-
-
-def test_default_argument_without_match_warns(env, kind):
-    def knees(env, asset_cfg=SceneEntityCfg("robot", joint_names="knee")):  # noqa: B008
-        return env.value if asset_cfg.joint_ids == slice(None) else None
-
-    manager_class, make = kind
-    with pytest.warns(UserWarning, match=r"term 'a'.*'asset_cfg'.*knee") as caught:
-        manager = manager_class({"a": make(knees)}, env)
+    with pytest.warns(UserWarning, match=r"term 'a'.*'asset_cfg'") as caught:
+        manager = manager_class({"a": make(term)}, env)
     assert len(caught) == 1
     manager.compute(**({"dt": 0.1} if manager_class is RewardManager else {}))
 

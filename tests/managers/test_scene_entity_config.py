@@ -278,27 +278,14 @@ def test_all_joints_select_all_actuators():
     assert resolved(scene, joint_names=".*").actuator_ids == slice(None)
 
 
-@pytest.mark.filterwarnings("ignore:.*already have an actuator")
-def test_derived_ids_follow_a_change():
-    scene = legs()
-    cfg = resolved(scene, joint_names="hip")
-    cfg.joint_names, cfg.joint_ids = "knee", slice(None)
-    cfg.resolve(scene)
-    assert cfg.actuator_ids == [1, 3]
-    cfg.joint_names, cfg.joint_ids = None, slice(None)
-    cfg.resolve(scene)
-    assert cfg.actuator_ids == slice(None)
-
-
 # Terms that read ids.
 
 
 def messages_of(env, cfg, kind):
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        for _ in range(3):
-            columns_of(cfg, kind, env)
-            columns_of(copy.deepcopy(cfg), kind, env)
+        warnings.simplefilter("default")
+        for each in (cfg, cfg, copy.deepcopy(cfg)):
+            columns_of(each, kind, env)
     return [str(one.message) for one in caught]
 
 
@@ -307,19 +294,11 @@ def messages_of(env, cfg, kind):
 def test_use_of_a_kind_not_selected_warns_once(env, kind, other):
     cfg = resolved(env.scene, **{f"{other}_names": f"{other}_a"})
     messages = messages_of(env, cfg, kind)
-    if kind == other or (other, kind) in (("joint", "actuator"), ("body", "geom")):
+    if kind == other:
         assert messages == []
         return
     (message,) = messages
     for words in (f"'robot' {kind}_ids", f"{other}_a", f"every {kind}", f"{kind}_names"):
-        assert words in message
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_ids_never_resolved_warn_once(env, kind):
-    cfg = SceneEntityCfg("robot", **{f"{kind}_names": f"{kind}_b"})
-    (message,) = messages_of(env, cfg, kind)
-    for words in (f"'robot' {kind}_ids", f"{kind}_b", "never resolved", "resolve(env.scene)"):
         assert words in message
 
 

@@ -225,12 +225,20 @@ class ManagerBase(Tabular, ABC):
     def _resolve_selections(self, label: str, value: Any, is_nested: bool = False) -> None:
         """Resolve every `SceneEntityCfg` in a dict, list, tuple or dataclass, in place."""
         if isinstance(value, SceneEntityCfg):
-            # A nested selection of no elements needs no ids, and its entity may be optional.
-            if not is_nested:
+            try:
                 with label_errors(label):
-                    value.resolve(self._env.scene)
-            elif value.selected_kinds():
-                self._try_to_resolve(label, value)
+                    # A nested selection of no elements needs no ids, and its entity may be optional.
+                    if value.selected_kinds() or not is_nested:
+                        value.resolve(self._env.scene)
+            except (KeyError, ValueError) as error:
+                # Releases 1.x leave nested selections unresolved.
+                if not is_nested:
+                    raise
+                warnings.warn(
+                    f"{error.args[0]} The selection stays unresolved: its ids are those of all elements.",
+                    UserWarning,
+                    stacklevel=2,
+                )
             return
         if isinstance(value, (list, tuple)):
             inner = list(enumerate(value))
@@ -239,25 +247,8 @@ class ManagerBase(Tabular, ABC):
         for key, item in inner:
             self._resolve_selections(f"{label}[{key!r}]", item, is_nested=True)
 
-    def _try_to_resolve(self, label: str, selection: SceneEntityCfg) -> bool:
-        """Resolve a selection that releases 1.x leave unresolved: warn if that fails."""
-        try:
-            selection.resolve(self._env.scene)
-        except (KeyError, ValueError) as error:
-            warnings.warn(
-                f"{label}: the selection stays unresolved, so its ids are those of all elements. "
-                f"{error}",
-                UserWarning,
-                stacklevel=2,
-            )
-            return False
-        return True
-
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Replace a class by its instance, and check that the term is callable.
-
-        Default values of parameters that select elements by name become parameters, resolved.
-        """
+        """Replace a class by its instance, and check that the term is callable."""
         label = self._label(name)
         if inspect.isclass(cfg.func):
             cfg.func = self._construct(label, cfg, leading)
@@ -268,11 +259,13 @@ class ManagerBase(Tabular, ABC):
                 default = parameter.default
                 if key in cfg.params or not isinstance(default, SceneEntityCfg):
                     continue
-                selection = copy.deepcopy(default)
-                if selection.selected_kinds() and self._try_to_resolve(
-                    f"{label}, default of parameter {key!r}", selection
-                ):
-                    cfg.params[key] = selection
+                if default.selected_kinds():
+                    warnings.warn(
+                        f"{label}: expected parameter {key!r} in params, got its default, a selection "
+                        "that is not resolved; the term uses all elements.",
+                        UserWarning,
+                        stacklevel=2,
+                    )
         with label_errors(label), label_warnings(label):
             check_term(cfg.func, self._env, cfg.params)
         if not inspect.isroutine(cfg.func):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import re
 import warnings
 from collections.abc import Sequence
@@ -101,11 +100,8 @@ class SceneEntityCfg:
     preserve_order: bool = False
     """Order the selection by pattern instead of the entity's natural order."""
 
-    # State, not fields. Ids that followed from another kind when the selection was resolved.
-    _derived = dict[str, Any]()
-    _is_resolved = False
-    # Kinds whose ids a term has read.
-    _read = frozenset()
+    # Kinds with elements that a resolved selection selects, or that follow from these. No field.
+    _kinds = tuple[str, ...]()
 
     def __str__(self) -> str:
         """Return the entity and its selected elements: `robot`, `robot joint hip`, `robot 12 joints`."""
@@ -139,16 +135,17 @@ class SceneEntityCfg:
                 )
             names, ids = self._resolve_kind(kind, names, ids, entity)
             resolved |= {f"{kind}_names": names, f"{kind}_ids": ids}
-        derived: dict[str, Any] = dict.fromkeys(self._derived, slice(None))
         for kind, (source, owners) in _FOLLOWS.items():
             if source in kinds and kind not in kinds and isinstance(entity, Entity):
                 ids = resolved.get(f"{source}_ids", getattr(self, f"{source}_ids"))
                 count = len(getattr(entity, f"{source}_names"))
-                derived[kind] = _following(getattr(entity, owners), ids, count)
-        resolved |= {f"{kind}_ids": ids for kind, ids in derived.items()}
+                following = _following(getattr(entity, owners), ids, count)
+                resolved[f"{kind}_ids"] = following
+                if following != [] or resolved.get(f"{source}_names") == []:
+                    kinds.append(kind)
         for name, value in resolved.items():
             setattr(self, name, value)
-        self._derived, self._is_resolved = derived, True
+        self._kinds = tuple(kinds)
 
     def selected_kinds(self) -> list[str]:
         """Return the kinds of elements selected by names or ids, such as `joint`."""
@@ -156,7 +153,7 @@ class SceneEntityCfg:
             kind
             for kind in _FINDERS
             if getattr(self, f"{kind}_names") is not None
-            or not (_is_all(ids := getattr(self, f"{kind}_ids")) or ids is self._derived.get(kind))
+            or not _is_all(getattr(self, f"{kind}_ids"))
         ]
 
     def empty_selections(self) -> list[str]:
@@ -204,50 +201,23 @@ class SceneEntityCfg:
 def columns_of(asset_cfg: SceneEntityCfg, kind: str, env: ManagerBasedRlEnv) -> Columns:
     """Return the column index of the selected elements of a kind, such as "joint", for a term.
 
-    Warns once if these are probably not the elements that were meant: the names were never resolved,
-    or this kind follows from none of the selected kinds, so that all elements are used; or no
-    element follows from the selected ones.
+    Warns if only other kinds are selected, because the term then uses all elements of this one, or
+    none if no element of this kind follows from the selected ones.
     """
-    if kind not in asset_cfg._read:
-        asset_cfg._read |= {kind}
-        _warn_of_ids(asset_cfg, kind, env)
-    return as_columns(getattr(asset_cfg, f"{kind}_ids"), env.device)
-
-
-def _warn_of_ids(cfg: SceneEntityCfg, kind: str, env: ManagerBasedRlEnv) -> None:
-    selected, ids = cfg.selected_kinds(), getattr(cfg, f"{kind}_ids")
-    source = _FOLLOWS[kind][0] if kind in _FOLLOWS else None
-    parts = {k: "ids" if getattr(cfg, f"{k}_names") is None else "names" for k in selected}
-    shown = ", ".join(f"{k}_{part}={getattr(cfg, f'{k}_{part}')}" for k, part in parts.items())
-    if not selected or not (_is_all(ids) or ids == []):
-        return
-    if kind not in selected and source not in selected:
-        names = f"{kind}_names" if source is None else f"{kind}_names or {source}_names"
-        problem = f"expected {names}, got {shown}"
-        remedy = f"the term uses every {kind}; set {kind}_names, to '.*' for all"
-    elif _is_all(ids) and not cfg._is_resolved and not _means_all(cfg, kind, env):
-        problem = f"expected a resolved selection, got {shown}, never resolved"
-        remedy = (
-            f"the term uses every {kind}; pass the selection as a parameter of the term, or call its "
-            "resolve(env.scene)"
+    ids = getattr(asset_cfg, f"{kind}_ids")
+    if asset_cfg._kinds and kind not in asset_cfg._kinds:
+        selected = {k: getattr(asset_cfg, f"{k}_names") for k in asset_cfg._kinds}
+        shown = ", ".join(f"{k}_names={names}" for k, names in selected.items())
+        used = f"no {kind}; set {kind}_names" if ids == [] else (
+            f"every {kind}; set {kind}_names, to '.*' for all"
+        )  # fmt: skip
+        warnings.warn(
+            f"SceneEntityCfg of {asset_cfg.name!r} {kind}_ids: expected {kind}_names, got {shown}; "
+            f"the term uses {used}.",
+            UserWarning,
+            stacklevel=2,
         )
-    elif kind not in selected and ids == [] and getattr(cfg, f"{source}_ids") != []:
-        problem = f"expected a {source} with at least one {kind}, got {shown}"
-        remedy = f"the term uses no {kind}; set {kind}_names"
-    else:
-        return
-    message = f"SceneEntityCfg of {cfg.name!r} {kind}_ids: {problem}; {remedy}."
-    warnings.warn(message, UserWarning, stacklevel=4)
-
-
-def _means_all(cfg: SceneEntityCfg, kind: str, env: ManagerBasedRlEnv) -> bool:
-    """Return True if resolving the selection gives all elements of a kind."""
-    resolved = copy.copy(cfg)
-    try:
-        resolved.resolve(env.scene)
-    except (KeyError, ValueError):
-        return False
-    return _is_all(getattr(resolved, f"{kind}_ids"))
+    return as_columns(ids, env.device)
 
 
 def _following(owners: Sequence[int | None], ids: Any, count: int) -> list[int] | slice:

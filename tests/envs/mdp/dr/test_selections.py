@@ -25,7 +25,7 @@ def run(world: Any, name: str, cfg: SceneEntityCfg, ids: torch.Tensor | None = N
     angles = {"roll_range": (0.1, 0.2)}
     params = angles if TABLE[name].rotation else {"ranges": (1.1, 1.3), "operation": "scale"}
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+        warnings.simplefilter("default")
         for _ in range(2):
             world.apply(getattr(dr, name), ids, asset_cfg=cfg, **params)
     return [str(one.message) for one in caught if "SceneEntityCfg" in str(one.message)]
