@@ -57,19 +57,15 @@ def test_sums_of_squares(moving: Any) -> None:
 
 def test_torques_of_joints_without_actuator(moving: Any) -> None:
     ankle = resolved(moving, joint_names=("ankle",))
-    with pytest.warns(UserWarning, match=r"joint_names=\['ankle'\]; the term uses no") as caught:
-        for _ in range(2):
-            value = rewards.joint_torques_l2(moving, ankle)
-    assert len(caught) == 1
+    with pytest.warns(UserWarning, match=r"joint_names=\['ankle'\]; the term uses no"):
+        value = rewards.joint_torques_l2(moving, ankle)
     assert value.tolist() == [0.0] * 4
 
 
 def test_torques_of_bodies_are_those_of_all(moving: Any) -> None:
     shin = resolved(moving, body_names=("shin",))
-    with pytest.warns(UserWarning, match="body_names=.*every actuator") as caught:
-        for _ in range(2):
-            value = rewards.joint_torques_l2(moving, shin)
-    assert len(caught) == 1
+    with pytest.warns(UserWarning, match="body_names=.*every actuator"):
+        value = rewards.joint_torques_l2(moving, shin)
     torch.testing.assert_close(value, rewards.joint_torques_l2(moving))
 
 
