@@ -31,10 +31,10 @@ import zstandard
 from measure import Row, output_of
 from websockets.sync.client import connect
 
+from mjlab.cli import training as environments
+from mjlab.cli.live import LiveView
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
-from mjlab.scripts import environments
-from mjlab.scripts.live import LiveView
 from mjlab.scripts.train import TrainConfig, launch_training
 from mjlab.tasks.registry import load_runner_cls
 

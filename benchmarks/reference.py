@@ -34,11 +34,12 @@ sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
 from learning import EVALUATION_SEED  # noqa: E402
 from measure import output_of, processor  # noqa: E402
 
+from mjlab.cli.devices import resolve_device  # noqa: E402
+from mjlab.cli.resume import resume_flags  # noqa: E402
+from mjlab.cli.train_process import run_forwarding_signals, train_command  # noqa: E402
 from mjlab.rl.plot import LABELS, plot_curves  # noqa: E402
 from mjlab.runs import Run  # noqa: E402
-from mjlab.runs.run import DONE  # noqa: E402
-from mjlab.scripts.devices import resolve_device  # noqa: E402
-from mjlab.scripts.reference import (  # noqa: E402
+from mjlab.runs.reference import (  # noqa: E402
     DATA,
     METRIC,
     Kind,
@@ -49,8 +50,7 @@ from mjlab.scripts.reference import (  # noqa: E402
     thinned,
     trained_seconds,
 )
-from mjlab.scripts.resume import resume_flags  # noqa: E402
-from mjlab.scripts.train_seeds import run_forwarding_signals, train_command  # noqa: E402
+from mjlab.runs.run import DONE  # noqa: E402
 from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, require_task  # noqa: E402
 from mjlab.utils.errors import UserError  # noqa: E402
 from mjlab.utils.processes import available_cores  # noqa: E402

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from mjlab.cli.main import main
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
 from mjlab.rl.config import (
@@ -21,7 +22,6 @@ from mjlab.rl.config import (
     RslRlOnPolicyRunnerCfg,
     gaussian_distribution,
 )
-from mjlab.scripts.cli import main
 from mjlab.sensor import CameraSensorCfg
 from mjlab.tasks.cartpole import cartpole_ppo_runner_cfg, cartpole_swingup_env_cfg
 from mjlab.tasks.cpu_profile import cpu_profile

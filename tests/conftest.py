@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 # Tests run several processes at a time; one thread each keeps them from fighting over the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from commands import Outcome
 
 # A shared machine is slow at times, which says nothing about the code.
 settings.register_profile("mjlab", deadline=None, derandomize=True)
@@ -61,3 +66,42 @@ def viser_server() -> Iterator:
     server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     yield server
     server.stop()
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., Outcome]:
+    """Return a function that runs a command."""
+    from commands import run_script
+
+    return run_script
+
+
+@pytest.fixture(scope="session")
+def run_main() -> Callable[..., Outcome]:
+    """Return a function that calls an entry point."""
+    from commands import run_main
+
+    return run_main
+
+
+@pytest.fixture(scope="session")
+def train(run) -> Callable[..., Path]:
+    """Return a function that trains a little and returns the run's folder."""
+    from commands import SMALL, TASK
+
+    def train(log_root: Path, iterations: int, *flags: str, status: int = 0) -> Path:
+        experiment = log_root / "cartpole"
+        before = set(experiment.iterdir()) if experiment.is_dir() else set()
+        argv = [TASK, *SMALL, "--log-root", str(log_root)]
+        outcome = run("train", *argv, "--agent.max-iterations", str(iterations), *flags)
+        assert outcome.status == status, outcome.err
+        (run_dir,) = set(experiment.iterdir()) - before
+        return run_dir
+
+    return train
+
+
+@pytest.fixture(scope="session")
+def trained(train, tmp_path_factory) -> Path:
+    """Return the folder of a finished run of two iterations; not to be changed."""
+    return train(tmp_path_factory.mktemp("trained") / "logs", 2)

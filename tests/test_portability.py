@@ -26,7 +26,7 @@ for name in ("SIGHUP", "SIGKILL", "SIGUSR1", "SIGQUIT"):
 for name in ("geteuid", "nice", "symlink", "sched_getaffinity", "sched_setaffinity"):
     delattr(os, name)
 sys.modules["fcntl"] = None
-from mjlab.scripts.cli import run_command
+from mjlab.cli.main import run_command
 from mjlab.scripts.{module} import command
 run_command(lambda argv: command(argv, "{module}"))
 """

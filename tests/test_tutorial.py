@@ -266,7 +266,7 @@ def test_a_heavier_pole_moves_differently(package):
 def test_the_task_is_registered_under_its_own_name_and_trains(package, tmp_path, capsys):
     assert TASK in registry.list_tasks()
     assert registry.load_env_cfg(TASK, play=True).episode_length_s == 1e10
-    from mjlab.scripts.flags import parse_flags
+    from mjlab.cli.flags import parse_flags
     from mjlab.scripts.train import TrainConfig, launch_training
 
     flags = ["--num-envs", "8", "--device", "cpu", "--log-root", str(tmp_path / "logs")]

@@ -20,10 +20,9 @@ import tyro
 from PIL import Image
 
 from mjlab.rl.checkpoint import latest_checkpoint
+from mjlab.runs.policy import make_env, make_policy
 from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.demo import DEMOS
-from mjlab.scripts.environments import make_env
-from mjlab.scripts.policy import make_policy
 from mjlab.terrains import (
     BoxInvertedPyramidStairsTerrainCfg,
     SubTerrainCfg,

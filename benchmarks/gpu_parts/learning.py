@@ -21,9 +21,9 @@ from measure import Row
 
 from gpu_parts.options import Options
 from gpu_parts.tasks import GO1_FLAT
+from mjlab.cli.policy_flags import parse_policy_flags
 from mjlab.rl.evaluation import EvaluationResult
 from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
-from mjlab.scripts.policy import parse_policy_flags
 from mjlab.tasks.registry import load_rl_cfg
 
 _PROFILE = "cpu"

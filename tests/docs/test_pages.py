@@ -156,7 +156,7 @@ def _flags_of_gpu() -> set[str]:
 
 
 def _flags_of_sweep() -> set[str]:
-    from mjlab.scripts.cli import COMMANDS
+    from mjlab.cli.main import COMMANDS
 
     (command,) = (command for command in COMMANDS if command.name == "sweep")
     return set(_FLAG.findall(command.details))

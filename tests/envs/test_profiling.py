@@ -10,6 +10,7 @@ import torch
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.envs.mdp.rewards import is_alive
+from mjlab.envs.profiling import profiled_steps
 from mjlab.managers import (
     CommandTerm,
     CommandTermCfg,
@@ -21,7 +22,6 @@ from mjlab.managers import (
     RecorderTermCfg,
     RewardTermCfg,
 )
-from mjlab.scripts.profile_env import profiled_steps
 from mjlab.tasks.registry import load_env_cfg
 
 STEPS = 6

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mjlab.scripts import cli
+from mjlab.cli import main as cli
 
 from .trials import Broken, descendants
 
@@ -40,9 +40,9 @@ _KEPT = 1 << 20
 # Late imports of commands, done before the fork.
 _IMPORTS = (
     "mjlab.envs", "mjlab.rl", "mjlab.rl.evaluation", "mjlab.rl.exporter_utils", "mjlab.rl.plot",
-    "mjlab.rl.run_logger", "mjlab.rl.sac", "mjlab.scripts.play", "mjlab.scripts.display",
+    "mjlab.rl.run_logger", "mjlab.rl.sac", "mjlab.scripts.play", "mjlab.cli.display",
     "mjlab.scripts.evaluate", "mjlab.scripts.export_scene", "mjlab.scripts.play",
-    "mjlab.scripts.profile_env", "mjlab.scripts.resume", "mjlab.scripts.train",
+    "mjlab.scripts.profile_env", "mjlab.cli.resume", "mjlab.scripts.train",
     "mjlab.scripts.verify", "mjlab.scripts.viz_nan", "mjlab.sim.native.engine",
     "mjlab.tasks.cartpole.cartpole_env_cfg", "mjlab.viewer.base", "matplotlib.figure",
     "matplotlib.backends.backend_agg", "onnx", "onnxruntime", "tensorboard.backend.event_processing",
@@ -256,7 +256,7 @@ def _become(script: str, argv: list[str], before: Callable[[], None], is_fresh: 
         logging.root.handlers.clear()
         before()
         if is_fresh:
-            os.execv(sys.executable, [sys.executable, "-m", "mjlab.scripts.cli", script, *argv])
+            os.execv(sys.executable, [sys.executable, "-m", "mjlab.cli.main", script, *argv])
         sys.argv = ["mjlab", script, *argv]
         try:
             cli.main()

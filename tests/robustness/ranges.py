@@ -55,11 +55,11 @@ def _configs(learner: Any) -> tuple[Any, Any]:
 
 def prepare(folder: Path) -> list[_Field]:
     """Return all fields with a range."""
+    from mjlab.cli.train_config import TrainConfig
     from mjlab.scripts.csv_to_npz import CsvToNpzConfig
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
-    from mjlab.scripts.train_config import TrainConfig
     from mjlab.scripts.verify import VerifyConfig
     from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig
 

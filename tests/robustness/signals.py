@@ -46,7 +46,7 @@ _PHASES = {
     "evaluation": ("mjlab.rl.evaluation:SolvedCheck", "evaluate", 2),
     "confirmation": ("mjlab.rl.evaluation:SolvedCheck", "confirm", 1),
     "plot": ("mjlab.rl.plot", "plot_run", 1),
-    "video": ("mjlab.scripts.results", "record_policy", 1),
+    "video": ("mjlab.cli.results", "record_policy", 1),
 }
 _HARMLESS = ("imports", "build", "plot", "video")
 """Phases with nothing to save, in which the default action of a signal is right."""
@@ -203,7 +203,7 @@ def _is_finished(root: Path, iterations: int) -> bool:
 def _result(run: Path) -> dict[str, Any]:
     """Return what was learned, and the curves of the evaluations, in all sessions of a run."""
     from mjlab.rl.checkpoint import load_checkpoint
-    from mjlab.scripts.reference import read_scalars_of_sessions
+    from mjlab.runs.reference import read_scalars_of_sessions
 
     content = load_checkpoint(checkpoints(run)[-1])
     names = ("iterations_finished", "last_evaluated", "owes_evaluation")

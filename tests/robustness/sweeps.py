@@ -44,7 +44,7 @@ _DEEP = 50_000
 
 def preload() -> None:
     """Import Optuna."""
-    importlib.import_module("mjlab.scripts.sweep_results")
+    importlib.import_module("mjlab.sweep.results")
 
 
 def prepare(folder: Path) -> dict[str, Any]:
@@ -88,7 +88,7 @@ def _start(
         return subprocess.Popen(["sh", "-c", script], stdout=log, stderr=log, process_group=0)
 
     def prepare() -> None:
-        from mjlab.scripts import sweep_runs
+        from mjlab.sweep import runs as sweep_runs
 
         sweep_runs.start_in_background = start
         before()
@@ -368,7 +368,7 @@ def _odd_over(trial: Trial, kind: str, good: Path, own: Path) -> None:
 
 
 def _fail_runs() -> None:
-    from mjlab.scripts import sweep_runs
+    from mjlab.sweep import runs as sweep_runs
 
     def start(words: list[str], environment: dict[str, str], log: Any) -> Any:
         return subprocess.Popen(["sh", "-c", "exit 1"])

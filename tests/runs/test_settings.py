@@ -6,11 +6,11 @@ import json
 
 import pytest
 
+from mjlab.cli.flags import parse_flags
 from mjlab.rl.config import RslRlDistillationRunnerCfg
 from mjlab.runs import Run, newest_run, runs_in
 from mjlab.runs.folder import write_info, write_params
 from mjlab.runs.settings import apply_settings, differences, typed_settings
-from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.train import TrainConfig
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.os import to_plain

@@ -19,9 +19,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from mjlab.cli import display
 from mjlab.rl.run_logger import IterationStats
 from mjlab.runs import Run
-from mjlab.scripts import cli, display
 
 TASK = "Mjlab-Cartpole-Swingup"
 SMALL = [
@@ -64,9 +64,8 @@ def _kept_process_settings() -> Iterator[None]:
 
 
 def run_script(script: str, *argv: str) -> Outcome:
-    """Run `script` (a command, or a module of mjlab.scripts) with `argv`, as the command line does."""
-    main = getattr(cli, script, None) or importlib.import_module(f"mjlab.scripts.{script}").main
-    return run_main(main, script, *argv)
+    """Run `script` (a module of mjlab.scripts) with `argv`, as the command line does."""
+    return run_main(importlib.import_module(f"mjlab.scripts.{script}").main, script, *argv)
 
 
 def run_main(main: Callable[[], None], name: str, *argv: str) -> Outcome:

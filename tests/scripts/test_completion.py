@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from mjlab.scripts.cli import ALIASES, COMMANDS
+from mjlab.cli.main import ALIASES, COMMANDS
 from mjlab.scripts.completion import candidates
 from mjlab.tasks.registry import list_tasks
 
@@ -48,7 +48,7 @@ def test_flags_and_their_values_are_completed(words, completed):
 def test_bash_completes(words, completed):
     line = " ".join(words)
     script = f"""
-mjlab() {{ {sys.executable} -m mjlab.scripts.cli "$@"; }}
+mjlab() {{ {sys.executable} -m mjlab.cli.main "$@"; }}
 eval "$(mjlab completion bash)"
 COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}
 _mjlab_complete

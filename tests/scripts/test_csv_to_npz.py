@@ -467,7 +467,7 @@ def test_the_page_plays_the_motion_and_follows_the_slider(csv, tmp_path):
 
 def test_its_help_needs_nothing_heavy():
     code = (
-        "import sys; from mjlab.scripts import cli; cli._dispatch(['csv-to-npz', '--help']); "
+        "import sys; from mjlab.cli import main as cli; cli._dispatch(['csv-to-npz', '--help']); "
         "assert not {'torch', 'mujoco', 'tyro'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

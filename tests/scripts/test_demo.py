@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from mjlab.runs.policy import load_policy, make_env
 from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts import demo
-from mjlab.scripts.environments import make_env
-from mjlab.scripts.policy import load_policy
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.viewer.page_server import open_browser
 

@@ -8,8 +8,8 @@ import math
 import pytest
 from commands import TASK
 
+from mjlab.cli.main import main
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.scripts.cli import main
 from mjlab.scripts.describe import DescribeConfig, TaskDescription, describe
 from mjlab.tasks.registry import list_tasks, load_env_cfg
 

@@ -189,8 +189,8 @@ def test_an_unknown_target_is_an_error_that_lists_the_choices(run, tmp_path: Pat
 def test_help_comes_without_building_anything() -> None:
     code = (
         "import sys; sys.argv = ['export-scene', '--help']\n"
-        "from mjlab.scripts.cli import export_scene\n"
-        "try:\n    export_scene()\nexcept SystemExit as end:\n    assert end.code == 0\n"
+        "from mjlab.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0\n"
         "assert not {'torch', 'mujoco', 'tyro'} & set(sys.modules)"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

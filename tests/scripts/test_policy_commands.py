@@ -10,8 +10,8 @@ import onnx
 import pytest
 from commands import SMALL
 
+from mjlab.cli.flags import parse_flags
 from mjlab.scripts.evaluate import EvaluateConfig
-from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.play import PlayConfig
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -50,7 +50,7 @@ def test_a_policy_of_weights_and_biases_is_played(run, trained, monkeypatch):
         asked.append((str(run_path), name))
         return trained / "model_1.pt", True
 
-    monkeypatch.setattr("mjlab.scripts.policy.get_wandb_checkpoint_path", fetch)
+    monkeypatch.setattr("mjlab.cli.policy_flags.get_wandb_checkpoint_path", fetch)
     outcome = run("play", TASK, *HEADLESS, "--wandb-run-path", "me/project/abc")
     assert outcome.status == 0, outcome.err
     assert asked == [("me/project/abc", None)]

@@ -10,13 +10,13 @@ import pytest
 import torch
 from commands import TASK
 
+from mjlab.cli.flags import parse_flags
+from mjlab.cli.main import main
 from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.folder import write_info
 from mjlab.runs.run import RUNNING_FILE
 from mjlab.runs.settings import typed_settings
-from mjlab.scripts.cli import main
-from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.train import TrainConfig, launch_training, settings_to_record
 from mjlab.tasks.tracking.motion_sources import (
     record_motions,

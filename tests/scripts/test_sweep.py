@@ -20,15 +20,15 @@ from typing import Any
 import pytest
 from commands import TASK
 
+from mjlab.cli import main as cli
+from mjlab.cli.train_config import TrainConfig, return_differences
 from mjlab.managers import CurriculumTermCfg, TerminationTermCfg
 from mjlab.rl.config import EvaluationCfg
 from mjlab.runs import Run
 from mjlab.runs.folder import write_info, write_params
-from mjlab.scripts import cli
-from mjlab.scripts.reference import read_scalars_of_sessions
-from mjlab.scripts.sweep_objective import choose_objective
-from mjlab.scripts.sweep_settings import Axis, Sweep
-from mjlab.scripts.train_config import TrainConfig, return_differences
+from mjlab.runs.reference import read_scalars_of_sessions
+from mjlab.sweep.objective import choose_objective
+from mjlab.sweep.settings import Axis, Sweep
 from mjlab.utils.errors import BadCallError
 
 optuna = pytest.importorskip("optuna")
@@ -117,12 +117,10 @@ def write_run(run_dir: Path, ended: str, results: dict[str, float], command: lis
 def machine(monkeypatch) -> Machine:
     """Two cores, and processes that do not train."""
     machine = Machine()
-    monkeypatch.setattr("mjlab.scripts.sweep_runs.start_in_background", machine.start)
-    monkeypatch.setattr(
-        "mjlab.scripts.sweep_runs.send_signal", lambda process, n: process.send_signal(n)
-    )
-    monkeypatch.setattr("mjlab.scripts.sweep_runs.available_cores", lambda: 2)
-    monkeypatch.setattr("mjlab.scripts.sweep_runs._SECONDS_BETWEEN_LOOKS", 0.0)
+    monkeypatch.setattr("mjlab.sweep.runs.start_in_background", machine.start)
+    monkeypatch.setattr("mjlab.sweep.runs.send_signal", lambda process, n: process.send_signal(n))
+    monkeypatch.setattr("mjlab.sweep.runs.available_cores", lambda: 2)
+    monkeypatch.setattr("mjlab.sweep.runs._SECONDS_BETWEEN_LOOKS", 0.0)
     return machine
 
 
@@ -454,7 +452,7 @@ def test_a_closed_terminal_does_not_keep_runs_from_saving(sweep, machine, folder
             raise OSError(5, "Input/output error")
         print(*words, **options)
 
-    monkeypatch.setattr("mjlab.scripts.sweep_runs.print", print_, raising=False)
+    monkeypatch.setattr("mjlab.sweep.runs.print", print_, raising=False)
     machine.interrupts_after = 2
     outcome = sweep(*LEARNING, "--folder", str(folder), "--jobs", "2")
     assert outcome.status == 130
@@ -484,8 +482,8 @@ def test_a_log_may_be_deleted(sweep, machine, folder, monkeypatch):
         Path(output.name).unlink()
         return start(command, environment, output)
 
-    monkeypatch.setattr("mjlab.scripts.sweep_runs.start_in_background", start_without_log)
-    monkeypatch.setattr("mjlab.scripts.sweep_runs._FIRST_REPORT_S", 0.0)
+    monkeypatch.setattr("mjlab.sweep.runs.start_in_background", start_without_log)
+    monkeypatch.setattr("mjlab.sweep.runs._FIRST_REPORT_S", 0.0)
     machine.fails = ("1e-3",)
     outcome = sweep(*LEARNING, "--folder", str(folder))
     assert "Failed   learning-rate=1e-3, seed 1: no output" in outcome.out
@@ -546,7 +544,7 @@ def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path
 
 
 def test_a_sweep_runs_once_at_a_time_and_keeps_its_flags(sweep, machine, folder):
-    from mjlab.scripts.sweep_study import only_process
+    from mjlab.sweep.study import only_process
 
     argv = ("--folder", str(folder))
     with only_process(folder):
@@ -739,10 +737,10 @@ def test_values_are_split_outside_brackets():
     ],
 )
 def test_runs_have_a_gpu_each_or_share_the_cores(monkeypatch, flags, jobs, visible, shares):
-    from mjlab.scripts.sweep_runs import machine_slots
+    from mjlab.sweep.runs import machine_slots
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6")
-    monkeypatch.setattr("mjlab.scripts.sweep_runs.available_cores", lambda: 8)
+    monkeypatch.setattr("mjlab.sweep.runs.available_cores", lambda: 8)
     sweep: Any = SimpleNamespace(machine_flags=flags, jobs=jobs, num_settings=2, seeds=2)
     slots = machine_slots(sweep)
     assert [slot.get("CUDA_VISIBLE_DEVICES") for slot in slots] == visible
@@ -753,7 +751,7 @@ def test_a_run_is_resumed_from_the_last_checkpoint_with_iterations_left(monkeypa
     """After its last iteration, nothing would be trained, and the last evaluation stay missing."""
     agent = SimpleNamespace(max_iterations=3)
     monkeypatch.setattr(
-        "mjlab.scripts.sweep_settings.train_config",
+        "mjlab.sweep.settings.train_config",
         lambda sweep, setting: SimpleNamespace(agent=agent),
     )
     values: Any = dict.fromkeys(field.name for field in dataclasses.fields(Sweep))
@@ -774,7 +772,7 @@ def test_a_run_is_resumed_from_the_last_checkpoint_with_iterations_left(monkeypa
 @pytest.mark.slow
 def test_a_sweep_that_trains_is_interrupted_and_continued(tmp_path):
     folder = tmp_path / "sweep"
-    command = [sys.executable, "-m", "mjlab.scripts.cli", "sweep", TASK, *LEARNING, "--seeds", "2"]
+    command = [sys.executable, "-m", "mjlab.cli.main", "sweep", TASK, *LEARNING, "--seeds", "2"]
     command += ["--folder", str(folder), "--device", "cpu", "--num-envs", "16", "--jobs", "2"]
     command += ["--agent.num-steps-per-env", "8", "--agent.save-interval", "1"]
     command += ["--agent.max-iterations", "2", "--agent.evaluation.num-episodes", "4"]

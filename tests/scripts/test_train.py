@@ -11,9 +11,9 @@ import yaml
 from commands import SMALL
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from mjlab.cli.flags import parse_flags
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.runs import Run
-from mjlab.scripts.flags import parse_flags
 from mjlab.scripts.train import TrainConfig, launch_training, run_train
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -167,7 +167,7 @@ def test_a_run_of_weights_and_biases_is_resumed(run, trained, tmp_path, monkeypa
         asked.append((experiment, str(run_path), name))
         return trained / "model_1.pt", True
 
-    monkeypatch.setattr("mjlab.scripts.resume.get_wandb_checkpoint_path", fetch)
+    monkeypatch.setattr("mjlab.cli.resume.get_wandb_checkpoint_path", fetch)
     outcome = run(
         "train", TASK, "--num-envs", "16", "--device", "cpu", "--agent.max-iterations", "3",
         "--agent.num-steps-per-env", "8", "--log-root", str(tmp_path), "--agent.resume", "True",

@@ -116,7 +116,7 @@ def test_a_folder_that_takes_no_more_is_told_without_tracebacks(tmp_path):
     program = (
         "import resource, signal, time\n"
         "now = time.time\n"
-        "from mjlab.scripts import display\n"
+        "from mjlab.cli import display\n"
         "def limit(self, stats):\n"
         "    if stats.iteration < 3:\n        return\n"
         "    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"

@@ -16,17 +16,18 @@ import yaml
 from commands import TASK
 from process_runs import ProcessRun
 
+from mjlab.cli import training as environments
+from mjlab.cli.live import _view_env_cfg
+from mjlab.cli.live_view import Exchange, LiveJob
+from mjlab.cli.policy_flags import env_cfg_of
+from mjlab.cli.train_config import parse_train_flags
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
 from mjlab.rl.learners import acting_cfg, with_learner
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.folder import write_info
-from mjlab.scripts import environments
-from mjlab.scripts.environments import make_env
+from mjlab.runs.policy import agent_cfg_of, load_policy, make_env
 from mjlab.scripts.evaluate import EvaluateConfig
-from mjlab.scripts.live import _view_env_cfg
-from mjlab.scripts.live_view import Exchange, LiveJob
-from mjlab.scripts.policy import agent_cfg_of, env_cfg_of, load_policy
-from mjlab.scripts.train import TrainConfig, parse_train_flags
+from mjlab.scripts.train import TrainConfig
 from mjlab.tasks import registry
 from mjlab.utils.processes import ProcessRank
 
@@ -250,8 +251,8 @@ def test_its_policy_is_that_of_its_export_and_takes_neither_thread_nor_replay(of
 def test_the_live_view_shows_it(tmp_path, monkeypatch):
     import viser
 
+    from mjlab.cli.live_view import make_viewer
     from mjlab.rl import MjlabOnPolicyRunner
-    from mjlab.scripts.live_view import make_viewer
 
     cfg = TrainConfig.from_task(TASK, learner="sac")
     cfg.env.scene.num_envs = 2

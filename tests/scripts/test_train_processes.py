@@ -13,10 +13,10 @@ from commands import TASK, interrupt_training
 from process_runs import SMALL, Ended, ProcessRun
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from mjlab.cli.train_config import parse_train_flags
+from mjlab.cli.training import training_env
 from mjlab.rl.checkpoint import load_checkpoint
 from mjlab.runs import Run
-from mjlab.scripts.environments import training_env
-from mjlab.scripts.train import parse_train_flags
 from mjlab.utils.processes import ProcessRank, available_cores
 from mjlab.utils.random import process_seed
 
@@ -209,7 +209,7 @@ def test_torchrun_trains_and_reports_a_failure(tmp_path):
 def test_the_launcher_trains_and_ctrl_c_saves_once(tmp_path):
     program = (
         "import sys\nfrom mjlab.rl.distributed import launch_workers\n"
-        "from mjlab.scripts.cli import run_command\n"
+        "from mjlab.cli.main import run_command\n"
         "command = [sys.executable, '-m', 'mjlab.scripts.train']\n"
         "run_command(lambda argv: launch_workers(command + argv, 2))\n"
     )

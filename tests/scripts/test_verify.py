@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from commands import run_script, stopped_after
 
+from mjlab.cli.train_process import run_forwarding_signals
 from mjlab.runs import Run
-from mjlab.scripts.reference import DATA, Reference, read_run, reference_path
-from mjlab.scripts.train_seeds import run_forwarding_signals
+from mjlab.runs.reference import DATA, Reference, read_run, reference_path
 
 ROOT = Path(__file__).resolve().parents[2]
 TASK, OTHER = "Mjlab-Cartpole-Swingup", "Mjlab-Cartpole-Balance"

@@ -238,8 +238,8 @@ def test_a_dump_with_spoilt_bytes_is_an_error_or_a_dump(dump_file: Path) -> None
 def test_help_comes_without_building_anything() -> None:
     code = (
         "import sys; sys.argv = ['viz-nan', '--help']\n"
-        "from mjlab.scripts.cli import viz_nan\n"
-        "try:\n    viz_nan()\nexcept SystemExit as end:\n    assert end.code == 0\n"
+        "from mjlab.cli.main import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0\n"
         "assert not {'torch', 'mujoco', 'tyro', 'viser'} & set(sys.modules)"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

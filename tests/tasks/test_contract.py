@@ -321,7 +321,7 @@ def test_the_annotations_of_all_its_configs_resolve_at_run_time(task):
 
 
 def test_its_help_lists_the_flags_of_its_terms(task):
-    from mjlab.scripts.flags import parse_flags
+    from mjlab.cli.flags import parse_flags
     from mjlab.scripts.train import TrainConfig
 
     out = io.StringIO()

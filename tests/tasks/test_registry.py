@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 import mjlab.tasks
+from mjlab.cli.main import run_command
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
 from mjlab.rl.learners import with_learner
 from mjlab.scene import SceneCfg
-from mjlab.scripts.cli import run_command
 from mjlab.tasks import registry
 from mjlab.tasks.registry import (
     TaskImportError,

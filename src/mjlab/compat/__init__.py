@@ -139,6 +139,7 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.envs.mdp.events": _EVENTS,
     "mjlab.envs.mdp.dr": _older("sync_actuator_delays"),
     "mjlab.envs.mdp.dr.actuator": _older("sync_actuator_delays"),
+    "mjlab.scripts.cli": {"main": "mjlab.cli.main:main"},
     "mjlab.scripts.csv_to_npz": _older("run_sim", module="mjlab.compat.older_scripts"),
     "mjlab.scripts.gcs": _older(
         "ensure_asset_downloaded",
@@ -146,6 +147,9 @@ _NAMES: dict[str, dict[str, str]] = {
         "ensure_default_motion",
         module="mjlab.compat.older_scripts",
     ),
+    "mjlab.scripts.profile_env": {
+        name: f"mjlab.envs.profiling:{name}" for name in ("StepProfile", "profiled_steps")
+    },
     "mjlab.tasks.manipulation.mdp": {**_EVENTS, **_REWARD_WEIGHT},
     "mjlab.tasks.manipulation.mdp.curriculums": _REWARD_WEIGHT,
     "mjlab.tasks.registry": {"_REGISTRY": "mjlab.compat.older_scripts:REGISTRY"},

@@ -2,7 +2,7 @@
 
 `TrainingProgress` collects what observers receive. It renders as a panel (rich, without borders),
 as a line for log files, and as the sentences that end a run. `NotebookProgress` shows the panel in one
-output of a notebook; `mjlab.scripts.display` shows it in terminals.
+output of a notebook; `mjlab.cli.display` shows it in terminals.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mjlab.scripts.help import ALL, SCREENS, TOPICS, flags_of, values_of
+from mjlab.cli.help import ALL, SCREENS, TOPICS, flags_of, values_of
 from mjlab.utils.errors import BadCallError
 
 _USAGE = """\
@@ -39,7 +39,7 @@ for name in """
 
 def candidates(words: list[str]) -> list[str]:
     """Return the completions of the last of `words`, the words after `mjlab` on a command line."""
-    from mjlab.scripts.cli import COMMANDS
+    from mjlab.cli.main import COMMANDS
 
     *before, partial = words or [""]
     if not before:
@@ -68,7 +68,7 @@ def _flag_candidates(before: list[str], partial: str) -> list[str]:
 
 def command(argv: list[str], prog: str) -> None:
     """Run `mjlab completion`."""
-    from mjlab.scripts.cli import ALIASES
+    from mjlab.cli.main import ALIASES
 
     names = " ".join(["mjlab", *ALIASES])
     scripts = {
@@ -88,7 +88,7 @@ def command(argv: list[str], prog: str) -> None:
 
 def main() -> None:
     """Entry point of `python -m mjlab.scripts.completion`."""
-    from mjlab.scripts.cli import run_alias
+    from mjlab.cli.main import run_alias
 
     run_alias("completion")
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import mujoco
 from mjviser import ViserMujocoScene
 
+from mjlab.cli.flags import parse_flags
+from mjlab.cli.main import run_alias
 from mjlab.compat import older_names
-from mjlab.scripts.cli import run_alias
 from mjlab.scripts.export_scene import robot_cfg
-from mjlab.scripts.flags import parse_flags
 from mjlab.tasks.tracking.motion_file import Motion, npz_path, read_motion, write_motion
 from mjlab.tasks.tracking.motion_order import Skeleton, arranged, plausible
 from mjlab.tasks.tracking.motion_recording import (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjlab.scripts.cli import run_alias
+from mjlab.cli.main import run_alias
 from mjlab.utils.errors import check_one_of
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def command(argv: list[str], prog: str) -> None:
     """Run `demo`."""
     name, flags = ("go1", argv) if not argv or argv[0].startswith("-") else (argv[0], argv[1:])
     check_one_of("demo", name, DEMOS)
-    from mjlab.scripts.flags import parse_flags
+    from mjlab.cli.flags import parse_flags
     from mjlab.scripts.play import PlayConfig, run_play
 
     demo = DEMOS[name]

@@ -8,14 +8,14 @@ import shutil
 from dataclasses import dataclass
 from typing import Any
 
-from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from mjlab.runs.run import registered_env_cfg
-from mjlab.scripts.flags import (
+from mjlab.cli.flags import (
     parse_flags,
     parse_known_flags,
     prepare_env_cfg,
     with_task_options,
 )
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.runs.run import registered_env_cfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.string import counted

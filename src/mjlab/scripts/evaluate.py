@@ -11,23 +11,20 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mjlab.rl.checkpoint import curricula_of, naming_checkpoint
-from mjlab.runs import Checkpoint
-from mjlab.runs.run import registered_env_cfg
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.devices import resolve_device
-from mjlab.scripts.environments import make_env
-from mjlab.scripts.flags import is_given
-from mjlab.scripts.policy import (
+from mjlab.cli.devices import resolve_device
+from mjlab.cli.flags import is_given
+from mjlab.cli.main import run_alias
+from mjlab.cli.policy_flags import (
     PolicyFlags,
-    agent_cfg_of,
     env_cfg_of,
     find_checkpoint,
-    has_foreign_runner,
-    make_policy,
     parse_policy_flags,
     report_policy,
 )
+from mjlab.rl.checkpoint import curricula_of, naming_checkpoint
+from mjlab.runs import Checkpoint
+from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_policy
+from mjlab.runs.run import registered_env_cfg
 from mjlab.utils.logging import print_notice
 from mjlab.utils.ranges import Count, Seed, check_ranges
 from mjlab.utils.string import counted

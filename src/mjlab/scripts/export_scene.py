@@ -12,8 +12,8 @@ from pathlib import Path
 from types import FrameType, SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.flags import parse_flags
+from mjlab.cli.flags import parse_flags
+from mjlab.cli.main import run_alias
 from mjlab.utils.errors import UserError
 from mjlab.utils.signals import FORWARDED, Interrupted, handled_signals
 from mjlab.utils.string import suggest

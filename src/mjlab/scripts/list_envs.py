@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from mjlab.scripts.cli import run_alias
+from mjlab.cli.main import run_alias
 
 
 def list_environments(keyword: str | None = None) -> list[str]:

@@ -6,23 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mjlab.compat import older_names
-from mjlab.runs import Checkpoint
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.devices import resolve_device
-from mjlab.scripts.environments import make_env
-from mjlab.scripts.policy import (
+from mjlab.cli.devices import resolve_device
+from mjlab.cli.main import run_alias
+from mjlab.cli.policy_flags import (
     PolicyFlags,
-    agent_cfg_of,
     env_cfg_of,
     find_checkpoint,
-    load_policy,
-    make_policy,
     parse_policy_flags,
     report_policy,
-    run_of,
 )
-from mjlab.scripts.record import VideoCfg, record_policy
+from mjlab.cli.record import VideoCfg, record_policy
+from mjlab.compat import older_names
+from mjlab.runs import Checkpoint, Run
+from mjlab.runs.policy import agent_cfg_of, load_policy, make_env, make_policy
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.ranges import Count, CountOrZero
@@ -99,7 +95,7 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         env_cfg.terminations = {}
     if cfg.video:
         folder = Path("videos")
-        if checkpoint is not None and run_of(checkpoint, task).exists:
+        if checkpoint is not None and Run(checkpoint.path.parent, task).exists:
             folder = checkpoint.path.parent / "videos" / "play"
         video = VideoCfg(
             length=cfg.num_steps or max(cfg.video_length, 1),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mjlab.cli.main import run_alias
 from mjlab.rl.plot import (
     DEFAULT_TAG,
     Curve,
@@ -20,8 +21,7 @@ from mjlab.rl.plot import (
     solved_at,
 )
 from mjlab.runs import Run
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.reference import parts_of
+from mjlab.runs.reference import parts_of
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.tables import Table

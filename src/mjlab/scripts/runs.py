@@ -10,8 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mjlab.cli.flags import parse_flags
 from mjlab.runs import Run, runs_in
-from mjlab.scripts.flags import parse_flags
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.os import to_plain

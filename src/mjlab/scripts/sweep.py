@@ -22,10 +22,16 @@ import shlex
 import subprocess
 from pathlib import Path
 
-from mjlab.scripts.flags import is_given, typed_names
-from mjlab.scripts.help import lookup
-from mjlab.scripts.sweep_objective import choose_objective
-from mjlab.scripts.sweep_settings import (
+from mjlab.cli.flags import is_given, read_count, typed_names
+from mjlab.cli.help import lookup
+from mjlab.cli.train_config import (
+    TrainConfig,
+    check_flags,
+    check_typed_flags,
+    report_moved_goal,
+)
+from mjlab.sweep.objective import choose_objective
+from mjlab.sweep.settings import (
     MAX_NAME,
     Axis,
     Sweep,
@@ -34,13 +40,6 @@ from mjlab.scripts.sweep_settings import (
     train_config,
     train_flags,
 )
-from mjlab.scripts.train_config import (
-    TrainConfig,
-    check_flags,
-    check_typed_flags,
-    report_moved_goal,
-)
-from mjlab.scripts.train_seeds import read_count
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.signals import Interrupted
 from mjlab.utils.string import counted
@@ -67,9 +66,9 @@ def command(argv: list[str], prog: str) -> None:
     """Run `mjlab sweep`."""
     sweep = parse_sweep(argv, prog)
     # Imports Optuna; flags are checked before.
-    from mjlab.scripts.sweep_results import Comparison
-    from mjlab.scripts.sweep_runs import Runs
-    from mjlab.scripts.sweep_study import DATABASE_ERRORS, Study, naming_database, only_process
+    from mjlab.sweep.results import Comparison
+    from mjlab.sweep.runs import Runs
+    from mjlab.sweep.study import DATABASE_ERRORS, Study, naming_database, only_process
 
     with only_process(sweep.folder), naming_database(sweep, *DATABASE_ERRORS):
         study = Study(sweep)

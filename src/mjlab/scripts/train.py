@@ -4,17 +4,43 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import os
 import signal
 import sys
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mjlab.cli.devices import gpus_to_share, training_device
+from mjlab.cli.flags import (
+    is_given,
+    options_of,
+    prepare_env_cfg,
+    report_untuned_learner,
+    suggest_profile,
+    typed_names,
+)
+from mjlab.cli.main import run_alias
+from mjlab.cli.policy_flags import prepare_teacher
+from mjlab.cli.resume import (
+    check_learner_resumes,
+    checkpoint_to_resume,
+    choose_seed,
+    is_finished,
+    restore_num_envs,
+    run_to_continue,
+    with_settings_of,
+)
+from mjlab.cli.train_config import (
+    TrainConfig,
+    check_flags,
+    check_typed_flags,
+    parse_train_flags,
+    report_moved_goal,
+)
+from mjlab.cli.training import training_env, training_runner
 from mjlab.compat import older_names
 from mjlab.rl.distributed import (
-    STORE_VARIABLE,
     ProcessOutput,
     broadcast_from_first,
     fail_together,
@@ -23,7 +49,6 @@ from mjlab.rl.distributed import (
     log_file,
     output_of,
 )
-from mjlab.rl.learners import learner_of
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.folder import (
     NewRunFolder,
@@ -33,38 +58,9 @@ from mjlab.runs.folder import (
     write_info,
     write_params,
 )
+from mjlab.runs.policy import has_foreign_runner
 from mjlab.runs.run import RunCfg
 from mjlab.runs.settings import Settings, differences, is_of_the_session, typed_settings
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.devices import gpus_to_share, training_device
-from mjlab.scripts.environments import training_env, training_runner
-from mjlab.scripts.flags import (
-    is_given,
-    options_of,
-    parse_for_run,
-    prepare_env_cfg,
-    report_untuned_learner,
-    suggest_profile,
-    typed_names,
-    with_task_options,
-)
-from mjlab.scripts.policy import has_foreign_runner, prepare_teacher
-from mjlab.scripts.resume import (
-    check_learner_resumes,
-    checkpoint_to_resume,
-    choose_seed,
-    is_finished,
-    restore_num_envs,
-    run_to_continue,
-    with_settings_of,
-)
-from mjlab.scripts.train_config import (
-    TrainConfig,
-    check_flags,
-    check_typed_flags,
-    report_moved_goal,
-)
-from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.logging import beside_results, print_list, print_notice
 from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
@@ -72,7 +68,7 @@ from mjlab.utils.ranges import check_ranges
 from mjlab.utils.signals import Interrupted
 
 if TYPE_CHECKING:
-    from mjlab.scripts.live import LiveView
+    from mjlab.cli.live import LiveView
 
 __getattr__ = older_names(__name__)
 
@@ -91,37 +87,6 @@ def command(argv: list[str], prog: str) -> None:
     # CUDA_VISIBLE_DEVICES restricts the workers to the selected GPUs.
     workers = [sys.executable, "-m", "mjlab.scripts.train", task, *flags, "--gpu-ids", "all"]
     launch_workers(workers, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
-
-
-def parse_train_flags(task: str, flags: list[str], prog: str) -> TrainConfig:
-    """Return the configuration of `task` updated by `flags`; exits on an unknown flag.
-
-    Raises:
-        UnknownProfileError: unknown profile.
-        ValueError: the learner is unknown, or not supported by the task.
-    """
-
-    def make_default(run: Run | None, **choices: Any) -> TrainConfig:
-        if run is None:
-            return with_task_options(TrainConfig.from_task(task, **choices), task)
-        # All processes parse the flags; our launcher has printed the messages before.
-        if STORE_VARIABLE not in os.environ and process_rank().is_first:
-            _report_choices(task, run, choices)
-        choices = {"profile": run.profile, "learner": run.learner, **choices}
-        resolved = run.cfg("train", **choices)
-        cfg = TrainConfig(env=resolved.env, agent=resolved.agent, **choices)
-        return with_task_options(cfg, task, run)
-
-    return parse_for_run(make_default, lambda cfg: run_to_continue(task, cfg), flags, prog)
-
-
-def _report_choices(task: str, run: Run, requested: Mapping[str, Any]) -> None:
-    """Print the profile and the learner of a run, unless requested or the default."""
-    if "profile" not in requested and run.profile is not None:
-        print_notice(f"Resuming with the profile {run.profile!r}, as before; --profile overrides.")
-    default = learner_of(load_rl_cfg(task, profile=requested.get("profile", run.profile)))
-    if "learner" not in requested and run.learner not in (None, default):
-        print_notice(f"Resuming with the learner {run.learner!r}, as before.")
 
 
 def launch_training(task: str, cfg: TrainConfig) -> Path:
@@ -171,7 +136,7 @@ def _train(
     output: ProcessOutput | None,
 ) -> tuple[Path, signal.Signals | None]:
     # Imports rsl_rl, which takes seconds; flags are checked before.
-    from mjlab.scripts.results import print_heading, report_divergence, write_results
+    from mjlab.cli.results import print_heading, report_divergence, write_results
 
     # One process looks up the checkpoint, before the new run folder could be found.
     path = broadcast_from_first(
@@ -220,7 +185,7 @@ def _train(
                 run.check_terms(cfg.env, cfg.agent.obs_groups)
             view = None
             if cfg.live and rank.is_first and not has_foreign_runner(task):
-                from mjlab.scripts.live import live_view
+                from mjlab.cli.live import live_view
 
                 view = stack.enter_context(live_view(task, cfg))
             env = training_env(cfg, device, folder.path, rank)
@@ -378,7 +343,7 @@ def _learn(
     """Train; return the stop reason."""
     is_shared = isinstance(folder, SharedRunFolder)
     if not is_shared:
-        from mjlab.scripts.display import show_training
+        from mjlab.cli.display import show_training
 
         show_training(task, cfg, runner, folder, view)
     ended = "failed"

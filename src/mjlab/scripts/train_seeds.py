@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
-from types import FrameType
 
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.devices import NO_GPU
-from mjlab.scripts.flags import is_given
+from mjlab.cli.devices import NO_GPU
+from mjlab.cli.flags import is_given, read_count
+from mjlab.cli.main import run_alias
+from mjlab.cli.train_process import run_forwarding_signals, train_command
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.logging import print_notice
-from mjlab.utils.processes import PARENT_VARIABLE
 from mjlab.utils.signals import (
-    FORWARDED,
     Interrupted,
-    handled_signals,
     interrupting_signal,
-    send_signal,
-    start_in_background,
 )
 
 _SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, sequentially (default: 5)."
@@ -53,8 +44,7 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
 
     Exits on invalid flags and on `--help`.
     """
-    from mjlab.scripts.train import parse_train_flags
-    from mjlab.scripts.train_config import check_typed_flags
+    from mjlab.cli.train_config import check_typed_flags, parse_train_flags
 
     task, *words = argv
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -76,55 +66,6 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
         print_notice(NO_GPU)
         flags = [*flags, "--device", "cpu"]
     return count, flags, cfg.experiment_folder
-
-
-def read_count(flag: str, text: str) -> int:
-    """Return the value of a flag that counts something.
-
-    Raises:
-        UserError: the text is not an integer from 1 to 10,000.
-    """
-    # `int` raises for thousands of digits.
-    if not (text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= 10_000):
-        raise UserError(f"{flag}: expected an integer in [1, 10000], got {text!r}.")
-    return int(text)
-
-
-def train_command(task: str, flags: list[str], seed: int) -> list[str]:
-    """Return the command that trains `task` with `seed` in another process."""
-    command = [sys.executable, "-m", "mjlab.scripts.train", task]
-    return [*command, *flags, "--agent.seed", str(seed)]
-
-
-def run_forwarding_signals(
-    command: list[str], seconds: float | None = None
-) -> tuple[int, signal.Signals | None]:
-    """Run `command`; return its exit status, and the first stop signal that this process received.
-
-    SIGINT, SIGTERM and SIGHUP do not end this process: each is forwarded to `command` once, and this
-    process waits until `command` has ended, e.g. saved. After `seconds`, `command` receives SIGINT.
-    """
-    child: subprocess.Popen[bytes] | None = None
-    received: list[signal.Signals] = []
-
-    def forward(number: int, frame: FrameType | None = None) -> None:
-        received.append(signal.Signals(number))
-        if child is not None:
-            send_signal(child, FORWARDED[number])
-
-    with handled_signals(forward, FORWARDED):
-        # A terminal sends Ctrl-C to all of its processes, and a second signal would give up the
-        # running iteration.
-        child = start_in_background(command, {**os.environ, PARENT_VARIABLE: str(os.getpid())})
-        for number in tuple(received):
-            send_signal(child, FORWARDED[number])
-        try:
-            status = child.wait(seconds)
-        except subprocess.TimeoutExpired:
-            if not received:
-                send_signal(child, signal.SIGINT)
-            status = child.wait()
-    return status, received[0] if received else None
 
 
 def main() -> None:

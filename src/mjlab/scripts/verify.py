@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mjlab.cli.devices import resolve_device
+from mjlab.cli.flags import parse_flags
+from mjlab.cli.main import run_alias
+from mjlab.cli.resume import resume_flags
 from mjlab.runs import Run, runs_in
-from mjlab.runs.run import DONE
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.devices import resolve_device
-from mjlab.scripts.flags import parse_flags
-from mjlab.scripts.reference import (
+from mjlab.runs.reference import (
     DATA,
     Comparison,
     Kind,
@@ -27,7 +27,7 @@ from mjlab.scripts.reference import (
     referenced_tasks,
     samples_limit,
 )
-from mjlab.scripts.resume import resume_flags
+from mjlab.runs.run import DONE
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.ranges import Seed
 from mjlab.utils.signals import Interrupted
@@ -35,7 +35,7 @@ from mjlab.utils.signals import Interrupted
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from mjlab.scripts.train_config import TrainConfig
+    from mjlab.cli.train_config import TrainConfig
 
 _OUTSIDE = 1
 # Rows of the printed table.
@@ -101,7 +101,7 @@ def _prepare(
     if cfg.seed in (seed.seed for seed in reference.seeds):
         # Allowed: the curve differs on other machines or with other library versions.
         print(f"Seed {cfg.seed} is part of the reference; its curve may be identical.")
-    from mjlab.scripts.train import parse_train_flags
+    from mjlab.cli.train_config import parse_train_flags
 
     train_flags = [*reference.train_flags, "--agent.seed", str(cfg.seed)]
     train_flags += ["--agent.run-name", f"verify_seed_{cfg.seed}", "--log-root", cfg.log_root]

@@ -13,8 +13,8 @@ from typing import Any
 import mujoco
 import viser
 
+from mjlab.cli.flags import parse_flags
 from mjlab.scripts.export_scene import ROBOTS, scene_and_options
-from mjlab.scripts.flags import parse_flags
 from mjlab.utils.errors import MjlabError, UserError
 from mjlab.utils.string import escaped
 from mjlab.utils.urdf import read_urdf

@@ -15,8 +15,8 @@ import viser
 
 import mjlab
 from mjlab.asset_zoo.robots import get_g1_robot_cfg, get_go1_robot_cfg
+from mjlab.cli.main import run_alias
 from mjlab.scene import Scene, SceneCfg
-from mjlab.scripts.cli import run_alias
 from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 from mjlab.utils.errors import check_exists

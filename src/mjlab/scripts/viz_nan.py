@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 import viser
 
-from mjlab.scripts.cli import run_alias
-from mjlab.scripts.flags import parse_flags
+from mjlab.cli.flags import parse_flags
+from mjlab.cli.main import run_alias
 from mjlab.utils.errors import UserError
 from mjlab.utils.nan_guard import NanDump
 from mjlab.utils.string import escaped

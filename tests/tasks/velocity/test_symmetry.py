@@ -10,10 +10,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from mjlab.cli.train_config import parse_train_flags
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg, SceneEntityCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-from mjlab.scripts.train import parse_train_flags
 from mjlab.sensor import BuiltinSensorCfg, GridPatternCfg, ObjRef, RayCastSensorCfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity import mdp

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mjlab.scripts.cli import Command, run_command, run_subcommand
+from mjlab.cli.main import Command, run_command, run_subcommand
+from mjlab.cli.policy_flags import parse_policy_flags
 from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
-from mjlab.scripts.policy import parse_policy_flags
 from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS
 
 _NAME = "python -m mjlab.tasks.tracking.scripts.evaluate"

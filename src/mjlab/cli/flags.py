@@ -1,0 +1,331 @@
+"""Flags of the commands: from `argv` to a config.
+
+- tyro reads the flags of a dataclass; `--env.rewards.<term> None` switches a term off.
+- `--profile` and `--learner` are parsed first, because the other flags and their defaults depend on
+  them. A command that resumes a run uses those of the run.
+- Tasks can add flags (`mjlab.tasks.registry.TaskOptions`).
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import is_dataclass
+from itertools import pairwise
+from pathlib import Path
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import tyro
+
+import mjlab
+from mjlab.cli.flag_values import flag_rules
+from mjlab.cli.help import TERM_DICTS, print_help, requested_topic
+from mjlab.runs.settings import apply_settings
+from mjlab.tasks.registry import (
+    PolicyOrigin,
+    TaskOptions,
+    list_profiles,
+    load_options_cls,
+    load_rl_cfg,
+)
+from mjlab.utils.errors import UserError
+from mjlab.utils.logging import print_notice
+from mjlab.utils.ranges import check_ranges
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
+    from mjlab.runs import Run
+
+C = TypeVar("C")
+
+CPU_PROFILE = "cpu"
+"""Name of the profile that `train` suggests on a CPU."""
+_CHOICES = ("profile", "learner")
+# Field of the task options.
+_FIELD = "options"
+
+
+def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
+    """Return `default` updated by `flags`; exits on an unknown flag, and after `--help [TOPIC]`.
+
+    `--env.rewards.<term> None` removes the term (same for all other kinds of terms). `None` also
+    removes a nested config if the field may be None, such as the noise of a term.
+
+    Raises:
+        ValueError: a typed number is out of its range.
+    """
+    config = _parsed(config_type, default, flags, prog)
+    check_ranges(config, typed_names(flags))
+    return config
+
+
+def _parsed(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
+    topic = requested_topic(flags)
+    if topic is not None:
+        print_help(default, topic, prog)
+        sys.exit(0)
+    arguments = _arguments(config_type, default, flags, prog)
+    return tyro.cli(config_type, **arguments)
+
+
+def parse_known_flags(
+    config_type: type[C], default: C, flags: list[str], prog: str
+) -> tuple[C, list[str]]:
+    """Return the result of `parse_flags`, and the ignored unknown flags."""
+    arguments = _arguments(config_type, default, flags, prog)
+    return tyro.cli(config_type, return_unknown_args=True, **arguments)
+
+
+def _arguments(config_type: Any, default: Any, flags: list[str], prog: str) -> dict[str, Any]:
+    """Return the arguments of `tyro.cli`. A bare `--video` becomes `--video True`."""
+    edited, flags = switch_terms_off(default, flags)
+    fields = dataclasses.fields(config_type)
+    switches = {"--" + f.name.replace("_", "-") for f in fields if f.type in ("bool", bool)}
+    words: list[str] = []
+    for flag, following in pairwise([*flags, "--"]):
+        words.append(flag)
+        if flag.replace("_", "-") in switches and following.startswith("--"):
+            words.append("True")
+    return {
+        "default": edited,
+        "args": words,
+        "prog": prog,
+        "config": mjlab.TYRO_FLAGS,
+        "registry": flag_rules(),
+    }
+
+
+def is_given(flag: str, flags: list[str]) -> bool:
+    """Return True if the command line `flags` sets `flag`, spelled with `-` or `_`."""
+    return any(word.partition("=")[0].replace("_", "-") == flag for word in flags)
+
+
+def typed_names(flags: list[str]) -> set[str]:
+    """Return the names of the settings in the command line `flags`, such as `agent.seed`."""
+    names = (word.partition("=")[0].replace("-", "_") for word in flags)
+    return {name.removeprefix("__") for name in names if name.startswith("__")}
+
+
+def read_count(flag: str, text: str) -> int:
+    """Return the value of a flag that counts something.
+
+    Raises:
+        UserError: the text is not an integer from 1 to 10,000.
+    """
+    # `int` raises for thousands of digits.
+    if not (text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= 10_000):
+        raise UserError(f"{flag}: expected an integer in [1, 10000], got {text!r}.")
+    return int(text)
+
+
+# Profile and learner.
+
+
+def parse_for_run(
+    make_default: Callable[..., C],
+    select: Callable[[C], Run | None],
+    flags: list[str],
+    prog: str,
+) -> C:
+    """Return the defaults for the selected run, profile and learner, updated by `flags`.
+
+    Args:
+        make_default: Function of the keywords `run`, and `profile` and `learner` if in `flags`, that
+            returns the defaults: with the settings of the run, or those of the task without a run.
+        select: Function that returns the run selected by the flags; None without a run.
+        flags: Command line.
+        prog: Name of the command, for messages.
+
+    Raises:
+        UnknownProfileError: unknown profile; the message lists the profiles of the task.
+        ValueError: unknown learner.
+    """
+    requested = requested_choices(flags)
+    default = make_default(run=None, **requested)
+    if requested_topic(flags) is not None:
+        return _parsed(type(default), default, flags, prog)
+    # The learner of the selected run may have flags that the task's learner lacks.
+    cfg, unknown = parse_known_flags(type(default), default, flags, prog)
+    run = select(cfg)
+    if run is None and not unknown:
+        return cfg
+    default = make_default(run=run, **requested)
+    return _parsed(type(default), default, flags, prog)
+
+
+def requested_choices(flags: list[str]) -> dict[str, str | None]:
+    """Return the profile and learner set by `flags`; None for the value `None`."""
+    choices: dict[str, str | None] = {}
+    for position, flag in enumerate(flags):
+        name, equals, value = flag.partition("=")
+        name = name.removeprefix("--")
+        if name not in _CHOICES or name == flag:
+            continue
+        if not equals:
+            # The parser reports a missing value.
+            value = flags[position + 1] if position + 1 < len(flags) else "None"
+        choices[name] = None if value == "None" else value
+    return choices
+
+
+def suggest_profile(task: str, profile: str | None, device: str) -> None:
+    """Print a hint to the `cpu` profile when training on the CPU without a profile."""
+    if profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task):
+        print_notice(f"`train {task} --profile {CPU_PROFILE}` has settings for a few cores.")
+
+
+def report_untuned_learner(task: str, profile: str | None, learner: str) -> None:
+    """Print a notice if `profile` has settings for a learner other than `learner`."""
+    from mjlab.rl.learners import learner_of
+
+    # A student uses the settings of the teacher's profile.
+    if profile is None or learner == "distillation":
+        return
+    tuned = learner_of(load_rl_cfg(task, profile=profile))
+    if tuned != learner:
+        print_notice(
+            f"The profile {profile!r} of {task} has settings for the learner {tuned!r}: using its "
+            f"environment, and the default networks, algorithm and iterations of {learner!r}."
+        )
+
+
+# Task flags.
+
+
+def with_task_options(cfg: C, task: str, run: Run | None = None) -> C:
+    """Return the flags of a command extended by the options of the task.
+
+    Args:
+        cfg: Dataclass of flags with their defaults.
+        task: Name of the task.
+        run: Run with the options to use as defaults.
+
+    Raises:
+        UnknownTaskError, TaskImportError: unknown task, or its options cannot be imported.
+        ValueError: an option of the task has the name of a flag of the command.
+    """
+    options = load_options_cls(task)
+    if options is None:
+        return cfg
+    own: Any = cfg
+    values = {field.name: getattr(own, field.name) for field in dataclasses.fields(own)}
+    taken = sorted({field.name for field in dataclasses.fields(options)} & values.keys())
+    if taken:
+        raise ValueError(
+            f"Options {options.__name__} of task {task!r}: expected names other than the flags of the "
+            f"command, got {taken}; rename these fields."
+        )
+    default = options()
+    if run is not None:
+        default, left_out = apply_settings(default, run.settings, "options")
+        for name, reason in left_out.items():
+            print_notice(f"{name}: {run.settings[name]} of the run left out: {reason}")
+    # No prefix: options look like flags of the command.
+    annotation: Any = Annotated[options, tyro.conf.arg(name="")]  # ty: ignore[invalid-type-form]
+    kind: Any = dataclasses.make_dataclass(
+        type(cfg).__name__,
+        [(_FIELD, annotation, dataclasses.field(default_factory=lambda: default))],
+        bases=(type(cfg),),
+        namespace={"__doc__": type(cfg).__doc__, "__module__": type(cfg).__module__},
+    )
+    return kind(**values)
+
+
+def options_of(task: str, cfg: Any) -> TaskOptions:
+    """Return the task options in the flags of a command, or their defaults."""
+    options = getattr(cfg, _FIELD, None)
+    if options is not None:
+        return options
+    return (load_options_cls(task) or TaskOptions)()
+
+
+def prepare_env_cfg(
+    task: str,
+    cfg: Any,
+    env_cfg: ManagerBasedRlEnvCfg,
+    checkpoint: Path | None,
+    wandb_run_path: str | None = None,
+) -> None:
+    """Let the task options edit `env_cfg` in place before the environment is built.
+
+    Args:
+        task: Name of the task.
+        cfg: Flags of the command, or None for the defaults of the task.
+        env_cfg: Environment config, edited in place.
+        checkpoint: Checkpoint of the acting policy, or None.
+        wandb_run_path: Weights & Biases run of a downloaded checkpoint, or None.
+
+    Raises:
+        ValueError: a resource of the task, such as a motion, was not found.
+    """
+    origin = PolicyOrigin(task, checkpoint, wandb_run_path)
+    options_of(task, cfg).prepare(env_cfg, origin)
+
+
+# Removal of terms.
+
+
+def switch_terms_off(default: C, flags: list[str]) -> tuple[C, list[str]]:
+    """Return a copy of `default` without the terms and configs set to None, and the remaining flags.
+
+    tyro checks the remaining flags.
+    """
+    config = copy.deepcopy(default)
+    remaining: list[str] = []
+    position = 0
+    while position < len(flags):
+        # `--flag None` or `--flag=None`.
+        words = [flags[position]]
+        flag, equals, value = words[0].partition("=")
+        if not equals and flags[position + 1 : position + 2] == ["None"]:
+            value = "None"
+            words.append(value)
+        position += len(words)
+        holder, name = _term_at(config, flag) if value == "None" else (None, "")
+        if holder is None:
+            remaining += words
+        elif isinstance(holder, dict):
+            holder[name] = None
+        else:
+            setattr(holder, name, None)
+    return config, remaining
+
+
+def _term_at(config: Any, flag: str) -> tuple[Any, str]:
+    """Return the dict or config that contains the entry `flag`, and its key; (None, "") if not found."""
+    if not flag.startswith("--"):
+        return None, ""
+    holder: Any = None
+    value, key, inside = config, "", ""
+    for part in flag.removeprefix("--").split("."):
+        inside, holder = key, value
+        if holder is None:
+            return None, ""
+        names = list(holder) if isinstance(holder, Mapping) else list(vars(holder))
+        # tyro prints `smooth_reward` as `smooth-reward` and accepts both.
+        spelled = {str(name).replace("_", "-"): name for name in reversed(names)}
+        key = spelled.get(part.replace("_", "-"))
+        if not isinstance(key, str):
+            return None, ""
+        value = holder[key] if isinstance(holder, Mapping) else getattr(holder, key)
+        if not is_dataclass(value) and not isinstance(value, Mapping | None):
+            return None, ""
+    is_term = isinstance(holder, dict) and inside in TERM_DICTS
+    return (holder, key) if is_term or _may_be_none(holder, key) else (None, "")
+
+
+def _may_be_none(holder: Any, key: str) -> bool:
+    """Return True if field `key` of a config is an optional config or dict."""
+    if not is_dataclass(holder):
+        return False
+    try:
+        options = get_args(get_type_hints(type(holder)).get(key))
+    except NameError:
+        # Annotations imported under TYPE_CHECKING cannot be resolved.
+        return False
+    return NoneType in options and any(
+        is_dataclass(option) or get_origin(option) is dict for option in options
+    )

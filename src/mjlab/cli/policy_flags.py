@@ -1,0 +1,251 @@
+"""Selection and loading of policies for `play`, `evaluate` and recordings."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from mjlab.cli.flags import (
+    is_given,
+    parse_for_run,
+    prepare_env_cfg,
+    typed_names,
+    with_task_options,
+)
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
+from mjlab.rl.learners import Learner
+from mjlab.runs import Checkpoint, Run, newest_run, resolve_checkpoint, runs_in
+from mjlab.runs.run import Purpose, RunCfg, registered_env_cfg
+from mjlab.runs.settings import apply_to_unchanged
+from mjlab.tasks.registry import load_rl_cfg
+from mjlab.utils.errors import UserError
+from mjlab.utils.logging import print_list, print_notice
+from mjlab.utils.os import get_wandb_checkpoint_path
+from mjlab.utils.ranges import check_ranges
+
+
+@dataclass
+class PolicyFlags:
+    """Flags that select the policy, the device and the engine."""
+
+    agent: Literal["zero", "random", "trained"] = "trained"
+    """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
+    checkpoint_file: str | None = None
+    """Checkpoint of the trained policy, its export (`.onnx`), or the folder of its run. None: last
+    checkpoint of the newest run of the task."""
+    wandb_run_path: str | None = None
+    """Weights & Biases run of the policy, as entity/project/run."""
+    wandb_checkpoint_name: str | None = None
+    """Checkpoint of the Weights & Biases run. None: newest."""
+    device: str | None = None
+    """Torch device. None: a GPU if available."""
+    engine: Literal["auto", "native", "warp"] | None = None
+    """Physics engine."""
+    log_root: str = "logs/rsl_rl"
+    """Root folder of all runs."""
+    profile: str | None = None
+    """Task profile, such as `cpu`. None: profile that the policy was trained with."""
+    learner: Learner | None = None
+    """Learner of the policy; selects its newest run. None: any."""
+    as_registered: bool = False
+    """Use the task as registered today, without the settings of the run that trained the policy."""
+    env: ManagerBasedRlEnvCfg | None = None
+    """Environment. None: config of the task, with the settings of the policy's run."""
+
+
+F = TypeVar("F", bound=PolicyFlags)
+
+
+def parse_policy_flags(
+    kind: type[F], flags: list[str], task: str, command: str, *, purpose: Purpose
+) -> F:
+    """Return the defaults of `kind` with the settings of the policy's run, updated by `flags`.
+
+    Args:
+        kind: Class of the flags of `command`.
+        flags: Command line after the task.
+        task: Name of the task.
+        command: Name of the command, for messages.
+        purpose: Purpose of the environments; see `registered_env_cfg`.
+
+    Raises:
+        UnknownProfileError: unknown profile.
+        ValueError: a typed number is out of its range.
+    """
+
+    def make_default(run: Run | None, **choices: Any) -> F:
+        # The learner does not change the flags, so the parser handles it.
+        profile = choices.get("profile")
+        if run is None:
+            env = registered_env_cfg(task, profile, purpose)
+            return with_task_options(kind(env=env, profile=profile), task)
+        choices = {"profile": run.profile, **choices}
+        env = run.cfg(purpose, **choices).env
+        return with_task_options(kind(env=env, profile=choices["profile"]), task, run)
+
+    cfg = parse_for_run(
+        make_default, lambda cfg: _run_of_policy(task, cfg), flags, f"{command} {task}"
+    )
+    check_ranges(cfg, typed_names(flags))
+    # --wandb-run-path has a use with any agent: a task may read other files from the run.
+    for flag in ("--checkpoint-file", "--wandb-checkpoint-name"):
+        if cfg.agent != "trained" and is_given(flag, flags):
+            print_notice(f"{flag} is ignored with --agent {cfg.agent}.")
+    return cfg
+
+
+# Policy selection.
+
+
+def find_checkpoint(task: str, flags: PolicyFlags) -> Checkpoint | None:
+    """Return the checkpoint selected by the flags, by default the last of the newest run of the task.
+
+    None if the agent is not trained.
+
+    Raises:
+        UserError: checkpoint not found, or written by a learner other than `flags.learner`.
+    """
+    checkpoint = _select(task, flags)
+    if checkpoint is None and flags.agent == "trained":
+        experiment = _experiment(task, flags)
+        by, choice = "", ""
+        if flags.learner is not None:
+            by, choice = f" by the learner {flags.learner!r}", f" --learner {flags.learner}"
+        raise UserError(
+            f"No checkpoint of {task}{by} found in {experiment}; run `train {task}{choice}` first, or use "
+            "--checkpoint-file or --wandb-run-path."
+        )
+    if checkpoint is None or flags.learner is None or checkpoint.path.suffix == ".onnx":
+        return checkpoint
+    if (found := checkpoint.learner) != flags.learner:
+        raise UserError(
+            f"--learner: expected {found!r}, which wrote {checkpoint}, got {flags.learner!r}; leave it out, "
+            "or name another checkpoint."
+        )
+    return checkpoint
+
+
+def _select(task: str, flags: PolicyFlags) -> Checkpoint | None:
+    if flags.agent != "trained":
+        return None
+    if flags.checkpoint_file is not None:
+        return resolve_checkpoint(Path(flags.checkpoint_file), task)
+    if flags.wandb_run_path is not None:
+        run, name = Path(flags.wandb_run_path), flags.wandb_checkpoint_name
+        return Checkpoint(get_wandb_checkpoint_path(_experiment(task, flags), run, name)[0])
+    run = newest_run(runs_in(_experiment(task, flags), task, flags.learner))
+    return None if run is None else run.newest
+
+
+def _experiment(task: str, flags: PolicyFlags) -> Path:
+    return Path(flags.log_root).resolve() / load_rl_cfg(task).experiment_name
+
+
+def _run_of_policy(task: str, flags: PolicyFlags) -> Run | None:
+    """Return the run of the policy selected by the flags; None if unknown.
+
+    Errors are reported by `find_checkpoint`.
+    """
+    # Runs of Weights & Biases are downloaded once, after parsing.
+    if flags.wandb_run_path and flags.checkpoint_file is None:
+        return None
+    try:
+        checkpoint = _select(task, flags)
+    except UserError:
+        return None
+    if checkpoint is None:
+        return None
+    run = Run(checkpoint.path.parent, task)
+    return run.as_registered() if flags.as_registered else run
+
+
+# Configs of a policy.
+
+
+def env_cfg_of(
+    task: str, flags: PolicyFlags, checkpoint: Checkpoint | None, *, purpose: Purpose
+) -> ManagerBasedRlEnvCfg:
+    """Return the environment config in `flags`, or that of the policy's run for `purpose`.
+
+    The task options have prepared the config for the policy in `checkpoint`.
+
+    Raises:
+        UserError: the terms of the run are in another order.
+        ValueError: a resource of the task was not found.
+    """
+    run = None if checkpoint is None or flags.as_registered else Run(checkpoint.path.parent, task)
+    is_fetched = checkpoint is not None and flags.checkpoint_file is None
+    registered = registered_env_cfg(task, flags.profile, purpose)
+    cfg = registered if flags.env is None else copy.deepcopy(flags.env)
+    if run is not None and (flags.env is None or (is_fetched and flags.wandb_run_path)):
+        cfg = apply_to_unchanged(cfg, registered, run.settings, "env")
+    path = None if checkpoint is None else checkpoint.path
+    prepare_env_cfg(task, flags, cfg, path, flags.wandb_run_path if is_fetched else None)
+    return cfg
+
+
+def report_policy(
+    task: str,
+    checkpoint: Checkpoint | None,
+    flags: PolicyFlags,
+    env: ManagerBasedRlEnvCfg,
+    purpose: Purpose,
+) -> None:
+    """Print the selected policy, and how its environment `env` differs from the registered one.
+
+    Raises:
+        UserError: observations or actions of the run were in another order.
+    """
+    if checkpoint is None:
+        return
+    run = Run(checkpoint.path.parent, task)
+    if flags.checkpoint_file is None:
+        print_notice(f"Checkpoint: {checkpoint} ({run.describe()})")
+    cfg = RunCfg(env=env, agent=load_rl_cfg(task), left_out={})
+    if not flags.as_registered:
+        cfg = replace(run.cfg(purpose), env=env)
+    print_list(
+        f"Settings of {run.folder.name} and of this command:",
+        run.notes(purpose, cfg, flags.profile),
+    )
+    run.check_terms(env, ("actor", "student"))
+
+
+def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Run | None) -> None:
+    """Resolve checkpoint and network of the teacher in a distillation config, in place.
+
+    The network is that of the teacher's run. A `resumed` run keeps its teacher. Other configs are
+    unchanged.
+
+    Raises:
+        UserError: checkpoint not found, or not a PPO checkpoint of this task; or the resumed run
+            has a different teacher.
+        CheckpointError: the checkpoint is damaged.
+    """
+    if not isinstance(cfg, RslRlDistillationRunnerCfg):
+        return
+    flag, teacher = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
+    if resumed is not None:
+        recorded = resumed.params["agent"].get("teacher_checkpoint")
+        if teacher is not None and teacher != recorded:
+            raise UserError(
+                f"{flag}: expected {recorded} of the resumed run, got {teacher}; leave it out."
+            )
+        cfg.teacher_checkpoint = recorded if isinstance(recorded, str) else None
+    elif teacher is not None:
+        checkpoint = resolve_checkpoint(Path(teacher), task)
+        if (learner := checkpoint.learner) != "ppo":
+            raise UserError(
+                f"{flag}: expected a checkpoint of the learner 'ppo', got {checkpoint} of {learner!r}."
+            )
+        run = Run(checkpoint.path.parent, task)
+        if not run.is_of(task, None):
+            raise UserError(
+                f"{flag}: expected a checkpoint of {task}, got {checkpoint} of {run.info['task']}."
+            )
+        cfg.teacher_checkpoint = str(checkpoint)
+        of_teacher: Any = run.cfg("train", learner="ppo").agent
+        cfg.teacher = of_teacher.actor

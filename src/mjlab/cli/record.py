@@ -1,0 +1,83 @@
+"""Video recording of policies."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.runs import Checkpoint
+from mjlab.runs.policy import agent_cfg_of, make_env, make_policy
+from mjlab.utils.wrappers.video_recorder import ClipWriter
+from mjlab.viewer.base import done_mask, reset_policy
+
+
+@dataclass(frozen=True)
+class VideoCfg:
+    """Recording configuration."""
+
+    length: int = 200
+    """Number of frames, one per environment step."""
+    height: int | None = None
+    """Height (pixels). None: height of the task."""
+    width: int | None = None
+    """Width (pixels). None: width of the task."""
+    suffix: Literal["mp4", "gif"] = "mp4"
+    """File format."""
+    camera: int | str | None = None
+    """Model camera, name or index. None: viewer camera of the task."""
+    num_envs: int | None = None
+    """Number of environments. None: number of the task."""
+    engine: Any = None
+    """Physics engine. None: engine of the task."""
+    agent: str = "trained"
+    """Policy without a checkpoint: `zero` or `random`."""
+    profile: str | None = None
+    """Task profile used for training."""
+
+
+def record_policy(
+    task: str,
+    env_cfg: ManagerBasedRlEnvCfg,
+    checkpoint: Checkpoint | None,
+    folder: Path,
+    device: str,
+    video: VideoCfg | None = None,
+) -> Path | None:
+    """Record one clip into `folder` and return its path.
+
+    Raises:
+        RenderingUnavailableError: rendering is not available; the message names packages to install.
+    """
+    video = video or VideoCfg()
+    env_cfg = copy.deepcopy(env_cfg)
+    env_cfg.viewer.height = video.height or env_cfg.viewer.height
+    env_cfg.viewer.width = video.width or env_cfg.viewer.width
+    env = make_env(
+        task,
+        env_cfg,
+        device,
+        video.num_envs,
+        video.engine,
+        render_mode="rgb_array",
+        agent=agent_cfg_of(task, checkpoint, video.profile),
+    )
+    try:
+        policy = make_policy(task, env, video.agent, checkpoint, device, video.profile)
+        name = video.agent if checkpoint is None else checkpoint.path.stem
+        writer = ClipWriter(
+            folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
+        )
+        with torch.inference_mode():
+            for _ in range(video.length):
+                reset_policy(policy, done_mask(env.step(policy(env.get_observations()))))
+                writer.add(env.unwrapped.render(video.camera))
+        path = writer.close()
+    finally:
+        env.close()
+    print(f"Video: {path}")
+    return path

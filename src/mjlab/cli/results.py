@@ -1,0 +1,119 @@
+"""Lines printed before and after training, and the files written at its end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mjlab
+from mjlab.cli.flags import prepare_env_cfg
+from mjlab.cli.record import VideoCfg, record_policy
+from mjlab.runs import Run
+from mjlab.runs.reference import parts_of
+from mjlab.sim.warning_log import mujoco_warnings
+from mjlab.tasks.registry import load_rl_cfg
+from mjlab.utils.logging import beside_results
+from mjlab.utils.os import files_in
+from mjlab.utils.string import counted
+
+if TYPE_CHECKING:
+    from mjlab.cli.train_config import TrainConfig
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.utils.processes import ProcessRank
+
+_LOG_ROOT = "logs/rsl_rl"
+
+
+def print_heading(task: str, cfg: TrainConfig, env: Any, rank: ProcessRank) -> None:
+    """Print the task, the number of environments and the physics."""
+    under = f", profile {cfg.profile}" if cfg.profile else ""
+    under += "" if cfg.learner_name == "ppo" else f", learner {cfg.learner_name}"
+    each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
+    print(f"Task:    {task}, {counted(env.num_envs, 'environment')}{each}{under}")
+    print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
+
+
+def report_divergence(env: ManagerBasedRlEnv) -> None:
+    """Print the number of diverged environments, and MuJoCo's warnings."""
+    episodes = int(env.nan_resets.sum())
+    if episodes > 0:
+        environments = int((env.nan_resets > 0).sum())
+        print(
+            f"Diverged: the physics of {environments} of {counted(env.num_envs, 'environment')}, in "
+            f"{counted(episodes, 'episode')} (Simulation/nan_resets)"
+        )
+    for kind, times in mujoco_warnings().items():
+        print(f"MuJoCo warned {counted(times, 'time')}: {kind}")
+
+
+def write_results(
+    task: str, cfg: TrainConfig, run_dir: Path, device: str, ended: str | None = None
+) -> None:
+    """Plot the learning curve, record the trained policy if `cfg.result_video`, and list the files.
+
+    The last lines are commands for the next step, which depend on the stop reason `ended`.
+    """
+    from mjlab.rl.plot import plot_run
+
+    # A run solved at resume has no iterations.
+    with beside_results("learning curve"), contextlib.suppress(ValueError):
+        plot_run(parts_of(run_dir), title=task, evaluation=vars(cfg.agent.evaluation))
+    run = Run(run_dir, task)
+    checkpoint = run.newest
+    if cfg.result_video and checkpoint is not None:
+        with beside_results("video"):
+            env_cfg = run.cfg("play").env
+            prepare_env_cfg(task, cfg, env_cfg, checkpoint.path)
+            video = VideoCfg(profile=cfg.profile)
+            record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
+    print(f"Saved in {_short(run_dir)}:")
+    for pattern in ("model_*.pt", "*.onnx", "*.png", "videos/**/*.mp4"):
+        files = sorted(files_in(run_dir, pattern), key=lambda path: path.stat().st_mtime)
+        if files:
+            print(f"    {files[-1].relative_to(run_dir)}")
+    print("Next:")
+    for line in next_commands(task, cfg, run_dir, ended):
+        print(f"    {line}")
+
+
+def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None) -> list[str]:
+    """Return the commands that watch, score and, if interrupted, resume the run in `run_dir`.
+
+    The run records its settings, so only flags of the machine are repeated.
+    """
+    root = [] if cfg.log_root == _LOG_ROOT else ["--log-root", cfg.log_root]
+    machine = [
+        word
+        for flag, value in (("--device", cfg.device), ("--engine", cfg.engine))
+        if value is not None
+        for word in (flag, value)
+    ]
+    resume, flags = [*root, *machine], root
+    # The commands look for the newest policy in the experiment of the task.
+    if cfg.agent.experiment_name != load_rl_cfg(task).experiment_name:
+        resume += ["--agent.experiment-name", cfg.agent.experiment_name]
+        newest = Run(run_dir).newest
+        flags = ["--checkpoint-file", str(_short(run_dir if newest is None else newest.path))]
+    commands = [["play", task, *flags], ["evaluate", task, *flags]]
+    if ended == "interrupted":
+        commands.insert(0, ["train", task, *resume, "--agent.resume", "True"])
+    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
+    return [join(["uv", "run", *_program(), *command]) for command in commands]
+
+
+def _program() -> list[str]:
+    """Return the words before the subcommand: the user's script, which may register the task."""
+    script = Path(sys.argv[0])
+    is_own = script.suffix == ".py" and Path(mjlab.__file__).parent not in script.resolve().parents
+    return ["python", sys.argv[0]] if is_own else []
+
+
+def _short(path: Path) -> Path:
+    """Return `path` relative to the working folder if it is inside."""
+    path = path.resolve()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -1,0 +1,1 @@
+"""Parts of `mjlab sweep`: settings, training processes, database, comparison."""
