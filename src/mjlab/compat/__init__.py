@@ -423,65 +423,51 @@ _OLDER_PARAMS: dict[str, tuple[str, str]] = {
 
 
 def accepts_older_params(term: T) -> T:
-    """Decorator for terms (functions or classes): accept sites in `asset_cfg` instead of a sensor.
-
-    Calls (for a class: configs) with `asset_cfg` and without the sensor use the legacy term.
-    """
-    cls: Any = term
-    name = cls.__name__
-    sensor, path = _OLDER_PARAMS[name]
-
-    def is_older(params: dict[str, Any]) -> bool:
-        if isinstance(params.get(sensor), str) or not {"asset_cfg", sensor} & params.keys():
-            return False
-        _warn_once(
-            f"{name} without {sensor} is deprecated (site heights above z = 0, as in releases 1.1 and "
-            f"1.2); set {sensor}."
-        )
-        return True
-
-    if inspect.isclass(term):
-        # The legacy term is a subclass, so Python calls its `__init__` after `__new__`. Copies call
-        # `__new__` without arguments, on the class of the copied object.
-        def __new__(today: type, cfg: Any = None, env: Any = None) -> Any:
-            older = today is cls and cfg is not None and is_older(cfg.params)
-            return object.__new__(pkgutil.resolve_name(path) if older else today)
-
-        cls.__new__ = __new__
-        return term
-    either: Any = _either(cls, path, is_older)
-    signature = inspect.signature(cls)
-    parameters = dict(signature.parameters)
-    parameters[sensor] = parameters[sensor].replace(default=None)
-    asset_cfg = inspect.Parameter("asset_cfg", inspect.Parameter.KEYWORD_ONLY, default=None)
-    parameters.setdefault("asset_cfg", asset_cfg)
-    either.__signature__ = signature.replace(parameters=list(parameters.values()))
-    return either
-
-
-def _either(today: Any, path: str, is_older: Callable[[dict[str, Any]], bool]) -> Any:
-    """Return a function that calls the current or legacy term, with their `check_when_built`."""
-    signature = inspect.signature(today)
+    """Decorator for foot terms: calls with sites in `asset_cfg` and without a sensor use the older term."""
+    today: Any = term
+    sensor, path = _OLDER_PARAMS[today.__name__]
+    names = list(inspect.signature(today).parameters)
 
     @functools.wraps(today)
-    def term(*args: Any, **kwargs: Any) -> Any:
-        params = dict(zip(signature.parameters, args, strict=False)) | kwargs
-        return (pkgutil.resolve_name(path) if is_older(params) else today)(*args, **kwargs)
+    def either(*args: Any, **kwargs: Any) -> Any:
+        params = dict(zip(names, args, strict=False)) | kwargs
+        if isinstance(params.get(sensor), str) or not {"asset_cfg", sensor} & params.keys():
+            return today(*args, **kwargs)
+        warn_of_sites(today.__name__)
+        return pkgutil.resolve_name(path)(*args, **kwargs)
 
-    if hasattr(today, "check_when_built"):
-        older_check = f"{path}.check_when_built"
-        term.check_when_built = _either(today.check_when_built, older_check, is_older)  # ty: ignore
-    return term
+    return cast(T, either)
 
 
-def offers_older_sites(make_cfg: T) -> T:
-    """Decorator for the velocity template: foot terms accept sites, as in releases 1.1 and 1.2."""
-    make: Any = make_cfg
+def warn_of_sites(name: str) -> None:
+    """Warn once that a foot term reads sites instead of its sensor."""
+    sensor = _OLDER_PARAMS[name][0]
+    _warn_once(
+        f"{name} without {sensor} is deprecated (site heights above z = 0, as in releases 1.1 and "
+        f"1.2); set {sensor}."
+    )
 
-    @functools.wraps(make)
-    def template() -> Any:
-        cfg = make()
-        pkgutil.resolve_name("mjlab.compat.older_terms:offer_sites")(cfg)
-        return cfg
 
-    return cast(T, template)
+def translate_older(cfg: Any) -> None:
+    """Translate an environment config that a package of an older release filled in, in place."""
+    groups = [group.terms for group in cfg.observations.values() if group is not None]
+    terms = [
+        term for terms in (cfg.rewards, *groups) for term in terms.values() if term is not None
+    ]
+    feet = [
+        term
+        for term in terms
+        if hasattr(term.params.get("asset_cfg"), "site_names")
+        and (reads_foot_scan(term) or getattr(term.func, "__name__", "") in _OLDER_PARAMS)
+    ]
+    if feet:
+        pkgutil.resolve_name("mjlab.compat.older_terms:use_older_foot_terms")(cfg, feet)
+
+
+FOOT_SCAN = "foot_height_scan"
+"""Height sensor of the velocity template."""
+
+
+def reads_foot_scan(term: Any) -> bool:
+    """Return True if a parameter of a term is the height sensor of the velocity template."""
+    return FOOT_SCAN in [value for value in term.params.values() if isinstance(value, str)]

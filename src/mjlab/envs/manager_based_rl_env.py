@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.compat import translate_older
 from mjlab.envs import curriculum_state, env_state
 from mjlab.envs.divergence import DivergenceLog
 from mjlab.envs.mdp.events import reset_scene_to_default
@@ -145,6 +146,7 @@ class ManagerBasedRlEnv(Tabular):
                 machine.
         """
         check_env_cfg(cfg)
+        translate_older(cfg)
         if device is None:
             device = "cuda:0" if torch.cuda.is_available() else "cpu"
         check_device(device)

@@ -59,8 +59,11 @@ def contacts(**data: Any) -> Any:
     """Return a contact sensor with these data; `landed` is what it says of first contacts."""
     landed = data.pop("landed", None)
     fields = {"found": None, "force": None, "force_history": None, "current_air_time": None}
+    num_feet = next(iter(data.values())).shape[1]
     return SimpleNamespace(
-        data=SimpleNamespace(**{**fields, **data}), compute_first_contact=lambda dt: landed
+        data=SimpleNamespace(**{**fields, **data}),
+        primary_names=[f"foot_{i}" for i in range(num_feet)],
+        compute_first_contact=lambda dt: landed,
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from types import SimpleNamespace
 from typing import Any
 
@@ -67,17 +65,11 @@ def test_neither_sensor_nor_sites_is_an_error(env):
 
 def test_swing_height_has_the_values_of_release_1_1(env, monkeypatch):
     from mjlab.compat import older_terms
-    from mjlab.tasks.velocity.mdp import rewards as feet_rewards
-    from mjlab.tasks.velocity.mdp.observations import Source
 
     found = torch.tensor([[0, 1.0, 0], [0, 0, 1.0]])
     sensor = contacts(found=found, landed=torch.zeros(2, 3).bool())
     env.scene["feet"] = sensor
-    feet = Source("feet", [("a", 1), ("b", 2), ("c", 3)])
-    monkeypatch.setattr(feet_rewards, "check_air_time_sensor", lambda *args: None)
-    monkeypatch.setattr(feet_rewards, "contact_columns", lambda *args: feet)
     monkeypatch.setattr(older_terms, "check_same_feet", lambda *args: None)
-    monkeypatch.setattr(older_terms, "site_columns", lambda *args: feet)
     params = {
         "sensor_name": "feet",
         "target_height": 0.1,
@@ -86,7 +78,7 @@ def test_swing_height_has_the_values_of_release_1_1(env, monkeypatch):
         "asset_cfg": SceneEntityCfg("robot", site_ids=[0, 1, 2]),
     }
     cfg = RewardTermCfg(func=mdp.feet_swing_height, weight=1.0, params=params)
-    term: Any = mdp.feet_swing_height(cfg, env)
+    term: Any = older_terms.feet_swing_height(cfg, env)
     assert isinstance(term, mdp.feet_swing_height)
     assert term(env, **params).tolist() == [0.0, 0.0]
     assert term.peak_heights.flatten().tolist() == pytest.approx([0.1, 0.0, 0.3, 0.05, 0.15, 0.0])
@@ -96,17 +88,6 @@ def test_swing_height_has_the_values_of_release_1_1(env, monkeypatch):
     assert term(env, **params).tolist() == pytest.approx([1.0, 0.0])
     assert env.extras["log"]["Metrics/peak_height_mean"].item() == pytest.approx(0.0375)
     assert term.peak_heights.flatten().tolist() == pytest.approx([0.0, 0.0, 0.3, 0.0, 0.15, 0.0])
-
-
-def test_older_swing_height_can_be_copied():
-    from mjlab.compat import older_terms
-
-    for cls in (mdp.feet_swing_height, older_terms.feet_swing_height):
-        term: Any = object.__new__(cls)
-        term.peak_heights = torch.ones(2, 2)
-        for copied in (copy.copy(term), copy.deepcopy(term), pickle.loads(pickle.dumps(term))):
-            assert type(copied) is cls
-            assert torch.equal(copied.peak_heights, term.peak_heights)
 
 
 def to_sites(cfg: Any) -> None:
@@ -135,50 +116,49 @@ def test_the_template_of_1_1_builds_steps_and_warns_once_a_term(make_env):
     assert (windows == heights[:, None]).all(dim=2).all(dim=0).any()
 
 
-def test_sites_of_other_feet_than_the_contacts_are_refused(make_env):
-    def edit(cfg):
-        to_sites(cfg)
-        names = cfg.rewards["foot_clearance"].params["asset_cfg"].site_names
-        cfg.rewards["foot_swing_height"].params["asset_cfg"] = SceneEntityCfg(
-            "robot", site_names=tuple(names)[:2]
-        )
-
-    with pytest.raises(ValueError, match="same feet"):
-        make_env(edit=edit)
-
-
 def _feet_terms(cfg) -> list[Any]:
     critic = cfg.observations["critic"].terms
     return [critic["foot_height"], cfg.rewards["foot_clearance"], cfg.rewards["foot_swing_height"]]
 
 
-@pytest.mark.parametrize("prepare", [lambda cfg: cfg, copy.deepcopy], ids=["new", "copied"])
-def test_setting_sites_in_the_template_removes_its_height_sensor(prepare):
-    cfg = prepare(make_velocity_env_cfg())
-    sensors = [sensor.name for sensor in cfg.scene.sensors]
-    assert "foot_height_scan" in sensors
+def test_sites_filled_in_the_template_replace_its_height_sensor():
+    cfg = make_velocity_env_cfg()
     for term in _feet_terms(cfg):
         term.params["asset_cfg"].site_names = ("left", "right")
+    compat.translate_older(cfg)
     for term in _feet_terms(cfg):
         assert "foot_height_scan" not in term.params.values()
         assert term.params["asset_cfg"].site_names == ("left", "right")
-    assert _feet_terms(cfg)[2].params["sensor_name"] == "feet_ground_contact"
-    left = [sensor.name for sensor in cfg.scene.sensors]
-    assert left == [name for name in sensors if name != "foot_height_scan"]
+        assert term.func.__module__ == "mjlab.compat.older_terms"
+    assert [sensor.name for sensor in cfg.scene.sensors] == ["terrain_scan"]
 
 
-def test_a_template_whose_sites_are_not_asked_for_keeps_its_sensor():
+def test_sites_left_empty_in_the_template_are_dropped():
     cfg = make_velocity_env_cfg()
-    cfg.rewards["foot_clearance"].params["asset_cfg"].site_names = ("left", "right")
-    alone = copy.deepcopy(cfg.observations["critic"].terms["foot_height"])
-    for params in (cfg.observations["critic"].terms["foot_height"].params, alone.params):
-        assert params == {"sensor_name": "foot_height_scan"}
-        assert "asset_cfg" not in params
-        with pytest.raises(KeyError, match="no_such_parameter"):
-            params["no_such_parameter"]
-    with pytest.raises(KeyError, match="asset_cfg"):
-        alone.params["asset_cfg"]
-    assert "foot_height_scan" in [sensor.name for sensor in cfg.scene.sensors]
+    height, clearance, swing = _feet_terms(cfg)
+    clearance.params["asset_cfg"].site_names = ("left", "right")
+    compat.translate_older(cfg)
+    assert height.params == {"sensor_name": "foot_height_scan"}
+    assert clearance.func is mdp.feet_clearance
+    assert clearance.params["asset_cfg"].site_names == ("left", "right")
+    assert swing.func is mdp.feet_swing_height
+    assert "asset_cfg" not in swing.params
+    assert [sensor.name for sensor in cfg.scene.sensors] == ["terrain_scan", "foot_height_scan"]
+
+
+@pytest.mark.parametrize("takes_sites", [False, True])
+def test_empty_sites_stay_if_a_custom_term_takes_them(takes_sites):
+    def without(env, sensor_name, height_sensor_name, target_height):
+        pass
+
+    def with_sites(env, asset_cfg, **params):
+        pass
+
+    cfg = make_velocity_env_cfg()
+    swing = _feet_terms(cfg)[2]
+    swing.func = with_sites if takes_sites else without
+    compat.translate_older(cfg)
+    assert ("asset_cfg" in swing.params) == takes_sites
 
 
 def test_sites_in_another_order_than_the_contacts_are_accepted_with_a_warning(make_env):

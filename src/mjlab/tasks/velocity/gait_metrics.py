@@ -10,11 +10,7 @@ from typing import Any
 
 import torch
 
-from mjlab.tasks.velocity.mdp.observations import (
-    check_same_feet,
-    contact_columns,
-    height_columns,
-)
+from mjlab.tasks.velocity.mdp.observations import check_same_feet
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.torch import constant_tensor
 
@@ -75,14 +71,13 @@ def foot_slip(env: Any) -> torch.Tensor:
     Foot velocities are those of the sites of `foot_height_scan`, contacts those of
     `feet_ground_contact`.
 
-    Raises:
-        ValueError: a sensor does not exist, or the two sensors measure different feet.
+    Warns if the two sensors measure different feet.
     """
-    feet = height_columns(env, _HEIGHTS)
-    check_same_feet(env, contact_columns(env, _CONTACTS), feet)
+    check_same_feet(env, _CONTACTS, _HEIGHTS)
     in_contact = env.scene[_CONTACTS].data.found > 0
     robot = env.scene[_ROBOT]
-    sites = as_columns([robot.site_names.index(name) for name, _ in feet.columns], env.device)
+    feet = env.scene[_HEIGHTS].cfg.frame
+    sites = as_columns([robot.site_names.index(foot.name) for foot in feet], env.device)
     speed = robot.data.site_lin_vel_w[:, sites, :2].norm(dim=-1)
     return (speed * in_contact).sum(dim=1) / in_contact.sum(dim=1).clamp(min=1)
 

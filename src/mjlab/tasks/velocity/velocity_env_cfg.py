@@ -1,8 +1,8 @@
 """Base config of the velocity task: track commanded linear velocity and yaw rate.
 
-A robot package calls `make_velocity_env_cfg()` and fills in robot-specific settings: entity, feet,
-sensors, gains. See `config/go1` and `config/g1`. `make_flat` and `make_playable` adapt the config of
-any robot to flat ground and to play mode.
+`make_legged_env_cfg` returns the task of a robot, from the names of its parts; see `config/go1` and
+`config/g1`. `make_flat` and `make_playable` adapt it to flat ground and to play mode.
+`make_velocity_env_cfg` returns the template, whose names are left to fill in.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import copy
 import math
 from typing import Any
 
-from mjlab.compat import offers_older_sites
+from mjlab.entity import EntityCfg
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import (
     CommandTermCfg,
@@ -25,7 +25,16 @@ from mjlab.managers import (
     TerminationTermCfg,
 )
 from mjlab.scene import SceneCfg
-from mjlab.sensor import GridPatternCfg, ObjRef, RayCastSensorCfg, SensorCfg, TerrainHeightSensorCfg
+from mjlab.sensor import (
+    ContactMatch,
+    ContactSensorCfg,
+    GridPatternCfg,
+    ObjRef,
+    RayCastSensorCfg,
+    RingPatternCfg,
+    SensorCfg,
+    TerrainHeightSensorCfg,
+)
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.tasks.velocity import mdp
 from mjlab.terrains import TerrainEntityCfg
@@ -36,7 +45,77 @@ from mjlab.utils.string import suggest
 from mjlab.viewer import ViewerConfig
 
 
-@offers_older_sites
+def make_legged_env_cfg(
+    robot: EntityCfg,
+    *,
+    trunk: str,
+    base: str,
+    feet: tuple[str, ...],
+    soles: tuple[str, ...],
+    foot_contacts: ContactMatch,
+    foot_rays: RingPatternCfg,
+    action_scale: float | dict[str, float],
+    std_standing: dict[str, float],
+    std_walking: dict[str, float],
+    std_running: dict[str, float],
+) -> ManagerBasedRlEnvCfg:
+    """Return a new config of the rough-terrain task of a robot.
+
+    The robot needs a floating base, MuJoCo sensors `imu_lin_vel`, `imu_ang_vel` and `root_angmom`, and
+    geoms in groups other than 0, the group that rays hit.
+
+    Args:
+        robot: The robot.
+        trunk: Body that is kept upright, whose center of mass is randomized, and that viewers follow.
+        base: Body that the terrain scan is attached to.
+        feet: Site of each foot, in model order.
+        soles: Geoms of the feet, whose friction is randomized.
+        foot_contacts: Elements whose ground contacts are those of each foot, in the order of `feet`.
+        foot_rays: Rays from each foot site that measure its height.
+        action_scale: Scale from actions to joint targets (rad), or one per joint name pattern.
+        std_standing: Tolerance of joints around the default pose (rad) of standing commands, by joint
+            name pattern; see `variable_posture`.
+        std_walking: Tolerance of walking commands.
+        std_running: Tolerance of running commands.
+    """
+    cfg = make_velocity_env_cfg()
+    terrain, action = cfg.scene.terrain, cfg.actions["joint_pos"]
+    assert terrain is not None
+    assert terrain.terrain_generator is not None
+    assert isinstance(action, mdp.JointPositionActionCfg)
+    cfg.scene.entities = {"robot": robot}
+    terrain.terrain_generator.curriculum = True
+    get_sensor(cfg, "terrain_scan").frame = ObjRef(type="body", name=base, entity="robot")
+    heights = get_sensor(cfg, "foot_height_scan")
+    heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in feet)
+    heights.pattern = foot_rays
+    cfg.scene.sensors += (
+        ContactSensorCfg(
+            name="feet_ground_contact",
+            primary=foot_contacts,
+            secondary=ContactMatch(mode="body", pattern="terrain"),
+            fields=("found", "force"),
+            reduce="netforce",
+            num_slots=1,
+            track_air_time=True,
+        ),
+    )
+    action.scale = action_scale
+    cfg.events["foot_friction"].params["asset_cfg"].geom_names = soles
+    cfg.events["base_com"].params["asset_cfg"].body_names = (trunk,)
+    for name in ("upright", "body_ang_vel"):
+        cfg.rewards[name].params["asset_cfg"].body_names = (trunk,)
+    for name in ("foot_clearance", "foot_slip"):
+        cfg.rewards[name].params["asset_cfg"].site_names = feet
+    for term in (cfg.observations["critic"].terms["foot_height"], cfg.rewards["foot_swing_height"]):
+        del term.params["asset_cfg"]
+    cfg.rewards["pose"].params.update(
+        std_standing=std_standing, std_walking=std_walking, std_running=std_running
+    )
+    cfg.viewer.body_name = trunk
+    return cfg
+
+
 def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
     """Return a new config of the rough-terrain task, without a robot.
 
@@ -48,10 +127,7 @@ def make_velocity_env_cfg() -> ManagerBasedRlEnvCfg:
       `body_ang_vel`, `foot_clearance` and `foot_slip`; and the standard deviations of `pose`;
     - `viewer.body_name`.
 
-    Empty names of sensors and sites raise `ValueError` when the environment is built, and empty bodies of
-    `upright` and `body_ang_vel` are the root link. Empty names of events, and of rewards of weight 0
-    (here `angular_momentum`), only log a warning. Such events have no effect; such rewards raise once
-    they get a nonzero weight.
+    Sensors without a name raise `ValueError` when the environment is built; terms without names warn.
     """
     cfg = ManagerBasedRlEnvCfg(
         decimation=4,
@@ -108,18 +184,17 @@ def make_flat(cfg: ManagerBasedRlEnvCfg, play: bool) -> None:
     cfg.sim.nconmax = None
     cfg.sim.contact_sensor_maxmatch = 64
     cfg.sim.mujoco.ccd_iterations = 50
-    terrain: Any = cfg.scene.terrain
-    terrain.terrain_type, terrain.terrain_generator = "plane", None
+    assert cfg.scene.terrain is not None
+    cfg.scene.terrain.terrain_type, cfg.scene.terrain.terrain_generator = "plane", None
     remove_sensors(cfg, "terrain_scan")
     for group in ("actor", "critic"):
-        observations: Any = cfg.observations[group]
-        observations.terms.pop("height_scan", None)
-    upright: Any = cfg.rewards["upright"]
-    upright.params.pop("terrain_sensor_names", None)
+        cfg.observations[group].terms.pop("height_scan", None)
+    cfg.rewards["upright"].params.pop("terrain_sensor_names", None)
     cfg.terminations.pop("out_of_terrain_bounds", None)
     cfg.curriculum.pop("terrain_levels", None)
     if play:
-        twist: Any = cfg.commands["twist"]
+        twist = cfg.commands["twist"]
+        assert isinstance(twist, mdp.UniformVelocityCommandCfg)
         twist.ranges.lin_vel_x = (-1.5, 2.0)
         twist.ranges.ang_vel_z = (-0.7, 0.7)
 
@@ -131,8 +206,7 @@ def make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
     The robot starts on a random cell of a small terrain grid.
     """
     cfg.episode_length_s = int(1e9)
-    actor: Any = cfg.observations["actor"]
-    actor.enable_corruption = False
+    cfg.observations["actor"].enable_corruption = False
     cfg.events.pop("push_robot", None)
     cfg.terminations.pop("out_of_terrain_bounds", None)
     cfg.curriculum = {}
@@ -229,7 +303,12 @@ _CRITIC_TERMS: dict[str, ObservationTermCfg] = {
         func=mdp.height_scan, params={"sensor_name": "terrain_scan"}, scale=1.0 / 5.0
     ),
     "foot_height": ObservationTermCfg(
-        func=mdp.foot_height, params={"sensor_name": "foot_height_scan"}
+        func=mdp.foot_height,
+        params={
+            "sensor_name": "foot_height_scan",
+            # Sites instead of the sensor, as in releases 1.1 and 1.2. Dropped if left empty.
+            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
+        },
     ),
     "foot_air_time": ObservationTermCfg(
         func=mdp.foot_air_time, params={"sensor_name": "feet_ground_contact"}
@@ -401,6 +480,8 @@ _REWARDS: dict[str, RewardTermCfg] = {
             "height_sensor_name": "foot_height_scan",
             "target_height": 0.1,
             **_COMMANDED,
+            # As in `foot_height`.
+            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
         },
     ),
     "foot_slip": RewardTermCfg(

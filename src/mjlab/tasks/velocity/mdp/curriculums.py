@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import check_range, checked_when_built, require_command
 from mjlab.tasks.velocity.mdp.rewards import velocity_command
 from mjlab.tasks.velocity.mdp.velocity_command import RANGES
-from mjlab.utils.errors import check_exists, warned
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -42,19 +40,6 @@ class VelocityStage(TypedDict, total=False):
     """Yaw rate (rad/s)."""
 
 
-def _check_levels(
-    env: ManagerBasedRlEnv, command_name: str, use_elapsed_time: bool = False, **_: Any
-) -> None:
-    require_command(env, command_name)
-    term = env.command_manager.get_term(command_name)
-    if use_elapsed_time and not hasattr(term, "elapsed_s"):
-        raise ValueError(
-            f"use_elapsed_time: expected a command term with elapsed_s, got {type(term).__name__} as "
-            f"{command_name!r}; use UniformVelocityCommandCfg, or use_elapsed_time=False."
-        )
-
-
-@checked_when_built(_check_levels)
 def terrain_levels_vel(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor,
@@ -118,27 +103,6 @@ def _levels_to_log(terrain: Any) -> dict[str, torch.Tensor]:
     return logged | {name: level for name, level in pairs if not level.isnan()}
 
 
-def _check_stages(
-    env: ManagerBasedRlEnv, command_name: str, velocity_stages: Sequence[Any], **_: Any
-) -> None:
-    require_command(env, command_name)
-    for stage in velocity_stages:
-        if "step" not in stage:
-            raise ValueError(f"velocity_stages: expected a stage with 'step', got {dict(stage)}.")
-        for key, bounds in stage.items():
-            if key not in ("step", *RANGES):
-                # Ignored, as in releases 1.x.
-                with warned():
-                    check_exists(f"range in velocity_stages (step {stage['step']})", key, RANGES)
-            elif key != "step" and bounds is not None:
-                # The run may end before the stage.
-                with warned():
-                    check_range(
-                        f"velocity_stages: {key} of the stage of step {stage['step']}", bounds
-                    )
-
-
-@checked_when_built(_check_stages)
 def commands_vel(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor,
@@ -162,6 +126,12 @@ def commands_vel(
     ranges: Any = env.command_manager.get_term_cfg(command_name).ranges  # ty: ignore
     for stage in velocity_stages:
         if env.common_step_counter >= stage["step"]:
+            if unknown := stage.keys() - {"step", *RANGES}:
+                warnings.warn(
+                    f"velocity_stages: expected ranges {RANGES}, got {sorted(unknown)}, ignored.",
+                    UserWarning,
+                    stacklevel=2,
+                )
             for name in RANGES:
                 bounds = stage.get(name)
                 if bounds is not None:

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import torch
 
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.managers.term_checks import checked_when_built, require_command
-from mjlab.tasks.velocity.mdp.observations import height_columns
 from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
-from mjlab.utils.errors import check_exists, check_field, check_fields_positive, check_positive
+from mjlab.utils.errors import check_exists, check_field, check_fields_positive
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.torch import constant_tensor
 
@@ -174,9 +172,9 @@ def require_gait_clock(env: ManagerBasedRlEnv, command_name: str) -> GaitClockCo
     """Return the gait clock `command_name`.
 
     Raises:
-        ValueError: unknown command, or not a gait clock.
+        KeyError: unknown command.
+        ValueError: the command is not a gait clock.
     """
-    require_command(env, command_name)
     term = env.command_manager.get_term(command_name)
     if not isinstance(term, GaitClockCommand):
         raise ValueError(
@@ -186,25 +184,6 @@ def require_gait_clock(env: ManagerBasedRlEnv, command_name: str) -> GaitClockCo
     return term
 
 
-def _check_height_by_phase(
-    env: ManagerBasedRlEnv,
-    height_sensor_name: str,
-    command_name: str = "gait",
-    variance: float = 0.005,
-    offsets: tuple[float, ...] = (0.0, 0.5),
-    **_: Any,
-) -> None:
-    require_gait_clock(env, command_name)
-    feet = [name for name, _ in height_columns(env, height_sensor_name).columns]
-    if len(offsets) != len(feet):
-        raise ValueError(
-            f"offsets: expected one number per foot of {height_sensor_name!r}, {feet}, got {offsets}; "
-            "use (0, 0.5) for two feet, (0, 0.5, 0.5, 0) for a trot of four."
-        )
-    check_positive("variance", variance)
-
-
-@checked_when_built(_check_height_by_phase)
 def feet_height_by_phase(
     env: ManagerBasedRlEnv,
     height_sensor_name: str,
@@ -233,7 +212,7 @@ def feet_height_by_phase(
         rest_height: Sensor reading of a standing foot (m): 0 for the G1, whose sites are in the
             soles, and 0.0225 for the Go1, whose sites are at the foot centers.
     """
-    clock: Any = env.command_manager.get_term(command_name)
+    clock = require_gait_clock(env, command_name)
     target = clock.swing(offsets).mul_(swing_height)
     error = env.scene[height_sensor_name].data.heights - rest_height - target
     return torch.exp(error.square().sum(dim=1) / -variance)
@@ -247,7 +226,7 @@ class weighted_joint_deviation:
             exactly one pattern, and every pattern a joint.
         asset_cfg: Entity and joints; all joints by default.
 
-    Raises, when built: `ValueError` for weights that do not match the joints or are negative.
+    Raises, when built: `ValueError` for weights that do not match the joints.
     """
 
     # Derived from the config; not checkpointed.
@@ -259,7 +238,7 @@ class weighted_joint_deviation:
         asset: Entity = env.scene[asset_cfg.name]
         # Resolved names are in the order of the joint ids.
         joints = list(asset_cfg.joint_names or asset.joint_names)
-        values = values_of_joints(joints, "weights", weights, allow_zero=True)
+        values = values_of_joints(joints, "weights", weights)
         self._weights = torch.tensor(values, dtype=torch.float32, device=env.device)
 
     def __call__(

@@ -4,45 +4,21 @@ Derived quantities (link velocities, orientations, contacts) are one physics sub
 one environment step old; see `ManagerBasedRlEnv.step`. Commands are those that the policy observed.
 
 Foot terms combine columns of different sources (contacts, heights, sites), so all sources must list the
-feet in the same order. The terms check the order when they are built.
+feet in the same order. `feet_swing_height` warns of any other order when it is built.
 """
 
 from __future__ import annotations
 
-import math
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from mjlab.compat import accepts_older_params, older_names
-from mjlab.entity.building import short_name
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
 from mjlab.managers import RewardTermCfg, SceneEntityCfg
 from mjlab.managers.scene_entity_config import columns_of
-from mjlab.managers.term_checks import (
-    checked_when_built,
-    require_command,
-    require_fields,
-    require_sensor,
-)
-from mjlab.sensor import ContactSensor
-from mjlab.tasks.velocity.mdp.observations import (
-    Source,
-    check_air_time_sensor,
-    check_builtin_sensor,
-    check_force_sensor,
-    check_one_slot,
-    check_same_feet,
-    contact_columns,
-    height_columns,
-    site_columns,
-)
-from mjlab.tasks.velocity.mdp.terrain_utils import (
-    check_terrain_sensors,
-    terrain_normal_from_sensors,
-)
-from mjlab.utils.errors import check_in_range, check_positive, warned
+from mjlab.tasks.velocity.mdp.observations import check_same_feet
+from mjlab.tasks.velocity.mdp.terrain_utils import terrain_normal_from_sensors
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
@@ -70,16 +46,6 @@ _NORMAL_COLOR = (0.2, 0.8, 0.2, 0.8)
 _BODY_Z_COLOR = (0.2, 0.4, 1.0, 0.8)
 
 
-def check_command(
-    env: ManagerBasedRlEnv, command_name: str | None = None, std: float = 1.0, **_: Any
-) -> None:
-    """Raise `ValueError` unless the command exists; warn unless `std` > 0."""
-    require_command(env, command_name)
-    with warned():
-        check_positive("std", std)
-
-
-@checked_when_built(check_command)
 def track_linear_velocity(
     env: ManagerBasedRlEnv,
     std: float,
@@ -99,7 +65,6 @@ def track_linear_velocity(
     return torch.exp(error.square().sum(dim=1) / -(std**2))
 
 
-@checked_when_built(check_command)
 def track_angular_velocity(
     env: ManagerBasedRlEnv,
     std: float,
@@ -132,19 +97,15 @@ class upright:
         terrain_sensor_names: Ray sensors of the terrain normal. Hits are those of the last environment
             step.
 
-    Raises, when built: `ValueError` for several bodies or an unknown sensor, `TypeError` for a sensor
-    other than a ray sensor.
+    Raises, when built: `ValueError` for several bodies.
     """
 
     _transient = {"_normal"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
-        with warned():
-            check_positive("std", cfg.params["std"])
         self._env = env
         self._asset_cfg: SceneEntityCfg = cfg.params.get("asset_cfg", _DEFAULT_ASSET_CFG)
         self._body = single_body(env, self._asset_cfg)
-        check_terrain_sensors(env, cfg.params.get("terrain_sensor_names") or ())
         self._up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float32, device=env.device)
         # Reference direction of the last reward, for drawing.
         self._normal = self._up.repeat(env.num_envs, 1)
@@ -190,29 +151,24 @@ class upright:
                 visualizer.add_arrow(base, base + 0.3 * direction.cpu().numpy(), color)
 
 
-def single_body(
-    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG, **_: Any
-) -> int | None:
+def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None:
     """Return the index of the selected body; None for the root, without selection or with an empty one.
 
     Raises:
         ValueError: several bodies are selected; the message names them.
     """
-    ids: Any = asset_cfg.body_ids
-    if isinstance(ids, slice) and asset_cfg.body_names is None:
-        return None
-    entity: Entity = env.scene[asset_cfg.name]
-    ids = columns_of(asset_cfg, "body", env)
-    chosen = list(range(entity.num_bodies))[ids] if isinstance(ids, slice) else ids.tolist()
-    if not chosen:
-        return None
-    if len(chosen) != 1:
-        names = [entity.body_names[i] for i in chosen]
+    ids = asset_cfg.body_ids
+    if isinstance(ids, slice):
+        if asset_cfg.body_names is None:
+            return None
+        ids = range(env.scene[asset_cfg.name].num_bodies)[ids]
+    if len(ids) > 1:
+        names = [env.scene[asset_cfg.name].body_names[i] for i in ids]
         raise ValueError(
             f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
-            f"body_names for the root {short_name(entity.root_body.name)!r}."
+            "body_names for the root."
         )
-    return chosen[0]
+    return ids[0] if ids else None
 
 
 def body_quat(data: Any, body: int | None) -> torch.Tensor:
@@ -220,7 +176,6 @@ def body_quat(data: Any, body: int | None) -> torch.Tensor:
     return data.root_link_quat_w if body is None else data.body_link_quat_w[:, body]
 
 
-@checked_when_built(single_body)
 def body_angular_velocity_penalty(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -238,7 +193,6 @@ def body_angular_velocity_penalty(
     return velocity[:, :2].square().sum(dim=1)
 
 
-@checked_when_built(check_builtin_sensor)
 def angular_momentum_penalty(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """Squared norm of the angular momentum from a MuJoCo sensor (kg^2 m^4/s^2)."""
     squared = env.scene[sensor_name].data.square().sum(dim=1)
@@ -262,8 +216,7 @@ class variable_posture:
         walking_threshold: Minimum commanded motion of walking.
         running_threshold: Minimum commanded motion of running.
 
-    Raises, when built: `ValueError` for tables that do not match the joints or an unknown command.
-    Warns of standard deviations <= 0 and of walking_threshold > running_threshold.
+    Raises, when built: `ValueError` for tables that do not match the joints.
     """
 
     # Derived from the config; not checkpointed.
@@ -271,10 +224,6 @@ class variable_posture:
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         params = cfg.params
-        require_command(env, params["command_name"])
-        thresholds = params.get("walking_threshold", 0.5), params.get("running_threshold", 1.5)
-        with warned():
-            check_in_range("walking_threshold", thresholds[0], -math.inf, thresholds[1])
         # Resolved names are in the order of the joint ids.
         joints = params["asset_cfg"].joint_names
         if joints is None:
@@ -312,26 +261,6 @@ class variable_posture:
 # Feet: air time, clearance, swing height, slip, landing.
 
 
-def _check_air_time(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    threshold_min: float = 0.05,
-    threshold_max: float = 0.5,
-    command_name: str | None = None,
-    **_: Any,
-) -> None:
-    check_air_time_sensor(env, sensor_name)
-    require_command(env, command_name)
-    if threshold_min >= threshold_max:
-        warnings.warn(
-            f"threshold_min: expected less than threshold_max {threshold_max}, got {threshold_min}; "
-            "no air time counts.",
-            UserWarning,
-            stacklevel=2,
-        )
-
-
-@checked_when_built(_check_air_time)
 def feet_air_time(
     env: ManagerBasedRlEnv,
     sensor_name: str,
@@ -356,20 +285,7 @@ def feet_air_time(
     return if_commanded(swinging.sum(dim=1).float(), env, command_name, command_threshold)
 
 
-def _check_clearance(
-    env: ManagerBasedRlEnv,
-    height_sensor_name: str,
-    command_name: str | None = None,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    require_command(env, command_name)
-    heights = height_columns(env, height_sensor_name)
-    check_same_feet(env, heights, site_columns(env, asset_cfg))
-
-
 @accepts_older_params
-@checked_when_built(_check_clearance)
 def feet_clearance(
     env: ManagerBasedRlEnv,
     target_height: float,
@@ -393,22 +309,10 @@ def feet_clearance(
         asset_cfg: Entity, and the sites of the feet in the order of the sensor's frames.
     """
     error = env.scene[height_sensor_name].data.heights - target_height
-    return clearance_cost(env, error, command_name, command_threshold, asset_cfg)
-
-
-def clearance_cost(
-    env: ManagerBasedRlEnv,
-    error: torch.Tensor,
-    command_name: str | None,
-    command_threshold: float,
-    asset_cfg: SceneEntityCfg,
-) -> torch.Tensor:
-    """Return the cost, (N,), of height errors (m), (N, feet), weighted by horizontal speed."""
-    cost = (error.abs() * _site_speed(env, asset_cfg)).sum(dim=1)
+    cost = (error.abs() * site_speed(env, asset_cfg)).sum(dim=1)
     return if_commanded(cost, env, command_name, command_threshold)
 
 
-@accepts_older_params
 class feet_swing_height:
     """Error of the swing height at landing: sum of `(peak / target - 1)^2` over feet that land in this step.
 
@@ -421,20 +325,13 @@ class feet_swing_height:
         command_name: Velocity command.
         command_threshold: Commanded motion that must be exceeded to enable the cost.
 
-    Raises, when built: `ValueError` for unknown sensors, or sensors of different feet.
+    Warns, when built, if the sensors list different feet, or the feet in different orders.
     """
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
-        params = cfg.params
-        require_command(env, params["command_name"])
-        check_air_time_sensor(env, params["sensor_name"])
-        with warned():
-            check_positive("target_height", params["target_height"])
-        contacts = contact_columns(env, params["sensor_name"])
-        self._check_heights(env, params, contacts)
-        self.peak_heights = torch.zeros(
-            env.num_envs, len(contacts.columns), dtype=torch.float32, device=env.device
-        )
+        check_same_feet(env, cfg.params["sensor_name"], cfg.params["height_sensor_name"])
+        feet = len(env.scene[cfg.params["sensor_name"]].primary_names)
+        self.peak_heights = torch.zeros(env.num_envs, feet, dtype=torch.float32, device=env.device)
 
     def __call__(
         self,
@@ -466,37 +363,11 @@ class feet_swing_height:
         peaks.masked_fill_(has_landed, 0.0)
         return cost
 
-    def _check_heights(
-        self, env: ManagerBasedRlEnv, params: dict[str, Any], contacts: Source
-    ) -> None:
-        """Raise `ValueError` unless heights and contacts are those of the same feet."""
-        check_same_feet(env, contacts, height_columns(env, params["height_sensor_name"]))
-
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Clear the peak heights of `env_ids`, so that unfinished swings do not affect the next episode."""
         self.peak_heights[slice(None) if env_ids is None else env_ids] = 0.0
 
 
-def _check_slip(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    command_name: str,
-    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
-    **_: Any,
-) -> None:
-    require_command(env, command_name)
-    sites = site_columns(env, asset_cfg)
-    sensor = require_sensor(env, sensor_name, ContactSensor)
-    if len(sites.columns) > 1 or sensor.cfg.num_slots == 1:
-        check_same_feet(env, contact_columns(env, sensor_name), sites)
-        return
-    # The speed of a single site counts for every slot.
-    require_fields(sensor, "found")
-    with warned():
-        check_one_slot(env, sensor_name)
-
-
-@checked_when_built(_check_slip)
 def feet_slip(
     env: ManagerBasedRlEnv,
     sensor_name: str,
@@ -514,22 +385,12 @@ def feet_slip(
         asset_cfg: Entity, and the sites of the feet in the order of the sensor's columns.
     """
     in_contact = env.scene[sensor_name].data.found > 0
-    speed = _site_speed(env, asset_cfg)
+    speed = site_speed(env, asset_cfg)
     log_metric(env, "slip_velocity_mean", masked_mean(speed, in_contact))
     cost = torch.where(in_contact, speed.square_(), 0.0).sum(dim=1)
     return if_commanded(cost, env, command_name, command_threshold)
 
 
-def _check_landing(
-    env: ManagerBasedRlEnv, sensor_name: str, command_name: str | None = None, **_: Any
-) -> None:
-    require_command(env, command_name)
-    check_air_time_sensor(env, sensor_name)
-    check_one_slot(env, sensor_name)
-    check_force_sensor(env, sensor_name)
-
-
-@checked_when_built(_check_landing)
 def soft_landing(
     env: ManagerBasedRlEnv,
     sensor_name: str,
@@ -559,9 +420,7 @@ def soft_landing(
 
 def velocity_command(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Return a velocity command (vx, vy, wz) in the root frame (m/s, rad/s), (N, 3)."""
-    # Terms check the command's name when they are built.
-    manager: Any = env.command_manager
-    return manager.get_command(command_name)
+    return env.command_manager.get_command(command_name)
 
 
 def command_speed(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
@@ -605,21 +464,16 @@ def tilt_of(quat: torch.Tensor) -> torch.Tensor:
     return 4.0 * s * (1.0 - s)
 
 
-def values_of_joints(
-    joints: list[str], name: str, table: dict[str, float], allow_zero: bool = False
-) -> list[float]:
+def values_of_joints(joints: list[str], name: str, table: dict[str, float]) -> list[float]:
     """Return the value of each joint from `table`, a dict of name pattern to value.
 
     Args:
         joints: Joint names.
         name: Parameter name for messages.
         table: Dict of joint name pattern to value.
-        allow_zero: Accept 0, besides numbers > 0.
 
     Raises:
         ValueError: a joint matches no pattern or several, or a pattern matches no joint.
-
-    Warns of values that are negative or not allowed to be 0.
     """
     try:
         _, covered, values = resolve_matching_names_values(table, joints)
@@ -630,14 +484,10 @@ def values_of_joints(
         raise ValueError(
             f"{name}: expected patterns for all selected joints, got {list(table)}; missing: {missing}."
         )
-    wrong = {p: v for p, v in table.items() if not (v >= 0.0 if allow_zero else v > 0.0)}
-    if wrong:
-        bound = ">= 0" if allow_zero else "> 0"
-        warnings.warn(f"{name}: expected numbers {bound}, got {wrong}.", UserWarning, stacklevel=2)
     return [float(value) for value in values]
 
 
-def _site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
+def site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the horizontal speed of the selected sites (m/s), (N, sites)."""
     asset: Entity = env.scene[asset_cfg.name]
     sites = columns_of(asset_cfg, "site", env)

@@ -50,12 +50,6 @@ def terrain_normal_from_sensors(
     return fit_terrain_normal(torch.cat(points, dim=1), torch.cat(valid, dim=1))
 
 
-def check_terrain_sensors(env: ManagerBasedRlEnv, sensor_names: tuple[str, ...]) -> None:
-    """Raise `ValueError` for unknown sensors, `TypeError` for sensors other than `RayCastSensor`."""
-    for name in sensor_names:
-        require_sensor(env, name, RayCastSensor)
-
-
 @functools.lru_cache(maxsize=64)
 def _spread(count: int, max_points: int, device: str) -> torch.Tensor | slice:
     if count <= max_points:

@@ -8,16 +8,10 @@ from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_ACTION_SCALE
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import RewardTermCfg
-from mjlab.sensor import ContactMatch, ContactSensorCfg, ObjRef, RingPatternCfg
+from mjlab.sensor import ContactMatch, ContactSensorCfg, RingPatternCfg
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.velocity_env_cfg import (
-    get_sensor,
-    make_flat,
-    make_playable,
-    make_velocity_env_cfg,
-)
+from mjlab.tasks.velocity.velocity_env_cfg import make_flat, make_legged_env_cfg, make_playable
 
-_TORSO = "torso_link"
 # Model order, the order of contacts and sites.
 _FEET = ("left_foot", "right_foot")
 _FOOT_GEOMS = tuple(f"{foot}{i}_collision" for foot in _FEET for i in range(1, 8))
@@ -57,17 +51,6 @@ _STD_RUNNING = {
 }
 
 
-_FEET_GROUND_CONTACT = ContactSensorCfg(
-    name="feet_ground_contact",
-    primary=ContactMatch(
-        mode="subtree", pattern=r"^(left_ankle_roll_link|right_ankle_roll_link)$", entity="robot"
-    ),
-    secondary=ContactMatch(mode="body", pattern="terrain"),
-    fields=("found", "force"),
-    reduce="netforce",
-    num_slots=1,
-    track_air_time=True,
-)
 _SELF_COLLISION = ContactSensorCfg(
     name="self_collision",
     primary=ContactMatch(mode="subtree", pattern="pelvis", entity="robot"),
@@ -81,29 +64,38 @@ _SELF_COLLISION = ContactSensorCfg(
 
 def unitree_g1_rough_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the rough-terrain task, for training or for `play`."""
-    cfg = make_velocity_env_cfg()
-    terrain, action, twist = cfg.scene.terrain, cfg.actions["joint_pos"], cfg.commands["twist"]
-    assert terrain is not None
-    assert terrain.terrain_generator is not None
-    assert isinstance(action, mdp.JointPositionActionCfg)
-    assert isinstance(twist, mdp.UniformVelocityCommandCfg)
+    cfg = make_legged_env_cfg(
+        get_g1_robot_cfg(),
+        trunk="torso_link",
+        base="pelvis",
+        feet=_FEET,
+        soles=_FOOT_GEOMS,
+        foot_contacts=ContactMatch(
+            mode="subtree",
+            pattern=r"^(left_ankle_roll_link|right_ankle_roll_link)$",
+            entity="robot",
+        ),
+        foot_rays=RingPatternCfg.single_ring(radius=0.03, num_samples=6),
+        action_scale=dict(G1_ACTION_SCALE),
+        std_standing={".*": 0.05},
+        std_walking=dict(_STD_WALKING),
+        std_running=dict(_STD_RUNNING),
+    )
     cfg.sim.mujoco.ccd_iterations = 500
     cfg.sim.contact_sensor_maxmatch = 500
     cfg.sim.nconmax = 70
-    cfg.scene.entities = {"robot": get_g1_robot_cfg()}
-    terrain.terrain_generator.curriculum = True
-    terrain_scan, foot_heights = (get_sensor(cfg, n) for n in ("terrain_scan", "foot_height_scan"))
-    terrain_scan.frame = ObjRef(type="body", name="pelvis", entity="robot")
-    foot_heights.frame = tuple(ObjRef(type="site", name=foot, entity="robot") for foot in _FEET)
-    foot_heights.pattern = RingPatternCfg.single_ring(radius=0.03, num_samples=6)
-    cfg.scene.sensors += copy.deepcopy((_FEET_GROUND_CONTACT, _SELF_COLLISION))
-    action.scale = dict(G1_ACTION_SCALE)
+    cfg.scene.sensors += (copy.deepcopy(_SELF_COLLISION),)
+    twist = cfg.commands["twist"]
+    assert isinstance(twist, mdp.UniformVelocityCommandCfg)
     # Draw the command above the head.
     twist.viz.z_offset = 1.15
-    cfg.events["foot_friction"].params["asset_cfg"].geom_names = _FOOT_GEOMS
-    cfg.events["base_com"].params["asset_cfg"].body_names = (_TORSO,)
-    _set_rewards(cfg)
-    cfg.viewer.body_name = _TORSO
+    cfg.rewards["body_ang_vel"].weight = -0.05
+    cfg.rewards["angular_momentum"].weight = -0.02
+    cfg.rewards["self_collisions"] = RewardTermCfg(
+        func=mdp.self_collision_cost,
+        weight=-1.0,
+        params={"sensor_name": "self_collision", "force_threshold": 10.0},
+    )
     if play:
         make_playable(cfg)
     return cfg
@@ -114,21 +106,3 @@ def unitree_g1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     cfg = unitree_g1_rough_env_cfg(play=play)
     make_flat(cfg, play)
     return cfg
-
-
-def _set_rewards(cfg: ManagerBasedRlEnvCfg) -> None:
-    terms = cfg.rewards
-    for name in ("upright", "body_ang_vel"):
-        terms[name].params["asset_cfg"].body_names = (_TORSO,)
-    for name in ("foot_clearance", "foot_slip"):
-        terms[name].params["asset_cfg"].site_names = _FEET
-    terms["pose"].params["std_standing"] = {".*": 0.05}
-    terms["pose"].params["std_walking"] = dict(_STD_WALKING)
-    terms["pose"].params["std_running"] = dict(_STD_RUNNING)
-    terms["body_ang_vel"].weight = -0.05
-    terms["angular_momentum"].weight = -0.02
-    cfg.rewards["self_collisions"] = RewardTermCfg(
-        func=mdp.self_collision_cost,
-        weight=-1.0,
-        params={"sensor_name": "self_collision", "force_threshold": 10.0},
-    )
