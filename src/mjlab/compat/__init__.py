@@ -6,7 +6,8 @@ renamed or removed. A module or class where they arrive says so in one line:
 - `__getattr__ = older_names(__name__)` at the end of a module: names;
 - `@offers_older_attributes` on a class: attributes of its instances;
 - `@accepts_older_fields` on a config class: keyword arguments of its constructor;
-- `accept_older_methods(term)` in the command manager: signatures of a term's methods.
+- `accept_older_methods(term)` in the command manager: signatures of a term's methods;
+- `translate_older(cfg)` in the environment: terms of a config, `@accepts_older_params` on a term: calls.
 
 Each use warns once and names the replacement. Legacy names stay through 1.x and are removed in 2.0.
 Those without a replacement are in `mjlab.compat.older`, `older_terms` and `older_scripts`, which are

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
-
 import pytest
 import torch
 from velocity_tasks import GO1_ROUGH
 
-from mjlab.managers import RewardTermCfg, SceneEntityCfg
-from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.velocity_env_cfg import get_sensor, remove_sensors
 
 
@@ -63,19 +59,3 @@ def test_an_unknown_sensor_of_a_config_is_named_with_those_that_exist():
 
     with pytest.raises(KeyError, match=r"sensor 'scan'.*'foot_height_scan'"):
         get_sensor(task_cfg(), "scan")
-
-
-def test_a_selection_made_in_every_step_warns_once(make_env):
-    def own(env):
-        return mdp.joint_vel_l2(env, SceneEntityCfg("robot", joint_names="FL_hip_joint"))
-
-    def edit(cfg):
-        cfg.rewards["own"] = RewardTermCfg(func=own, weight=1.0)
-
-    env = make_env(edit=edit)
-    env.reset()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("default")
-        for _ in range(4):
-            env.step(torch.zeros(env.num_envs, 12))
-    assert len([one for one in caught if "never resolved" in str(one.message)]) == 1
