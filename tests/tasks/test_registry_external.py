@@ -80,6 +80,7 @@ def test_an_entry_point_may_name_a_module_or_something_in_it(install, value, pat
     text = textwrap.dedent(REGISTERS.format(task="Their-Task")) + "\nregister()\nTASKS = ['x']\n"
     install("their-package", {"any_name": value}, {path: text})
     assert "Their-Task" in registry.list_tasks()
+    assert str(registry.task_source("Their-Task")).endswith(path)
     assert "Mjlab-Cartpole-Swingup" in registry.list_tasks()
     assert registry.load_env_cfg("Their-Task").rewards["smooth_reward"].weight == 3.0
     assert registry.load_env_cfg("Mjlab-Cartpole-Balance").rewards["smooth_reward"].weight == 1.0

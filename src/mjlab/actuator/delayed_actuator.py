@@ -1,4 +1,4 @@
-"""Legacy path of delayed actuators (releases 1.1 and 1.2). Any actuator config takes a delay."""
+"""Module that packages of releases 1.1 and 1.2 import; every actuator config takes a delay."""
 
 from mjlab.compat import older_names
 

@@ -6,8 +6,8 @@ import dataclasses
 import logging
 import tempfile
 from collections.abc import Iterator, MutableMapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,50 +19,34 @@ logger = logging.getLogger(__name__)
 # Task registry as a dict.
 
 
-@dataclass
-class RegisteredTask:
-    """Copies of a task's configs, and its runner class."""
+class _Registry(MutableMapping[str, SimpleNamespace]):
+    """Registered tasks by name: copies of the configs, and the runner class."""
 
-    env_cfg: Any
-    """Environment config for training."""
-    play_env_cfg: Any
-    """Environment config for play."""
-    rl_cfg: Any
-    """Config of the learner."""
-    runner_cls: type | None
-    """Runner class. None: default."""
-
-
-class _Registry(MutableMapping[str, RegisteredTask]):
-    """Registered tasks by name."""
-
-    def __getitem__(self, name: str) -> RegisteredTask:
-        return RegisteredTask(
-            registry.load_env_cfg(name),
-            registry.load_env_cfg(name, play=True),
-            registry.load_rl_cfg(name),
-            registry.load_runner_cls(name),
+    def __getitem__(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(
+            env_cfg=registry.load_env_cfg(name),
+            play_env_cfg=registry.load_env_cfg(name, play=True),
+            rl_cfg=registry.load_rl_cfg(name),
+            runner_cls=registry.load_runner_cls(name),
         )
 
-    def __setitem__(self, name: str, task: RegisteredTask) -> None:
-        if name in self:
-            del self[name]
+    def __setitem__(self, name: str, task: Any) -> None:
+        registry._tasks.pop(name, None)
         registry.register_mjlab_task(
             name, task.env_cfg, task.play_env_cfg, task.rl_cfg, task.runner_cls
         )
 
     def __delitem__(self, name: str) -> None:
-        registry.require_task(name)
         del registry._tasks[name]
 
     def __contains__(self, name: object) -> bool:
-        return name in iter(self)
+        return name in registry.list_tasks()
 
     def __iter__(self) -> Iterator[str]:
         return iter(registry.list_tasks())
 
     def __len__(self) -> int:
-        return len(list(iter(self)))
+        return len(registry.list_tasks())
 
 
 REGISTRY = _Registry()

@@ -1,13 +1,5 @@
 """Built-in tasks, one package per family, and the task registry."""
 
-from __future__ import annotations
+from mjlab.utils.lazy import lazy_names
 
-from typing import Any
-
-
-def __getattr__(name: str) -> Any:
-    if name == "import_packages":
-        from mjlab.utils.lab_api.tasks.importer import import_packages
-
-        return import_packages
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(__name__, {"import_packages": "mjlab.utils.lab_api.tasks.importer"})

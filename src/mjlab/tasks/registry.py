@@ -13,6 +13,7 @@ the scripts call its `prepare` before they build the environment.
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 import importlib
 import inspect
@@ -94,9 +95,8 @@ def register_mjlab_task(
                 f"Task {task_id!r} profiles: expected names of letters, digits, '-' and '_', not 'None', "
                 f"got {profile!r}; use e.g. 'cpu'."
             )
-    source = sys._getframe(1).f_globals.get("__file__")
     _tasks[task_id] = _Task(
-        env_cfg, play_env_cfg, rl_cfg, runner_cls, dict(profiles or {}), options, source
+        env_cfg, play_env_cfg, rl_cfg, runner_cls, dict(profiles or {}), options
     )
 
 
@@ -196,8 +196,13 @@ def require_task(task_name: str) -> None:
 
 
 def task_source(task_name: str) -> str | None:
-    """Return the file that registered a task, or None outside a file. Raises `UnknownTaskError`."""
-    return _find(task_name).source
+    """Return a file of the package that registered a task.
+
+    That of an entry point, or for tasks registered otherwise the main script. None: an interactive
+    session. Raises `UnknownTaskError`.
+    """
+    module = sys.modules[_find(task_name).package or "__main__"]
+    return getattr(module, "__file__", None)
 
 
 # Options: task-specific command-line flags.
@@ -270,7 +275,8 @@ class _Task:
     runner_cls: Any
     profiles: dict[str, Any]
     options: Any
-    source: str | None
+    package: str | None = None
+    """Module whose import registered the task. None: not imported by `_discover`."""
 
 
 def _with_profile(
@@ -353,17 +359,19 @@ def _discover() -> None:
     for module in pkgutil.iter_modules(mjlab.tasks.__path__, "mjlab.tasks."):
         if module.ispkg:
             load = functools.partial(importlib.import_module, module.name)
-            _register_all(f"the package {module.name!r}", load)
+            _register_all(f"the package {module.name!r}", module.name, load)
     for entry_point in entry_points(group=TASK_PACKAGES):
         source = f"the package behind entry point {entry_point.name!r} ({entry_point.value})"
-        _register_all(source, entry_point.load)
+        _register_all(source, entry_point.module, entry_point.load)
 
 
-def _register_all(source: str, load: Callable[[], object]) -> None:
-    """Register the tasks of `source` by calling `load`; register none of them if it raises."""
+def _register_all(source: str, module: str, load: Callable[[], object]) -> None:
+    """Register the tasks of `module` by calling `load`; register none of them if it raises."""
     before = dict(_tasks)
     try:
         load()
+        for name in _tasks.keys() - before.keys():
+            _tasks[name] = dataclasses.replace(_tasks[name], package=module)
     # A broken package, even one that exits, must not affect the others.
     except (Exception, SystemExit) as error:
         # Roll back: tasks registered before the error may depend on code that did not run.

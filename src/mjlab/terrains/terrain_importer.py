@@ -1,4 +1,4 @@
-"""Module path of the terrain importer in release 1.1."""
+"""Module that packages of releases 1.1 and 1.2 import; `TerrainEntity` replaces it."""
 
 from mjlab.compat import older_names
 

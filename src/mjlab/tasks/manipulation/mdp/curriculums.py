@@ -1,4 +1,4 @@
-"""Curriculum terms of the manipulation tasks, now in `mjlab.envs.mdp`."""
+"""Module that packages of releases 1.1 and 1.2 import; curricula are in `mjlab.envs.mdp`."""
 
 from mjlab.compat import older_names
 

@@ -1,4 +1,4 @@
-"""Termination terms of the manipulation tasks, (N,) bool."""
+"""Public path of the termination terms of the manipulation tasks."""
 
 from mjlab.compat import older_names
 from mjlab.envs.mdp.terminations import illegal_contact

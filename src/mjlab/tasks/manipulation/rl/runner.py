@@ -1,4 +1,4 @@
-"""On-policy runner of the manipulation tasks."""
+"""Public path of the runner of the manipulation tasks."""
 
 from mjlab.rl.runner import ExportingOnPolicyRunner
 

@@ -1,4 +1,4 @@
-"""Runner of the velocity task."""
+"""Public path of the runner of the velocity task."""
 
 from mjlab.rl.runner import ExportingOnPolicyRunner
 
