@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
 import torch
-from robot_drawing import drawing_differences
-from robot_figures import compare, differences, figures_of, load_table
 from robot_scenes import check_drawing_changes_nothing, compiled, scene_of
 
-import mjlab
-from mjlab import compat
 from mjlab.asset_zoo.robots import get_yam_robot_cfg
 from mjlab.asset_zoo.robots.i2rt_yam import yam_constants as yam
 from mjlab.entity import Entity
 from mjlab.sim import MujocoCfg, Simulation
 
-TABLE = load_table("i2rt_yam")
 FINGERTIPS = {f"{side}f_down{number}_collision" for side in "lr" for number in range(6, 12)}
 # The settings of the manipulation tasks.
 MUJOCO = MujocoCfg(timestep=0.005, impratio=10, cone="elliptic", iterations=10, ls_iterations=20)
@@ -53,22 +46,6 @@ def hold(robot: Entity, joint_pos: torch.Tensor) -> None:
 
 def built(**changes) -> mujoco.MjModel:
     return compiled(get_yam_robot_cfg(), **changes)
-
-
-def test_every_figure_is_that_of_the_table():
-    assert differences(yam.get_spec(), TABLE) == []
-
-
-def test_a_change_of_the_coupling_is_seen():
-    figures = figures_of(yam.get_spec().compile())
-    for change in ({"data": [0, 1, 0, 0, 0]}, {"obj2": "joint6"}, {"solref": [0.01, 1.0]}):
-        table = TABLE | {"equalities": [TABLE["equalities"][0] | change]}
-        assert len(compare(figures, table)) == 1
-    assert compare(figures, {k: v for k, v in TABLE.items() if k != "equalities"})
-
-
-def test_every_body_is_drawn_about_as_large_as_in_the_table():
-    assert drawing_differences(yam.get_spec(), TABLE) == []
 
 
 def test_the_spotlight_follows_the_gripper():
@@ -188,17 +165,6 @@ def test_a_new_config_collides_with_the_gripper_only():
     assert get_yam_robot_cfg().collisions == (yam.GRIPPER_ONLY_COLLISION,)
 
 
-def test_a_config_that_a_task_changes_leaves_the_next_one_as_it_was():
-    changed = get_yam_robot_cfg()
-    changed.init_state.joint_pos["joint2"] = 0.0
-    changed.articulation.actuators[0].stiffness = 1.0
-    changed.collisions[0].contype.clear()
-    assert get_yam_robot_cfg() == get_yam_robot_cfg()
-    assert get_yam_robot_cfg().init_state.joint_pos["joint2"] == 1.047
-    assert get_yam_robot_cfg().articulation.actuators[0].stiffness > 1.0
-    assert get_yam_robot_cfg().collisions[0].contype
-
-
 # In the simulation.
 
 
@@ -231,18 +197,3 @@ def test_what_is_drawn_changes_neither_masses_nor_contacts():
     cfg.collisions = (yam.FULL_COLLISION,)
     cfg.init_state.joint_pos["joint2"] = 1.7
     check_drawing_changes_nothing(cfg, MUJOCO, {}, at_least=45)
-
-
-# The package.
-
-
-def test_the_model_lies_within_the_package():
-    assert yam.YAM_XML.is_file()
-    assert yam.YAM_XML.is_relative_to(Path(mjlab.__file__).parent)
-    assert (yam.YAM_XML.parents[1] / "README.md").read_text().count("MIT License") == 1
-
-
-def test_its_older_loader_of_meshes_finds_none():
-    compat._warn_once.cache_clear()
-    with pytest.warns(FutureWarning, match="get_assets"):
-        assert yam.get_assets("assets") == {}

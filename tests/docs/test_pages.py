@@ -217,12 +217,6 @@ def test_flags_on_a_command_line_are_of_that_command() -> None:
     assert not wrong
 
 
-def test_a_flag_that_only_another_command_has_is_noticed() -> None:
-    assert _unknown("train", "TASK --live --host 0.0.0.0") == {"host"}
-    assert not _unknown("play", "TASK --host 0.0.0.0")
-    assert _unknown("profile-env", "TASK --num-episodes 3") == {"num-episodes"}
-
-
 def test_documented_objects_exist() -> None:
     named = [name for page in PAGES for name in _OBJECT.findall(page.read_text(encoding="utf-8"))]
     assert len(named) > 100

@@ -4,22 +4,13 @@ from __future__ import annotations
 
 import importlib
 import json
-import random
 import re
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
-import pytest
-import torch
-
-from . import damage
-from .commands import Ended, check_end
-from .runs import same
 from .test_robustness import FAMILIES
-from .trials import Broken, Result, Trial, Verdict, table
 
 # Trials that end in every way there is. Run apart, because processes are forked.
 STUB = """
@@ -76,71 +67,6 @@ def test_trials_that_fail_hang_crash_or_leave_processes_are_told(tmp_path: Path)
     # Processes that a trial started end with it, and its files are gone.
     assert not Path("/proc", (folder / "child").read_text()).exists()
     assert not list(folder.glob("trial_*"))
-
-
-def test_a_trial_follows_from_family_number_and_seed(tmp_path: Path) -> None:
-    draws = {
-        key: Trial(*key, tmp_path).rng.random()
-        for key in (("page", 3, 0), ("page", 4, 0), ("page", 3, 1), ("kills", 3, 0))
-    }
-    assert len(set(draws.values())) == 4
-    assert Trial("page", 3, 0, tmp_path).rng.random() == draws["page", 3, 0]
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({}, None),
-        ({"status": 1, "err": "error: expected 1, got 2"}, None),
-        ({"status": 1}, "without a word"),
-        (
-            {"status": 1, "err": "Traceback (most recent call last):\n  x\nKeyError: 'a'"},
-            "KeyError",
-        ),
-        ({"status": -11}, "SIGSEGV"),
-        ({"status": 120, "err": "lost"}, "120"),
-        ({"stuck": "deaf to Ctrl-C"}, "deaf"),
-        ({"size": 10_000_000}, "10,000,000"),
-    ],
-)
-def test_a_command_ends_well_or_says_why_not(changes: dict[str, Any], reason: str | None) -> None:
-    usual: dict[str, Any] = {"status": 0, "out": "", "err": "", "size": 0, "stuck": None}
-    ended = Ended(**{**usual, **changes}, was_asked=False)
-    if reason is None:
-        check_end(ended)
-        return
-    with pytest.raises(Broken, match=reason):
-        check_end(ended)
-
-
-def test_damages_change_a_file_and_repeat() -> None:
-    data = random.Random(0).randbytes(500)
-    for apply in set(damage._DAMAGES):
-        first, again = (apply(data, random.Random(5)) for _ in range(2))
-        assert first == again
-        assert first[0] != data, apply
-    flipped, _ = damage._flip(data, random.Random(1))
-    differing = [(a ^ b).bit_count() for a, b in zip(data, flipped, strict=True)]
-    assert sum(differing) == 1
-
-
-def test_contents_are_compared_to_the_bit() -> None:
-    nan = torch.tensor([float("nan")])
-    assert same({"a": [nan, float("nan")]}, {"a": [nan.clone(), float("nan")]})
-    assert not same(torch.tensor([0.0]), torch.tensor([-0.0]))
-    assert not same({"a": 1}, {"a": True})
-    assert not same([1], [1, 2])
-
-
-def test_the_table_counts_failures() -> None:
-    broken = Verdict("page", 7, "odd bytes", "it\nended")
-    result = Result("page", 3.0, 12, [broken])
-    result.notes["seen"] = 2
-    text = table([result], seed=5)
-    assert "| page | 12 | 11 | 1 |" in text
-    assert "| all | 12 | 11 | 1 |" in text
-    assert "odd bytes: it ended (`make torture PARTS=page SEED=5 TRIAL=7`)" in text
-    assert "seen (2 times)" in text
 
 
 def test_every_family_is_registered() -> None:

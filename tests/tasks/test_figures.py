@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 from task_figures import differences, tables
 
@@ -101,62 +99,3 @@ for variant in ("", "-No-State-Estimation"):
 @pytest.mark.parametrize("task", TABLES)
 def test_the_task_has_the_figures_of_its_table(task):
     assert set(differences(TABLES[task])) == DEVIATIONS.get(task, set())
-
-
-def edited(edit) -> list[str]:
-    table = copy.deepcopy(TABLES["Mjlab-Cartpole-Swingup"])
-    edit(table)
-    return sorted(set(differences(table)) - DEVIATIONS["Mjlab-Cartpole-Swingup"])
-
-
-def test_the_comparison_sees_a_changed_number():
-    def edit(table):
-        table["env"]["events"]["reset_hinge"]["params"]["position_range"] = [-0.034, 0.035]
-
-    assert edited(edit) == [
-        "env.events.reset_hinge.params.position_range[1] is 0.035 in the table, 0.034 here"
-    ]
-
-
-def test_the_comparison_sees_another_function_and_another_class():
-    def edit(table):
-        table["env"]["terminations"]["time_out"]["func"] = "envs.mdp.terminations:bad_orientation"
-        table["env"]["actions"]["effort"]["_"] = "JointPositionActionCfg"
-
-    assert [line.split(" is ")[0] for line in edited(edit)] == [
-        "env.actions.effort._",
-        "env.terminations.time_out.func",
-    ]
-
-
-def test_the_comparison_sees_terms_that_are_missing_or_too_many():
-    def edit(table):
-        del table["env"]["observations"]["critic"]["terms"]["pole_vel"]
-        table["env"]["rewards"]["extra"] = {"_": "RewardTermCfg"}
-
-    assert [line.split(" is ")[0] for line in edited(edit)] == [
-        "env.observations.critic.terms.pole_vel",
-        "env.rewards.extra",
-    ]
-
-
-def test_the_comparison_sees_a_field_that_is_default_on_one_side_only():
-    def edit(table):
-        del table["env"]["sim"]["mujoco"]["timestep"]
-        table["env"]["observations"]["actor"]["history_length"] = 3
-
-    assert edited(edit) == [
-        "env.observations.actor.history_length is 3 in the table, and default here",
-        "env.sim.mujoco.timestep is default in the table, and 0.01 here",
-    ]
-
-
-def test_the_comparison_sees_play_differences_that_are_missing_or_too_many():
-    def edit(table):
-        del table["play_differs"]["episode_length_s"]
-        table["play_differs"]["decimation"] = 4
-
-    assert edited(edit) == [
-        "play: decimation should be 4, and is 5",
-        "play: episode_length_s is 50.0 in training, 10000000000.0 in play",
-    ]
