@@ -38,11 +38,6 @@ def test_packages_of_each_release_build_step_and_train(tmp_path, project, engine
     assert all(trial["task"] in table for trial in trials)
 
 
-def test_there_is_a_package_for_each_minor_release():
-    names = {project.parent.name for project in OWN_PACKAGES}
-    assert {f"tasks_1_{minor}" for minor in range(1, 7)} <= names
-
-
 def test_the_page_names_every_package():
     page = (Path(__file__).parents[1] / "docs" / "how-to" / "packages.md").read_text()
     assert [path for path in OWN_PACKAGES if path.parent.name not in page] == []

@@ -29,16 +29,12 @@ from mjlab.managers import (
     SceneEntityCfg,
     TerminationTermCfg,
 )
-from mjlab.rl import RslRlModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 from mjlab.scene import SceneCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
-from mjlab.tasks.registry import register_mjlab_task
 from mjlab.tasks.velocity.rl import VelocityOnPolicyRunner
 from mjlab.terrains import TerrainEntityCfg
 from mjlab.utils.spec_config import CollisionCfg
-
-from . import names as names
 
 
 def get_spec() -> mujoco.MjSpec:
@@ -262,33 +258,3 @@ class ArmRunner(VelocityOnPolicyRunner):
         if self.logger.logger_type == "tensorboard":
             exported = Path(self.logger.log_dir) / "exported" / "arm.onnx"
             assert exported.exists(), f"expected the exported policy at {exported}"
-
-
-def arm_rl_cfg() -> RslRlOnPolicyRunnerCfg:
-    return RslRlOnPolicyRunnerCfg(
-        actor=RslRlModelCfg(
-            hidden_dims=(16,),
-            rnn_type="lstm",
-            rnn_hidden_dim=8,
-            class_name="RNNModel",
-            distribution_cfg={
-                "class_name": "GaussianDistribution",
-                "init_std": 1.0,
-                "std_type": "scalar",
-            },
-        ),
-        critic=RslRlModelCfg(
-            hidden_dims=(16,), rnn_type="lstm", rnn_hidden_dim=8, class_name="RNNModel"
-        ),
-        algorithm=RslRlPpoAlgorithmCfg(num_mini_batches=1),
-        experiment_name="tasks_1_3_arm",
-    )
-
-
-register_mjlab_task(
-    task_id="Tasks13-Arm",
-    env_cfg=arm_env_cfg(),
-    play_env_cfg=arm_env_cfg(play=True),
-    rl_cfg=arm_rl_cfg(),
-    runner_cls=ArmRunner,
-)

@@ -8,12 +8,11 @@ import torch
 
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.envs.mdp.actions import JointPositionActionCfg
-from mjlab.rl import RslRlOnPolicyRunnerCfg
 from mjlab.tasks.tracking import mdp
 from mjlab.tasks.tracking.mdp import MotionCommand, MotionCommandCfg
 from mjlab.tasks.tracking.tracking_env_cfg import VELOCITY_RANGE, make_tracking_env_cfg
 
-from .hopper import BODIES, get_hopper_cfg, make_rl_cfg
+from .hopper import BODIES, get_hopper_cfg
 from .make_motion import MOTION
 
 
@@ -68,7 +67,3 @@ def imitate_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
         cfg.episode_length_s = int(1e9)
         cfg.observations["actor"].enable_corruption = False
     return cfg
-
-
-def imitate_rl_cfg() -> RslRlOnPolicyRunnerCfg:
-    return make_rl_cfg("tasks_1_5_imitate")

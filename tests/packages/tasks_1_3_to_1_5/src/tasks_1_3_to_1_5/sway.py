@@ -25,12 +25,10 @@ from mjlab.managers import (
     SceneEntityCfg,
     TerminationTermCfg,
 )
-from mjlab.rl import RslRlOnPolicyRunnerCfg
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.terrains import TerrainEntityCfg
 
-from .hopper import make_rl_cfg
 from .make_motion import MOTION
 
 
@@ -196,7 +194,3 @@ def sway_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
         terminations={"time_out": TerminationTermCfg(mdp.time_out, {}, True)},
         sim=SimulationCfg(mujoco=MujocoCfg(0.005)),
     )
-
-
-def sway_rl_cfg() -> RslRlOnPolicyRunnerCfg:
-    return make_rl_cfg("tasks_1_5_sway")

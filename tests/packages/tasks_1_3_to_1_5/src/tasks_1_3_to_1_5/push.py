@@ -24,7 +24,6 @@ from mjlab.managers import (
     SceneEntityCfg,
     TerminationTermCfg,
 )
-from mjlab.rl import RslRlModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 from mjlab.scene import SceneCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
@@ -196,18 +195,6 @@ def push_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     if play:
         cfg.episode_length_s = 1e9
     return cfg
-
-
-def push_rl_cfg() -> RslRlOnPolicyRunnerCfg:
-    return RslRlOnPolicyRunnerCfg(
-        actor=RslRlModelCfg(
-            hidden_dims=(16,),
-            distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0},
-        ),
-        critic=RslRlModelCfg(hidden_dims=(16,)),
-        algorithm=RslRlPpoAlgorithmCfg(num_mini_batches=1),
-        experiment_name="tasks_1_4_push",
-    )
 
 
 class SearchRunner:

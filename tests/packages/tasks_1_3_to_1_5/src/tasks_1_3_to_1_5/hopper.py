@@ -8,11 +8,9 @@ import mujoco
 
 from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
-from mjlab.rl import RslRlModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
 from mjlab.utils.spec_config import CollisionCfg
 
 BODIES = ("torso", "thigh", "shank")
-_GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "scalar"}
 
 
 def get_spec() -> mujoco.MjSpec:
@@ -37,13 +35,4 @@ def get_hopper_cfg() -> EntityCfg:
                 friction={"foot_collision": (0.9,)},
             ),
         ),
-    )
-
-
-def make_rl_cfg(experiment_name: str) -> RslRlOnPolicyRunnerCfg:
-    return RslRlOnPolicyRunnerCfg(
-        actor=RslRlModelCfg((16, 16), "elu", True, distribution_cfg=_GAUSSIAN),
-        critic=RslRlModelCfg((16, 16), "elu", True),
-        algorithm=RslRlPpoAlgorithmCfg(2, 1),
-        experiment_name=experiment_name,
     )
