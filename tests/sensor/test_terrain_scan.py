@@ -11,7 +11,6 @@ import torch
 
 from mjlab.entity import EntityCfg
 from mjlab.envs.mdp import height_scan
-from mjlab.managers.term_checks import check_term
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sensor import GridPatternCfg, ObjRef, RayCastSensorCfg, TerrainHeightSensorCfg
 from mjlab.sim import SimulationCfg
@@ -141,5 +140,5 @@ def test_height_observations_warn_once_per_sensor(alignment):
     with pytest.warns(UserWarning, match="'robot/foot'") as caught:
         scene.check_terrain_scans(sim.mj_model)
         for _ in ("actor", "critic"):
-            check_term(height_scan, env, {"sensor_name": "scan"})  # ty: ignore
+            height_scan(env, "scan")  # ty: ignore
     assert len(caught) == 1

@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
-from mjlab.sensor import ContactSensor, RayCastSensor, Sensor
-from mjlab.sensor.terrain_scan import check_terrain_scan
-from mjlab.utils.errors import (
-    UnknownNameError,
-    WrongTypeError,
-    check_exists,
-    check_in_range,
-    warned,
-)
+from mjlab.sensor import ContactSensor, Sensor
+from mjlab.utils.errors import UnknownNameError, WrongTypeError, check_exists
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -105,28 +98,6 @@ def require_fields(sensor: ContactSensor, *fields: str) -> None:
             f"Contact sensor {sensor.cfg.name!r} fields: expected {missing}, got "
             f"{tuple(sensor.cfg.fields)}; add the missing fields."
         )
-
-
-def check_contact_sensor(env: ManagerBasedRlEnv, sensor_name: str, **params: Any) -> None:
-    """Check a term that counts contacts, or forces above `force_threshold` in a force history."""
-    sensor = require_sensor(env, sensor_name, ContactSensor)
-    has_history = sensor.cfg.history_length > 0 and "force" in sensor.cfg.fields
-    if not has_history:
-        require_fields(sensor, "found")
-    threshold = params.get("force_threshold")
-    if has_history and threshold is not None:
-        with warned():
-            check_in_range("force_threshold (N)", threshold, 0.0, math.inf)
-
-
-def check_height_scan(env: ManagerBasedRlEnv, sensor_name: str, **_: Any) -> None:
-    """Warn if the rays of a term that measures heights miss the ground or meet their robot.
-
-    Sensors of other classes are not checked. See `check_terrain_scan`.
-    """
-    sensor = env.scene[sensor_name]
-    if isinstance(sensor, RayCastSensor):
-        check_terrain_scan(sensor, env.sim.mj_model)
 
 
 def require_command(env: ManagerBasedRlEnv, name: str | None) -> None:

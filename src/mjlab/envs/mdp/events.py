@@ -6,6 +6,7 @@ States are written to `qpos` and `qvel`: derived quantities are stale until the 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
@@ -14,8 +15,6 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.managers.term_checks import checked_when_built
-from mjlab.utils.errors import check_exists, warned
 from mjlab.utils.indexing import as_ids, num_selected
 from mjlab.utils.lab_api.math import (
     quat_apply,
@@ -78,15 +77,6 @@ def reset_scene_to_default(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None)
             )
 
 
-def _check_ranges(env: ManagerBasedRlEnv, **params: Any) -> None:
-    """Warn of keys that are not used."""
-    for name in ("pose_range", "velocity_range"):
-        for key in params.get(name) or {}:
-            with warned():
-                check_exists(f"key of {name}", key, _SE3_KEYS)
-
-
-@checked_when_built(_check_ranges)
 def reset_root_state_uniform(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -111,7 +101,6 @@ def reset_root_state_uniform(
     _write_root(asset, asset_cfg.name, ids, pose, velocity_range)
 
 
-@checked_when_built(_check_ranges)
 def reset_root_state_from_flat_patches(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -182,7 +171,6 @@ def randomize_terrain(env: ManagerBasedRlEnv, env_ids: torch.Tensor | None) -> N
         env.scene.terrain.randomize_env_origins(resolve_env_ids(env, env_ids))
 
 
-@checked_when_built(_check_ranges)
 def push_by_setting_velocity(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
@@ -380,6 +368,13 @@ def _sample_se3_range(
 ) -> torch.Tensor:
     """Sample (..., 6) in the order of the keys. Missing keys are sampled too, from (0, 0)."""
     ranges = range_dict or {}
+    unused = [key for key in ranges if key not in _SE3_KEYS]
+    if unused:
+        warnings.warn(
+            f"pose_range, velocity_range: expected keys {_SE3_KEYS}, got {unused}, which are not used.",
+            UserWarning,
+            stacklevel=3,
+        )
     bounds = [ranges.get(key, (0.0, 0.0)) for key in _SE3_KEYS]
     return sample_ranges(bounds, shape[:-1], device)
 

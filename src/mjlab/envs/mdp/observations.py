@@ -12,8 +12,9 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.managers.term_checks import check_height_scan, checked_when_built
 from mjlab.sensor.builtin_sensor import BuiltinSensor
+from mjlab.sensor.raycast_sensor import RayCastSensor
+from mjlab.sensor.terrain_scan import check_terrain_scan
 from mjlab.utils.errors import WrongTypeError, check_exists
 
 if TYPE_CHECKING:
@@ -130,7 +131,6 @@ def projected_gravity_from_sensor(env: ManagerBasedRlEnv, sensor_name: str) -> t
     return -builtin_sensor(env, sensor_name)
 
 
-@checked_when_built(check_height_scan)
 def height_scan(
     env: ManagerBasedRlEnv,
     sensor_name: str,
@@ -139,12 +139,16 @@ def height_scan(
 ) -> torch.Tensor:
     """Height of each ray's frame above its hit (m), (N, frames * rays), frame by frame.
 
+    Warns once if the rays miss the ground or meet their robot.
+
     Args:
         sensor_name: Ray-cast sensor.
         offset: Offset subtracted from the heights of hits (m).
         miss_value: Value of rays without a hit. Default: the sensor's `max_distance`.
     """
     sensor = env.scene[sensor_name]
+    if isinstance(sensor, RayCastSensor):
+        check_terrain_scan(sensor, env.sim.mj_model)
     data = sensor.data
     if miss_value is None:
         miss_value = sensor.cfg.max_distance

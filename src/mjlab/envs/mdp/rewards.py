@@ -8,7 +8,6 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.managers.term_checks import check_contact_sensor, checked_when_built
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
@@ -111,7 +110,6 @@ def flat_orientation_l2(
     return asset.data.projected_gravity_b[:, :2].square().sum(dim=1)
 
 
-@checked_when_built(check_contact_sensor)
 def self_collision_cost(
     env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
 ) -> torch.Tensor:

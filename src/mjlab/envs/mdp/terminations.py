@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import check_contact_sensor, checked_when_built
 from mjlab.utils.nan_guard import NanGuard
 
 if TYPE_CHECKING:
@@ -50,7 +49,6 @@ def root_height_below_minimum(
     return asset.data.root_link_pos_w[:, 2] < minimum_height
 
 
-@checked_when_built(check_contact_sensor)
 def illegal_contact(
     env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 10.0
 ) -> torch.Tensor:

@@ -234,7 +234,7 @@ class FieldRow:
     also_writes: tuple[str, ...] = ()
     """Additional fields written by `after`."""
     before: Callable[[Selection], None] | None = None
-    """Check called before the write; raises if a selected object is not supported."""
+    """Callback before the write; warns or raises if a selected object is not supported."""
     after: Callable[[Selection], None] | None = None
     """Callback after the write that updates dependent fields."""
 
@@ -313,13 +313,6 @@ def randomize(
         if row.after is not None:
             row.after(selection)
     return [(selection, tuple(bounds) if has_axes else ()) for selection, bounds in jobs]
-
-
-def targets_of(
-    env: ManagerBasedRlEnv, ranges: Any, asset_cfg: SceneEntityCfg, kind: ObjectKind
-) -> list[Selection]:
-    """Return the selections `randomize` would write with these `ranges`, in all environments."""
-    return [select(env, None, asset_cfg, kind, pattern) for pattern, _ in _by_pattern(ranges)]
 
 
 def rotate(

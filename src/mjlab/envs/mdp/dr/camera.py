@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 
-from mjlab.envs.mdp.dr._core import CAMERA, ROBOT, field_term, rotation_term, targets_of
-from mjlab.managers.term_checks import checked_when_built
+from mjlab.envs.mdp.dr._core import CAMERA, field_term, rotation_term
 
 if TYPE_CHECKING:
-    from mjlab.envs import ManagerBasedRlEnv
     from mjlab.envs.mdp.dr._core import Selection
-    from mjlab.envs.mdp.dr._types import Ranges
-    from mjlab.managers.scene_entity_config import SceneEntityCfg
 
 __all__ = ["cam_fovy", "cam_intrinsic", "cam_pos", "cam_quat"]
 
@@ -45,35 +41,31 @@ cam_quat = rotation_term(
 )
 
 
-def _check_cam_fovy(
-    env: ManagerBasedRlEnv, ranges: Ranges, asset_cfg: SceneEntityCfg = ROBOT, **_: Any
-) -> None:
+def _warn_of_lenses(selection: Selection) -> None:
     """Warn if a selected camera has a sensor size: MuJoCo then ignores fovy."""
-    model = env.sim.mj_model
-    for selection in targets_of(env, ranges, asset_cfg, CAMERA):
-        # Orthographic cameras have no focal length: fovy is the height of the image.
-        ignored = [
-            name
-            for name, camera in zip(selection.names, selection.columns.tolist(), strict=True)
-            if model.cam_sensorsize[camera, 1] > 0.0
-            and model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
-        ]
-        if ignored:
-            warnings.warn(
-                f"cam_fovy: expected cameras without focal and sensorsize, got {ignored}, whose "
-                "fovy MuJoCo ignores; use dr.cam_intrinsic, or select other cameras (camera_names "
-                "of the SceneEntityCfg).",
-                UserWarning,
-                stacklevel=2,
-            )
+    model = selection.env.sim.mj_model
+    # Orthographic cameras have no focal length: fovy is the height of the image.
+    ignored = [
+        name
+        for name, camera in zip(selection.names, selection.columns.tolist(), strict=True)
+        if model.cam_sensorsize[camera, 1] > 0.0
+        and model.cam_projection[camera] == mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    ]
+    if ignored:
+        warnings.warn(
+            f"cam_fovy: expected cameras without focal and sensorsize, got {ignored}, whose fovy "
+            "MuJoCo ignores; use dr.cam_intrinsic, or select other cameras (camera_names of the "
+            "SceneEntityCfg).",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
-cam_fovy = checked_when_built(_check_cam_fovy)(
-    field_term(
-        __name__,
-        "cam_fovy",
-        CAMERA,
-        "Randomize vertical fields of view (degrees). Warns when the term is built for cameras with "
-        "focal length and sensor size, because MuJoCo ignores their fovy; use `cam_intrinsic`.",
-    )
+cam_fovy = field_term(
+    __name__,
+    "cam_fovy",
+    CAMERA,
+    "Randomize vertical fields of view (degrees). Warns of cameras with focal length and sensor "
+    "size, because MuJoCo ignores their fovy; use `cam_intrinsic`.",
+    before=_warn_of_lenses,
 )
