@@ -370,8 +370,8 @@ def test_an_environment_alone_moves_as_among_others(make):
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (lambda cfg: setattr(cfg.scene, "num_envs", 0), "scene.num_envs.*0"),
-        (lambda cfg: setattr(cfg.scene, "num_envs", -4), "scene.num_envs.*-4"),
+        (lambda cfg: setattr(cfg.scene, "num_envs", 0), "num_envs.*0"),
+        (lambda cfg: setattr(cfg.scene, "num_envs", -4), "num_envs.*-4"),
         (lambda cfg: setattr(cfg, "decimation", 0), "decimation.*0"),
         (lambda cfg: setattr(cfg.sim.mujoco, "timestep", 0.0), "timestep.*0.0"),
         (lambda cfg: setattr(cfg.sim.mujoco, "timestep", math.nan), "timestep.*nan"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 
 import numpy as np
@@ -10,9 +9,6 @@ import pytest
 import torch
 
 from mjlab.envs import ManagerBasedRlEnv, mdp
-from mjlab.envs import manager_based_rl_env as env_checks
-from mjlab.envs import manager_based_rl_env as env_module
-from mjlab.envs.manager_based_rl_env import as_reset_ids, check_device
 from mjlab.managers import (
     CommandTerm,
     CommandTermCfg,
@@ -39,67 +35,35 @@ def env():
     env.close()
 
 
-@pytest.fixture
-def nothing_is_built(monkeypatch):
-    def fail(*args, **kwargs):
-        pytest.fail("the scene was built before the check")
-
-    monkeypatch.setattr(env_module, "Scene", fail)
-
-
 # The config.
 
 
-@pytest.mark.parametrize(
-    ("path", "value", "words"),
-    [
-        ("decimation", 2.5, "decimation.*2.5"),
-        ("decimation", "4", "decimation.*'4'"),
-        ("decimation", 10**400, r"decimation.*\[1, 2147483647\]"),
-        ("scene.num_envs", "4", "scene.num_envs.*'4'"),
-        ("scene.num_envs", 4.0, "scene.num_envs.*4.0"),
-        ("scene.entities", {"x": None}, r"scene.entities\['x'\]: .*got None"),
-        ("sim.mujoco.timestep", "0.01", "timestep.*'0.01'"),
-        ("sim.mujoco.timestep", 1e300, r"sim\.mujoco\.timestep.*e\+300"),
-        ("sim.mujoco.timestep", math.inf, r"sim\.mujoco\.timestep.*inf"),
-        ("episode_length_s", 1e300, r"episode_length_s.*1e\+300"),
-        ("episode_length_s", math.inf, "episode_length_s.*finite.*inf"),
-        ("episode_length_s", math.nan, "episode_length_s.*finite.*nan"),
-        ("episode_length_s", None, "episode_length_s.*None"),
-    ],
-)
-@pytest.mark.usefixtures("nothing_is_built")
-def test_a_config_that_cannot_work_is_refused_before_anything_is_built(path, value, words):
+@pytest.mark.parametrize("value", [0, 2.5, "4"])
+def test_decimation_is_a_count(value):
     cfg = cartpole()
-    *parents, field = path.split(".")
-    owner = cfg
-    for parent in parents:
-        owner = getattr(owner, parent)
-    setattr(owner, field, value)
-    with pytest.raises(ValueError, match=words):
+    cfg.decimation = value
+    with pytest.raises(ValueError, match="decimation.*expected an integer >= 1"):
         ManagerBasedRlEnv(cfg, device="cpu")
 
 
 def test_an_episode_may_last_for_decades():
     cfg = cartpole()
     cfg.episode_length_s, cfg.decimation = 1e9, 1
-    env_checks.check_env_cfg(cfg)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    assert not env.step(torch.zeros(NUM_ENVS, 1))[3].any()
+    env.close()
 
 
-def test_whole_numbers_of_numpy_are_whole_numbers():
+def test_counts_of_numpy():
     cfg = cartpole()
-    cfg.decimation, cfg.scene.num_envs = True, np.int32(3)
-    env_checks.check_env_cfg(cfg)
+    cfg.decimation, cfg.scene.num_envs = np.int32(2), np.int32(3)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    assert env.reset()[0]["actor"].shape[0] == 3
+    env.close()
 
 
 # The device.
-
-
-@pytest.mark.parametrize("device", ["gpu", "cuda:x", "", "meta", 0])
-@pytest.mark.usefixtures("nothing_is_built")
-def test_what_is_no_device_is_refused(device):
-    with pytest.raises(ValueError, match=r"device: expected 'cpu', 'cuda'"):
-        ManagerBasedRlEnv(cartpole(), device=device)
 
 
 def test_without_a_device_there_is_a_default(monkeypatch):
@@ -123,21 +87,6 @@ def test_a_time_limit_needs_an_episode_length(length, limited):
     truncated = env.step(torch.zeros(NUM_ENVS, 1))[3]
     assert truncated.tolist() == [limited] * NUM_ENVS
     env.close()
-
-
-def test_cuda_is_refused_where_there_is_none(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match="'cuda:0'.*no CUDA.*'cpu'"):
-        check_device("cuda:0")
-
-
-def test_a_gpu_that_is_not_there_is_refused(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    for device in ("cpu", "cuda", "cuda:1"):
-        check_device(device)
-    with pytest.raises(ValueError, match="0 to 1.*'cuda:2'"):
-        check_device("cuda:2")
 
 
 # Actions.
@@ -184,35 +133,24 @@ def test_an_array_of_another_shape_is_refused(env):
         (3, [3]),
         ([], []),
         ([5, 0], [5, 0]),
-        ([-1, -6], [5, 0]),
-        (np.array([1, 2], dtype=np.int32), [1, 2]),
-        (torch.tensor([1], dtype=torch.uint8), [1]),
-        ([False, True, False, False, True, False], [1, 4]),
-        (torch.zeros(NUM_ENVS, dtype=torch.bool), []),
+        (torch.tensor([-1, 2], dtype=torch.int32), [5, 2]),
+        (np.array([1, 2]), [1, 2]),
+        (torch.tensor([True, False, False, True, False, False]), [0, 3]),
     ],
 )
-def test_environments_are_named_in_many_ways(env_ids, expected):
-    ids = as_reset_ids(env_ids, NUM_ENVS, "cpu")
-    assert ids.tolist() == expected
-    assert ids.dtype == torch.long
+def test_reset_ids(env, env_ids, expected):
+    env.step(torch.zeros(NUM_ENVS, 1))
+    env.reset(env_ids=env_ids)
+    assert (env.episode_length_buf == 0).nonzero().flatten().tolist() == sorted(expected)
 
 
 @pytest.mark.parametrize(
-    ("env_ids", "words"),
-    [
-        ([0, 6], r"got \[6\]"),
-        (torch.tensor([-7]), r"got \[-7\]"),
-        (torch.ones(5, dtype=torch.bool), "mask of length 5"),
-        (torch.tensor([0.0, 1.0]), "float32"),
-        ([1.5], "float32"),
-        ("all", "got 'all'"),
-        ([None], r"got \[None\]"),
-    ],
+    "env_ids", [[0, 6], torch.tensor([-7]), torch.ones(5, dtype=torch.bool), torch.tensor([1.5])]
 )
-def test_environments_that_do_not_exist_are_refused_and_nothing_changes(env, env_ids, words):
+def test_a_wrong_reset_changes_nothing(env, env_ids):
     env.step(torch.zeros(NUM_ENVS, 1))
     before, state = env.episode_length_buf.clone(), torch.get_rng_state()
-    with pytest.raises(ValueError, match=f"integers from 0 to 5.*{words}"):
+    with pytest.raises(IndexError):
         env.reset(env_ids=env_ids, seed=3)
     assert torch.equal(env.episode_length_buf, before)
     assert torch.equal(torch.get_rng_state(), state), "no generator may be reseeded"
@@ -269,24 +207,10 @@ def test_an_interval_that_episodes_do_not_reach_warns(shortest, global_time, lim
 
 
 def test_episodes_without_reset_events_warn_once():
-    assert len(odd("mode 'reset'", events={})) == 1
-    assert (
-        len(
-            odd(
-                "mode 'reset'",
-                events={},
-                commands={},
-                rewards={},
-                observations={},
-                curriculum={},
-                metrics={},
-                reset=False,
-            )
-        )
-        == 1
-    )
+    parts = {"commands": {}, "rewards": {}, "observations": {}, "curriculum": {}, "metrics": {}}
+    assert len(odd("mode 'reset'", events={}, reset=False, **parts)) == 1
     push = EventTermCfg(func=lambda env, env_ids: None, mode="step")
-    assert len(odd("mode 'reset'", events={"push": push})) == 1
+    assert len(odd("mode 'reset'", events={"push": push}, reset=False, **parts)) == 1
     start = EventTermCfg(func=mdp.reset_scene_to_default, mode="reset")
     assert odd("mode 'reset'", events={"start": start}) == []
 

@@ -15,7 +15,7 @@ from mjlab.cli.flags import prepare_env_cfg
 from mjlab.cli.record import VideoCfg, record_policy
 from mjlab.runs import Run
 from mjlab.runs.reference import parts_of
-from mjlab.sim.warning_log import mujoco_warnings
+from mjlab.sim.divergence import mujoco_warnings
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.logging import beside_results
 from mjlab.utils.os import files_in

@@ -5,17 +5,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-import warnings
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from mjlab.compat import translate_older
 from mjlab.envs import curriculum_state, env_state
-from mjlab.envs.divergence import DivergenceLog
+from mjlab.envs.cfg_checks import check_env_cfg, report_odd_times, report_start
 from mjlab.envs.mdp.events import reset_scene_to_default
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
@@ -26,6 +24,7 @@ from mjlab.managers import (
     CurriculumManager,
     CurriculumTermCfg,
     EventManager,
+    EventMode,
     EventTermCfg,
     MetricsManager,
     MetricsTermCfg,
@@ -47,8 +46,8 @@ from mjlab.managers import (
 )
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
-from mjlab.utils.config_fields import check_fields_exist
-from mjlab.utils.errors import UnsupportedError, WrongStateError, check_count, check_in_range
+from mjlab.sim.divergence import DivergenceLog
+from mjlab.utils.errors import UnsupportedError, WrongStateError
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
 from mjlab.utils.string import counted
@@ -58,10 +57,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mjlab.viewer.debug_visualizer import DebugVisualizer
-
-# Terms multiply single-precision numbers with it.
-_LONGEST_STEP = torch.finfo(torch.float32).max
-"""Longest control timestep (s)."""
 
 
 @dataclass(kw_only=True)
@@ -141,7 +136,7 @@ class ManagerBasedRlEnv(Tabular):
         `rgb_array`. Additional keyword arguments are ignored.
 
         Raises:
-            ValueError: invalid config, named by field, or unknown device.
+            ValueError: invalid config, named by field.
             EngineUnavailableError: the engine does not support the device or cannot run on this
                 machine.
         """
@@ -149,7 +144,6 @@ class ManagerBasedRlEnv(Tabular):
         translate_older(cfg)
         if device is None:
             device = "cuda:0" if torch.cuda.is_available() else "cpu"
-        check_device(device)
         # Checked before the scene creates tensors on a device that the engine does not support.
         Simulation.check(cfg.scene.num_envs, cfg.sim, device)
         self.cfg = cfg
@@ -207,13 +201,7 @@ class ManagerBasedRlEnv(Tabular):
         self.metadata["render_fps"] = 1.0 / self.step_dt
         self.load_managers()
         report_odd_times(self)
-        moves = (e for e in self.scene.entities.values() if e is not self.scene.terrain)
-        # Commands of motions place robots, so tasks with commands are checked at the first reset.
-        self._may_not_start = "reset" not in self.event_manager.available_modes and any(
-            e.is_articulated or e.is_mocap or not e.is_fixed_base for e in moves
-        )
-        if not self.command_manager.active_terms:
-            self._report_start()
+        report_start(self)
         # Expanding model fields invalidated the simulation's graphs.
         self.sim.create_graph()
         self.setup_manager_visualizers()
@@ -306,6 +294,7 @@ class ManagerBasedRlEnv(Tabular):
         self.metrics_manager = (
             MetricsManager(cfg.metrics, self) if cfg.metrics else NullMetricsManager()
         )
+        self.metrics_manager.excluded = self.diverged
         self.recorder_manager = (
             RecorderManager(cfg.recorders, self) if cfg.recorders else NullRecorderManager()
         )
@@ -324,6 +313,9 @@ class ManagerBasedRlEnv(Tabular):
             or self.scene.needs_substep
             or self.metrics_manager.needs_substep
         )
+        self._recorded_fields = self.scene.recorded_fields
+        modes: tuple[EventMode, ...] = ("step", "interval")
+        self._step_modes = [m for m in modes if m in self.event_manager.available_modes]
         if "startup" in self.event_manager.available_modes:
             self.event_manager.apply(mode="startup")
 
@@ -347,71 +339,42 @@ class ManagerBasedRlEnv(Tabular):
     ) -> tuple[VecEnvObs, dict[str, Any]]:
         """Start new episodes in `env_ids` (None: all); return observations and extras.
 
-        A `seed` reseeds every random number generator. All environments are observed, but only
-        `env_ids` advance the state of observation terms; see `ObservationManager.compute`. Forces
-        and accelerations are current in `env_ids`, and those of the last substep in other
-        environments, as after `step`; before the first substep they are current everywhere.
-
-        Raises:
-            ValueError: `env_ids` out of range, not integers, or a mask of the wrong length.
+        `env_ids` is anything that indexes a tensor: integers, a mask, a slice. A `seed` reseeds
+        every random number generator. All environments are observed, but only `env_ids` advance the
+        state of observation terms; see `ObservationManager.compute`. Forces and accelerations are
+        current in `env_ids`, and those of the last substep in other environments, as after `step`;
+        before the first substep they are current everywhere.
         """
-        env_ids = as_reset_ids(env_ids, self.num_envs, self.device)
+        all_ids = torch.arange(self.num_envs, device=self.device)
+        ids = all_ids if env_ids is None else all_ids[env_ids].flatten()
         if seed is not None:
             self.seed(seed)
         if self._built_state is None:
             curriculum_state.begin(self)
         self._clear_extras()
-        stepped = env_ids[self.episode_length_buf[env_ids] > 0]
+        stepped = ids[self.episode_length_buf[ids] > 0]
         if len(stepped) > 0:
             self.recorder_manager.record_pre_reset(stepped)
         moved = self.scene.take_moved_envs()
-        self._reset_idx(env_ids)
+        self._reset_idx(ids)
         self.curriculum_manager.after_term = None
-        self.scene.write_data_to_sim(env_ids)
-        self._forward(env_ids, moved)
-        self.command_manager.compute(dt=0.0, env_ids=env_ids)
-        self._may_not_start &= self.scene.take_moved_envs() is None
-        self._report_start()
+        self._forward(ids, moved)
+        self.command_manager.compute(dt=0.0, env_ids=ids)
+        # Commands update what they move.
+        self.scene.take_moved_envs()
         self.sim.sense()
-        self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=env_ids)
-        self.recorder_manager.record_post_reset(env_ids)
+        self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=ids)
+        self.recorder_manager.record_post_reset(ids)
         return self.obs_buf, self.extras
 
     @torch.no_grad()
     def step(self, action: torch.Tensor) -> VecEnvStepReturn:
         """Advance all environments by one environment step, without gradients.
 
-        Order: process actions; `decimation` physics substeps; terminations and rewards; step and
-        interval events; resets of environments that are done; `forward`; commands; observations.
-        On both engines:
-
-        - Terminations, rewards, metrics, step and interval events read the results of the last
-          substep: `qpos` and `qvel` are current; derived quantities (`xpos`, `cvel`, `sensordata`,
-          contacts, forces) belong to the state at the start of that substep.
-        - Commands and observations read current positions, velocities and quantities derived from
-          them: poses and velocities of links, position and velocity sensors, rays, images.
-        - Quantities of the acceleration stage (contact and constraint forces, contact sensors,
-          `qacc`, `actuator_force`, accelerometers, force and torque sensors) stay those that acted
-          on the robot in the last substep: `forward` stops at `stage="vel"`.
-        - A full `forward` recomputes them in environments that were reset, so that no data of the
-          old episode is seen, and in environments whose root pose, joint positions or mocap pose an
-          event wrote through `Entity`. Contact histories and air times begin with the first substep
-          after a reset.
-
-        If the physics of an environment diverges (positions, velocities or accelerations not finite
-        or beyond MuJoCo's `mjMAXVAL` of 1e10), its episode terminates with zero reward for the step.
-        `diverged`, (N,) bool, marks these environments; `nan_resets`, (N,), counts their episodes.
-
-        Commands that write positions, and terms that write `sim.data` directly, must call
-        `sim.forward(env_ids)` on the environments they change.
-
-        With `observes_ends` and `auto_reset`, `step` also observes the k environments whose episodes
-        are truncated and not terminated, before their reset; with `observes_failures`, all k whose
-        episodes end, except diverged ones. `extras["final_observations"]`, group to (k, ...), holds
-        the observations `step` would have returned had the episodes continued, and
-        `extras["final_ids"]`, (k,), their ids in ascending order. Commands are an exception: final
-        observations contain the commands of the step, neither advanced nor resampled. Steps without
-        such environments have neither entry. The flags do not affect trajectories.
+        Terminations, rewards, metrics and events read quantities of the last substep, commands and
+        observations current ones; `docs/explanation/concepts.md` has the order and the age of each
+        quantity. The physics of environments in `diverged` diverged: their episodes terminate with
+        zero reward. See `observes_ends` for the final observations in `extras`.
 
         Args:
             action: Float tensor, (N, A); arrays and lists are converted. NaN and infinite values
@@ -421,62 +384,25 @@ class ManagerBasedRlEnv(Tabular):
             Observations (of the new episode in environments that were reset); reward (N,);
             terminated (N,) and truncated (N,) bool; extras, with `extras["log"]`. The next step
             overwrites only the extras.
-
-        Raises:
-            ValueError: action of the wrong shape, or not numeric.
-            RuntimeError: without `auto_reset`, an environment is done and was not reset.
         """
-        if not self.cfg.auto_reset and self._pending_reset.any():
-            ids = self._pending_reset.nonzero().flatten().tolist()
-            raise WrongStateError(
-                f"step: environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were "
-                "not reset; call env.reset(env_ids=...) first, or set auto_reset=True in the config."
-            )
+        self._check_no_reset_is_due()
         self._clear_extras()
-        self.action_manager.nonfinite.begin_step(self.diverged, self.common_step_counter + 1)
-        self.action_manager.process_action(action)
+        self._process_action(action)
         self._run_physics()
-        self.episode_length_buf += 1
-        if not self._holds_common_steps:
-            self.common_step_counter += 1
-            self._stepped_to = self.common_step_counter
-        self._evaluate_step()
-
-        # Events.
-        self._divergence_log.end_step(self.diverged, self.common_step_counter)
-        for mode in ("step", "interval"):
-            if mode in self.event_manager.available_modes:
-                self.event_manager.apply(mode=mode, dt=self.step_dt)
-
-        # Resets.
+        self._advance_counters()
+        self._compute_terminations()
+        self._compute_rewards()
+        self.metrics_manager.compute()
+        for mode in self._step_modes:
+            self.event_manager.apply(mode=mode, dt=self.step_dt)
         moved = self.scene.take_moved_envs()
-        if self.observes_ends and self.cfg.auto_reset:
-            self._observe_ends(moved)
-        reset_ids = self.reset_buf.new_empty(0, dtype=torch.long)
-        if self.cfg.auto_reset:
-            reset_ids = self.reset_buf.nonzero().flatten()
-        command_dt: float | torch.Tensor = self.step_dt
-        if len(reset_ids) > 0:
-            self.recorder_manager.record_pre_reset(reset_ids)
-            self._reset_idx(reset_ids)
-            self.scene.write_data_to_sim(reset_ids)
-            # Commands of new episodes do not advance in time.
-            command_dt = torch.full_like(self.reward_buf, self.step_dt)
-            command_dt[reset_ids] = 0.0
-
-        # Commands and observations.
+        self._observe_ends(moved)
+        reset_ids = self._reset_ended()
         self._forward(reset_ids, moved)
-        self.command_manager.compute(dt=command_dt)
-        # Moves by resets are up to date after `forward`; commands update their own moves.
-        self.scene.take_moved_envs()
+        self._compute_commands(reset_ids)
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True)
-        if self.cfg.auto_reset:
-            if len(reset_ids) > 0:
-                self.recorder_manager.record_post_reset(reset_ids)
-        else:
-            self._pending_reset |= self.reset_buf
-        self.recorder_manager.record_post_step()
+        self._record(reset_ids)
         # Copies, because libraries stack the results of a rollout at its end.
         return (
             self.obs_buf,
@@ -517,6 +443,26 @@ class ManagerBasedRlEnv(Tabular):
         """Return the observations of the last step or reset."""
         return self.observation_manager.compute()
 
+    # Phases of a step.
+
+    def _check_no_reset_is_due(self) -> None:
+        """Raise `RuntimeError` if, without `auto_reset`, an environment is done and was not reset."""
+        if not self.cfg.auto_reset and self._pending_reset.any():
+            ids = self._pending_reset.nonzero().flatten().tolist()
+            raise WrongStateError(
+                f"step: environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were "
+                "not reset; call env.reset(env_ids=...) first, or set auto_reset=True in the config."
+            )
+
+    def _clear_extras(self) -> None:
+        self.extras["log"] = {}
+        for name in ("final_observations", "final_ids"):
+            self.extras.pop(name, None)
+
+    def _process_action(self, action: torch.Tensor) -> None:
+        self.action_manager.nonfinite.begin_step(self.diverged, self.common_step_counter + 1)
+        self.action_manager.process_action(action)
+
     def _run_physics(self) -> None:
         self._divergence_log.begin_step()
         substeps = self.cfg.decimation
@@ -524,7 +470,7 @@ class ManagerBasedRlEnv(Tabular):
             self._sim_step_counter += substeps
             self.action_manager.apply_action()
             self.scene.write_data_to_sim()
-            recorded = self.sim.step(substeps, self.scene.recorded_fields)
+            recorded = self.sim.step(substeps, self._recorded_fields)
             self.scene.update(self.physics_dt, recorded, substeps)
             return
         for substep in range(substeps):
@@ -536,34 +482,36 @@ class ManagerBasedRlEnv(Tabular):
             self.scene.update(dt=self.physics_dt)
             self.metrics_manager.compute_substep()
 
-    def _evaluate_step(self) -> None:
-        """Compute terminations, rewards and metrics; end the episodes whose physics diverged."""
+    def _advance_counters(self) -> None:
+        self.episode_length_buf += 1
+        if not self._holds_common_steps:
+            self.common_step_counter += 1
+            self._stepped_to = self.common_step_counter
+
+    def _compute_terminations(self) -> None:
+        """Evaluate the terminations; episodes whose physics diverged terminate."""
+        manager = self.termination_manager
         self.diverged.copy_(self.sim.bad_states())
-        for manager in (self.termination_manager, self.reward_manager):
-            manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
-        self.reset_buf = self.termination_manager.compute()
-        self.reset_terminated = self.termination_manager.terminated
-        self.reset_time_outs = self.termination_manager.time_outs
+        manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
+        self.reset_buf = manager.compute()
+        self.reset_terminated = manager.terminated
+        self.reset_time_outs = manager.time_outs
         self.reset_terminated |= self.diverged
         self.reset_buf |= self.diverged
         self._nan_resets += self.diverged
-        self.reward_buf = self.reward_manager.compute(dt=self.step_dt)
+        self.extras["log"]["Simulation/nan_resets"] = self.diverged.sum()
+        self.extras["log"]["Simulation/nan_terminations"] = manager.nonfinite.count
+
+    def _compute_rewards(self) -> None:
+        manager = self.reward_manager
+        manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
+        self.reward_buf = manager.compute(dt=self.step_dt)
         # Covers rewards added by subclasses of the manager.
         self.reward_buf.masked_fill_(self.diverged, 0.0)
-        log = self.extras["log"]
-        log["Simulation/nan_resets"] = self.diverged.sum()
-        log["Simulation/nan_rewards"] = self.reward_manager.nonfinite.count
-        log["Simulation/nan_terminations"] = self.termination_manager.nonfinite.count
-        self.metrics_manager.excluded = self.diverged
-        self.metrics_manager.compute()
-
-    def _clear_extras(self) -> None:
-        self.extras["log"] = {}
-        for name in ("final_observations", "final_ids"):
-            self.extras.pop(name, None)
+        self.extras["log"]["Simulation/nan_rewards"] = manager.nonfinite.count
 
     def _observe_ends(self, moved: torch.Tensor | None) -> None:
-        """Store the final observations of episodes that end in `extras`; see `step`.
+        """Store the final observations of episodes that end in `extras`, see `observes_ends`.
 
         Data read by resets and curricula (derived quantities, rays, images, random numbers) is not
         affected.
@@ -571,6 +519,8 @@ class ManagerBasedRlEnv(Tabular):
         Args:
             moved: Environments moved by an event, (N,) bool. None: no environment.
         """
+        if not (self.observes_ends and self.cfg.auto_reset):
+            return
         if self.observes_failures:
             observed = self.reset_buf & ~self.diverged
         else:
@@ -591,37 +541,18 @@ class ManagerBasedRlEnv(Tabular):
         }
         self.extras["final_ids"] = ids
 
-    def _forward(self, reset_ids: torch.Tensor, moved: torch.Tensor | None) -> None:
-        """Update derived quantities to the stage described in `step`.
-
-        Args:
-            reset_ids: Environments that were reset.
-            moved: Environments moved before the resets, (N,) bool. None: no environment. Excludes
-                moves by resets, covered by `reset_ids`: reading them would synchronize with the GPU.
-        """
-        self.scene.place_cameras(self.sim.model)
-        full = reset_ids
-        if moved is not None:
-            full = moved.index_fill(0, reset_ids, True).nonzero().flatten()
-        # Before the first substep, the data holds no forces to preserve.
-        if len(full) == self.num_envs or self._sim_step_counter == 0:
-            self.sim.forward()
-        elif len(full) > 0:
-            self.sim.forward_after_reset(full)
-        else:
-            self.sim.forward(stage="vel")
-
-    def _report_start(self) -> None:
-        """Warn, once, if nothing places the entities at the start of an episode."""
-        if self._may_not_start:
-            self._may_not_start = False
-            warnings.warn(
-                f"{type(self.cfg).__name__} events: expected a term of mode 'reset', got "
-                f"{list(self.cfg.events)}; episodes start at the model's qpos0 instead of init_state. "
-                "Add EventTermCfg(func=mdp.reset_scene_to_default, mode='reset').",
-                UserWarning,
-                stacklevel=3,
-            )
+    def _reset_ended(self) -> torch.Tensor:
+        """Reset the environments that are done, with `auto_reset`; return their ids."""
+        ids = self.reset_buf.nonzero().flatten()
+        if len(ids) == 0:
+            return ids
+        self._divergence_log.report(self.diverged, self.common_step_counter)
+        if not self.cfg.auto_reset:
+            self._pending_reset |= self.reset_buf
+            return ids[:0]
+        self.recorder_manager.record_pre_reset(ids)
+        self._reset_idx(ids)
+        return ids
 
     def _reset_idx(self, env_ids: torch.Tensor) -> None:
         # The curriculum runs first, because it reads the final state of the episode.
@@ -652,6 +583,43 @@ class ManagerBasedRlEnv(Tabular):
             log.update(manager.reset(env_ids))
         self.episode_length_buf[env_ids] = 0
         self._pending_reset[env_ids] = False
+        self.scene.write_data_to_sim(env_ids)
+
+    def _forward(self, reset_ids: torch.Tensor, moved: torch.Tensor | None) -> None:
+        """Make positions and velocities current, and forces too in environments that were placed.
+
+        Args:
+            reset_ids: Environments that were reset.
+            moved: Environments moved before the resets, (N,) bool. None: no environment. Excludes
+                moves by resets, covered by `reset_ids`: reading them would synchronize with the GPU.
+        """
+        if self.scene.world_cameras:
+            self.scene.place_cameras(self.sim.model)
+        full = reset_ids
+        if moved is not None:
+            full = moved.index_fill(0, reset_ids, True).nonzero().flatten()
+        # Before the first substep, the data holds no forces to preserve.
+        if len(full) == self.num_envs or self._sim_step_counter == 0:
+            self.sim.forward()
+        elif len(full) > 0:
+            self.sim.forward_after_reset(full)
+        else:
+            self.sim.forward(stage="vel")
+
+    def _compute_commands(self, reset_ids: torch.Tensor) -> None:
+        dt: float | torch.Tensor = self.step_dt
+        if len(reset_ids) > 0:
+            # Commands of new episodes do not advance in time.
+            dt = torch.full_like(self.reward_buf, dt)
+            dt[reset_ids] = 0.0
+        self.command_manager.compute(dt=dt)
+        # Moves by resets are up to date after `_forward`; commands update their own moves.
+        self.scene.take_moved_envs()
+
+    def _record(self, reset_ids: torch.Tensor) -> None:
+        if len(reset_ids) > 0:
+            self.recorder_manager.record_post_reset(reset_ids)
+        self.recorder_manager.record_post_step()
 
     # Seeds, rendering, saving, closing.
 
@@ -738,134 +706,3 @@ class ManagerBasedRlEnv(Tabular):
             self._renderer = None
         self.recorder_manager.close()
         self.sim.close()
-
-
-def check_env_cfg(cfg: ManagerBasedRlEnvCfg) -> None:
-    """Check config values that would otherwise fail late.
-
-    Raises:
-        ValueError: invalid value; the message names the field, the value and the allowed values.
-    """
-    check_fields_exist(type(cfg).__name__, cfg)
-    check_count("scene.num_envs", cfg.scene.num_envs)
-    check_count("decimation", cfg.decimation)
-    check_in_range("decimation", cfg.decimation, 1, 2**31 - 1)
-    timestep = cfg.sim.mujoco.timestep
-    if not (isinstance(timestep, Real) and timestep > 0):
-        raise ValueError(f"sim.mujoco.timestep: expected a number > 0 (s), got {timestep!r}.")
-    step_dt = float(timestep) * cfg.decimation
-    check_in_range("sim.mujoco.timestep times decimation (s)", step_dt, 0.0, _LONGEST_STEP)
-    for name, entity in cfg.scene.entities.items():
-        if entity is None:
-            raise ValueError(
-                f"scene.entities[{name!r}]: expected an EntityCfg, got None, which disables only "
-                f"terms; use del cfg.scene.entities[{name!r}] to remove the entity."
-            )
-    length = cfg.episode_length_s
-    if not (isinstance(length, Real) and math.isfinite(length)):
-        raise ValueError(f"episode_length_s: expected a finite number (s), got {length!r}.")
-    # Steps of an episode are counted in 64 bits.
-    if float(length) / step_dt >= 2**63:
-        raise ValueError(
-            f"episode_length_s: expected less than 2**63 steps of {step_dt:g} s, got {length!r}; use 1e9 "
-            "for tasks without a time limit."
-        )
-
-
-def report_odd_times(env: ManagerBasedRlEnv) -> None:
-    """Warn of time limits that count as failures, and of events that episodes are too short for."""
-    terms = {name: cfg for name, cfg in env.cfg.terminations.items() if cfg is not None}
-    limits = [n for n, cfg in terms.items() if getattr(cfg.func, "__name__", None) == "time_out"]
-    failures = [] if env.cfg.is_finite_horizon else [n for n in limits if not terms[n].time_out]
-    if failures:
-        warnings.warn(
-            f"TerminationManager terms {failures} time_out: expected True for a time limit, got False; "
-            "episodes that reach it count as failures without bootstrapping. Set time_out=True.",
-            UserWarning,
-            stacklevel=3,
-        )
-    if limits and env.max_episode_length <= 0:
-        warnings.warn(
-            f"episode_length_s: expected a number > 0 (s), got {env.cfg.episode_length_s!r}; terms "
-            f"{limits} end episodes at every step. Set episode_length_s, or remove the terms.",
-            UserWarning,
-            stacklevel=3,
-        )
-    longest = env.max_episode_length * env.step_dt
-    rare = {
-        name: cfg.interval_range_s
-        for name, cfg in env.cfg.events.items()
-        if cfg is not None and cfg.mode == "interval" and not cfg.is_global_time
-        # Resets resample the timers.
-        if limits and (cfg.interval_range_s or (0.0,))[0] > longest + 0.5 * env.step_dt
-    }
-    if rare:
-        warnings.warn(
-            f"EventManager terms {list(rare)} interval_range_s: expected intervals shorter than the "
-            f"episode ({longest:.4g} s), got {list(rare.values())}; timers restart with episodes, so "
-            "the events never happen. Use is_global_time=True, or mode='reset'.",
-            UserWarning,
-            stacklevel=3,
-        )
-
-
-def check_device(device: Any) -> None:
-    """Check that tensors can be created on `device`.
-
-    Raises:
-        ValueError: not the name of a CPU or CUDA device, or a CUDA device that does not exist.
-    """
-    try:
-        parsed = torch.device(device) if isinstance(device, str) else None
-    except RuntimeError:
-        parsed = None
-    if parsed is None or parsed.type not in ("cpu", "cuda"):
-        raise ValueError(f"device: expected 'cpu', 'cuda' or 'cuda:<index>', got {device!r}.")
-    if parsed.type != "cuda":
-        return
-    if not torch.cuda.is_available():
-        raise ValueError(
-            f"device: got {device!r}, but PyTorch finds no CUDA device; use 'cpu', or install an "
-            "NVIDIA driver and PyTorch with CUDA."
-        )
-    count = torch.cuda.device_count()
-    if (parsed.index or 0) >= count:
-        raise ValueError(f"device: expected a GPU index from 0 to {count - 1}, got {device!r}.")
-
-
-def as_reset_ids(env_ids: Any, num_envs: int, device: str) -> torch.Tensor:
-    """Return the environments to reset as a 1-D int64 tensor on `device`.
-
-    Args:
-        env_ids: Integer indices, a bool mask (num_envs,), a slice, or None for all.
-        num_envs: Number of environments.
-        device: Device of the result.
-
-    Raises:
-        ValueError: mask of the wrong length, or indices not integer or out of range.
-    """
-    if env_ids is None or isinstance(env_ids, slice):
-        return as_ids(env_ids, num_envs, device)
-    expected = (
-        f"env_ids: expected integers from 0 to {num_envs - 1}, a bool mask of length {num_envs}, a "
-        "slice, or None for all environments"
-    )
-    try:
-        ids = torch.as_tensor(env_ids, device=device).flatten()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{expected}, got {env_ids!r}.") from error
-    if ids.dtype == torch.bool:
-        if len(ids) != num_envs:
-            raise ValueError(f"{expected}, got a mask of length {len(ids)}.")
-        return ids.nonzero().flatten()
-    # An empty list becomes a float tensor.
-    if ids.numel() == 0:
-        return ids.long()
-    if ids.is_floating_point() or ids.is_complex():
-        raise ValueError(f"{expected}, got numbers of type {ids.dtype}.")
-    ids = ids.long()
-    wrong = ids[(ids < -num_envs) | (ids >= num_envs)]
-    if len(wrong) > 0:
-        raise ValueError(f"{expected}, got {wrong[:10].tolist()}{' ...' * (len(wrong) > 10)}.")
-    # Negative ids count from the end.
-    return ids % num_envs

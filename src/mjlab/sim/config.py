@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mjlab.compat import ALWAYS_ENABLED_FLAGS, accepts_older_fields
+from mjlab.utils.errors import check_positive
 from mjlab.utils.nan_guard import NanGuardCfg
 from mjlab.utils.ranges import Positive, Range, Weight
 
@@ -56,10 +57,12 @@ class MujocoCfg:
         """Write the options to `model`. Flags are added to those already set.
 
         Raises:
-            ValueError: unknown option or flag; the message lists the valid ones.
+            ValueError: unknown option or flag (the message lists the valid ones), or a timestep that
+                is not positive.
         """
         from mjlab.utils.mujoco import OPTION_ENUMS, enum_bits, enum_value
 
+        check_positive("MujocoCfg.timestep", self.timestep)
         for option in fields(MujocoCfg):
             name, value = option.name, getattr(self, option.name)
             if name == "enableflags":

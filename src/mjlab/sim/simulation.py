@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from mjlab.sim.config import SimulationCfg
+from mjlab.sim.divergence import collect_mujoco_warnings
 from mjlab.sim.engine import (
     CameraView,
     Capabilities,
@@ -37,7 +38,6 @@ from mjlab.sim.randomization import (
     is_structure,
 )
 from mjlab.sim.sim_data import FieldView
-from mjlab.sim.warning_log import collect_mujoco_warnings
 from mjlab.utils.errors import UnknownAttributeError, check_positive
 from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.memory import check_memory
