@@ -479,12 +479,14 @@ class WarpEngine(Engine):
     def reset(self, env_ids: torch.Tensor | None) -> None:
         # `mjwarp.reset_data` clears the contacts of all environments with those of the first, and
         # overflow flags before they are read. So fields are reset one by one.
-        for name in (*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET):
-            tensor = self.data_field(name)
-            tensor.zero_() if env_ids is None else tensor.index_fill_(0, env_ids, 0)
-        rows = slice(None) if env_ids is None else env_ids
+        cleared = dict.fromkeys((*ZERO_INPUTS, *_RESULTS_ZERO_ON_RESET), 0)
         # Awake for as long as possible.
-        self.data_field("tree_asleep")[rows] = -(1 + mujoco.mjMINAWAKE)
+        cleared["tree_asleep"] = -(1 + mujoco.mjMINAWAKE)
+        for name, value in cleared.items():
+            tensor = self.data_field(name)
+            # `tensor[env_ids] = value` waits for a GPU (seen on an H200 with torch 2.11).
+            tensor.fill_(value) if env_ids is None else tensor.index_fill_(0, env_ids, value)
+        rows = slice(None) if env_ids is None else env_ids
         model = self.wp_model
         mocap = as_torch(model.mocap_bodyid).long()
         starts = {
