@@ -18,7 +18,6 @@ import torch
 from mjlab.rl.checkpoint import (
     CheckpointError,
     RunFolderError,
-    check_fits,
     check_terms,
     copied,
     ensure_writable_folder,
@@ -116,34 +115,6 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(tmp_path: Path):
     assert rejected > 100
 
 
-@pytest.mark.parametrize(
-    ("part", "value"),
-    [
-        *[(part, float("nan")) for part in ("actor_state_dict", "critic_state_dict", "moment")],
-        *[(part, float("inf")) for part in ("actor_state_dict", "critic_state_dict", "lr")],
-    ],
-)
-def test_weights_and_rates_that_are_not_finite_are_refused(make_runner, tmp_path, part, value):
-    runner = make_runner()
-    runner.learn(1)
-    runner.save(str(tmp_path / "model_0.pt"))
-    broken = load_checkpoint(tmp_path / "model_0.pt")
-    optimizer = broken["optimizer_state_dict"]
-    if part == "lr":
-        optimizer["param_groups"][0]["lr"] = value
-    elif part == "moment":
-        optimizer["state"][0]["exp_avg"].view(-1)[0] = value
-    else:
-        name = next(iter(broken[part]))
-        broken[part][name].view(-1)[0] = value
-    save_checkpoint(broken, tmp_path / "model_1.pt")
-    before = {key: value.clone() for key, value in runner.alg.get_policy().state_dict().items()}
-    with pytest.raises(CheckpointError, match=r"model_1.pt.*(NaN or infinite|float inf)"):
-        runner.load(str(tmp_path / "model_1.pt"))
-    after = runner.alg.get_policy().state_dict()
-    assert all(torch.equal(before[key], after[key]) for key in before)
-
-
 def entry(*way: Any) -> Any:
     """Return a function that edits the entry at `way` of a checkpoint; None: removes it."""
 
@@ -160,51 +131,22 @@ def entry(*way: Any) -> Any:
 
 WEIGHT = entry("actor_state_dict", "mlp.0.weight")
 MOMENT = entry("optimizer_state_dict", "state", 1, "exp_avg")
-SQUARE = entry("optimizer_state_dict", "state", 1, "exp_avg_sq")
 STEP = entry("optimizer_state_dict", "state", 1, "step")
 GROUP = ("optimizer_state_dict", "param_groups", 0)
-DAMAGES: dict[str, tuple[Any, Any]] = {
-    "sparse weights": (WEIGHT, torch.Tensor.to_sparse),
-    "weights in rows": (WEIGHT, torch.Tensor.to_sparse_csr),
-    "weights without memory": (WEIGHT, lambda x: x.to("meta")),
+EDITS: dict[str, tuple[Any, Any]] = {
+    "NaN weights": (WEIGHT, lambda x: x * math.nan),
     "quantized weights": (WEIGHT, lambda x: torch.quantize_per_tensor(x, 0.1, 0, torch.qint8)),
-    "complex weights": (WEIGHT, lambda x: x + 1j),
-    "integer weights": (WEIGHT, torch.Tensor.long),
-    "a number for weights": (WEIGHT, lambda x: 0.5),
+    "sparse weights": (WEIGHT, torch.Tensor.to_sparse),
     "a text for weights": (WEIGHT, lambda x: "mlp"),
-    "weights beyond floats": (WEIGHT, lambda x: x.double() + 1e300),
+    "no weights": (entry("actor_state_dict"), None),
     "integer keys": (entry("actor_state_dict"), lambda x: dict(enumerate(x.values()))),
-    "infinite moments": (MOMENT, lambda x: x + math.inf),
-    "infinite squares": (SQUARE, lambda x: x + math.inf),
-    "negative squares": (SQUARE, lambda x: -x - 1e-9),
-    "moments of another shape": (MOMENT, lambda x: x[:1]),
-    "sparse moments": (MOMENT, torch.Tensor.to_sparse),
-    "no moment": (MOMENT, None),
-    "no moments": (entry("optimizer_state_dict", "state", 1), lambda x: {}),
-    "moments of another optimizer": (
-        entry("optimizer_state_dict", "state", 1), lambda x: {"momentum_buffer": x["exp_avg"]},
-    ),
-    "a negative step": (STEP, lambda x: -x),
-    "an infinite step": (STEP, lambda x: x + math.inf),
-    "a step of text": (STEP, str),
-    "a step per weight": (STEP, lambda x: x.repeat(3)),
+    "other moments": (MOMENT, lambda x: x + 1e-9),
     "a negative rate": (entry(*GROUP, "lr"), lambda x: -x),
-    "a rate of text": (entry(*GROUP, "lr"), str),
-    "no rate": (entry(*GROUP, "lr"), None),
-    "large betas": (entry(*GROUP, "betas"), lambda x: (1.5, 0.9)),
-    "a third beta": (entry(*GROUP, "betas"), lambda x: (*x, 0.9)),
-    "odd switches": (entry(*GROUP, "capturable"), lambda x: 0.5),
-    "odd parameters": (entry(*GROUP, "params"), lambda x: [*x[:-1], 0.5]),
     "a group too many": (entry(*GROUP[:2]), lambda x: x * 2),
-    "states in a list": (entry("optimizer_state_dict", "state"), lambda x: list(x.values())),
     "no states": (entry("optimizer_state_dict", "state"), None),
-    "a text for iterations": (entry("iter"), str),
-    "a truth value for iterations": (entry("iter"), bool),
-    "NaN iterations": (entry("iterations_finished"), lambda x: math.nan),
-    "too many iterations": (entry("iterations_finished"), lambda x: 10**30),
+    "a text for iterations": (entry("iterations_finished"), str),
     "a list of infos": (entry("infos"), lambda x: [x]),
-    "a number as identity": (entry("identity"), lambda x: 3),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -220,39 +162,36 @@ def saved(tmp_path_factory) -> dict[str, Any]:
     return load_checkpoint(path)
 
 
-@pytest.mark.parametrize("what", DAMAGES)
-def test_a_damaged_entry_is_an_error_with_its_cure(make_runner, tmp_path: Path, saved, what):
+@pytest.mark.parametrize("what", EDITS)
+def test_an_edited_checkpoint_is_told(make_runner, tmp_path: Path, caplog, saved, what):
+    path = tmp_path / "model_1.pt"
     save_checkpoint({}, tmp_path / "model_0.pt")
-    edit, change = DAMAGES[what]
-    content = copied(saved)
+    save_checkpoint(saved, path)
+    content = torch.load(path, weights_only=True)
+    edit, change = EDITS[what]
     edit(content, change)
-    torch.save(content, tmp_path / "model_1.pt")
+    torch.save(content, path)
     runner = make_runner()
-    before = copied(runner.alg.save())
-    with pytest.raises(CheckpointError) as caught:
-        runner.load(str(tmp_path / "model_1.pt"))
-    text = str(caught.value)
-    assert "model_1.pt" in text
-    assert "model_0.pt" in text or "a checkpoint of this task" in text
-    after = runner.alg.save()
-    for part in ("actor_state_dict", "critic_state_dict"):
-        assert all(torch.equal(before[part][key], after[part][key]) for key in before[part])
+    before, said = copied(runner.alg.save()), ""
+    try:
+        runner.load(str(path))
+    except CheckpointError as error:
+        said = str(error)
+        after = runner.alg.save()
+        for part in ("actor_state_dict", "critic_state_dict"):
+            assert all(torch.equal(before[part][key], after[part][key]) for key in before[part])
+    said += caplog.text
+    assert "model_1.pt" in said
+    assert "use an earlier checkpoint" in said
+    assert "model_0.pt" in said
 
 
-class Statistics(torch.nn.Module):
-    def __init__(self, value: float) -> None:
-        super().__init__()
-        for name in ("_std", "count", "factor", "step"):
-            self.register_parameter(name, torch.nn.Parameter(torch.full((2,), value)))
-        self.register_buffer("_var", torch.full((2,), abs(value)))
-
-
-def test_only_statistics_are_never_negative():
-    saved = Statistics(-1.0).state_dict()
-    check_fits(Statistics(1.0), saved, name="actor", path="model_0.pt")
-    saved["_var"] = -saved["_var"]
-    with pytest.raises(CheckpointError, match="_var: expected values >= 0, got -1"):
-        check_fits(Statistics(1.0), saved, name="actor", path="model_0.pt")
+def test_contents_without_checksum_are_not_judged(tmp_path: Path, caplog):
+    torch.save({"a": torch.zeros(2)}, tmp_path / "model_0.pt")
+    assert list(load_checkpoint(tmp_path / "model_0.pt")) == ["a"]
+    save_checkpoint({"names": {"a", "b", "c"}, "b": [1, None]}, tmp_path / "model_1.pt")
+    load_checkpoint(tmp_path / "model_1.pt")
+    assert not caplog.text
 
 
 def test_too_little_memory_is_no_fault_of_the_file(make_runner, tmp_path, saved, monkeypatch):
@@ -309,17 +248,6 @@ def test_moments_that_share_memory_are_separated(make_runner, tmp_path: Path, sa
     assert not torch.equal(state["exp_avg"], state["exp_avg_sq"])
 
 
-@pytest.mark.parametrize("left", [0, 1])
-def test_missing_moments_are_a_warning(make_runner, tmp_path: Path, saved, caplog, left):
-    content = copied(saved)
-    states = content["optimizer_state_dict"]["state"]
-    for number in list(states)[left:]:
-        del states[number]
-    save_checkpoint(content, tmp_path / "model_1.pt")
-    make_runner().load(str(tmp_path / "model_1.pt"))
-    assert "has no moments of" in caplog.text
-
-
 @pytest.mark.parametrize("garbage", [7, {}, None, {"a": torch.zeros(2)}])
 @pytest.mark.parametrize(
     "part", ["version", "num_envs", "rng", "observations", "logger", "hidden_states"]
@@ -339,7 +267,7 @@ def test_a_malformed_training_state_is_one_clear_error(
         other.learn(2)
     except CheckpointError as error:
         told = str(error)
-    assert "training_state" in told or "does not fit" in caplog.text
+    assert "malformed" in told or "does not fit" in caplog.text
 
 
 @pytest.mark.parametrize("content", [b"hello, world", b"PK\x03\x04 no zip", b"\x80\x04."])
@@ -379,7 +307,7 @@ def test_another_object_than_a_dict_is_refused(tmp_path: Path):
         load_checkpoint(tmp_path / "model_0.pt")
 
 
-def test_another_network_is_refused_with_all_shapes(make_runner, tmp_path: Path):
+def test_another_network_is_an_error(make_runner, tmp_path: Path):
     from rl_fake_env import runner_cfg
 
     make_runner(tmp_path / "run").learn(1)
@@ -388,8 +316,10 @@ def test_another_network_is_refused_with_all_shapes(make_runner, tmp_path: Path)
     before = [parameter.clone() for parameter in other.alg.actor.parameters()]
     with pytest.raises(CheckpointError) as caught:
         other.load(str(tmp_path / "run" / "model_0.pt"))
-    assert "mlp.0.weight: expected (9, 2), found (8, 2)" in str(caught.value)
-    assert "mlp.2.weight: expected (2, 9), found (2, 8)" in str(caught.value)
+    assert "its actor does not fit" in str(caught.value)
+    assert "mlp.0.weight" in str(caught.value)
+    assert "mlp.2.weight" in str(caught.value)
+    assert "a checkpoint of this task" in str(caught.value)
     for one, kept in zip(other.alg.actor.parameters(), before, strict=True):
         assert torch.equal(one, kept)
 
@@ -415,21 +345,6 @@ def test_a_checkpoint_of_rsl_rl_continues_at_the_next_iteration(make_runner, tmp
     assert runner.env.unwrapped.common_step_counter == 17
     torch.save({**runner.alg.save(), "iter": 4, "infos": None}, tmp_path / "model_4.pt")
     assert runner.load(str(tmp_path / "model_4.pt")) == {}
-
-
-@pytest.mark.parametrize("value", [math.nan, {"actor": 3}, [1]])
-def test_malformed_sizes_are_an_error(value):
-    with pytest.raises(CheckpointError, match="sizes"):
-        migrate({"sizes": value}, "model_0.pt")
-
-
-@pytest.mark.parametrize("value", [math.nan, "no", None])
-def test_a_malformed_switch_is_an_error(make_runner, tmp_path: Path, value):
-    runner = make_runner()
-    runner.save(str(tmp_path / "model_0.pt"))
-    content = {**load_checkpoint(tmp_path / "model_0.pt"), "owes_evaluation": value}
-    with pytest.raises(CheckpointError, match="owes_evaluation"):
-        runner.load_content(content, tmp_path / "model_0.pt")
 
 
 def test_a_checkpoint_is_read_once(make_runner, tmp_path: Path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from mjlab.rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from mjlab.rl.checkpoint import CheckpointError
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
 
 Damage = Callable[[dict[str, Any]], Any]
@@ -152,68 +151,17 @@ def test_a_replay_of_other_environments_is_left_out(tmp_path, caplog):
     assert "starts empty" in caplog.text
 
 
-# Files: each damage is an error that names the entry and the cure, and changes nothing.
-
-
-def set_entry(name: str, value: Any) -> Damage:
-    return lambda state: state.__setitem__(name, value)
-
-
-def set_tensor(name: str, edit: Callable[[torch.Tensor], Any]) -> Damage:
-    def damage(state: dict[str, Any]) -> None:
-        state["tensors"][name] = edit(state["tensors"][name].clone())
-
-    return damage
-
-
-DAMAGES: dict[str, tuple[str, Damage]] = {
-    "another type of entry": ("num_filled", set_entry("num_filled", 2.0)),
-    "a truth value": ("num_ends_stored", set_entry("num_ends_stored", True)),
-    "more rows than there are": ("num_filled", set_entry("num_filled", 5)),
-    "fewer than none": ("num_filled", set_entry("num_filled", -1)),
-    "a row past the end": ("row", set_entry("row", 5)),
-    "a negative row": ("row", set_entry("row", -1)),
-    "negative ends": ("num_ends_stored", set_entry("num_ends_stored", -3)),
-    "ends never stored": ("end_numbers", set_entry("num_ends_stored", 0)),
-    "no row": ("row", lambda state: state.pop("row")),
-    "no tensors": ("tensors", lambda state: state.pop("tensors")),
-    "tensors of another type": ("tensors", set_entry("tensors", [1, 2])),
-    "no rewards": ("rewards", lambda state: state["tensors"].pop("rewards")),
-    "no ends": ("ends/actor", lambda state: state["tensors"].pop("ends/actor")),
-    "a number for a tensor": ("kinds", set_tensor("kinds", lambda x: 3)),
-    "doubles": ("actions", set_tensor("actions", torch.Tensor.double)),
-    "kinds of another type": ("kinds", set_tensor("kinds", torch.Tensor.long)),
-    "an unknown kind": ("kinds", set_tensor("kinds", lambda x: x.fill_(7))),
-    "NaN": ("observations/actor", set_tensor("observations/actor", lambda x: x.fill_(math.nan))),
-    "infinite": ("rewards", set_tensor("rewards", lambda x: x.fill_(math.inf))),
-    "NaN in an end": ("ends/actor", set_tensor("ends/actor", lambda x: x.fill_(math.nan))),
-    "fewer rows": ("actions", set_tensor("actions", lambda x: x[:-1])),
-    "wider ends": ("ends/actor", set_tensor("ends/actor", lambda x: x.repeat(1, 2))),
-    "one dimension": ("rewards", set_tensor("rewards", torch.Tensor.flatten)),
-    "nothing": ("rewards", set_tensor("rewards", lambda x: x[:, :0])),
-    "more ends than there are numbers": ("ends", set_entry("num_ends_stored", 10**30)),
-    "a number among the tensors": ("more", lambda state: state["tensors"].update(more=3)),
-    "a number as name": ("tensors", lambda state: state["tensors"].update({5: torch.ones(2)})),
-    "sparse": ("rewards", set_tensor("rewards", torch.Tensor.to_sparse)),
-    "no memory": ("actions", set_tensor("actions", lambda x: x.to("meta"))),
-    "complex": ("actions", set_tensor("actions", lambda x: x + 1j)),
-    "truth values": ("rewards", set_tensor("rewards", torch.Tensor.bool)),
-}
-
-
-@pytest.mark.parametrize("what", DAMAGES)
-def test_a_damaged_replay_is_an_error(tmp_path, what):
-    name, damage = DAMAGES[what]
+@pytest.mark.parametrize("name", ["rewards", "kinds", "observations/actor"])
+def test_an_edited_replay_is_an_error(tmp_path, name):
     files = ReplayFiles(tmp_path / "model_1.pt")
     files.write(History(4, [[GOES_ON, TERMINATED, TIMED_OUT]] * 6).storage)
-    state = load_checkpoint(files.path)
-    damage(state)
-    save_checkpoint(state, files.path)
+    state = torch.load(files.path, weights_only=True)
+    state["tensors"][name].view(-1)[0] += 1
+    torch.save(state, files.path)
     storage = History(4, []).storage
-    with pytest.raises(CheckpointError, match=f"{name}.*delete this file") as caught:
+    with pytest.raises(CheckpointError, match="delete this file") as caught:
         files.read(storage)
     assert str(files.path) in str(caught.value)
-    assert str(caught.value).count("; ") == 1
     assert storage.num_filled == 0
 
 

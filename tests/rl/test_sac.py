@@ -149,29 +149,6 @@ def test_a_run_of_another_device_resumes(tmp_path):
     assert other.current_learning_iteration == 1
 
 
-@pytest.mark.parametrize(
-    ("way", "value"),
-    [
-        (("noise", "steps_left"), torch.full((8,), -1)),
-        (("reward_scale", "factor"), torch.tensor(-1.0)),
-        (("reward_scale",), {}),
-        (("num_steps",), 2.5),
-        (("log_alpha",), torch.tensor(float("nan"))),
-        (("actor",), {0: torch.ones(2)}),
-    ],
-)
-def test_an_odd_state_is_an_error_that_names_it(tmp_path, way, value):
-    runner = make_runner()
-    runner.learn(1)
-    content = {**runner.alg.save(), "iter": 0}
-    holder = content["sac_state_dict"]
-    for key in way[:-1]:
-        holder = holder[key]
-    holder[way[-1]] = value
-    with pytest.raises(CheckpointError, match=rf"model_0\.pt.*{'.'.join(way)}"):
-        make_runner().load_content(content, tmp_path / "model_0.pt")
-
-
 def test_a_run_says_that_it_resumes_without_its_replay(tmp_path, caplog):
     make_runner(tmp_path, save_replay=False).learn(2)
     assert not list(tmp_path.glob("replay*"))

@@ -20,6 +20,7 @@ import re
 import tempfile
 import warnings
 import zipfile
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from operator import index
@@ -45,20 +46,8 @@ logger = logging.getLogger(__name__)
 VERSION = 1
 """Format of `training_state`."""
 
-# Entries with the same type in files of mjlab and rsl_rl: dicts and numbers of iterations.
-_DICT_ENTRIES = (
-    "model_state_dict", "actor_state_dict", "critic_state_dict", "student_state_dict",
-    "teacher_state_dict", "optimizer_state_dict", "rnd_state_dict", "rnd_optimizer_state_dict",
-    "sac_state_dict", "infos", "training_state", "sizes",
-)  # fmt: skip
-_COUNT_ENTRIES = {"iter": -1, "iterations_finished": 0, "last_evaluated": 0}
-# Entries whose values are never negative: moments of optimizers, statistics of SAC, and statistics in
-# buffers of networks. Parameters of these names may be.
-_NEVER_NEGATIVE = re.compile(
-    r"\w*optimizer_state_dict\.state\..+\.(step|exp_avg_sq|max_exp_avg_sq|square_avg)"
-    r"|sac_state_dict\.(noise|reward_scale)\.(steps_left|_count|_sum|_largest|factor)"
-    r"|\w+_state_dict\.(.+\.)?(_var|_std|count|running_var)"
-)
+_CHECKSUM = "checksum"
+_NETWORKS = ("actor", "critic", "student", "teacher")
 
 # Legacy layouts: names of the standard deviation, and prefixes of actor and critic in one state dict.
 _STD_NAMES = {
@@ -103,7 +92,7 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
 
     The write is atomic: data goes to a temporary file in the same folder; the file is flushed to disk
     and then renamed. An existing file at `path` stays until then, and a failure leaves no files
-    behind. NumPy scalars are written as Python's.
+    behind. NumPy scalars are written as Python's. A checksum of the contents is added.
 
     Raises:
         CheckpointError: the disk is full, the folder is read-only, and the like; or `data` holds
@@ -111,7 +100,7 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
     """
     path = Path(path)
     try:
-        data = as_plain_data(dict(data))
+        plain = as_plain_data(dict(data))
     except TypeError as error:
         raise CheckpointError(
             f"Checkpoint {str(path)!r}: expected tensors, numbers, strings, None, and dicts, lists and "
@@ -124,7 +113,7 @@ def save_checkpoint(data: Mapping[str, Any], path: str | os.PathLike[str]) -> No
             # Serialize in memory first: torch's zip writer turns a failing `write` of the
             # underlying file into a RuntimeError that hides the reason.
             buffer = io.BytesIO()
-            torch.save(data, buffer)
+            torch.save({**plain, _CHECKSUM: _checksum(plain)}, buffer)
             file.write(buffer.getbuffer())
         # The rename is on disk only once the folder is flushed. Not every system can open folders.
         with contextlib.suppress(OSError):
@@ -149,11 +138,26 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Load a checkpoint of `save_checkpoint` or rsl_rl, with all tensors on the CPU.
 
     Only data is read: a file whose pickle would run code is rejected. Checksums are compared, so that
-    corruption on disk is detected (files of torch before 1.6 have no checksums).
+    corruption on disk is detected (files of torch before 1.6 have no checksums). A file that was edited
+    since is a warning.
 
     Raises:
-        CheckpointError: the file is missing, truncated, hostile or not a checkpoint. Other tensors than
-            dense ones are an error, too.
+        CheckpointError: the file is missing, truncated, hostile or not a checkpoint.
+    """
+    data, is_intact = read_checkpoint(path)
+    if not is_intact:
+        cure = _other_checkpoint(path)
+        logger.warning(
+            "Checkpoint %r is not as it was written (another checksum). If you did not edit it, use %s.",
+            str(path), cure,
+        )  # fmt: skip
+    return data
+
+
+def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
+    """Return the contents of a checkpoint, and False if they are not those written.
+
+    See `load_checkpoint`. Contents without checksum, of rsl_rl and earlier versions, count as intact.
     """
     path = Path(path)
     if not path.is_file():
@@ -171,7 +175,10 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
             if zipfile.is_zipfile(path):
                 check_archive(path)
             data = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = [(name, x) for name, x in _leaves(data) if isinstance(x, torch.Tensor)]
+        if not isinstance(data, dict):
+            raise ValueError(f"expected a dict, got a {type(data).__name__}")
+        written = data.pop(_CHECKSUM, None)
+        return data, written is None or written == _checksum(data)
     except pickle.UnpicklingError as error:
         called = re.search(r"(?:GLOBAL|class|function) ([\w.]+)", str(error))
         reason, hint = "not a file of torch, or corrupt", ""
@@ -189,21 +196,32 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise unusable(
             path, f"truncated or corrupt ({path.stat().st_size} bytes; {first_line(error)})"
         ) from error
-    if not isinstance(data, dict):
-        raise unusable(path, f"expected a dict, got a {type(data).__name__}")
-    for name, value in tensors:
-        if not _is_dense(value):
-            raise unusable(path, f"{name}: expected a dense tensor, got {_described(value)}")
-    return data
+
+
+def _checksum(data: Any) -> int:
+    """Return the CRC-32 of nested plain data."""
+    total = 0
+    for name, value in _leaves(data):
+        if isinstance(value, torch.Tensor):
+            name = f"{name} {value.dtype} {tuple(value.shape)}"
+            values = value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
+        else:
+            values = repr(value).encode()
+        total = zlib.crc32(values, zlib.crc32(name.encode(), total))
+    return total
 
 
 def unusable(path: str | os.PathLike[str], reason: str) -> CheckpointError:
     """Return the error for a checkpoint that is damaged: file, reason, and the checkpoint to use instead."""
-    earlier = latest_checkpoint(Path(path).parent, before=Path(path).name)
-    cure = "another checkpoint" if earlier is None else f"an earlier checkpoint, {str(earlier)!r}"
+    cure = _other_checkpoint(path)
     return CheckpointError(
         f"Checkpoint {str(path)!r}: {reason}; use {cure}. Nothing was changed.", reason
     )
+
+
+def _other_checkpoint(path: str | os.PathLike[str]) -> str:
+    earlier = latest_checkpoint(Path(path).parent, before=Path(path).name)
+    return "another checkpoint" if earlier is None else f"an earlier checkpoint, {str(earlier)!r}"
 
 
 def latest_checkpoint(folder: Path, before: str = "") -> Path | None:
@@ -330,35 +348,34 @@ def load_algorithm(
         True if the iteration count is to be loaded.
 
     Raises:
-        CheckpointError: a part is missing, does not fit, or is not finite. Nothing was changed.
+        CheckpointError: a part is missing or does not fit. Nothing was changed.
     """
-    optimizer, changed_from = algorithm.optimizer, None
-
-    def is_wanted(name: str) -> bool:
-        return load_cfg is None or bool(load_cfg.get(name))
-
+    optimizer, changed_from, part = algorithm.optimizer, None, "state"
     # rsl_rl loads one part after the other: an error leaves the algorithm partly loaded.
     before = copied(algorithm.save())
-    for name in ("actor", "critic", "student", "teacher", "rnd"):
-        model = getattr(algorithm, "rnd" if name == "rnd" else f"_raw_{name}", None)
-        if strict and is_wanted(name) and f"{name}_state_dict" in before and model is not None:
-            check_fits(model, checkpoint.get(f"{name}_state_dict"), name=name, path=path)
-            if name == "rnd":
-                check_optimizer_fits(model.optimizer, checkpoint, "rnd_optimizer_state_dict", path)
-    if is_wanted("optimizer"):
-        changed_from = _other_kind(optimizer, checkpoint.get("optimizer_state_dict"))
+    try:
+        if (saved := checkpoint.get("optimizer_state_dict")) is not None:
+            changed_from = _other_kind(optimizer, saved)
         if changed_from is not None:
             checkpoint = {**checkpoint, "optimizer_state_dict": optimizer.state_dict()}
-        else:
-            check_optimizer_fits(optimizer, checkpoint, "optimizer_state_dict", path)
-    try:
+        # Loaded once more below; here, an error is known to be of this network.
+        for name in _NETWORKS:
+            network = getattr(algorithm, f"_raw_{name}", None)
+            if network is not None and (load_cfg is None or load_cfg.get(name)):
+                part = name
+                network.load_state_dict(checkpoint[f"{name}_state_dict"], strict=strict)
+        part = "state"
         loads_iteration = algorithm.load(checkpoint, load_cfg, strict)
     except Exception as error:
         algorithm.load(before, None, True)
         if isinstance(error, (torch.OutOfMemoryError, MemoryError)):
             raise
-        text = f"{type(error).__name__}: {error}" if isinstance(error, KeyError) else str(error)
-        raise unusable(path, f"does not fit this algorithm: {text}") from error
+        text = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise CheckpointError(
+            f"Checkpoint {path!r}: its {part} does not fit this run: {text}\nUse a checkpoint of this task "
+            "and learner, or the network config and the observations of the training run. Nothing was "
+            "changed."
+        ) from error
     if hasattr(algorithm, "student"):
         # rsl_rl's distillation loads the rate of its optimizer only.
         algorithm.learning_rate = optimizer.param_groups[0]["lr"]
@@ -418,170 +435,6 @@ def set_deviation(model: torch.nn.Module, name: str, value: float) -> None:
     )
 
 
-def check_fits(
-    model: torch.nn.Module, saved: Mapping[str, Any] | None, *, name: str, path: str
-) -> None:
-    """Check that the state dict `saved` fits `model`.
-
-    Raises:
-        CheckpointError: parameters are missing, unknown, or of the wrong shape or type, or NaN or
-            infinite. The message lists all of wrong names and shapes.
-    """
-    if saved is None:
-        raise CheckpointError(
-            f"Checkpoint {path!r} holds no {name} weights; use a checkpoint of the same learner."
-        )
-    # Parameters remain parameters, for `misfit`.
-    state = model.state_dict(keep_vars=True)
-    own = {key: value for key, value in state.items() if isinstance(value, torch.Tensor)}
-    expected = {key: tuple(value.shape) for key, value in own.items()}
-    found = {key: tuple(value.shape) for key, value in saved.items() if hasattr(value, "shape")}
-    if expected != found:
-        lines = [
-            f"  {key}: expected {expected.get(key, 'nothing')}, found {found.get(key, 'nothing')}"
-            for key in sorted(expected.keys() | found.keys(), key=str)
-            if expected.get(key) != found.get(key)
-        ]
-        raise CheckpointError(
-            f"Checkpoint {path!r}: its {name} does not fit this task's {name} config.\n"
-            + "\n".join(lines)
-            + "\nUse a checkpoint of this task, or the network config "
-            f"(--agent.{name}.) and the observations of the training run."
-        )
-    for key, value in own.items():
-        if fault := misfit(value, saved[key], f"{name}_state_dict.{key}"):
-            raise unusable(path, fault)
-
-
-def check_optimizer_fits(
-    optimizer: torch.optim.Optimizer, checkpoint: Mapping[str, Any], name: str, path: str
-) -> None:
-    """Check that the entry `name` of `checkpoint` is a state that `optimizer` continues from.
-
-    torch compares only numbers of parameters, would fail at the next update, and starts with new
-    moments for an empty state. Here the state of a copy after one step, under the saved settings and
-    with gradients of 0, says what a state consists of.
-
-    Raises:
-        CheckpointError: the state does not fit.
-    """
-
-    def stepped(groups: Any) -> dict[int, Any]:
-        probe = copy.deepcopy(optimizer)
-        probe.load_state_dict({"state": {}, "param_groups": groups})
-        for parameter in (p for group in probe.param_groups for p in group["params"]):
-            parameter.grad = torch.zeros_like(parameter)
-        probe.step()
-        return probe.state_dict()["state"]
-
-    groups = optimizer.state_dict()["param_groups"]
-    try:
-        stepped(groups)
-    except (torch.OutOfMemoryError, MemoryError):
-        raise
-    except Exception:
-        # Optimizers of packages may keep what a copy lacks.
-        return
-    saved: Any = checkpoint.get(name)
-    try:
-        fault = None
-        for number, (own, group) in enumerate(zip(groups, saved["param_groups"], strict=True)):
-            # Settings differ between releases of torch.
-            own = {key: value for key, value in own.items() if key in group}
-            group = {key: group[key] for key in own}
-            fault = fault or misfit(own, group, f"{name}.param_groups.{number}")
-            if group["params"] != own["params"]:
-                raise ValueError(f"params {group['params']}")
-        if fault is None:
-            like = stepped(saved["param_groups"])
-            new = like.keys() - saved["state"].keys()
-            if new and (saved["state"] or "sac_state_dict" not in checkpoint):
-                logger.warning(
-                    "%s of %r has no moments of %d of %d parameters: they start at 0.",
-                    name, path, len(new), len(like),
-                )  # fmt: skip
-            for number, state in saved["state"].items():
-                # Written by earlier releases of torch for SGD without momentum.
-                state = {key: value for key, value in state.items() if value is not None}
-                own = like.get(number, {})
-                fault = fault or misfit(own, state, f"{name}.state.{number}")
-    except (torch.OutOfMemoryError, MemoryError):
-        raise
-    except Exception as error:
-        fault = (
-            f"{name}: expected a state that fits these networks ({type(error).__name__}: {error})"
-        )
-    if fault is not None:
-        raise unusable(path, fault)
-
-
-def misfit(own: Any, saved: Any, name: str, *, same_rows: bool = True) -> str | None:
-    """Return the first difference in structure of `saved` from `own`, or None.
-
-    Expected are the same keys, lengths, types, and shapes, and numbers that are finite if those of
-    `own` are, and not negative where they never are.
-
-    Args:
-        own: State of a new object; parameters of networks are of type `Parameter`.
-        saved: State of the same object, from a file.
-        name: Name of the entry, for the result.
-        same_rows: Compare the first size of tensors, too.
-    """
-    expected = found = ""
-    parts: Iterable[tuple[Any, Any, Any]] = ()
-    if isinstance(own, torch.Tensor):
-        return _tensor_misfit(own, saved, name, same_rows)
-    if isinstance(own, Mapping):
-        if not isinstance(saved, Mapping):
-            expected = "a dict"
-        elif own.keys() != saved.keys():
-            expected, found = f"the entries {list(own)}", str(list(saved))
-        else:
-            parts = ((own[key], saved[key], key) for key in own)
-    elif isinstance(own, (list, tuple)):
-        if not isinstance(saved, (list, tuple)) or len(own) != len(saved):
-            expected = f"{len(own)} values"
-        else:
-            parts = zip(own, saved, range(len(own)), strict=True)
-    elif isinstance(own, bool):
-        if not isinstance(saved, bool | None):
-            expected = "True, False or None"
-    elif isinstance(own, int | float):
-        limit = 1.0 if ".betas." in name else 2.0**63
-        if isinstance(saved, bool) or not isinstance(saved, int | float) or not 0 <= saved < limit:
-            expected = f"a number in [0, {limit:g})"
-    if expected:
-        return f"{name}: expected {expected}, got {found or _described(saved)}"
-    faults = (misfit(a, b, f"{name}.{key}", same_rows=same_rows) for a, b, key in parts)
-    return next((fault for fault in faults if fault), None)
-
-
-def _tensor_misfit(own: torch.Tensor, saved: Any, name: str, same_rows: bool) -> str | None:
-    if own.dim() == 0 and type(saved) is float:
-        # Earlier releases of torch count steps by numbers.
-        saved = torch.tensor(saved)
-    skipped = 0 if same_rows else 1
-    expected, found = "", _described(saved)
-    if not isinstance(saved, torch.Tensor) or not _is_dense(saved):
-        expected = "a dense tensor"
-    elif saved.dim() != own.dim() or saved.shape[skipped:] != own.shape[skipped:]:
-        expected, found = f"shape {tuple(own.shape)}", f"{tuple(saved.shape)}"
-    elif (saved.is_floating_point(), saved.is_complex(), saved.dtype == torch.bool) != (
-        own.is_floating_point(), own.is_complex(), own.dtype == torch.bool,
-    ):  # fmt: skip
-        expected, found = f"numbers like {own.dtype}", str(saved.dtype)
-    # Conversions of doubles may overflow.
-    elif not (values := saved.to(own.dtype)).isfinite().all() and own.isfinite().all():
-        expected, found = "finite values", "NaN or infinite ones"
-    elif (
-        not isinstance(own, torch.nn.Parameter)
-        and _NEVER_NEGATIVE.fullmatch(name)
-        and bool((values < 0).any())
-    ):
-        expected, found = "values >= 0", f"{float(values.min()):g}"
-    return f"{name}: expected {expected}, got {found}" if expected else None
-
-
 def not_finite(entries: Mapping[str, Any]) -> list[str]:
     """Return the names of the tensors in nested `entries` with values that are NaN or infinite."""
     tensors = {
@@ -597,25 +450,14 @@ def not_finite(entries: Mapping[str, Any]) -> list[str]:
     return [name for name, is_finite in zip(tensors, finite, strict=True) if not is_finite]
 
 
-def _is_dense(value: torch.Tensor) -> bool:
-    """Return True for tensors that are arrays of numbers in memory."""
-    is_array = value.layout == torch.strided and value.device.type != "meta"
-    return is_array and not value.is_nested and not value.is_quantized
-
-
-def _described(value: Any) -> str:
-    if not isinstance(value, torch.Tensor):
-        text = repr(value)
-        return f"{type(value).__name__} {text}" if len(text) <= 20 else f"a {type(value).__name__}"
-    kind = "nested" if value.is_nested else "quantized" if value.is_quantized else str(value.layout)
-    return f"a tensor ({kind.removeprefix('torch.')}, {value.device.type})"
-
-
 def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values in nested dicts and sequences, with their positions."""
     if not isinstance(value, (dict, list, tuple, set)):
         yield name, value
         return
+    if isinstance(value, set):
+        # The order of texts differs between processes.
+        value = sorted(value, key=repr)
     for key, item in value.items() if isinstance(value, dict) else enumerate(value):
         yield from _leaves(item, f"{name}.{key}" if name else str(key))
 
@@ -634,13 +476,9 @@ def _kind_of(group: Mapping[str, Any]) -> str | None:
     return "adamw" if group.get(_IS_ADAMW) else kinds[0]
 
 
-def _other_kind(optimizer: torch.optim.Optimizer, saved: Any) -> str | None:
+def _other_kind(optimizer: torch.optim.Optimizer, saved: Mapping[str, Any]) -> str | None:
     """Return the name of the optimizer of the state `saved` if it is another one; else None."""
-    try:
-        group = dict(saved["param_groups"][0])
-    except (KeyError, IndexError, TypeError, ValueError):
-        return None
-    own = optimizer.param_groups[0]
+    group, own = saved["param_groups"][0], optimizer.param_groups[0]
     found, expected = _kind_of(group), _kind_of(own)
     if found is None or expected is None or found == expected:
         return None
@@ -759,7 +597,7 @@ def curricula_of(content: Mapping[str, Any]) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def naming_checkpoint(path: str | os.PathLike[str], *passing: type[Exception]) -> Generator[None]:
-    """Convert errors of the block, which restores a training state, to `CheckpointError`.
+    """Convert errors of the block, which reads entries of a checkpoint, to `CheckpointError`.
 
     Args:
         path: Checkpoint file.
@@ -771,8 +609,7 @@ def naming_checkpoint(path: str | os.PathLike[str], *passing: type[Exception]) -
         raise
     except Exception as error:
         # A state of the wrong form raises any error.
-        text = f"training_state is malformed ({type(error).__name__}: {error})"
-        raise unusable(path, text) from error
+        raise unusable(path, f"malformed ({type(error).__name__}: {error})") from error
 
 
 def restore_lasting_state(state: dict[str, Any], env: VecEnv, algorithm: Any = None) -> list[str]:
@@ -861,59 +698,28 @@ def _matching_observations(state: dict[str, Any], env: VecEnv) -> TensorDict:
     observations = state.get("observations")
     if observations is None:
         raise ValueError("The run failed within an iteration, so the checkpoint has no episodes.")
-    own = dict(env.get_observations().flatten_keys("\n").items())
-    if fault := misfit(own, observations, "training_state.observations"):
-        raise ValueError(f"{fault}.")
+    expected, found = (
+        {name: tuple(value.shape) for name, value in group.items()}
+        for group in (env.get_observations().flatten_keys("\n"), observations)
+    )
+    if expected != found:
+        raise ValueError(f"training_state observations: expected {expected}, got {found}.")
     return TensorDict(observations, batch_size=[env.num_envs]).unflatten_keys("\n")
 
 
 def _models(algorithm: Any) -> list[Any]:
-    names = ("actor", "critic", "student", "teacher")
-    return [getattr(algorithm, name) for name in names if hasattr(algorithm, name)]
+    return [getattr(algorithm, name) for name in _NETWORKS if hasattr(algorithm, name)]
 
 
 # Legacy layouts.
 
 
-def migrate(checkpoint: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Return `checkpoint`, read from `path`, in the current layout; the argument is not modified.
+def migrate(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `checkpoint` in the current layout; the argument is not modified.
 
     Two legacy layouts are supported: one state dict for actor and critic together
     (`model_state_dict`), and an actor whose standard deviation is named `std` or `log_std`.
-
-    Raises:
-        CheckpointError: an entry has the wrong type.
     """
-    infos = checkpoint.get("infos")
-    env_state = infos.get("env_state") if isinstance(infos, dict) else None
-    dicts = {name: checkpoint.get(name) for name in _DICT_ENTRIES}
-    counts = {name: checkpoint.get(name, least) for name, least in _COUNT_ENTRIES.items()}
-    if isinstance(env_state, dict):
-        counts["common_step_counter"] = env_state.get("common_step_counter", 0)
-    try:
-        # None is a missing entry: rsl_rl writes `infos` as None.
-        sizes = dicts["sizes"] if isinstance(dicts["sizes"], dict) else {}
-        parts = {f"sizes.{name}": terms for name, terms in sizes.items()}
-        for name, value in {**dicts, **parts, "infos.env_state": env_state}.items():
-            if not isinstance(value, dict | None):
-                raise ValueError(f"{name}: expected a dict, got a {type(value).__name__}.")
-        for name, value in counts.items():
-            least = _COUNT_ENTRIES.get(name, 0)
-            if type(value) is not int or not least <= value < 2**63:
-                raise ValueError(
-                    f"{name}: expected an integer in [{least}, 2**63), got {_described(value)}."
-                )
-        for name, terms in parts.items():
-            for term, shape in (terms or {}).items():
-                if not isinstance(shape, (list, tuple)) or any(type(n) is not int for n in shape):
-                    raise ValueError(f"{name}.{term}: expected a shape, got {_described(shape)}.")
-        for name in ("task", "identity"):
-            if not isinstance(value := checkpoint.get(name), str | None):
-                raise ValueError(f"{name}: expected a text, got {_described(value)}.")
-        if not isinstance(owes := checkpoint.get("owes_evaluation", False), bool):
-            raise ValueError(f"owes_evaluation: expected True or False, got {_described(owes)}.")
-    except ValueError as error:
-        raise unusable(path, str(error).rstrip(".")) from error
     migrated = dict(checkpoint)
     if migrated.get("model_state_dict") is not None:
         parts: dict[str, dict[str, Any]] = {"actor_state_dict": {}, "critic_state_dict": {}}
@@ -952,7 +758,7 @@ def copied(value: Any) -> Any:
 
 
 def as_plain_data(value: Any, path: str = "") -> Any:
-    """Return `value` with NumPy scalars converted to Python's; other containers are not copied.
+    """Return `value` with NumPy scalars converted to Python's; tensors are not copied.
 
     Args:
         value: Tensors, numbers, strings, None, and dicts, lists, tuples and sets of those.
@@ -967,24 +773,13 @@ def as_plain_data(value: Any, path: str = "") -> Any:
     if kind in _ATOMS:
         return value
     if kind in _SEQUENCES:
-        items = [as_plain_data(item, f"{path}[{index}]") for index, item in enumerate(value)]
-        same = all(one is other for one, other in zip(items, value, strict=True))
-        return value if same else kind(items)
+        return kind(as_plain_data(item, f"{path}[{index}]") for index, item in enumerate(value))
     if kind not in _DICTS:
         raise TypeError(f"{path or 'value'} is a {kind.__module__}.{kind.__qualname__}")
-    entries = {
-        as_plain_data(key, f"a key of {path or 'value'}"): as_plain_data(
-            item, f"{path}.{key}" if path else str(key)
-        )
-        for key, item in value.items()
-    }
-    if all(
-        key is other and entries[key] is value[other]
-        for key, other in zip(entries, value, strict=True)
-    ):
-        return value
     # A copy instead of a new dict: state dicts of modules carry versions as an attribute.
     plain = copy.copy(value)
     plain.clear()
-    plain.update(entries)
+    for key, item in value.items():
+        place = f"{path}.{key}" if path else str(key)
+        plain[as_plain_data(key, f"a key of {path or 'value'}")] = as_plain_data(item, place)
     return plain

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from mjlab.rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from mjlab.utils.errors import check_count, check_in_range
+from mjlab.rl.checkpoint import CheckpointError, read_checkpoint, save_checkpoint
+from mjlab.utils.errors import check_count
 from mjlab.utils.memory import check_memory
 
 logger = logging.getLogger(__name__)
@@ -24,8 +24,6 @@ logger = logging.getLogger(__name__)
 _CONTINUES, _TERMINATED, _TIMED_OUT, _CUT_OFF = range(4)
 # Steps per slot for final observations: time-outs are rare.
 _STEPS_PER_TIME_OUT = 32
-# Prefixes of the tensors of an observation group.
-_PER_GROUP = ("observations", "ends")
 
 
 @dataclass
@@ -255,64 +253,6 @@ class ReplayStorage:
         }
 
 
-def check_contents(state: Mapping[str, Any]) -> None:
-    """Check a result of `ReplayStorage.state_dict` that was read from a file.
-
-    Raises:
-        ValueError: entries are missing, of another type, out of range, NaN or infinite, or of shapes
-            that do not fit one another. The message names the first.
-    """
-    tensors = state.get("tensors")
-    if not isinstance(tensors, Mapping):
-        raise ValueError(f"Replay tensors: expected a dict, got {type(tensors).__name__}.")
-    groups = {name.partition("/")[2] for name in map(str, tensors) if "/" in name}
-    dtypes = dict.fromkeys(("actions", "rewards"), torch.float32)
-    dtypes |= {"kinds": torch.int8, "end_numbers": torch.int64}
-    dtypes |= {f"{part}/{name}": torch.float32 for name in groups for part in _PER_GROUP}
-    if unknown := [name for name in tensors if name not in dtypes]:
-        raise ValueError(f"Replay tensors: expected {list(dtypes)}, got also {unknown}.")
-    for name, dtype in dtypes.items():
-        tensor = tensors.get(name)
-        found = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
-        if not isinstance(tensor, torch.Tensor) or tensor.dtype != dtype:
-            raise ValueError(f"Replay {name}: expected a tensor of {dtype}, got {found}.")
-        if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            raise ValueError(f"Replay {name}: expected finite values, got NaN or infinite ones.")
-    shape = tensors["rewards"].shape
-    if len(shape) != 2 or 0 in shape:
-        raise ValueError(f"Replay rewards: expected shape (rows, environments), got {shape}.")
-    rows = shape[0]
-    for name in dtypes:
-        if not name.startswith("ends/") and tensors[name].shape[:2] != shape:
-            raise ValueError(
-                f"Replay {name}: expected {tuple(shape)} as first sizes, as rewards, got "
-                f"{tuple(tensors[name].shape)}."
-            )
-    for group in groups:
-        ends, stored = (tensors[f"{part}/{group}"].shape for part in ("ends", "observations"))
-        if ends[1:] != stored[2:] or ends[:1] == (0,):
-            raise ValueError(
-                f"Replay ends/{group}: expected shape (ends, *{tuple(stored[2:])}), as observations, got "
-                f"{tuple(ends)}."
-            )
-    for name in ("row", "num_filled", "num_ends_stored"):
-        if type(state.get(name)) is not int:
-            raise ValueError(f"Replay {name}: expected an integer, got {state.get(name)!r}.")
-    check_in_range("Replay num_filled", state["num_filled"], 0, rows - 1)
-    # Rows are written from 0 on, until all are.
-    is_full = state["num_filled"] == rows - 1
-    first, last = (0, rows - 1) if is_full else (state["num_filled"],) * 2
-    check_in_range("Replay row", state["row"], first, last)
-    stored = state["num_ends_stored"]
-    check_in_range("Replay num_ends_stored", stored, 0, 2**62)
-    for name, low, high in (
-        ("kinds", _CONTINUES, _CUT_OFF),
-        ("end_numbers", 0, max(stored - 1, 0)),
-    ):
-        for value in tensors[name].aminmax():
-            check_in_range(f"Replay {name}", int(value), low, high)
-
-
 class ReplayFiles:
     """Replay file of a checkpoint: `replay_model_100.pt` next to `model_100.pt`.
 
@@ -341,7 +281,7 @@ class ReplayFiles:
         or capacity than `storage`, which is not changed.
 
         Raises:
-            CheckpointError: the file is damaged, malformed, or not of the checkpoint with `identity`
+            CheckpointError: the file is damaged or edited, or not of the checkpoint with `identity`
                 (None: a checkpoint of an earlier version, without identity).
         """
         if not self.path.exists():
@@ -352,13 +292,12 @@ class ReplayFiles:
             return None
         cure = "delete this file, and the replay starts empty. Nothing was changed."
         try:
-            state = load_checkpoint(self.path)
-            check_contents(state)
-        except (CheckpointError, ValueError) as error:
-            reason = error.reason if isinstance(error, CheckpointError) else error
-            raise CheckpointError(
-                f"Replay {str(self.path)!r} is damaged ({reason}); {cure}"
-            ) from error
+            state, is_intact = read_checkpoint(self.path)
+            reason = "" if is_intact else "not as it was written, another checksum"
+        except CheckpointError as error:
+            reason = error.reason
+        if reason:
+            raise CheckpointError(f"Replay {str(self.path)!r} is damaged ({reason}); {cure}")
         if (found := state.get("identity")) != identity:
             raise CheckpointError(
                 f"Replay {str(self.path)!r}: expected the replay of its checkpoint (identity "

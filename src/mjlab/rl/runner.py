@@ -30,7 +30,6 @@ from tensordict import TensorDict
 from mjlab.rl.checkpoint import (
     RunRescue,
     capture_training_state,
-    check_fits,
     check_terms,
     copied,
     load_algorithm,
@@ -580,23 +579,23 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             load_cfg: Parts to load; None: all.
             strict: Require every parameter to fit.
         """
-        # torch's optimizers keep the loaded tensors, and write to them.
-        checkpoint = migrate(copied(content), str(path))
-        groups = self.cfg.get("obs_groups") or {}
+        groups, replay = self.cfg.get("obs_groups") or {}, None
         networks = [name for name in groups if load_cfg is None or load_cfg.get(name)]
-        check_terms(checkpoint.get("sizes"), term_shapes(self.env, groups), networks, str(path))
         storage: Any = getattr(self.alg, "storage", None)
-        replay = None
-        if load_cfg is None and isinstance(storage, ReplayStorage):
-            # First, because an error must leave everything unchanged.
-            replay = ReplayFiles(path).read(storage, checkpoint.get("identity"))
+        # The algorithm comes last, because an error must leave everything unchanged.
+        with naming_checkpoint(path):
+            # torch's optimizers keep the loaded tensors, and write to them.
+            checkpoint = migrate(copied(content))
+            check_terms(checkpoint.get("sizes"), term_shapes(self.env, groups), networks, str(path))
+            if load_cfg is None and isinstance(storage, ReplayStorage):
+                replay = ReplayFiles(path).read(storage, checkpoint.get("identity"))
+            finished = int(checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1))
+            infos = checkpoint.get("infos") or {}
+            counter = (infos.get("env_state") or {}).get("common_step_counter")
         if load_algorithm(self.alg, checkpoint, load_cfg, strict, str(path)):
-            finished = checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1)
             self.current_learning_iteration = finished
             self._solved_check.last_iteration = checkpoint.get("last_evaluated", 0)
             self._owes_evaluation = checkpoint.get("owes_evaluation", False)
-        infos = checkpoint.get("infos") or {}
-        counter = (infos.get("env_state") or {}).get("common_step_counter")
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
@@ -652,11 +651,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             CheckpointError: the file is missing, corrupt, hostile, malformed, or of a different
                 network.
         """
-        checkpoint = migrate(load_checkpoint(path), str(path))
-        policy = checkpoint.get("actor_state_dict")
-        algorithm: Any = self.alg
-        check_fits(algorithm._raw_teacher, policy, name="teacher", path=str(path))
-        algorithm.load({"actor_state_dict": policy}, {"teacher": True}, strict=True)
+        checkpoint = migrate(load_checkpoint(path))
+        policy = {"teacher_state_dict": checkpoint.get("actor_state_dict")}
+        load_algorithm(self.alg, policy, {"teacher": True}, True, str(path))
 
     @property
     def _checkpoint_path(self) -> str:

@@ -29,11 +29,10 @@ from rsl_rl.utils import (
 from tensordict import TensorDict
 from torch import nn
 
-from mjlab.rl.checkpoint import misfit
 from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
-from mjlab.utils.errors import check_count, check_field
+from mjlab.utils.errors import check_field
 from mjlab.utils.memory import check_memory
 
 # Range of scaled returns if `value_range` is None.
@@ -419,20 +418,6 @@ class SAC:
         """
         self._end_updates()
         cfg = dict.fromkeys(_PARTS, True) if load_cfg is None else load_cfg
-        state: Any = loaded_dict.get("sac_state_dict")
-        if load_cfg is None:
-            own = self.save()["sac_state_dict"]
-            # Parameters remain parameters, for `misfit`.
-            for name, model in (("actor", self.actor), ("target", self._target)):
-                own[name] = model.state_dict(keep_vars=True)
-            if isinstance(state, dict) and state.get("reward_scale") is None:
-                # Saved by a run with a `value_range`.
-                own["reward_scale"] = None
-            # Noise and running returns may be of another number of environments.
-            if fault := misfit(own, state, "sac_state_dict", same_rows=False):
-                raise ValueError(fault)
-            for name in ("num_steps", "num_updates"):
-                check_count(f"sac_state_dict.{name}", state[name], 0)
         if cfg.get("actor"):
             for model in (self.actor, self._policy):
                 model.load_state_dict(loaded_dict["actor_state_dict"], strict=strict)
@@ -443,12 +428,13 @@ class SAC:
             self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
             self.learning_rate = self.optimizer.param_groups[1]["lr"]
         if load_cfg is None:
+            state = loaded_dict["sac_state_dict"]
             self.actor.load_state_dict(state["actor"])
             self._target.load_state_dict(state["target"])
             with torch.no_grad():
                 self._log_alpha.copy_(state["log_alpha"])
             # Generators of CPUs and GPUs have states of other sizes.
-            if state["generator"].shape == own["generator"].shape:
+            if state["generator"].shape == self._generator.get_state().shape:
                 self._generator.set_state(state["generator"].cpu())
             self._num_steps, self._num_updates_made = state["num_steps"], state["num_updates"]
             self._noise.load_state_dict(state["noise"])

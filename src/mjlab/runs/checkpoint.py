@@ -37,12 +37,12 @@ class Checkpoint:
         """Content of the file, in the current layout.
 
         Raises:
-            CheckpointError: the file is missing, damaged, hostile or malformed.
+            CheckpointError: the file is missing, damaged or hostile.
         """
         # Imports torch.
         from mjlab.rl.checkpoint import load_checkpoint, migrate
 
-        return migrate(load_checkpoint(self.path), str(self.path))
+        return migrate(load_checkpoint(self.path))
 
     @property
     def number(self) -> int | None:
