@@ -592,10 +592,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             finished = int(checkpoint.get("iterations_finished", checkpoint.get("iter", -1) + 1))
             infos = checkpoint.get("infos") or {}
             counter = (infos.get("env_state") or {}).get("common_step_counter")
+            evaluated = int(checkpoint.get("last_evaluated", 0))
         if load_algorithm(self.alg, checkpoint, load_cfg, strict, str(path)):
             self.current_learning_iteration = finished
-            self._solved_check.last_iteration = checkpoint.get("last_evaluated", 0)
-            self._owes_evaluation = checkpoint.get("owes_evaluation", False)
+            self._solved_check.last_iteration = evaluated
+            self._owes_evaluation = bool(checkpoint.get("owes_evaluation", False))
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
