@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from lifting_stand_ins import ORIGIN_STEP, Object, StandInEnv, lifting_command
+from lifting_stand_ins import ORIGIN_STEP, StandInEnv, lifting_command
 
 from mjlab.tasks.manipulation.mdp import LiftingCommandCfg
 from mjlab.viewer.debug_visualizer import NullDebugVisualizer
@@ -259,33 +259,8 @@ def test_a_mistake_in_the_config_is_one_clear_message(fields, message):
         lifting_command(**fields)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"success_threshold": 0.0}, "success_threshold.* 0.0"),
-        ({"success_threshold": math.nan}, "success_threshold.* nan"),
-        (
-            {"target_position_range": Range(x=(0.5, 0.3))},
-            r"target_position_range.x.*\(0.5, 0.3\)",
-        ),
-        ({"object_pose_range": PoseRange(yaw=(0.0, math.inf))}, "object_pose_range.yaw"),
-    ],
-)
-def test_odd_numbers_warn_once(fields, message):
-    with pytest.warns(UserWarning, match=message) as caught:
-        lifting_command(**fields)
-    assert len(caught) == 1
-
-
-def test_an_object_that_cannot_move_is_refused_unless_it_stays():
-    env = StandInEnv(cube=Object(4, [0], is_fixed_base=True))
-    with pytest.raises(ValueError, match="'cube'.*fixed base.*free joint"):
-        lifting_command(env)
-    lifting_command(env, object_pose_range=None)
-
-
 def test_an_object_that_is_not_in_the_scene_is_refused():
-    with pytest.raises(KeyError, match=r"entity 'cueb'; did you mean 'cube'"):
+    with pytest.raises(KeyError, match="'cueb'"):
         lifting_command(entity_name="cueb")
 
 

@@ -236,15 +236,9 @@ def test_viewers_show_the_goal_and_mark_the_wanted_cube():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"entity_names": ()}, r"entity_names: .*got \(\)"),
         ({"difficulty": "hard"}, "difficulty"),
     ],
 )
 def test_a_mistake_in_the_config_is_one_clear_message(fields, message):
     with pytest.raises(ValueError, match=message):
         multi_cube_command(**fields)
-
-
-def test_reversed_range_of_objects_warns():
-    with pytest.warns(UserWarning, match="object_pose_range.x"):
-        multi_cube_command(object_pose_range=PoseRange(x=(1.0, 0.0)))

@@ -11,7 +11,6 @@ from tracking_tasks import G1, G1_BLIND, part_of, task_cfg, unperturbed
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.tracking.mdp import motion_sampling as start_module
-from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg
 from mjlab.tasks.tracking.mdp.motion_library import MotionFrame
 from mjlab.utils.lab_api.math import quat_from_euler_xyz, quat_mul
 
@@ -442,11 +441,8 @@ def test_the_state_of_a_run_on_motions_of_other_lengths_is_refused(make_env, tmp
         ({"motion_file": ""}, "motion_file: expected a motion"),
         ({"motion_file": "nothing.npz"}, "motion 'nothing.npz'"),
         ({"anchor_body_name": "head"}, "anchor_body_name: .*'torso_link'.*'head'"),
-        ({"body_names": ("pelvis", "torso_link", "tail")}, r"body_names: .*'robot'.*\['tail'\]"),
-        ({"body_names": ("pelvis", "torso_link", "pelvis")}, "body_names: expected distinct"),
+        ({"body_names": ("pelvis", "torso_link", "tail")}, "'tail'"),
         ({"sampling_mode": "random"}, "sampling_mode.*'random'"),
-        ({"adaptive_kernel_size": 0}, "adaptive_kernel_size.* 0"),
-        ({"adaptive_uniform_ratio": 0.0}, "adaptive_uniform_ratio.* 0.0"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_when_the_task_is_built(changes, message):
@@ -455,7 +451,7 @@ def test_what_does_not_fit_is_refused_when_the_task_is_built(changes, message):
     assert "CommandManager term 'motion'" in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["dog", "self_collision"])
+@pytest.mark.parametrize("name", ["dog"])
 def test_what_is_no_entity_is_named_with_those_of_the_scene(name):
     with pytest.raises(KeyError, match=f"CommandManager term 'motion': .*'{name}'.*'robot'"):
         ManagerBasedRlEnv(task_cfg(entity_name=name), device="cpu")
@@ -464,11 +460,8 @@ def test_what_is_no_entity_is_named_with_those_of_the_scene(name):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"pose_range": {"z": (0.1, -0.1)}}, r"pose_range\['z'\].*\(0.1, -0.1\)"),
+        ({"pose_range": {"up": (0.0, 1.0)}}, "pose_range.*'up'"),
         ({"velocity_range": {"up": (0.0, 1.0)}}, "velocity_range.*'up'"),
-        ({"joint_position_range": (0.2, -0.2)}, "joint_position_range"),
-        ({"adaptive_alpha": 1.5, "adaptive_lambda": 0.0}, "adaptive_lambda.* 0.0.*alpha.* 1.5"),
-        ({"viz": MotionCommandCfg.VizCfg(mode="axes")}, "viz.mode.*ghost.*'axes'"),
     ],
 )  # fmt: skip
 def test_odd_settings_are_one_warning(make_env, changes, message):

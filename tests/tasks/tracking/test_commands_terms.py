@@ -203,40 +203,8 @@ def test_no_end_effectors_have_no_error_and_unknown_ones_are_refused(env):
             measure(command, ("tail",))
 
 
-def set_param(kind, name, **params):
-    def edit(cfg):
-        getattr(cfg, kind)[name].params.update(params)
-
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (set_param("rewards", "motion_body_pos", command_name="twist"), "'twist'.*'motion'"),
-    ],
-)
-def test_terms_that_could_not_work_are_refused_when_the_task_is_built(edit, message):
-    with pytest.raises((KeyError, ValueError), match=message):
-        ManagerBasedRlEnv(task_cfg("wave", num_envs=1, edit=edit), device="cpu")
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (
-            set_param("rewards", "motion_body_pos", body_names=("pelvis", "tail")),
-            r"'motion_body_pos': body_names: .*got \['tail'\]",
-        ),
-        (set_param("rewards", "motion_body_pos", body_names=()), r"body_names: .*got \(\)"),
-        (set_param("rewards", "motion_body_pos", std=0.0), "std.*0.0"),
-        (set_param("terminations", "ee_body_pos", body_names=("hand",)), r"got \['hand'\]"),
-        (set_param("terminations", "anchor_pos", threshold=-1.0), "threshold.*-1.0"),
-    ],
-)
-def test_odd_parameters_of_terms_warn_once(edit, message):
-    with pytest.warns(UserWarning, match=message) as caught:
-        env = ManagerBasedRlEnv(task_cfg("wave", num_envs=1, edit=edit), device="cpu")
-    assert len([one for one in caught if "expected" in str(one.message)]) == 1
-    env.reset()
-    env.step(torch.zeros(1, env.action_manager.total_action_dim))
+@pytest.mark.parametrize("names", [("pelvis", "tail"), ()])
+def test_bodies_that_are_not_tracked_warn(env, place, names):
+    place()
+    with pytest.warns(UserWarning, match="body_names: expected tracked bodies"):
+        mdp.motion_relative_body_position_error_exp(env, "motion", 0.3, names)

@@ -327,8 +327,6 @@ def test_what_makes_no_sense_is_refused_when_the_command_is_built(fields, messag
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"rel_standing_envs": 1.2}, "rel_standing_envs.*1.2"),
-        ({"init_velocity_prob": -0.1}, "init_velocity_prob.*-0.1"),
         ({"resampling_time_range": (-1.0, 2.0)}, "resampling_time_range"),
     ],
 )
@@ -338,34 +336,14 @@ def test_odd_numbers_of_the_command_warn(fields, message):
     assert len(caught) == 1
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"ranges": {"lin_vel_x": (1.0, -1.0)}}, r"ranges.lin_vel_x.*\(1.0, -1.0\)"),
-        ({"ranges": {"ang_vel_z": (0.0, math.nan)}}, "ranges.ang_vel_z.*nan"),
-        ({"heading_command": True, "ranges": {"heading": (2.0, 1.0)}}, "ranges.heading"),
-    ],
-)
-def test_odd_ranges_are_one_warning(fields, message):
-    with pytest.warns(UserWarning, match=f"UniformVelocityCommandCfg {message}") as warned:
-        velocity_command(**fields)
-    assert len(warned) == 1
+def test_unknown_entity(make_env):
+    name = "robto"
 
-
-@pytest.mark.parametrize("name", ["robto", "feet_ground_contact"])
-def test_what_is_no_entity_is_refused_with_those_that_exist(make_env, name):
     def edit(cfg):
         cfg.commands["twist"].entity_name = name
 
-    with pytest.raises(UnknownNameError, match=rf"'twist': .*'{name}'.*\['terrain', 'robot'\]"):
+    with pytest.raises(UnknownNameError, match=rf"'twist': .*'{name}'.*'terrain', 'robot'"):
         make_env(edit=edit)
-
-
-def test_a_robot_that_is_fixed_cannot_start_moving():
-    env = StandInEnv(num_envs=8)
-    env.robot.is_fixed_base = True
-    with pytest.raises(ValueError, match="init_velocity_prob.*fixed base, got 0.5"):
-        velocity_command(env, init_velocity_prob=0.5)
 
 
 # Viewers.

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-import mujoco
-import numpy as np
 import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.term_checks import check_range, require_entity
 from mjlab.tasks.manipulation.mdp.goal_panel import GoalPanel
-from mjlab.utils.errors import check_one_of, check_positive, warned
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.lab_api.math import sample_ranges
 
 if TYPE_CHECKING:
@@ -105,12 +100,6 @@ class GoalCommand(CommandTerm):
     def __init__(self, cfg: GoalCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         check_one_of("difficulty", cfg.difficulty, _DIFFICULTIES)
-        with warned():
-            check_positive("success_threshold", cfg.success_threshold)
-        for axis in ("x", "y", "z"):
-            with warned():
-                name = f"target_position_range.{axis}"
-                check_range(name, getattr(cfg.target_position_range, axis))
         self.target_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.goal_age = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self.last_goal_met = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -256,7 +245,7 @@ class LiftingCommandCfg(GoalCommandCfg):
     """Visualization settings."""
 
     def build(self, env: ManagerBasedRlEnv) -> LiftingCommand:
-        """Build the term; raises `ValueError` for invalid ranges or a fixed object."""
+        """Build the term."""
         return LiftingCommand(self, env)
 
 
@@ -270,10 +259,7 @@ class LiftingCommand(GoalCommand):
 
     def __init__(self, cfg: LiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        is_moved = cfg.object_pose_range is not None
-        self.object: Entity = require_object(env, cfg.entity_name, is_moved)
-        if cfg.object_pose_range is not None:
-            check_pose_range(cfg.object_pose_range)
+        self.object: Entity = env.scene[cfg.entity_name]
         self.metrics = {
             "object_height": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
             **self.metrics,
@@ -320,7 +306,7 @@ class MultiCubeLiftingCommandCfg(GoalCommandCfg):
     """Ranges of the object poses."""
 
     def build(self, env: ManagerBasedRlEnv) -> MultiCubeLiftingCommand:
-        """Build the term; raises `ValueError` for invalid ranges or fixed objects."""
+        """Build the term."""
         return MultiCubeLiftingCommand(self, env)
 
 
@@ -339,12 +325,7 @@ class MultiCubeLiftingCommand(GoalCommand):
 
     def __init__(self, cfg: MultiCubeLiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        check_pose_range(cfg.object_pose_range)
-        if not cfg.entity_names:
-            raise ValueError("entity_names: expected at least one object, got ().")
-        self.objects: list[Entity] = [
-            require_object(env, name, is_moved=True) for name in cfg.entity_names
-        ]
+        self.objects: list[Entity] = [env.scene[name] for name in cfg.entity_names]
         self.target_selection = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         ids = [torch.as_tensor(one.indexing.geom_ids).long().cpu() for one in self.objects]
         # Scene ids of the geoms of each object, (K, G).
@@ -390,24 +371,6 @@ class MultiCubeLiftingCommand(GoalCommand):
         for index in visualizer.get_env_indices(self.num_envs):
             mark = target[index].cpu().numpy() + (0.0, 0.0, _MARK_HEIGHT)
             visualizer.add_sphere(mark, _MARK_RADIUS, _MARK_COLOR)
-
-
-def check_pose_range(within: Any) -> None:
-    """Warn of an invalid range in `within`."""
-    for name in ("x", "y", "z", "yaw"):
-        with warned():
-            check_range(f"object_pose_range.{name}", getattr(within, name))
-
-
-def require_object(env: ManagerBasedRlEnv, name: str, is_moved: bool) -> Entity:
-    """Return the entity `name`; raises `ValueError` if it has a fixed base and `is_moved`."""
-    entity = require_entity(env, name)
-    if is_moved and entity.is_fixed_base:
-        raise ValueError(
-            f"Entity {name!r}: expected a floating base, got a fixed base; give its root body a "
-            "free joint."
-        )
-    return entity
 
 
 # Placement of several objects without overlap.
@@ -475,75 +438,6 @@ def distance_apart(
             "and be thrown apart. Widen x or y, or use fewer or smaller objects.", list(names),
         )  # fmt: skip
     return radii.unsqueeze(1) + radii.unsqueeze(2)
-
-
-# Reach of an arm.
-
-
-def check_reach(
-    env: ManagerBasedRlEnv, command_name: str, cfg: GoalCommandCfg, entity_name: str, site: str
-) -> None:
-    """Warn if goals or objects of a command are certainly out of an arm's reach.
-
-    `success_threshold` is added to the reach, because objects count as at their goal within it.
-    """
-    found = reach(env.sim.mj_model, f"{entity_name}/{site}")
-    if found is None:
-        return
-    center, longest = found
-    goals, starts = cfg.target_position_range, getattr(cfg, "object_pose_range", None)
-    places: list[tuple[str, Any, str]]
-    places = [("goals", (goals.x, goals.y, goals.z), "narrow target_position_range")]
-    if cfg.difficulty == "fixed":
-        nearer = "move the arm nearer, or use difficulty 'dynamic', whose goals have a range"
-        places = [("goals", [(value,) for value in FIXED_GOAL], nearer)]
-    if starts is not None:
-        places.append(("objects", (starts.x, starts.y, starts.z), "narrow object_pose_range"))
-    for kind, ranges, remedy in places:
-        corners = itertools.product(*ranges)
-        farthest = max(corners, key=lambda point: math.dist(point, center))
-        distance = math.dist(farthest, center)
-        if distance > longest + cfg.success_threshold:
-            warnings.warn(
-                f"Command {command_name!r} {kind}: expected at most {longest:.2f} m from the first "
-                f"joint of entity {entity_name!r}, the reach of site {site!r}, got {distance:.2f} m "
-                f"at {farthest} (m, relative to the environment's origin); {remedy}.",
-                UserWarning,
-                stacklevel=2,
-            )
-
-
-def reach(model: mujoco.MjModel, site: str) -> tuple[np.ndarray, float] | None:
-    """Return the center (3,) and the maximum reach of a site (m); None: unlimited.
-
-    The center is the joint nearest to the base, in the model's initial configuration. The reach is
-    an upper bound: the sum of the distances from joint to joint plus the travel of slide joints.
-    Joint limits may reduce it. The reach is unlimited with a floating base or an unlimited slide
-    joint.
-    """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    point, length, is_jointed = data.site(site).xpos.copy(), 0.0, False
-    body = int(model.site_bodyid[model.site(site).id])
-    while body > 0:
-        first = int(model.body_jntadr[body])
-        for joint in reversed(range(first, first + int(model.body_jntnum[body]))):
-            kind = model.jnt_type[joint]
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
-                return None
-            if kind == mujoco.mjtJoint.mjJNT_SLIDE:
-                if not model.jnt_limited[joint]:
-                    return None
-                # jnt_range bounds qpos; its initial value may be nonzero.
-                start = model.qpos0[model.jnt_qposadr[joint]]
-                length += float(np.abs(model.jnt_range[joint] - start).max())
-                continue
-            anchor = data.xanchor[joint].copy()
-            # Links between joints are rigid, so the joint-to-joint distance is an upper bound.
-            length += float(np.linalg.norm(point - anchor))
-            point, is_jointed = anchor, True
-        body = int(model.body_parentid[body])
-    return (point, length) if is_jointed or length > 0.0 else (point, 0.0)
 
 
 __getattr__ = older_names(__name__)

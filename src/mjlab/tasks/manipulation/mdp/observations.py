@@ -6,9 +6,6 @@ positions are positions of their root links. Images have channels first: (N, C, 
 
 from __future__ import annotations
 
-import math
-import warnings
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -16,14 +13,11 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.managers.term_checks import checked_when_built, require_sensor
-from mjlab.sensor import CameraSensor
 from mjlab.tasks.manipulation.mdp.commands import (
     LiftingCommand,
     MultiCubeLiftingCommand,
-    check_reach,
 )
-from mjlab.utils.errors import WrongTypeError, check_exists, check_in_range, check_positive, warned
+from mjlab.utils.errors import WrongTypeError
 from mjlab.utils.lab_api.math import quat_apply_inverse
 
 if TYPE_CHECKING:
@@ -46,67 +40,6 @@ DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 
 
-def check_task_term(
-    env: ManagerBasedRlEnv,
-    *,
-    kinds: tuple[type, ...] = (),
-    has_hand: bool = False,
-    command_name: str | None = None,
-    object_name: str | None = None,
-    asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG,
-    max_vel: float = 0.0,
-    **params: Any,
-) -> None:
-    """Check a term of a manipulation task.
-
-    Args:
-        env: The environment.
-        kinds: Classes of commands that the term reads; see `goal_command`.
-        has_hand: The term reads the end effector, a site of `asset_cfg`.
-        command_name: Parameter of the term, as the following ones.
-        object_name: Entity.
-        asset_cfg: Robot.
-        max_vel: Speed limit, >= 0.
-        params: Further parameters; `std` and `..._std` must be positive.
-
-    Raises:
-        KeyError: unknown command.
-        TypeError: the command is not of `kinds`.
-        ValueError: unknown object, or not exactly one site.
-
-    Warns of numbers outside their ranges, and of goals out of reach.
-    """
-    for name, value in params.items():
-        if name.endswith("std"):
-            with warned():
-                check_positive(name, value)
-    with warned():
-        check_in_range("max_vel", max_vel, 0.0, math.inf)
-    if object_name is not None:
-        check_exists("entity in object_name", object_name, env.scene.entities)
-    command = None if command_name is None else goal_command(env, command_name, *kinds)
-    if has_hand:
-        site = find_site(env, asset_cfg)
-        # One warning for all terms that read the same goal and hand.
-        place, known = (command_name, asset_cfg.name, site), vars(env).setdefault("_reached", set())
-        if command is not None and place not in known:
-            known.add(place)
-            check_reach(env, str(command_name), command.cfg, asset_cfg.name, site)
-
-
-def find_site(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> str:
-    """Return the name of the selected site; raises `ValueError` unless exactly one is selected."""
-    names, ids = env.scene[asset_cfg.name].site_names, columns_of(asset_cfg, "site", env)
-    selected = list(names[ids]) if isinstance(ids, slice) else [names[index] for index in ids]
-    if len(selected) != 1:
-        raise ValueError(
-            f"asset_cfg: expected one site of entity {asset_cfg.name!r}, got {len(selected)}; set "
-            f"site_names, e.g. to the site between the fingers. Available: {list(names)}."
-        )
-    return selected[0]
-
-
-@checked_when_built(partial(check_task_term, has_hand=True))
 def ee_to_object_distance(
     env: ManagerBasedRlEnv, object_name: str, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -135,7 +68,6 @@ def object_to_goal_distance(
     return quat_apply_inverse(asset.data.root_link_quat_w, offset)
 
 
-@checked_when_built(partial(check_task_term, has_hand=True))
 def target_position(
     env: ManagerBasedRlEnv, command_name: str, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -148,50 +80,22 @@ def target_position(
     return quat_apply_inverse(site_quat(env, asset_cfg), offset)
 
 
-@checked_when_built(partial(check_task_term, has_hand=True))
 def ee_velocity(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
     """Linear velocity of the end effector in the end-effector frame (m/s), (N, 3)."""
-    asset: Entity = env.scene[asset_cfg.name]
-    sites = columns_of(asset_cfg, "site", env)
-    velocity = asset.data.site_lin_vel_w[:, sites].squeeze(1)
+    velocity = _at_site(env, asset_cfg, env.scene[asset_cfg.name].data.site_lin_vel_w)
     return quat_apply_inverse(site_quat(env, asset_cfg), velocity)
 
 
 # Images.
 
 
-def _check_camera(
-    env: ManagerBasedRlEnv,
-    sensor_name: str,
-    data_type: str,
-    min_depth: float = 0.01,
-    cutoff_distance: float = math.inf,
-    **_: Any,
-) -> None:
-    cfg = require_sensor(env, sensor_name, CameraSensor).cfg
-    if data_type not in cfg.data_types:
-        raise ValueError(
-            f"Camera {sensor_name!r} data_types: expected {data_type!r} among them, got "
-            f"{tuple(cfg.data_types)}; add it."
-        )
-    if not 0.0 <= min_depth < cutoff_distance:
-        warnings.warn(
-            "min_depth and cutoff_distance: expected 0 <= min_depth < cutoff_distance, got "
-            f"{min_depth} and {cutoff_distance}.",
-            UserWarning,
-            stacklevel=2,
-        )
-
-
-@checked_when_built(partial(_check_camera, data_type="rgb"))
 def camera_rgb(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """RGB image in [0, 1], (N, 3, height, width)."""
     return env.scene[sensor_name].data.rgb.permute(0, 3, 1, 2).float().div_(255.0)
 
 
-@checked_when_built(partial(_check_camera, data_type="depth"))
 def camera_depth(
     env: ManagerBasedRlEnv, sensor_name: str, cutoff_distance: float, min_depth: float = 0.01
 ) -> torch.Tensor:
@@ -206,13 +110,11 @@ def camera_depth(
     return torch.where(depth > 0.0, fraction, 1.0)
 
 
-@checked_when_built(partial(_check_camera, data_type="segmentation"))
 def camera_segmentation(env: ManagerBasedRlEnv, sensor_name: str) -> torch.Tensor:
     """Object id and type of each pixel, (N, 2, height, width) int32; background: (-1, -1)."""
     return env.scene[sensor_name].data.segmentation.permute(0, 3, 1, 2)
 
 
-@checked_when_built(partial(_check_camera, data_type="segmentation"))
 def camera_target_cube_mask(
     env: ManagerBasedRlEnv, sensor_name: str, command_name: str
 ) -> torch.Tensor:
@@ -244,14 +146,25 @@ def goal_command(env: ManagerBasedRlEnv, name: str, *kinds: type) -> Any:
 
 def site_pos(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the world position of the selected site, (N, 3)."""
-    asset: Entity = env.scene[asset_cfg.name]
-    return asset.data.site_pos_w[:, columns_of(asset_cfg, "site", env)].squeeze(1)
+    return _at_site(env, asset_cfg, env.scene[asset_cfg.name].data.site_pos_w)
 
 
 def site_quat(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
     """Return the world orientation of the selected site, (N, 4)."""
-    asset: Entity = env.scene[asset_cfg.name]
-    return asset.data.site_quat_w[:, columns_of(asset_cfg, "site", env)].squeeze(1)
+    return _at_site(env, asset_cfg, env.scene[asset_cfg.name].data.site_quat_w)
+
+
+def _at_site(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg, values: torch.Tensor
+) -> torch.Tensor:
+    """Return the row of `values`, (N, sites, D), of the selected site; raises unless it is one."""
+    chosen = values[:, columns_of(asset_cfg, "site", env)]
+    if chosen.shape[1] != 1:
+        raise ValueError(
+            f"asset_cfg: expected one site of entity {asset_cfg.name!r}, got {chosen.shape[1]}; set "
+            f"site_names. Available: {list(env.scene[asset_cfg.name].site_names)}."
+        )
+    return chosen[:, 0]
 
 
 __getattr__ = older_names(__name__)

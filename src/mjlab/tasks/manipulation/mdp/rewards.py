@@ -6,18 +6,15 @@ before the last physics substep.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.managers.term_checks import checked_when_built
 from mjlab.tasks.manipulation.mdp.commands import LiftingCommand, MultiCubeLiftingCommand
 from mjlab.tasks.manipulation.mdp.observations import (
     DEFAULT_ASSET_CFG,
-    check_task_term,
     goal_command,
     site_pos,
 )
@@ -35,7 +32,6 @@ __all__ = [
 ]
 
 
-@checked_when_built(partial(check_task_term, kinds=(LiftingCommand,), has_hand=True))
 def staged_position_reward(
     env: ManagerBasedRlEnv,
     command_name: str,
@@ -55,7 +51,6 @@ def staged_position_reward(
     return _staged(hand, target.data.root_link_pos_w, goal, reaching_std, bringing_std)
 
 
-@checked_when_built(partial(check_task_term, kinds=(LiftingCommand,)))
 def bring_object_reward(
     env: ManagerBasedRlEnv, command_name: str, object_name: str, std: float
 ) -> torch.Tensor:
@@ -65,7 +60,6 @@ def bring_object_reward(
     return _closeness(target.data.root_link_pos_w, goal, std)
 
 
-@checked_when_built(partial(check_task_term, kinds=(MultiCubeLiftingCommand,), has_hand=True))
 def multi_cube_staged_position_reward(
     env: ManagerBasedRlEnv,
     command_name: str,
@@ -80,7 +74,6 @@ def multi_cube_staged_position_reward(
     return _staged(hand, target, command.target_pos, reaching_std, bringing_std)
 
 
-@checked_when_built(partial(check_task_term, kinds=(MultiCubeLiftingCommand,)))
 def multi_cube_bring_object_reward(
     env: ManagerBasedRlEnv, command_name: str, std: float
 ) -> torch.Tensor:
@@ -89,7 +82,6 @@ def multi_cube_bring_object_reward(
     return _closeness(command.target_object_pos(), command.target_pos, std)
 
 
-@checked_when_built(check_task_term)
 def joint_velocity_hinge_penalty(
     env: ManagerBasedRlEnv, max_vel: float, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
-import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import mujoco
 import numpy as np
@@ -16,7 +14,6 @@ import torch
 from mjlab.compat import older_names
 from mjlab.entity.building import short_name
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.term_checks import require_entity
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
     MotionReader,
@@ -34,18 +31,10 @@ from mjlab.tasks.tracking.mdp.motion_sampling import (
     perturbed_start,
 )
 from mjlab.tasks.tracking.motion_order import Skeleton
-from mjlab.utils.errors import (
-    WrongTypeError,
-    check_count,
-    check_one_of,
-    check_positive,
-    warned,
-)
+from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_ids, is_empty
-from mjlab.utils.lab_api.math import (
-    matrix_from_quat,
-    quat_error_magnitude,
-)
+from mjlab.utils.lab_api.math import matrix_from_quat, quat_error_magnitude
+from mjlab.utils.torch import constant_tensor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,7 +52,6 @@ __all__ = [
 ]
 
 _MODES = ("adaptive", "uniform", "start")
-_DRAWINGS = ("ghost", "frames")
 # Axis lengths of bodies and of the anchor (m).
 _REFERENCE_LENGTHS = (0.08, 0.1)
 _ROBOT_LENGTHS = (0.12, 0.15)
@@ -72,17 +60,6 @@ _AXIS_RADIUS = 0.008
 # Geom group hidden in ghosts by all viewers.
 _HIDDEN_GROUP = 3
 _SAMPLING_METRICS = ("sampling_entropy", "sampling_top1_prob", "sampling_top1_bin")
-# Attributes read by the terms; commands may be of a custom class.
-_READ = (
-    "anchor_pos_w",
-    "anchor_quat_w",
-    "robot_anchor_pos_w",
-    "robot_anchor_quat_w",
-    "body_pos_relative_w",
-    "body_quat_relative_w",
-    "robot_body_pos_w",
-    "robot_body_quat_w",
-)
 
 
 @dataclass(kw_only=True)
@@ -174,12 +151,28 @@ class MotionCommand(MotionReader, CommandTerm):
 
     def __init__(self, cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
-        check_command_cfg(cfg)
+        check_one_of("anchor_body_name", cfg.anchor_body_name, cfg.body_names)
+        check_one_of("sampling_mode", cfg.sampling_mode, _MODES)
+        if ignored := {*cfg.pose_range, *cfg.velocity_range} - {*AXES}:
+            warnings.warn(
+                f"MotionCommandCfg pose_range and velocity_range: expected keys {list(AXES)}, got "
+                f"{sorted(ignored)}, ignored.",
+                UserWarning,
+                stacklevel=2,
+            )
         self.scene = env.scene
-        self.robot: Entity = find_robot(cfg, env)
+        self.robot: Entity = env.scene[cfg.entity_name]
+        root = short_name(self.robot.root_body.name)
+        if cfg.body_names[0] != root:
+            warnings.warn(
+                f"MotionCommandCfg body_names: expected the floating base {root!r} first, got "
+                f"{cfg.body_names[0]!r}; episodes start with the base in its pose.",
+                UserWarning,
+                stacklevel=2,
+            )
         self.body_names = tuple(cfg.body_names)
         self.anchor_index = self.body_names.index(cfg.anchor_body_name)
-        indexes = [self.robot.body_names.index(name) for name in self.body_names]
+        indexes, _ = self.robot.find_bodies(self.body_names, preserve_order=True)
         self.body_indexes = torch.tensor(indexes, device=self.device)
         self.anchor_body = indexes[self.anchor_index]
         self.motion_files, self.motion = read_library(
@@ -470,139 +463,24 @@ class MotionCommand(MotionReader, CommandTerm):
 
 
 def motion_command(env: ManagerBasedRlEnv, command_name: str) -> MotionCommand:
-    """Return the motion command called `command_name`."""
-    # Existence and type are checked when the term is built.
-    manager: Any = env.command_manager
-    return manager.get_term(command_name)
-
-
-def check_motion_term(
-    env: ManagerBasedRlEnv,
-    command_name: str,
-    body_names: tuple[str, ...] | None = None,
-    std: float | None = None,
-    threshold: float | None = None,
-    **_: Any,
-) -> None:
-    """Check a term that reads a motion command.
-
-    Raises:
-        KeyError: unknown command.
-        TypeError: the command lacks attributes of `MotionCommand`.
-
-    Warns of bodies that the command does not track, of empty `body_names`, and of `std` or
-    `threshold` not positive.
-    """
-    command: Any = motion_command(env, command_name)
-    missing: list[str] = []
-    if not isinstance(command, MotionCommand):
-        # dir() instead of getattr: properties may fail before the first reset.
-        missing = sorted(set(_READ) - set(dir(command)))
-        missing += [] if hasattr(command.cfg, "body_names") else ["cfg.body_names"]
-    if missing:
-        raise WrongTypeError(
-            f"Command {command_name!r}: expected a MotionCommand or a term with its attributes, "
-            f"got a {type(command).__name__} without {', '.join(missing)}."
-        )
-    if body_names is not None:
-        unknown = [name for name in body_names if name not in _tracked(command)]
-        if unknown or not body_names:
-            warnings.warn(
-                f"body_names: expected tracked bodies, got {unknown or ()}, ignored. Available: "
-                f"{list(_tracked(command))}.",
-                UserWarning,
-                stacklevel=2,
-            )
-    for name, value in (("std", std), ("threshold", threshold)):
-        if value is not None:
-            with warned():
-                check_positive(name, value)
+    """Return the motion command called `command_name`, a `MotionCommand` or a term with its attributes."""
+    return cast("MotionCommand", env.command_manager.get_term(command_name))
 
 
 def body_columns(command: MotionReader, body_names: tuple[str, ...] | None) -> slice | torch.Tensor:
     """Return the columns of `body_names` (None: all) among the tracked bodies, in their order."""
     if body_names is None:
         return slice(None)
-    device = str(command.body_pos_relative_w.device)
-    return _columns_of(tuple(body_names), tuple(_tracked(command)), device)
-
-
-def _tracked(command: MotionReader) -> Sequence[str]:
-    return command.body_names if isinstance(command, MotionReader) else command.cfg.body_names
-
-
-@functools.lru_cache(maxsize=256)
-def _columns_of(body_names: tuple[str, ...], tracked: tuple[str, ...], device: str) -> torch.Tensor:
-    columns = [i for i, name in enumerate(tracked) if name in body_names]
-    return torch.tensor(columns, dtype=torch.long, device=device)
-
-
-# Checks of config and robot.
-
-
-def check_command_cfg(cfg: MotionCommandCfg) -> None:
-    """Raise `ValueError` for names or numbers that cannot be used; warn once of odd ones."""
-    if len(set(cfg.body_names)) != len(cfg.body_names):
-        raise ValueError(f"body_names: expected distinct bodies, got {list(cfg.body_names)}.")
-    check_one_of("anchor_body_name", cfg.anchor_body_name, cfg.body_names)
-    check_one_of("sampling_mode", cfg.sampling_mode, _MODES)
-    check_count("adaptive_kernel_size", cfg.adaptive_kernel_size)
-    if cfg.adaptive_uniform_ratio == 0:
-        # All start probabilities would be 0 before the first failure.
-        raise ValueError(
-            f"adaptive_uniform_ratio: expected a number > 0, got {cfg.adaptive_uniform_ratio}."
-        )
-    odd = []
-    if cfg.viz.mode not in _DRAWINGS:
-        odd.append(f"viz.mode expected one of {list(_DRAWINGS)}, got {cfg.viz.mode!r}")
-    ranges = {"joint_position_range": cfg.joint_position_range}
-    for name in ("pose_range", "velocity_range"):
-        for axis, bounds in getattr(cfg, name).items():
-            ranges[f"{name}[{axis!r}]"] = bounds
-            if axis not in AXES:
-                odd.append(f"{name} expected keys {list(AXES)}, got {axis!r}, ignored")
-    for name, (low, high) in ranges.items():
-        if not -math.inf < low <= high < math.inf:
-            odd.append(f"{name} expected finite (low, high) with low <= high, got {(low, high)}")
-    if cfg.adaptive_uniform_ratio < 0:
-        odd.append(f"adaptive_uniform_ratio expected > 0, got {cfg.adaptive_uniform_ratio}")
-    for name in ("adaptive_lambda", "adaptive_alpha"):
-        if not 0.0 < getattr(cfg, name) <= 1.0:
-            odd.append(f"{name} expected in (0, 1], got {getattr(cfg, name)}")
-    if odd:
-        warnings.warn(f"MotionCommandCfg: {'; '.join(odd)}.", UserWarning, stacklevel=2)
-
-
-def find_robot(cfg: MotionCommandCfg, env: ManagerBasedRlEnv) -> Entity:
-    """Return the entity `cfg.entity_name`.
-
-    Raises:
-        KeyError: unknown entity.
-        ValueError: fixed base, or a tracked body not found.
-
-    Warns if the first tracked body is not the floating base.
-    """
-    robot = require_entity(env, cfg.entity_name)
-    if robot.is_fixed_base:
-        raise ValueError(
-            f"Entity {cfg.entity_name!r}: expected a floating base, got a fixed base; give its "
-            "root body a free joint."
-        )
-    missing = [name for name in cfg.body_names if name not in robot.body_names]
-    if missing:
-        raise ValueError(
-            f"body_names: expected bodies of entity {cfg.entity_name!r}, got {missing}. Available: "
-            f"{list(robot.body_names)}."
-        )
-    root = short_name(robot.root_body.name)
-    if cfg.body_names[0] != root:
+    tracked = command.body_names if isinstance(command, MotionReader) else command.cfg.body_names
+    columns = tuple(i for i, name in enumerate(tracked) if name in body_names)
+    if len(columns) < max(len(body_names), 1):
         warnings.warn(
-            f"MotionCommandCfg body_names: expected the floating base {root!r} first, got "
-            f"{cfg.body_names[0]!r}; episodes start with the base in its pose.",
+            f"body_names: expected tracked bodies, got {tuple(body_names)}; others are ignored. "
+            f"Available: {tuple(tracked)}.",
             UserWarning,
             stacklevel=2,
         )
-    return robot
+    return constant_tensor(columns, command.body_pos_relative_w.device, torch.long)
 
 
 # Visualization.

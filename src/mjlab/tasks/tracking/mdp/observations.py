@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.term_checks import checked_when_built
-from mjlab.tasks.tracking.mdp.commands import check_motion_term, motion_command
+from mjlab.tasks.tracking.mdp.commands import motion_command
 from mjlab.utils.lab_api.math import quat_apply_inverse, quat_conjugate, quat_mul
 
 if TYPE_CHECKING:
@@ -22,7 +21,6 @@ __all__ = [
 ]
 
 
-@checked_when_built(check_motion_term)
 def motion_anchor_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Position of the reference anchor in the frame of the robot anchor (m), (N, 3)."""
     command = motion_command(env, command_name)
@@ -30,7 +28,6 @@ def motion_anchor_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tens
     return quat_apply_inverse(command.robot_anchor_quat_w, offset)
 
 
-@checked_when_built(check_motion_term)
 def motion_anchor_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Orientation of the reference anchor in the frame of the robot anchor, (N, 6).
 
@@ -41,7 +38,6 @@ def motion_anchor_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tens
     return _two_columns(relative)
 
 
-@checked_when_built(check_motion_term)
 def robot_body_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Positions of the robot's tracked bodies in the frame of its anchor (m), (N, 3 K)."""
     command = motion_command(env, command_name)
@@ -50,7 +46,6 @@ def robot_body_pos_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     return quat_apply_inverse(command.robot_anchor_quat_w[:, None], offset).flatten(1)
 
 
-@checked_when_built(check_motion_term)
 def robot_body_ori_b(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Orientations of the robot's tracked bodies in the frame of its anchor, (N, 6 K).
 

@@ -11,8 +11,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
-from mjlab.managers.term_checks import checked_when_built
-from mjlab.tasks.tracking.mdp.commands import body_columns, check_motion_term, motion_command
+from mjlab.tasks.tracking.mdp.commands import body_columns, motion_command
 from mjlab.utils.lab_api.math import quat_error_magnitude
 
 if TYPE_CHECKING:
@@ -30,7 +29,6 @@ __all__ = [
 BodyNames = tuple[str, ...] | None
 
 
-@checked_when_built(check_motion_term)
 def motion_global_anchor_position_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float
 ) -> torch.Tensor:
@@ -40,7 +38,6 @@ def motion_global_anchor_position_error_exp(
     return torch.exp(error / -(std**2))
 
 
-@checked_when_built(check_motion_term)
 def motion_global_anchor_orientation_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float
 ) -> torch.Tensor:
@@ -50,7 +47,6 @@ def motion_global_anchor_orientation_error_exp(
     return torch.exp(angle.square() / -(std**2))
 
 
-@checked_when_built(check_motion_term)
 def motion_relative_body_position_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:
@@ -60,7 +56,6 @@ def motion_relative_body_position_error_exp(
     return _rewarded(away, body_columns(command, body_names), std)
 
 
-@checked_when_built(check_motion_term)
 def motion_relative_body_orientation_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:
@@ -70,7 +65,6 @@ def motion_relative_body_orientation_error_exp(
     return _rewarded(angle.unsqueeze(-1), body_columns(command, body_names), std)
 
 
-@checked_when_built(check_motion_term)
 def motion_global_body_linear_velocity_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:
@@ -80,7 +74,6 @@ def motion_global_body_linear_velocity_error_exp(
     return _rewarded(error, body_columns(command, body_names), std)
 
 
-@checked_when_built(check_motion_term)
 def motion_global_body_angular_velocity_error_exp(
     env: ManagerBasedRlEnv, command_name: str, std: float, body_names: BodyNames = None
 ) -> torch.Tensor:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.compat import older_names
-from mjlab.managers.term_checks import checked_when_built
-from mjlab.tasks.tracking.mdp.commands import body_columns, check_motion_term, motion_command
+from mjlab.tasks.tracking.mdp.commands import body_columns, motion_command
 from mjlab.utils.lab_api.math import quat_apply_inverse as quat_apply_inverse
 
 if TYPE_CHECKING:
@@ -27,7 +26,6 @@ __all__ = [
 BodyNames = tuple[str, ...] | None
 
 
-@checked_when_built(check_motion_term)
 def bad_anchor_pos(env: ManagerBasedRlEnv, command_name: str, threshold: float) -> torch.Tensor:
     """Terminate if the distance of robot anchor and reference anchor exceeds `threshold` (m)."""
     command = motion_command(env, command_name)
@@ -35,7 +33,6 @@ def bad_anchor_pos(env: ManagerBasedRlEnv, command_name: str, threshold: float) 
     return torch.linalg.vector_norm(offset, dim=1) > threshold
 
 
-@checked_when_built(check_motion_term)
 def bad_anchor_pos_z_only(
     env: ManagerBasedRlEnv, command_name: str, threshold: float
 ) -> torch.Tensor:
@@ -44,7 +41,6 @@ def bad_anchor_pos_z_only(
     return (command.anchor_pos_w[:, 2] - command.robot_anchor_pos_w[:, 2]).abs() > threshold
 
 
-@checked_when_built(check_motion_term)
 def bad_anchor_ori(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg, command_name: str, threshold: float
 ) -> torch.Tensor:
@@ -62,7 +58,6 @@ def _down(quat: torch.Tensor) -> torch.Tensor:
     return 2.0 * (x * x + y * y) - 1.0
 
 
-@checked_when_built(check_motion_term)
 def bad_motion_body_pos(
     env: ManagerBasedRlEnv, command_name: str, threshold: float, body_names: BodyNames = None
 ) -> torch.Tensor:
@@ -76,7 +71,6 @@ def bad_motion_body_pos(
     return (torch.linalg.vector_norm(offset, dim=-1) > threshold).any(dim=1)
 
 
-@checked_when_built(check_motion_term)
 def bad_motion_body_pos_z_only(
     env: ManagerBasedRlEnv, command_name: str, threshold: float, body_names: BodyNames = None
 ) -> torch.Tensor:
@@ -90,7 +84,6 @@ def bad_motion_body_pos_z_only(
     return (offset.abs() > threshold).any(dim=1)
 
 
-@checked_when_built(check_motion_term)
 def motion_ended(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """End the episode at the last frame of the motion. Use as a time-out: the robot did not fail.
 

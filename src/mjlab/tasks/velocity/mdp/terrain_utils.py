@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import TYPE_CHECKING
 
@@ -42,19 +41,17 @@ def terrain_normal_from_sensors(
     points, valid = [], []
     for name in sensor_names:
         data = require_sensor(env, name, RayCastSensor).data
-        rays = _spread(data.distances.shape[1], max_points, str(data.distances.device))
+        count, device = data.distances.shape[1], data.distances.device
+        rays: slice | torch.Tensor = slice(None)
+        if count > max_points:
+            rays = torch.linspace(
+                0, count - 1, max_points, dtype=torch.float32, device=device
+            ).long()
         points.append(data.hit_pos_w[:, rays])
         valid.append(data.distances[:, rays] >= 0.0)
     if len(points) == 1:
         return fit_terrain_normal(points[0], valid[0])
     return fit_terrain_normal(torch.cat(points, dim=1), torch.cat(valid, dim=1))
-
-
-@functools.lru_cache(maxsize=64)
-def _spread(count: int, max_points: int, device: str) -> torch.Tensor | slice:
-    if count <= max_points:
-        return slice(None)
-    return torch.linspace(0, count - 1, max_points, dtype=torch.float32).long().to(device)
 
 
 def fit_terrain_normal(points: torch.Tensor, valid_mask: torch.Tensor) -> torch.Tensor:

@@ -11,9 +11,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
-from mjlab.managers.term_checks import check_range, require_entity
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
-from mjlab.utils.errors import check_field, check_in_range, warned
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_apply, wrap_to_pi
 
@@ -31,13 +29,6 @@ __all__ = [
 
 RANGES = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """Ranges of the command components (vx, vy, wz)."""
-_PROBABILITIES = (
-    "rel_standing_envs",
-    "rel_heading_envs",
-    "rel_world_envs",
-    "rel_forward_envs",
-    "init_velocity_prob",
-)
 # Colors of the arrows, by meaning.
 _ARROW_COLORS: dict[str, Color] = {
     "commanded velocity": (0.2, 0.2, 0.6, 1.0),
@@ -111,26 +102,6 @@ class UniformVelocityCommandCfg(CommandTermCfg):
         return UniformVelocityCommand(self, env)
 
 
-def check_command_cfg(cfg: UniformVelocityCommandCfg) -> None:
-    """Raise `ValueError` for contradictory heading settings; warn of odd ranges and fractions."""
-    for name in RANGES:
-        # A curriculum may replace them before they are used.
-        with warned():
-            check_range(f"UniformVelocityCommandCfg ranges.{name}", getattr(cfg.ranges, name))
-    if cfg.heading_command != (cfg.ranges.heading is not None):
-        expected = "a range" if cfg.heading_command else "None"
-        raise ValueError(
-            f"ranges.heading: expected {expected} with heading_command={cfg.heading_command}, got "
-            f"{cfg.ranges.heading}."
-        )
-    if cfg.ranges.heading is not None:
-        with warned():
-            check_range("UniformVelocityCommandCfg ranges.heading", cfg.ranges.heading)
-    for name in _PROBABILITIES:
-        with warned():
-            check_in_range(f"UniformVelocityCommandCfg {name}", getattr(cfg, name), 0.0, 1.0)
-
-
 class UniformVelocityCommand(CommandTerm):
     """Velocity command (vx, vy, wz) in the root frame, sampled uniformly.
 
@@ -163,10 +134,13 @@ class UniformVelocityCommand(CommandTerm):
     def __init__(self, cfg: UniformVelocityCommandCfg, env: ManagerBasedRlEnv) -> None:
         # Copy the ranges, because curricula edit them at run time.
         super().__init__(dataclasses.replace(cfg, ranges=dataclasses.replace(cfg.ranges)), env)
-        check_command_cfg(cfg)
-        self.robot: Entity = require_entity(env, cfg.entity_name)
-        is_possible = cfg.init_velocity_prob == 0.0 or not self.robot.is_fixed_base
-        check_field(cfg, "init_velocity_prob", is_possible, "0 for an entity with a fixed base")
+        if cfg.heading_command != (cfg.ranges.heading is not None):
+            expected = "a range" if cfg.heading_command else "None"
+            raise ValueError(
+                f"ranges.heading: expected {expected} with heading_command={cfg.heading_command}, got "
+                f"{cfg.ranges.heading}."
+            )
+        self.robot: Entity = env.scene[cfg.entity_name]
         self.vel_command_b = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self.vel_command_w = torch.zeros_like(self.vel_command_b)
         self.heading_target = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
