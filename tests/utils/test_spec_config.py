@@ -102,35 +102,6 @@ def test_edits_that_a_fallback_overwrites_are_reported(spec):
         warn_overlapping_geom_edits([geom], [collision], spec)
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "allowed"),
-    [
-        ("condim", 2, "1, 3, 4 or 6"),
-        ("condim", {"foot": 5}, "1, 3, 4 or 6"),
-        ("contype", -1, ">= 0"),
-        ("conaffinity", -1, ">= 0"),
-        ("priority", {"torso": -2}, ">= 0"),
-        ("margin", -0.1, ">= 0"),
-        ("gap", -0.1, ">= 0"),
-        ("solmix", 1.5, r"\[0, 1\]"),
-        ("friction", (1, 1, 1, 1), "up to 3 numbers"),
-        ("solref", {"foot": 0.1}, "up to 2 numbers"),
-    ],
-)
-@pytest.mark.parametrize("cls", [GeomCfg, CollisionCfg])
-def test_invalid_values_are_refused_with_field_and_pattern(spec, cls, field, value, allowed):
-    required = REQUIRED if cls is CollisionCfg else {}
-    cfg = cls(geom_names_expr=(".*",), **{**required, field: value})
-    where = f"pattern '{next(iter(value))}'" if isinstance(value, dict) else ""
-    with pytest.raises(ValueError, match=rf"{cls.__name__}\.{field}.*{where}.*{allowed}"):
-        cfg.edit_spec(spec)
-
-
-def test_the_group_of_a_geom_is_checked():
-    with pytest.raises(ValueError, match=r"group: .*\[0, 5\], got 6"):
-        GeomCfg(geom_names_expr=(), group=6).validate()
-
-
 def test_geoms_that_share_a_name_are_matched_together(spec):
     GeomCfg(geom_names_expr=("$",), group=2).edit_spec(spec)
     assert spec.compile().geom_group.tolist() == [0, 0, 0, 2]
@@ -207,20 +178,9 @@ def test_a_skybox_from_a_gradient_and_a_cube_from_files():
     assert "".join(spec.texture("g").gridlayout) == ".U..LFRB.D.."
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"builtin": "flat", "width": 0, "height": 4}, "width: .*> 0, got 0"),
-        ({"builtin": "flat", "width": 4}, "height None"),
-        ({}, "source"),
-        ({"builtin": "stripes"}, r"builtin.*\['none'.*'stripes'"),
-        ({"type": "skybox", "file": "sky.png"}, "six faces"),
-        ({"type": "skybox", "file": "sky.png", "gridsize": (1, 1)}, "six faces"),
-    ],
-)
-def test_textures_that_cannot_be_made_are_refused(fields, message):
-    with pytest.raises(ValueError, match=message):
-        TextureCfg(**{"name": "t", "type": "2d", **fields}).edit_spec(mujoco.MjSpec())
+def test_an_unknown_builtin_image_is_an_error():
+    with pytest.raises(ValueError, match=r"builtin.*\['none'.*'stripes'"):
+        TextureCfg(name="t", type="2d", builtin="stripes").edit_spec(mujoco.MjSpec())  # ty: ignore
 
 
 @pytest.mark.parametrize("count", [1, 7])
@@ -236,11 +196,6 @@ def test_friction_may_be_any_sequence(spec, friction):
     GeomCfg(geom_names_expr=(".*",), friction=friction).edit_spec(spec)
     expected = [0.7, 0.1] if len(friction) else [1.0, 0.005]
     np.testing.assert_allclose(spec.geoms[0].friction[:2], expected)
-
-
-def test_a_texture_cannot_be_repeated_zero_times():
-    with pytest.raises(ValueError, match="texrepeat"):
-        MaterialCfg(name="m", texrepeat=(1.0, 0.0)).edit_spec(mujoco.MjSpec())
 
 
 def test_meshes_get_their_hull_limit():

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import mujoco
-import numpy as np
 
-from mjlab.utils.errors import check_exists, check_field, check_one_of
+from mjlab.utils.errors import check_exists
 from mjlab.utils.mujoco import enum_value
 from mjlab.utils.string import filter_exp, resolve_field
 
@@ -60,7 +59,7 @@ class SpecCfg(ABC):
         """Apply the edit. Raises `ValueError` for invalid values."""
 
     def validate(self) -> None:
-        """Raise `ValueError` for invalid values, with the value and the allowed values."""
+        """Check the fields. MuJoCo checks most of them when it compiles the spec."""
         return
 
 
@@ -104,8 +103,7 @@ class CollisionCfg(SpecCfg):
             field[: len(values)] = values
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Apply the setup. Raises `ValueError` for invalid values."""
-        self.validate()
+        """Apply the setup."""
         geoms, others = _split_geoms(spec, self.geom_names_expr)
         names = tuple(geom.name for geom in geoms)
         filled = []
@@ -130,12 +128,6 @@ class CollisionCfg(SpecCfg):
         if self.disable_other_geoms:
             for geom in others:
                 geom.contype = geom.conaffinity = 0
-
-    def validate(self) -> None:
-        """Raise `ValueError` for invalid values, with field, pattern and allowed values."""
-        for field in _ALWAYS_WRITTEN:
-            check_field(self, field, getattr(self, field) is not None, "a value")
-        _validate_collision(self)
 
 
 @dataclass
@@ -172,16 +164,10 @@ class GeomCfg(SpecCfg):
     """Weight in [0, 1] for averaging the contact parameters of two geoms."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Patch the geoms. Raises `ValueError` for invalid values."""
-        self.validate()
+        """Patch the geoms."""
         geoms, _ = _split_geoms(spec, self.geom_names_expr)
         for field in ("group", *_ALWAYS_WRITTEN, *_PATCHES):
             _patch(geoms, field, getattr(self, field))
-
-    def validate(self) -> None:
-        """Raise `ValueError` for invalid values, with field, pattern and allowed values."""
-        check_values(self, "group", lambda value: value in range(6), "an integer in [0, 5]")
-        _validate_collision(self)
 
 
 @dataclass
@@ -204,8 +190,7 @@ class MaterialCfg(SpecCfg):
     """Patterns of geom names, matched at the start of the name."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Add the material. Raises `ValueError` for invalid values."""
-        self.validate()
+        """Add the material."""
         material = spec.add_material(
             name=self.name,
             rgba=self.rgba,
@@ -220,10 +205,6 @@ class MaterialCfg(SpecCfg):
             for geom in spec.geoms:
                 if geom.name in chosen:
                     geom.material = self.name
-
-    def validate(self) -> None:
-        """Raise `ValueError` unless both values of `texrepeat` are positive."""
-        check_values(self, "texrepeat", lambda value: min(value) > 0, "two positive numbers")
 
 
 @dataclass
@@ -266,7 +247,7 @@ class TextureCfg(SpecCfg):
     """Flip the image vertically."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Add the texture. Raises `ValueError` for invalid values."""
+        """Add the texture. Raises `ValueError` for an unknown type, image or mark, with the available ones."""
         self.validate()
         texture = spec.add_texture(
             name=self.name,
@@ -281,34 +262,13 @@ class TextureCfg(SpecCfg):
             texture.gridlayout[cell] = letter
 
     def validate(self) -> None:
-        """Raise `ValueError` if the source or the size is missing; warn of missing faces."""
-        for field, enum in (("type", _TEXTURE), ("builtin", _BUILTIN), ("mark", _MARK)):
-            mujoco_enum(self, field, enum)
-        for field in ("width", "height"):
-            check_values(self, field, lambda value: value > 0, "an integer > 0")
-        drawn = self.builtin != "none"
-        if drawn and (self.width is None or self.height is None):
-            raise ValueError(
-                f"TextureCfg {self.name!r}: builtin {self.builtin!r} requires width and height "
-                f"(pixels), got width {self.width} and height {self.height}."
-            )
-        if not drawn and self.file is None and not self.cubefiles:
-            raise ValueError(
-                f"TextureCfg {self.name!r}: expected a source, got none; set `builtin`, `file` or "
-                "`cubefiles`."
-            )
+        """Warn of missing and unused faces."""
         if self.cubefiles and len(self.cubefiles) != _CUBE_FACES:
             warnings.warn(
                 f"TextureCfg {self.name!r} cubefiles: expected {_CUBE_FACES} files, got "
                 f"{len(self.cubefiles)}; missing faces are blank, and others are not used.",
                 UserWarning,
                 stacklevel=2,
-            )
-        one_image = self.file is not None and self.gridsize in (None, (1, 1), [1, 1])
-        if self.type == "skybox" and one_image and not drawn:
-            raise ValueError(
-                f"TextureCfg {self.name!r}: a skybox requires six faces, got one image; set `gridsize` "
-                "and `gridlayout`, or six `cubefiles`."
             )
 
 
@@ -322,7 +282,7 @@ class MeshCfg(SpecCfg):
     """Maximum number of vertices of the convex hull, at least 4. -1: no limit."""
 
     def edit_spec(self, spec: mujoco.MjSpec) -> None:
-        """Edit the meshes. Raises `ValueError` for invalid values."""
+        """Edit the meshes. Raises `ValueError` for an invalid `maxhullvert`."""
         self.validate()
         chosen = set(filter_exp(self.mesh_names_expr, tuple(mesh.name for mesh in spec.meshes)))
         meshes = [mesh for mesh in spec.meshes if mesh.name in chosen]
@@ -332,13 +292,16 @@ class MeshCfg(SpecCfg):
                 mesh.maxhullvert = value
 
     def validate(self) -> None:
-        """Raise `ValueError` for an invalid `maxhullvert`, with the pattern."""
-        check_values(
-            self,
-            "maxhullvert",
-            lambda value: value == -1 or value > 3,
-            "-1 or an integer > 3",
+        """Raise `ValueError` for an invalid `maxhullvert`: MuJoCo would end the process."""
+        values = (
+            self.maxhullvert if isinstance(self.maxhullvert, dict) else {".*": self.maxhullvert}
         )
+        for pattern, value in values.items():
+            if value is not None and value != -1 and value < 4:
+                raise ValueError(
+                    f"MeshCfg.maxhullvert for pattern {pattern!r}: expected -1 or an integer > 3, got "
+                    f"{value!r}."
+                )
 
 
 @dataclass
@@ -388,9 +351,8 @@ class LightCfg(SpecCfg):
         _set_given(light, self, _LIGHT_FIELDS)
 
     def validate(self) -> None:
-        """Raise `ValueError` for an unknown mode or type; warn of a target mode without `target`."""
-        check_one_of("LightCfg.type", self.type, ("spot", "directional"))
-        _validate_mode(self)
+        """Warn of a target mode without `target`."""
+        _warn_without_target(self)
 
 
 @dataclass
@@ -426,8 +388,8 @@ class CameraCfg(SpecCfg):
             camera.targetbody = find_body(self, spec, self.target).name
 
     def validate(self) -> None:
-        """Raise `ValueError` for an unknown mode; warn of a target mode without `target`."""
-        _validate_mode(self)
+        """Warn of a target mode without `target`."""
+        _warn_without_target(self)
 
 
 def _set_given(element: Any, cfg: SpecCfg, fields: Sequence[str]) -> None:
@@ -502,22 +464,7 @@ def _patch(geoms: Sequence[mujoco.MjsGeom], field: str, value: Any) -> None:
             setattr(geom, field, entry)
 
 
-def _validate_collision(cfg: GeomCfg | CollisionCfg) -> None:
-    for field in ("contype", "conaffinity", "priority", "margin", "gap"):
-        check_values(cfg, field, lambda value: value >= 0, "a number >= 0")
-    check_values(cfg, "condim", lambda value: value in (1, 3, 4, 6), "1, 3, 4 or 6")
-    check_values(cfg, "solmix", lambda value: 0 <= value <= 1, "a number in [0, 1]")
-    for field, size in _ARRAYS.items():
-        check_values(
-            cfg,
-            field,
-            lambda value, size=size: np.ndim(value) == 1 and len(value) <= size,
-            f"a tuple of up to {size} numbers",
-        )
-
-
-def _validate_mode(cfg: LightCfg | CameraCfg) -> None:
-    mujoco_enum(cfg, "mode", _CAM_LIGHT)
+def _warn_without_target(cfg: LightCfg | CameraCfg) -> None:
     if cfg.mode.startswith("target") and cfg.target is None:
         warnings.warn(
             f"{type(cfg).__name__} {cfg.name!r}: mode {cfg.mode!r} has no effect without `target`, the "
@@ -525,18 +472,6 @@ def _validate_mode(cfg: LightCfg | CameraCfg) -> None:
             UserWarning,
             stacklevel=2,
         )
-
-
-def check_values(owner: SpecCfg, field: str, is_valid: Callable[[Any], bool], allowed: str) -> None:
-    """Raise `ValueError` unless all values of a field (scalar, or dict by pattern) are valid."""
-    values = getattr(owner, field)
-    by_pattern = values if isinstance(values, dict) else {None: values}
-    for pattern, value in by_pattern.items():
-        if value is not None and not is_valid(value):
-            where = "" if pattern is None else f" for pattern {pattern!r}"
-            raise ValueError(
-                f"{type(owner).__name__}.{field}{where}: expected {allowed}, got {value!r}."
-            )
 
 
 def mujoco_enum(owner: SpecCfg, field: str, enum: tuple[Any, str]) -> int:
