@@ -225,18 +225,3 @@ def handled_signals(
         yield
     finally:
         restore_handlers(previous)
-
-
-@contextlib.contextmanager
-def first_interrupt_calls(callback: Callable[[], None], enabled: bool) -> Generator[None]:
-    """Call `callback` on the first Ctrl+C; a second Ctrl+C interrupts as usual."""
-
-    def handler(signum: int, frame: Any) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        callback()
-
-    previous = replace_handlers(handler, [signal.SIGINT] if enabled else [])
-    try:
-        yield
-    finally:
-        restore_handlers(previous)

@@ -13,6 +13,7 @@ import inspect
 import logging
 import math
 import queue
+import signal
 import time
 import traceback
 from abc import ABC, abstractmethod
@@ -26,7 +27,7 @@ import torch
 
 from mjlab.compat import older_names
 from mjlab.utils.errors import check_count, check_positive
-from mjlab.utils.signals import first_interrupt_calls
+from mjlab.utils.signals import handled_signals
 from mjlab.utils.string import counted
 from mjlab.utils.tracebacks import users_lines
 
@@ -222,10 +223,12 @@ class BaseViewer(ABC):
         self._interrupted = False
         self._step_limit = math.inf if num_steps is None else self._total_steps + num_steps
 
-        def interrupt() -> None:
+        def interrupt(*_: Any) -> None:
+            # The second Ctrl+C ends the program.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             self._interrupted = True
 
-        with first_interrupt_calls(interrupt, enabled=catch_sigint):
+        with handled_signals(interrupt, [signal.SIGINT] if catch_sigint else []):
             try:
                 self.setup()
                 self._last_tick = self._next_frame = time.perf_counter()

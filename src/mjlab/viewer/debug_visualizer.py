@@ -150,43 +150,11 @@ class NullDebugVisualizer:
     def get_env_indices(self, num_envs: int) -> Iterable[int]:
         return (self.env_idx,) if 0 <= self.env_idx < num_envs else ()
 
-    def add_arrow(self, start, end, color, width=0.015, label=None) -> None:
-        pass
+    def clear(self, *args, **kwargs) -> None:
+        """Draw nothing."""
 
-    def add_frame(
-        self,
-        position,
-        rotation_matrix,
-        scale=0.3,
-        label=None,
-        axis_radius=0.01,
-        alpha=1.0,
-        axis_colors=None,
-    ) -> None:
-        pass
-
-    def add_sphere(self, center, radius, color, label=None) -> None:
-        pass
-
-    def add_cylinder(self, start, end, radius, color, label=None) -> None:
-        pass
-
-    def add_ellipsoid(self, center, size, mat, color, label=None) -> None:
-        pass
-
-    def add_box(self, center, size, mat, color, label=None) -> None:
-        pass
-
-    def add_ghost_mesh(
-        self, qpos, model, mocap_pos=None, mocap_quat=None, alpha=0.5, label=None
-    ) -> None:
-        pass
-
-    def add_legend(self, *args, **kwargs) -> None:
-        pass
-
-    def clear(self) -> None:
-        pass
+    add_arrow = add_frame = add_sphere = add_cylinder = add_ellipsoid = add_box = clear
+    add_ghost_mesh = add_legend = clear
 
 
 def pose_ghost(

@@ -14,7 +14,7 @@ from viewer_fakes import FakeEnv, push
 from mjlab.viewer import NativeMujocoViewer, RenderingUnavailableError, ViewerConfig
 from mjlab.viewer.base import TermHistory, ViewerAction
 from mjlab.viewer.native import keys
-from mjlab.viewer.native.keys import _ACTIONS, action_of_key
+from mjlab.viewer.native.keys import ACTIONS
 from mjlab.viewer.native.viewer import (
     MousePush,
     PlotCfg,
@@ -29,9 +29,9 @@ def test_keys_are_none_that_mujocos_window_uses_itself() -> None:
     strings = [*mujoco.mjVISSTRING, *mujoco.mjRNDSTRING]
     taken = {ord(shortcut) for _, _, shortcut in strings if shortcut}
     taken |= {ord(digit) for digit in "012345"}  # Groups.
-    assert not taken & set(_ACTIONS)
-    assert action_of_key(ord(" ")) is ViewerAction.TOGGLE_PAUSE
-    assert action_of_key(ord("P")) is None
+    assert not taken & set(ACTIONS)
+    assert ACTIONS.get(ord(" ")) is ViewerAction.TOGGLE_PAUSE
+    assert ACTIONS.get(ord("P")) is None
 
 
 def test_without_a_display_the_error_names_the_browser_viewer(monkeypatch) -> None:

@@ -48,7 +48,7 @@ def test_terms_are_recorded_while_it_runs_and_start_over_with_another_environmen
 
 
 def test_without_metrics_there_is_no_tab_for_them(viser_server, env, scene) -> None:
-    env.metrics_manager = SimpleNamespace()
+    env.metrics_manager = SimpleNamespace(active_terms=[])
     overlays = ViserTermOverlays(viser_server, env, scene, frame_time=0.02)
     tabs = viser_server.gui.add_tab_group()
     overlays.setup_tabs(tabs)

@@ -33,7 +33,7 @@ KEY_KP_ADD, KEY_KP_ENTER, KEY_KP_EQUAL = range(334, 337)
 KEY_LEFT_SHIFT, KEY_LEFT_CONTROL, KEY_LEFT_ALT, KEY_LEFT_SUPER = range(340, 344)
 KEY_RIGHT_SHIFT, KEY_RIGHT_CONTROL, KEY_RIGHT_ALT, KEY_RIGHT_SUPER = range(344, 348)
 
-_ACTIONS = {
+ACTIONS = {
     KEY_ENTER: ViewerAction.RESET,
     KEY_SPACE: ViewerAction.TOGGLE_PAUSE,
     KEY_MINUS: ViewerAction.SPEED_DOWN,
@@ -45,6 +45,7 @@ _ACTIONS = {
     KEY_F9: ViewerAction.TOGGLE_SHOW_ALL_ENVS,
     KEY_RIGHT: ViewerAction.SINGLE_STEP,
 }
+"""Actions by GLFW key code."""
 
 KEY_HELP = (
     ("Space / Right", "pause / single step"),
@@ -55,8 +56,3 @@ KEY_HELP = (
     ("9 / F9", "debug drawings / of all envs"),
 )
 """Keys and their actions, as shown in the window."""
-
-
-def action_of_key(key: int) -> ViewerAction | None:
-    """Return the action of a GLFW key code, or None."""
-    return _ACTIONS.get(key)

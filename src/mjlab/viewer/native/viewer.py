@@ -29,7 +29,7 @@ from mjlab.viewer.model_sync import (
     sync_model_fields,
     to_numpy,
 )
-from mjlab.viewer.native.keys import KEY_HELP, action_of_key
+from mjlab.viewer.native.keys import ACTIONS, KEY_HELP
 from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer, add_moving_geoms
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, move_sun, prepare_sun
 
@@ -236,7 +236,7 @@ class NativeMujocoViewer(BaseViewer):
 
     def _on_key(self, key: int) -> None:
         # Called in the window's thread; the main thread performs the action.
-        action = action_of_key(key)
+        action = ACTIONS.get(key)
         if action is not None:
             self.request_action(action.value)
         if self._user_key_callback is not None:

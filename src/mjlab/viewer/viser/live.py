@@ -127,9 +127,7 @@ class LiveViewer(ViserPlayViewer):
         if self._panel is not None:
             progress = self._progress
             age = 0.0 if progress is None else time.time() - progress["time"]
-            content = progress_html(self._title, progress, age)
-            if content != self._panel.content:
-                self._panel.content = content
+            self._panel.content = progress_html(self._title, progress, age)
 
     def _show_curve(self, progress: Progress) -> None:
         if self._plot is not None:

@@ -53,7 +53,7 @@ class ViserTermOverlays:
                 self._has_weight,
             )
             self.reward_plotter = ViserTermPlotter(self.server, names, "Reward", env_idx=env_idx)
-        metrics: list[str] = list(getattr(self.env.metrics_manager, "active_terms", ()))
+        metrics: list[str] = list(self.env.metrics_manager.active_terms)
         if metrics:
             with tabs.add_tab("Metrics", icon=viser.Icon.CHART_LINE):
                 self.metrics_plotter = ViserTermPlotter(

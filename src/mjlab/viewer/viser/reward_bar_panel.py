@@ -52,7 +52,6 @@ class RewardBarPanel:
         self._names = term_names
         self._history = TermHistory(max(1, round(_WINDOW_S / update_dt)))
         self._html = server.gui.add_html("")
-        self._shown = ""
         self.refresh()
 
     def update(self, terms: Iterable[tuple[str, Sequence[float]]]) -> None:
@@ -71,14 +70,12 @@ class RewardBarPanel:
         means = dict(itertools.islice(means.items(), self._max_terms))
         largest = max((abs(value) for value in means.values()), default=0.0) or 1.0
         rows = "".join(_row(name, value, largest) for name, value in means.items())
-        content = (
+        self._html.content = (
             '<div style="padding:0.25em 1em;font-size:0.8em">'
             f"<div><strong>Mean of the last {self._history.length} steps</strong></div>"
             '<div style="display:flex;justify-content:space-between"><span>sum</span>'
             f"<strong>{total:+.4f}</strong></div>{rows}</div>"
         )
-        if content != self._shown:
-            self._shown = self._html.content = content
 
     def clear_histories(self) -> None:
         """Clear the recorded values."""

@@ -337,7 +337,6 @@ class SimulationControls:
         with gui.add_folder("Info"):
             self._status = gui.add_html("")
             self._legend = gui.add_html("")
-        self._shown = self._shown_legend = ""
         with gui.add_folder("Simulation"):
             self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
             self._step = gui.add_button(
@@ -360,16 +359,12 @@ class SimulationControls:
         self._step.disabled = not paused
 
     def show_status(self, status: ViewerStatus) -> None:
-        """Update the displayed status if it changed."""
-        content = status_html(status)
-        if content != self._shown:
-            self._shown = self._status.content = content
+        """Update the displayed status. The server sends only changes."""
+        self._status.content = status_html(status)
 
     def show_legend(self, legend: Mapping[str, Color]) -> None:
-        """Update the displayed legend if it changed."""
-        content = legend_html(legend)
-        if content != self._shown_legend:
-            self._shown_legend = self._legend.content = content
+        """Update the displayed legend."""
+        self._legend.content = legend_html(legend)
 
 
 def legend_html(legend: Mapping[str, Color]) -> str:
