@@ -6,7 +6,7 @@ Evaluated between environment steps; forces and contacts are those of the last p
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import torch
 
@@ -14,17 +14,21 @@ from mjlab.tasks.velocity.mdp.observations import check_same_feet
 from mjlab.utils.indexing import as_columns
 from mjlab.utils.torch import constant_tensor
 
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs.mdp.actions.actions import BaseAction
+
 _ROBOT = "robot"
 _CONTACTS = "feet_ground_contact"
 _HEIGHTS = "foot_height_scan"
 
 
-def joint_torque(env: Any) -> torch.Tensor:
+def joint_torque(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the mean actuator torque |tau| over joints (N m), (num_envs,)."""
     return env.scene[_ROBOT].data.qfrc_actuator.abs().mean(dim=1)
 
 
-def torque_share(env: Any) -> torch.Tensor:
+def torque_share(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the maximum of |force| / limit over actuators, (num_envs,).
 
     Actuators without a force limit in the model count as 0.
@@ -42,19 +46,19 @@ def torque_share(env: Any) -> torch.Tensor:
     return (force / constant_tensor(tuple(limits), env.device)).amax(dim=1)
 
 
-def mechanical_power(env: Any) -> torch.Tensor:
+def mechanical_power(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the sum of |tau q_dot| over joints (W), (num_envs,)."""
     data = env.scene[_ROBOT].data
     return (data.qfrc_actuator * data.joint_vel).abs().sum(dim=1)
 
 
-def action_rate(env: Any) -> torch.Tensor:
+def action_rate(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the mean of scale |a_t - a_(t-1)| over actions, (num_envs,).
 
     For joint position actions: change of the target per step (rad), before clipping.
     """
     manager = env.action_manager
-    terms = [manager.get_term(name) for name in manager.active_terms]
+    terms = [cast("BaseAction", manager.get_term(name)) for name in manager.active_terms]
     sizes = [term.action_dim for term in terms]
     changes = [
         change * term.scale
@@ -65,7 +69,7 @@ def action_rate(env: Any) -> torch.Tensor:
     return torch.cat(changes, dim=1).abs().mean(dim=1)
 
 
-def foot_slip(env: Any) -> torch.Tensor:
+def foot_slip(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the mean horizontal speed of feet in contact (m/s), (num_envs,); 0 without contact.
 
     Foot velocities are those of the sites of `foot_height_scan`, contacts those of

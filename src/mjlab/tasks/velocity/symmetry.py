@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 from weakref import WeakKeyDictionary
 
 import mujoco
@@ -21,9 +21,11 @@ import numpy as np
 import torch
 
 from mjlab.envs import mdp as envs_mdp
+from mjlab.sensor import ContactSensor
 from mjlab.tasks.velocity import mdp
 
 if TYPE_CHECKING:
+    from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
 DIRECTION = (1.0, -1.0, 1.0)
@@ -106,8 +108,7 @@ class _Mirrors:
 def _mirror_of_term(
     env: ManagerBasedRlEnv, group: str, name: str, instants: int, shape: tuple[int, ...]
 ) -> Mirror:
-    configs: Any = env.cfg.observations
-    cfg = configs[group].terms[name]
+    cfg = env.cfg.observations[group].terms[name]
     owner = f"Observation {group}/{name}"
     kind = _KINDS.get(cfg.func)
     if kind is None:
@@ -186,7 +187,7 @@ def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
 
 
 def _reference_pose(
-    model: mujoco.MjModel, robot: Any
+    model: mujoco.MjModel, robot: Entity
 ) -> tuple[mujoco.MjData, np.ndarray, np.ndarray]:
     """Return the kinematics at `qpos0`, and position and rotation matrix of the robot's root."""
     data = mujoco.MjData(model)
@@ -213,16 +214,17 @@ def _lever_arms(
     Raises:
         ValueError: the group does not observe the required angular velocity.
     """
-    configs: Any = env.cfg.observations
-    terms = {name: configs[group].terms[name] for name in spans}
-    factors = {name: 1.0 if cfg.scale is None else cfg.scale for name, cfg in terms.items()}
+    terms = {name: env.cfg.observations[group].terms[name] for name in spans}
+    # `_mirror_of_term` accepts no other scales.
+    scales = {name: cast("float | None", cfg.scale) for name, cfg in terms.items()}
+    factors = {name: 1.0 if scale is None else scale for name, scale in scales.items()}
     sensors = {
         name: _sensor(env, cfg.params["sensor_name"])
         for name, cfg in terms.items()
         if cfg.func is envs_mdp.builtin_sensor
     }
     turning = {n: s.body for n, s in sensors.items() if s.kind == mujoco.mjtSensor.mjSENS_GYRO}
-    robot: Any = env.scene[_ROBOT]
+    robot: Entity = env.scene[_ROBOT]
     for name, cfg in terms.items():
         if cfg.func is envs_mdp.base_ang_vel:
             turning[name] = robot.indexing.root_body_id
@@ -278,7 +280,7 @@ def _of_joints(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
 
 
 def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) -> Mirror:
-    robot: Any = env.scene[_ROBOT]
+    robot: Entity = env.scene[_ROBOT]
     joints = mirror_of_joints(env.sim.mj_model, robot)
     manager = env.action_manager
     terms = {name: manager.get_term(name) for name in manager.active_terms}
@@ -307,8 +309,8 @@ def _of_feet(
     env: ManagerBasedRlEnv, params: dict[str, Any], signs: tuple[float, ...] = (1.0,)
 ) -> Mirror:
     """Return the mirror of foot vectors with `signs`, of a contact or height sensor."""
-    sensor: Any = env.scene[params["sensor_name"]]
-    is_contact = hasattr(sensor, "primary_names")
+    sensor = env.scene[params["sensor_name"]]
+    is_contact = isinstance(sensor, ContactSensor)
     names = sensor.primary_names if is_contact else [frame.name for frame in sensor.cfg.frame]
     size, feet = len(signs), partners(names)
     return Mirror([size * foot + i for foot in feet for i in range(size)], signs * len(feet))
@@ -316,7 +318,7 @@ def _of_feet(
 
 def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     """Return the mirror of the rays of a sensor with one frame on the mirror plane."""
-    cfg: Any = env.scene[params["sensor_name"]].cfg
+    cfg = env.scene[params["sensor_name"]].cfg
     frames = cfg.frame if isinstance(cfg.frame, tuple) else (cfg.frame,)
     rays = torch.cat(cfg.pattern.generate_rays(env.sim.mj_model, "cpu"), dim=1)
     distances = (
@@ -409,7 +411,7 @@ class Coupling(NamedTuple):
     factor: float
 
 
-def mirror_of_joints(model: mujoco.MjModel, robot: Any) -> Mirror:
+def mirror_of_joints(model: mujoco.MjModel, robot: Entity) -> Mirror:
     """Return the mirror of the joints of entity `robot`, in entity order.
 
     Partners are found by name. The sign of a joint is -1 if the mirror image of its axis is opposite to

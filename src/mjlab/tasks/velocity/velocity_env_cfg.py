@@ -264,61 +264,41 @@ _FOOT_HEIGHT_SCAN = TerrainHeightSensorCfg(
 _SENSORS: tuple[SensorCfg, ...] = (_TERRAIN_SCAN, _FOOT_HEIGHT_SCAN)
 
 
-def _noise(size: float) -> UniformNoiseCfg:
-    return UniformNoiseCfg(n_min=-size, n_max=size)
+def _term(
+    func: object, noise: float | None = None, scale: float | None = None, **params: object
+) -> ObservationTermCfg:
+    """Return an observation term with parameters and uniform noise of half-width `noise`."""
+    uniform = None if noise is None else UniformNoiseCfg(n_min=-noise, n_max=noise)
+    return ObservationTermCfg(func=func, params=params, noise=uniform, scale=scale)
 
 
-_ACTOR_TERMS: dict[str, ObservationTermCfg] = {
-    "base_lin_vel": ObservationTermCfg(
-        func=mdp.builtin_sensor,
-        params={"sensor_name": "robot/imu_lin_vel"},
-        noise=_noise(0.5),
-    ),
-    "base_ang_vel": ObservationTermCfg(
-        func=mdp.builtin_sensor,
-        params={"sensor_name": "robot/imu_ang_vel"},
-        noise=_noise(0.2),
-    ),
-    "projected_gravity": ObservationTermCfg(func=mdp.projected_gravity, noise=_noise(0.05)),
-    "joint_pos": ObservationTermCfg(
-        func=mdp.joint_pos_rel, params={"biased": True}, noise=_noise(0.01)
-    ),
-    "joint_vel": ObservationTermCfg(func=mdp.joint_vel_rel, noise=_noise(1.5)),
-    "actions": ObservationTermCfg(func=mdp.last_action),
-    "command": ObservationTermCfg(func=mdp.generated_commands, params={"command_name": "twist"}),
-    "height_scan": ObservationTermCfg(
-        func=mdp.height_scan,
-        params={"sensor_name": "terrain_scan"},
-        noise=_noise(0.1),
-        # 1 / max_distance of the rays.
-        scale=1.0 / 5.0,
-    ),
+# 1 / max_distance of the rays.
+_SCAN_SCALE = 1.0 / 5.0
+_ACTOR_TERMS = {
+    "base_lin_vel": _term(mdp.builtin_sensor, 0.5, sensor_name="robot/imu_lin_vel"),
+    "base_ang_vel": _term(mdp.builtin_sensor, 0.2, sensor_name="robot/imu_ang_vel"),
+    "projected_gravity": _term(mdp.projected_gravity, 0.05),
+    "joint_pos": _term(mdp.joint_pos_rel, 0.01, biased=True),
+    "joint_vel": _term(mdp.joint_vel_rel, 1.5),
+    "actions": _term(mdp.last_action),
+    "command": _term(mdp.generated_commands, command_name="twist"),
+    "height_scan": _term(mdp.height_scan, 0.1, _SCAN_SCALE, sensor_name="terrain_scan"),
 }
 # The critic observes the actor's terms without noise (no corruption in its group) and without
 # encoder bias, and further foot terms.
-_CRITIC_TERMS: dict[str, ObservationTermCfg] = {
+_CRITIC_TERMS = {
     **copy.deepcopy(_ACTOR_TERMS),
-    "joint_pos": ObservationTermCfg(func=mdp.joint_pos_rel),
-    "height_scan": ObservationTermCfg(
-        func=mdp.height_scan, params={"sensor_name": "terrain_scan"}, scale=1.0 / 5.0
+    "joint_pos": _term(mdp.joint_pos_rel),
+    "height_scan": _term(mdp.height_scan, None, _SCAN_SCALE, sensor_name="terrain_scan"),
+    "foot_height": _term(
+        mdp.foot_height,
+        sensor_name="foot_height_scan",
+        # Sites instead of the sensor, as in releases 1.1 and 1.2. Dropped if left empty.
+        asset_cfg=SceneEntityCfg("robot", site_names=_NO_NAMES),
     ),
-    "foot_height": ObservationTermCfg(
-        func=mdp.foot_height,
-        params={
-            "sensor_name": "foot_height_scan",
-            # Sites instead of the sensor, as in releases 1.1 and 1.2. Dropped if left empty.
-            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
-        },
-    ),
-    "foot_air_time": ObservationTermCfg(
-        func=mdp.foot_air_time, params={"sensor_name": "feet_ground_contact"}
-    ),
-    "foot_contact": ObservationTermCfg(
-        func=mdp.foot_contact, params={"sensor_name": "feet_ground_contact"}
-    ),
-    "foot_contact_forces": ObservationTermCfg(
-        func=mdp.foot_contact_forces, params={"sensor_name": "feet_ground_contact"}
-    ),
+    "foot_air_time": _term(mdp.foot_air_time, sensor_name="feet_ground_contact"),
+    "foot_contact": _term(mdp.foot_contact, sensor_name="feet_ground_contact"),
+    "foot_contact_forces": _term(mdp.foot_contact_forces, sensor_name="feet_ground_contact"),
 }
 
 _COMMANDS: dict[str, CommandTermCfg] = {

@@ -353,11 +353,11 @@ class MotionCommand(MotionReader, CommandTerm):
 
         Termination flags stay set until the next step, and environments may be reset again before.
         """
-        terminations: Any = getattr(self._env, "termination_manager", None)
-        if self.sampler is None or terminations is None:
+        if self.sampler is None:
             return
         now = int(self._env.common_step_counter)
-        failed = terminations.terminated[env_ids] & (self._counted_at[env_ids] != now)
+        terminated = self._env.termination_manager.terminated[env_ids]
+        failed = terminated & (self._counted_at[env_ids] != now)
         self._counted_at[env_ids] = now
         ids = env_ids[failed]
         if not is_empty(ids):
@@ -545,7 +545,7 @@ class MotionDrawing:
                     )
 
 
-def ghost_model(robot: Any, color: tuple[float, float, float, float]) -> mujoco.MjModel:
+def ghost_model(robot: Entity, color: tuple[float, float, float, float]) -> mujoco.MjModel:
     """Return a single-color model of the robot; collision geoms are hidden if it has visual geoms.
 
     The model contains the robot alone, so that nothing else in the scene has a ghost.

@@ -11,17 +11,18 @@ the frame before it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
 from mjlab.managers import TerminationTermCfg
-from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg, body_columns
+from mjlab.tasks.tracking.mdp.commands import MotionCommandCfg, body_columns, motion_command
 from mjlab.tasks.tracking.mdp.terminations import motion_ended
 from mjlab.utils.errors import check_exists
 from mjlab.utils.lab_api.math import quat_error_magnitude
 
 if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
     from mjlab.tasks.tracking.mdp.motion_library import MotionFrame, MotionReader
 
 __all__ = [
@@ -92,36 +93,36 @@ def compute_ee_orientation_error(
 # Evaluation metrics, and the config of evaluation environments.
 
 
-def mpkpe(env: Any) -> torch.Tensor:
+def mpkpe(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the mean distance of the tracked bodies to the reference in the world (m), (N,)."""
     return compute_mpkpe(_frame(env))
 
 
-def r_mpkpe(env: Any) -> torch.Tensor:
+def r_mpkpe(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the mean distance of the tracked bodies to the relative reference (m), (N,)."""
     return compute_root_relative_mpkpe(_frame(env))
 
 
-def joint_vel_error(env: Any) -> torch.Tensor:
+def joint_vel_error(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the root mean square of the joint velocity errors (rad/s), (N,)."""
     return compute_joint_velocity_error(_frame(env))
 
 
-def ee_pos_error(env: Any) -> torch.Tensor:
+def ee_pos_error(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the mean distance of hands and feet to the relative reference (m), (N,)."""
     return compute_ee_position_error(_frame(env), _end_effectors(env))
 
 
-def ee_ori_error(env: Any) -> torch.Tensor:
+def ee_ori_error(env: ManagerBasedRlEnv) -> torch.Tensor:
     """Return the mean angle of hands and feet to the relative reference (rad), (N,)."""
     return compute_ee_orientation_error(_frame(env), _end_effectors(env))
 
 
-def _frame(env: Any) -> MotionFrame:
-    return env.command_manager.get_term(_COMMAND).matching_frame
+def _frame(env: ManagerBasedRlEnv) -> MotionFrame:
+    return motion_command(env, _COMMAND).matching_frame
 
 
-def _end_effectors(env: Any) -> tuple[str, ...]:
+def _end_effectors(env: ManagerBasedRlEnv) -> tuple[str, ...]:
     manager = env.termination_manager
     if _END_EFFECTORS not in manager.active_terms:
         return ()
@@ -146,7 +147,7 @@ UNITS = {
 """Units of `TRACKING_ERRORS`."""
 
 
-def play_motions_once(cfg: Any) -> None:
+def play_motions_once(cfg: ManagerBasedRlEnvCfg) -> None:
     """Edit an environment config so that each episode is one motion from start to end.
 
     Pushes are removed. Noise, randomization and start perturbations are unchanged. Motions longer

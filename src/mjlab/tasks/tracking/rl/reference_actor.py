@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from rsl_rl.models import MLPModel
@@ -10,6 +10,9 @@ from torch import nn
 
 from mjlab.envs import mdp
 from mjlab.tasks.tracking.mdp.commands import MotionCommand
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
 
 _OUTPUT_SCALE = 0.01
 
@@ -42,10 +45,9 @@ class ReferenceActor(MLPModel):
     @property
     def with_reference(self) -> _WithReference:
         """Network with reference term, stored as `mlp`."""
-        network: Any = self.mlp
-        return network
+        return cast("_WithReference", self.mlp)
 
-    def follow(self, env: Any, command: MotionCommand) -> None:
+    def follow(self, env: ManagerBasedRlEnv, command: MotionCommand) -> None:
         """Set the reference term from the actions of `env` and the joints of `command`.
 
         Raises:
@@ -102,7 +104,7 @@ class _WithReference(nn.Module):
         return self.mlp(latent) + nn.functional.linear(raw, self.weight, self.bias)
 
 
-def _command_offset(env: Any, groups: list[str], command: MotionCommand) -> int:
+def _command_offset(env: ManagerBasedRlEnv, groups: list[str], command: MotionCommand) -> int:
     """Return the index of the first reference joint position in the actor's observations."""
     manager, offset = env.observation_manager, 0
     for group in groups:

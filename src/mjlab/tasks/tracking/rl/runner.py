@@ -70,7 +70,7 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             ValueError: no motion command found, or `ReferenceActor` cannot follow it.
         """
         super().__init__(env, train_cfg, log_dir, device)
-        manager: Any = self.env.unwrapped.command_manager
+        manager = self.env.unwrapped.command_manager
         terms = {name: manager.get_term(name) for name in manager.active_terms}
         name = next((n for n, term in terms.items() if isinstance(term, MotionCommand)), "motion")
         check_exists("motion command", name, terms)

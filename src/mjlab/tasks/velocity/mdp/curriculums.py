@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import torch
 
 from mjlab.compat import older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.tasks.velocity.mdp.rewards import velocity_command
-from mjlab.tasks.velocity.mdp.velocity_command import RANGES
+from mjlab.tasks.velocity.mdp.velocity_command import (
+    RANGES,
+    UniformVelocityCommand,
+    UniformVelocityCommandCfg,
+)
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -65,19 +69,21 @@ def terrain_levels_vel(
     Returns, for logging: mean and maximum level, and the mean level per sub-terrain if each
     sub-terrain has one column.
     """
-    terrain: Any = env.scene.terrain
+    terrain = env.scene.terrain
     if terrain is None or terrain.terrain_origins is None:
         return {}
+    generator = terrain.cfg.terrain_generator
+    assert generator is not None
     asset: Entity = env.scene[asset_cfg.name]
     offset = asset.data.root_link_pos_w[env_ids, :2] - env.scene.env_origins[env_ids, :2]
     distance = torch.linalg.vector_norm(offset, dim=1)
     command = velocity_command(env, command_name)[env_ids]
     duration: torch.Tensor | float = env.max_episode_length_s
     if use_elapsed_time:
-        term: Any = env.command_manager.get_term(command_name)
+        term = cast("UniformVelocityCommand", env.command_manager.get_term(command_name))
         duration = term.elapsed_s[env_ids]
     required = torch.linalg.vector_norm(command[:, :2], dim=1) * duration * 0.5
-    move_up = distance > terrain.cfg.terrain_generator.size[0] / 2.0
+    move_up = distance > generator.size[0] / 2.0
     move_down = (distance < required) & ~move_up
     # Before the first reset, robots are at their model pose.
     has_moved = env.episode_length_buf[env_ids] > (0 if env.common_step_counter > 0 else torch.inf)
@@ -123,7 +129,7 @@ def commands_vel(
 
     Returns, for logging, the bounds in use.
     """
-    ranges: Any = env.command_manager.get_term_cfg(command_name).ranges  # ty: ignore
+    cfg = cast("UniformVelocityCommandCfg", env.command_manager.get_term_cfg(command_name))
     for stage in velocity_stages:
         if env.common_step_counter >= stage["step"]:
             if unknown := stage.keys() - {"step", *RANGES}:
@@ -135,7 +141,7 @@ def commands_vel(
             for name in RANGES:
                 bounds = stage.get(name)
                 if bounds is not None:
-                    setattr(ranges, name, tuple(bounds))
-    bounds = [float(bound) for name in RANGES for bound in getattr(ranges, name)]
+                    setattr(cfg.ranges, name, tuple(bounds))
+    bounds = [float(bound) for name in RANGES for bound in getattr(cfg.ranges, name)]
     names = [f"{name}_{end}" for name in RANGES for end in ("min", "max")]
     return dict(zip(names, torch.tensor(bounds, dtype=torch.float32).unbind(), strict=True))
