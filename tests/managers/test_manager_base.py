@@ -237,11 +237,11 @@ class Reads:
 @pytest.mark.parametrize(
     ("term", "params", "message"),
     [
-        (Counter, {"stepp": 1.0}, r"Counter.*'stepp'; did you mean 'step'\? Available: \['step'\]"),
-        (with_asset, {}, r"with_asset: missing parameter 'asset_cfg'"),
-        (with_asset, {"asset": None}, r"unknown.*'asset'.*'asset_cfg'.*missing.*'asset_cfg'"),
-        (Reads, {"sdt": 1.0}, r"Reads: unknown parameter 'sdt'; did you mean 'std'"),
-        (value, {"weight": 1.0}, r"value: unknown parameter 'weight'; available: \[\]"),
+        (Counter, {"stepp": 1.0}, r"'stepp'.*step=1.0"),
+        (with_asset, {}, r"missing.*'asset_cfg'"),
+        (with_asset, {"asset": None}, r"'asset_cfg'"),
+        (Reads, {"std": 1.0, "scal": 1.0}, r"'scal'.*scale=1.0"),
+        (value, {"weight": 1.0}, r"'weight'.*\(env\)"),
         (functools.partial(with_asset, asset_cfg=None), {"env": 1}, r"'env'"),
     ],
 )
@@ -282,7 +282,7 @@ def test_decorated_terms_take_their_own_parameters(env):
     cfg = RewardTermCfg(func=scaled(value), weight=1.0, params={"by": 3.0})
     manager = RewardManager({"a": cfg}, env, scale_by_dt=False)
     assert torch.equal(manager.compute(1.0), 3.0 * env.value)
-    with pytest.raises(TypeError, match="term 'a'.*'bi'"):
+    with pytest.raises(TypeError, match="term 'a'.*'by'"):
         RewardManager({"a": RewardTermCfg(func=scaled(value), weight=1.0, params={"bi": 3.0})}, env)
 
 

@@ -96,6 +96,15 @@ def test_terms_of_weight_zero_are_not_called(env):
     assert manager._step_reward.abs().max() == 0.0
 
 
+def test_parameters_of_weight_zero_are_not_checked(env):
+    cfg = RewardTermCfg(func=lambda env, size: env.value * size, weight=0.0)
+    manager = RewardManager({"a": cfg}, env, scale_by_dt=False)
+    assert manager.compute(0.02).tolist() == [0.0] * 4
+    live = manager.get_term_cfg("a")
+    live.weight, live.params["size"] = 1.0, 2.0
+    assert torch.equal(manager.compute(0.02), 2.0 * env.value)
+
+
 def test_a_changed_weight_takes_effect_at_the_next_step(env):
     env.values = {"a": torch.ones(4)}
     manager = RewardManager({"a": term("a")}, env, scale_by_dt=False)

@@ -93,35 +93,6 @@ def unfilled(kind, seen):
 
 
 @pytest.mark.parametrize("kind", ["function", "class"])
-def test_an_unfilled_reward_of_weight_0_is_an_error_once_it_has_a_weight(
-    make_env, seen, caplog, kind
-):
-    off, error = unfilled(kind, seen)
-    off.weight = 0.0
-    manager = RewardManager({"a": off}, make_env())
-    assert "RewardManager term 'a': size is negative" in caplog.text
-    assert "weight is 0" in caplog.text
-    assert (manager.compute(dt=1.0) == 0.0).all()
-    manager.reset(None)
-    assert manager.get_visualizable_terms() == []
-    manager.get_term_cfg("a").weight = 2.0
-    for _ in range(2):
-        with pytest.raises(error, match="RewardManager term 'a': size is negative"):
-            manager.compute(dt=1.0)
-
-
-def test_a_reward_of_weight_0_that_is_filled_later_is_built_then(make_env, seen):
-    off, _ = unfilled("class", seen)
-    off.weight = 0.0
-    manager = RewardManager({"a": off}, make_env())
-    live = manager.get_term_cfg("a")
-    live.weight, live.params["size"] = 2.0, 3
-    for _ in range(2):
-        assert (manager.compute(dt=1.0) == 6.0).all()
-    assert isinstance(live.func, Checked)
-
-
-@pytest.mark.parametrize("kind", ["function", "class"])
 def test_an_unfilled_reward_with_a_weight_is_refused(make_env, seen, kind):
     on, error = unfilled(kind, seen)
     with pytest.raises(error, match="RewardManager term 'a': size is negative"):

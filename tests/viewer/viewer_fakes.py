@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import mujoco
 import torch
 
-from mjlab.managers.manager_base import SensorSwitches
+from mjlab.managers.debug_vis import SensorSwitches
 from mjlab.viewer.viewer_config import ViewerConfig
 
 XML = """

@@ -12,13 +12,9 @@ from mjlab.managers.curriculum_manager import (
     CurriculumTermCfg,
     NullCurriculumManager,
 )
+from mjlab.managers.debug_vis import SensorSwitches
 from mjlab.managers.event_manager import EventManager, EventMode, EventTermCfg
-from mjlab.managers.manager_base import (
-    ManagerBase,
-    ManagerTermBase,
-    ManagerTermBaseCfg,
-    SensorSwitches,
-)
+from mjlab.managers.manager_base import ManagerBase, ManagerTermBase, ManagerTermBaseCfg
 from mjlab.managers.metrics_manager import MetricsManager, MetricsTermCfg, NullMetricsManager
 from mjlab.managers.observation_manager import (
     ObservationGroupCfg,

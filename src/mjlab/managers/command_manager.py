@@ -11,12 +11,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import accept_older_methods
-from mjlab.managers.manager_base import (
-    BuiltTermsManager,
-    DebugVisSwitches,
-    ManagerTermBase,
-    NullManager,
-)
+from mjlab.managers.debug_vis import DebugVisSwitches
+from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase, NullManager
 from mjlab.managers.nonfinite import finite_mean
 from mjlab.utils.errors import UnsupportedError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty

@@ -13,12 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes
-from mjlab.managers.manager_base import (
-    ManagerTermBaseCfg,
-    TermFunctionSwitches,
-    TermListManager,
-    label_errors,
-)
+from mjlab.managers.debug_vis import TermFunctionSwitches
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, label_errors
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sim.randomization import RecomputeLevel
 from mjlab.utils.errors import check_one_of

@@ -14,7 +14,7 @@ import inspect
 import logging
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -26,17 +26,13 @@ from mjlab.managers.term_checks import check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
 from mjlab.utils.state import SKIP, mark_stateful, plain_scalar, stateful
-from mjlab.utils.string import counted, suggest
+from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, Tabular, function_name
 
 if TYPE_CHECKING:
-    import viser
-
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.viewer.debug_visualizer import DebugVisualizer
 
 logger = logging.getLogger(__name__)
-_BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 T = TypeVar("T")
 TermT = TypeVar("TermT")
 
@@ -248,47 +244,43 @@ class ManagerBase(Tabular, ABC):
             self._resolve_selections(f"{label}[{key!r}]", item, is_nested=True)
 
     def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Replace a class by its instance, and check that the term is callable."""
+        """Replace a class by its instance, and check that the term takes its parameters."""
         label = self._label(name)
         if inspect.isclass(cfg.func):
-            cfg.func = self._construct(label, cfg, leading)
-        signature = _signature(cfg.func)
-        if signature is not None:
-            check_params(label, cfg.func, signature, leading, cfg.params)
-            for key, parameter in signature.parameters.items():
-                default = parameter.default
-                if key in cfg.params or not isinstance(default, SceneEntityCfg):
-                    continue
-                if default.selected_kinds():
-                    warnings.warn(
-                        f"{label}: expected parameter {key!r} in params, got its default, a selection "
-                        "that is not resolved; the term uses all elements.",
-                        UserWarning,
-                        stacklevel=2,
-                    )
-        with label_errors(label), label_warnings(label):
+            with label_errors(label):
+                cfg.func = cfg.func(cfg=cfg, env=self._env)
+            if not callable(cfg.func):
+                raise WrongTypeError(f"{label}: {type(cfg.func).__name__} has no __call__.")
+        with label_errors(label):
             check_term(cfg.func, self._env, cfg.params)
+        self._check_call(label, cfg, leading)
         if not inspect.isroutine(cfg.func):
             # Plain classes have run-time state too.
             mark_stateful(cfg.func, self.num_envs)
             self._class_terms[name] = cfg.func
 
-    def _construct(self, label: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> Any:
-        """Return the instance of a class-based term."""
-        cls = cfg.func
+    def _check_call(self, label: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
+        """Raise the `TypeError` of the call now: events and curricula are called late."""
         try:
-            with label_errors(label), label_warnings(label):
-                term = cls(cfg=cfg, env=self._env)
-        except (KeyError, TypeError):
-            # Constructors read `cfg.params` too; name the wrong parameter, if that is the cause.
-            call = getattr(cls, "__call__", None)  # noqa: B004
-            signature = _signature(call)
-            if signature is not None:
-                check_params(label, cls, signature, ("self", *leading), cfg.params)
-            raise
-        if not callable(term):
-            raise WrongTypeError(f"{label}: {cls.__name__} has no __call__.")
-        return term
+            # Of a decorated term, that of the decorator's function.
+            signature = inspect.signature(cfg.func, follow_wrapped=False)
+        except ValueError:
+            return  # Compiled functions may have none.
+        try:
+            signature.bind(*leading, **cfg.params)
+        except TypeError as error:
+            raise WrongTypeError(f"{label} params: {error}; the term takes {signature}.") from error
+        for name, parameter in signature.parameters.items():
+            default = parameter.default
+            if name in cfg.params or not isinstance(default, SceneEntityCfg):
+                continue
+            if default.selected_kinds():
+                warnings.warn(
+                    f"{label}: expected {name!r} in params, got its default, a selection that is not "
+                    "resolved; the term uses all elements.",
+                    UserWarning,
+                    stacklevel=2,
+                )
 
     def _evaluate(self, name: str, cfg: ManagerTermBaseCfg) -> torch.Tensor:
         """Call a term. Raises unless it returns a real tensor with one value per environment."""
@@ -439,70 +431,6 @@ def label_errors(label: str) -> Generator[None]:
         raise labeled from error
 
 
-@contextlib.contextmanager
-def label_warnings(label: str) -> Generator[None]:
-    """Prefix warnings of the block with `label`."""
-    caught: list[warnings.WarningMessage] = []
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            yield
-    finally:
-        for one in caught:
-            message = f"{label}: {one.message}"
-            warnings.warn_explicit(message, one.category, one.filename, one.lineno)
-
-
-def check_params(
-    label: str,
-    function: Any,
-    signature: inspect.Signature,
-    leading: Sequence[str],
-    params: Mapping[str, Any],
-) -> None:
-    """Raise `TypeError` unless a term can be called with its parameters.
-
-    The message names each wrong or missing parameter and lists those of the term.
-
-    Args:
-        label: Name of the term.
-        function: Function, instance or class of the term.
-        signature: Signature of the call.
-        leading: Names of the positional arguments before the parameters.
-        params: Parameters of the term's config.
-    """
-    try:
-        signature.bind(*leading, **params)
-        return
-    except TypeError as error:
-        cause = error
-    # Decorators made with `functools.wraps` may take other parameters than the term they wrap.
-    with contextlib.suppress(TypeError, ValueError):
-        inspect.signature(function, follow_wrapped=False).bind(*leading, **params)
-        return
-    owner = getattr(function, "__qualname__", type(function).__name__)
-    parameters = signature.parameters.values()
-    positional = [p.name for p in parameters if p.kind is not p.KEYWORD_ONLY][: len(leading)]
-    accepted = [p for p in parameters if p.kind in _BY_NAME and p.name not in positional]
-    names = [p.name for p in accepted]
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
-    faults = [] if takes_any else [
-        f"unknown parameter {name!r}; {suggest(name, names)}" for name in params if name not in names
-    ]  # fmt: skip
-    faults += [
-        f"missing parameter {p.name!r}; got {list(params)}."
-        for p in accepted
-        if p.default is p.empty and p.name not in params
-    ]
-    raise WrongTypeError(f"{label} params of {owner}: {' '.join(faults) or cause}") from cause
-
-
-def _signature(function: Any) -> inspect.Signature | None:
-    try:
-        return inspect.signature(function)
-    except (ValueError, TypeError):
-        return None
-
-
 # Config edits.
 
 
@@ -576,72 +504,3 @@ def _same(a: Any, b: Any) -> bool:
     if isinstance(a, torch.Tensor) or isinstance(b, torch.Tensor):
         return False
     return bool(a == b)
-
-
-# Debug visualization, enabled per term in viewers.
-
-
-class DebugVisSwitches:
-    """Mixin of managers with debug visualization. All terms are enabled by default."""
-
-    _hidden: frozenset[str] = frozenset()
-
-    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the drawable terms, as (name, object with `debug_vis`)."""
-        raise NotImplementedError
-
-    def debug_vis(self, visualizer: DebugVisualizer) -> None:
-        """Draw all enabled terms."""
-        for name, term in self.get_visualizable_terms():
-            if name not in self._hidden:
-                term.debug_vis(visualizer)
-
-    def set_debug_vis(self, name: str, enabled: bool) -> None:
-        """Enable or disable the debug visualization of a term.
-
-        Raises `ValueError`, listing the drawable terms, if `name` is not drawable.
-        """
-        check_exists("drawable term", name, [known for known, _ in self.get_visualizable_terms()])
-        self._hidden = self._hidden - {name} if enabled else self._hidden | {name}
-
-    def create_debug_vis_gui(
-        self, server: viser.ViserServer, on_change: Callable[[], None] | None = None
-    ) -> None:
-        """Add a checkbox per drawable term; `on_change` is called after a change."""
-        for name, _ in self.get_visualizable_terms():
-            box = server.gui.add_checkbox(name, initial_value=name not in self._hidden)
-
-            def switch(_event: Any, name: str = name, box: Any = box) -> None:
-                self.set_debug_vis(name, box.value)
-                if on_change is not None:
-                    on_change()
-
-            box.on_update(switch)
-
-
-class TermFunctionSwitches(DebugVisSwitches):
-    """`DebugVisSwitches` for managers of a list of terms; the term functions draw."""
-
-    _term_names: list[str]
-    _term_cfgs: list[Any]
-
-    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the drawable terms, as (name, function object)."""
-        terms = zip(self._term_names, self._term_cfgs, strict=True)
-        return [
-            (name, cfg.func)
-            for name, cfg in terms
-            if callable(getattr(cfg.func, "debug_vis", None))
-        ]
-
-
-class SensorSwitches(DebugVisSwitches):
-    """`DebugVisSwitches` for the sensors of a scene."""
-
-    def __init__(self, sensors: Mapping[str, Any]) -> None:
-        """Store a reference to the scene's sensors by name."""
-        self._sensors = sensors
-
-    def get_visualizable_terms(self) -> list[tuple[str, Any]]:
-        """Return the sensors with debug visualization, as (name, sensor)."""
-        return [(name, sensor) for name, sensor in self._sensors.items() if sensor.draws]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,19 +11,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.compat import offers_older_attributes
-from mjlab.managers.manager_base import (
-    ManagerTermBaseCfg,
-    TermFunctionSwitches,
-    TermListManager,
-    label_errors,
-)
+from mjlab.managers.debug_vis import TermFunctionSwitches
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, label_errors
 from mjlab.managers.nonfinite import NonFiniteWatch
 from mjlab.utils.indexing import as_index, is_empty
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
@@ -32,8 +25,7 @@ class RewardTermCfg(ManagerTermBaseCfg):
     """Reward term configuration: `func(env, **params)` returns one value per environment."""
 
     weight: float
-    """Weight of the term. With weight 0 the function is not called, and an invalid term is logged
-    as a warning; it raises at the first step with another weight."""
+    """Weight of the term. With weight 0 the function is not called."""
 
 
 @offers_older_attributes
@@ -138,31 +130,10 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             for name, mean in zip(self._term_names, means, strict=True)
         }
 
-    def _make_callable(self, name: str, cfg: Any, leading: Sequence[str]) -> None:
-        """Build a term; defer errors of a term with weight 0 until a curriculum sets its weight."""
-        func, build_now = cfg.func, super()._make_callable
-        try:
-            build_now(name, cfg, leading)
-        except (KeyError, TypeError, ValueError) as error:
-            if cfg.weight != 0.0:
-                raise
-            logger.warning(
-                "%s Ignored, because its weight is 0; raises with another weight.",
-                error.args[0] if len(error.args) == 1 else error,
-            )
-        else:
-            return
-
-        def build_and_call(env: Any, **_: Any) -> Any:
-            cfg.func = func
-            try:
-                build_now(name, cfg, leading)
-            except Exception:
-                cfg.func = build_and_call
-                raise
-            return cfg.func(env, **cfg.params)
-
-        cfg.func = build_and_call
+    def _check_call(self, label: str, cfg: Any, leading: Sequence[str]) -> None:
+        # Terms of weight 0 are not called.
+        if cfg.weight != 0.0:
+            super()._check_call(label, cfg, leading)
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return the weighted rate of each term in the last step of one environment."""
