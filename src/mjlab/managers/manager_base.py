@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import torch
 
 from mjlab.managers.scene_entity_config import SceneEntityCfg
-from mjlab.managers.term_checks import check_real, check_term
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
 from mjlab.utils.state import SKIP, mark_stateful, plain_scalar, stateful
@@ -251,8 +250,6 @@ class ManagerBase(Tabular, ABC):
                 cfg.func = cfg.func(cfg=cfg, env=self._env)
             if not callable(cfg.func):
                 raise WrongTypeError(f"{label}: {type(cfg.func).__name__} has no __call__.")
-        with label_errors(label):
-            check_term(cfg.func, self._env, cfg.params)
         self._check_call(label, cfg, leading)
         if not inspect.isroutine(cfg.func):
             # Plain classes have run-time state too.
@@ -283,7 +280,7 @@ class ManagerBase(Tabular, ABC):
                 )
 
     def _evaluate(self, name: str, cfg: ManagerTermBaseCfg) -> torch.Tensor:
-        """Call a term. Raises unless it returns a real tensor with one value per environment."""
+        """Call a term. Raises unless it returns a tensor with one value per environment."""
         value = cfg.func(self._env, **cfg.params)
         if not isinstance(value, torch.Tensor):
             raise WrongTypeError(
@@ -296,7 +293,6 @@ class ManagerBase(Tabular, ABC):
                 f"environment, got {tuple(value.shape)}; reduce the other dimensions (sum, mean, "
                 "squeeze) in the term."
             )
-        check_real(value, self._label, name)
         return value
 
 

@@ -15,7 +15,6 @@ import torch
 
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
-from mjlab.managers.term_checks import check_real
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
 from mjlab.utils.errors import WrongTypeError, check_exists
 from mjlab.utils.indexing import as_ids, is_empty
@@ -558,7 +557,6 @@ class ObservationTerm:
                 *(self._name, tuple(self._raw_shape), tuple(value.shape)),
             )
             self._raw_shape = value.shape
-        check_real(value, str, self._name)
         # Policies are float32, whatever torch's default dtype.
         return value.float() if value.dtype == torch.float64 else value
 
@@ -576,7 +574,6 @@ class ObservationTerm:
             )
         if value.shape[0] != self._env.num_envs:
             _warn(f"{self._name}: expected shape {expected}, got {tuple(value.shape)}.")
-        check_real(value, str, self._name)
 
     def _check_clip(self, clip: Any) -> None:
         expected = (

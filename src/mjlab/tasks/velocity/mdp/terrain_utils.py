@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.managers.term_checks import require_sensor
-from mjlab.sensor import RayCastSensor
-
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
@@ -33,14 +30,10 @@ def terrain_normal_from_sensors(
         env: The environment.
         sensor_names: Ray sensors; one plane is fitted to all hits.
         max_points: Maximum number of rays per sensor, evenly spaced over its rays.
-
-    Raises:
-        ValueError: unknown sensor.
-        TypeError: a sensor is not a `RayCastSensor`.
     """
     points, valid = [], []
     for name in sensor_names:
-        data = require_sensor(env, name, RayCastSensor).data
+        data = env.scene[name].data
         count, device = data.distances.shape[1], data.distances.device
         rays: slice | torch.Tensor = slice(None)
         if count > max_points:
