@@ -27,7 +27,11 @@ from public_interface import (
 # What differs on purpose.
 DEVIATIONS = {
     # Private: how the group finds its actuators.
-    "mjlab.actuator.builtin_group.BuiltinActuatorGroup": {"field _index_groups is missing"},
+    "mjlab.actuator.builtin_group.BuiltinActuatorGroup": {
+        "field _index_groups is missing",
+        "field _delayed_groups is missing",
+    },
+    "mjlab.actuator.fused_group.FusedActuatorGroup": {"field _groups is missing"},
     # Private, and a config is not a cache.
     "mjlab.utils.noise.noise_cfg.NoiseCfg": {"field _tensor_cache is missing"},
     # Nothing leaves the machine unless it is asked for.

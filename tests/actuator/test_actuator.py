@@ -374,13 +374,6 @@ def test_custom_kinds_are_delayed_and_reset_too(make_world):
     assert write(world, 3.0) == [4.0, 4.0, 18.0]
 
 
-def test_delay_line_of_a_group_cannot_be_advanced_from_outside(make_world):
-    world = make_world(motor_cfg(delay_min_lag=1, delay_max_lag=1))
-    actuator = world.entity.actuators[0]
-    with pytest.raises(RuntimeError, match=r"group.*write_data_to_sim"):
-        actuator.apply_delay(actuator.get_command(world.entity.data))
-
-
 def test_delay_line_survives_capture_and_restore(make_world):
     world = make_world(motor_cfg(delay_min_lag=0, delay_max_lag=3, delay_hold_prob=0.5))
     for k in range(5):

@@ -104,7 +104,6 @@ def test_element_still_tells_the_configured_limit(make_world):
 
 
 def test_assigning_a_parameter_acts_like_changing_it_in_place(make_world):
-    """The actuators of a group share one tensor, which an assignment must not leave behind."""
     world = make_world(pd_cfg(target_names_expr=("hip",)), pd_cfg(target_names_expr=("knee",)))
     world.set_state(POS, torch.zeros(3, 3))
     knee = world.entity.actuators[1]

@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
@@ -161,7 +161,6 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         self._global_ctrl_ids: torch.Tensor | None = None
         self._global_element_ids: torch.Tensor | None = None
         self._delay_buffer: DelayBuffer | None = None
-        self._in_group = False
         self._resets_delay = True
 
     # Targets and ids.
@@ -251,7 +250,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         self._global_element_ids = torch.tensor(element_ids, dtype=torch.int64, device=device)
         self._global_ctrl_ids = torch.tensor(columns, dtype=torch.int64, device=device)
         self._ctrl_ids = torch.tensor(own_ids, dtype=torch.int64, device=device)
-        self._in_group, self._resets_delay, self._delay_buffer = False, True, None
+        self._resets_delay, self._delay_buffer = True, None
         if self.has_delay:
             self._delay_buffer = self.make_delay_buffer(data.nworld, device)
 
@@ -268,14 +267,9 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
             per_env_phase=cfg.delay_per_env_phase,
         )
 
-    def join_group(self, delay_buffer: DelayBuffer | None, resets_delay: bool) -> None:
-        """Delegate the delay and writing of controls to a group of actuators.
-
-        Exactly one of the actuators that share a delay buffer resets it.
-        """
-        self._in_group = True
-        self._resets_delay = resets_delay
-        self._delay_buffer = delay_buffer
+    def share_delay(self, line: DelayBuffer, resets: bool) -> None:
+        """Use a delay line that other actuators use too. Exactly one of them `resets` it."""
+        self._delay_buffer, self._resets_delay = line, resets
 
     # Control.
 
@@ -286,9 +280,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     def apply_delay(self, cmd: ActuatorCmd) -> ActuatorCmd:
         """Append the command to the delay buffer and return the delayed command. Feedback is unchanged.
 
-        Raises:
-            RuntimeError: a group advances this actuator's delay buffer; a second call would advance
-                it twice.
+        Not for actuators that share a delay line: `Entity.write_data_to_sim` advances it.
         """
         return self._delayed(cmd, None)
 
@@ -306,10 +298,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
     @staticmethod
     def control_law(params: dict[str, torch.Tensor], cmd: ActuatorCmd) -> torch.Tensor:
-        """Return the controls as a function of only parameters and command.
-
-        Defined for actuators that can be evaluated together; see `FusedActuatorGroup`.
-        """
+        """Return the controls as a function of only parameters and command."""
         raise UnsupportedError("control_law is not defined for this actuator; use compute.")
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
@@ -317,10 +306,13 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
         With `env_ids` (environments just reset), other environments are unchanged.
         """
-        if env_ids is None:
-            ctrl = self.compute(self.apply_delay(self.get_command(data)))
-        else:
-            ctrl = self.compute_after_reset(self._delayed(self.get_command(data), env_ids), env_ids)
+        cmd = self.get_command(data)
+        cmd = self.apply_delay(cmd) if env_ids is None else self._delayed(cmd, env_ids)
+        self.write_controls(data, cmd, env_ids)
+
+    def write_controls(self, data: EntityData, cmd: ActuatorCmd, env_ids: EnvIds = None) -> None:
+        """Compute the controls of a delayed command and write them; see `apply_controls`."""
+        ctrl = self.compute(cmd) if env_ids is None else self.compute_after_reset(cmd, env_ids)
         if self._mjs_actuators:
             write_columns(data.data.ctrl, self.global_ctrl_ids, ctrl, env_ids)
 
@@ -344,11 +336,6 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     def _delayed(self, cmd: ActuatorCmd, env_ids: EnvIds) -> ActuatorCmd:
         if self._delay_buffer is None:
             return cmd
-        if self._in_group:
-            raise WrongStateError(
-                f"The delay of {type(self).__name__} for {self._target_names} is advanced by its "
-                "actuator group; write controls with Entity.write_data_to_sim()."
-            )
         targets = (cmd.position_target, cmd.velocity_target, cmd.effort_target)
         return ActuatorCmd(*delay_rows(self._delay_buffer, targets, env_ids), cmd.pos, cmd.vel)
 
@@ -384,8 +371,7 @@ def is_constant_within_step(function: Callable[..., Any]) -> bool:
 class DirectActuator(Actuator[ActuatorCfgT]):
     """Actuator whose controls are the commands `command_fields`, one block of columns each.
 
-    `BuiltinActuatorGroup` writes many direct actuators to the simulation at once. Subclasses define
-    `command_fields`, and `_add_element` or `edit_spec`.
+    Subclasses define `command_fields`, and `_add_element` or `edit_spec`.
     """
 
     # Function that adds an element, and the config fields that are its keyword arguments.
@@ -463,12 +449,6 @@ _FIELDS = {
     ),
     TransmissionType.SITE: (None, None, "site_effort_target", None, None),
 }  # fmt: skip
-_POSITIONS = {"position": 0, "velocity": 1, "effort": 2}
-
-
-def target_field(transmission: TransmissionType, command: CommandField) -> str | None:
-    """Return the EntityData field of a kind of target, or None."""
-    return _FIELDS[transmission][_POSITIONS[command]]
 
 
 def read_command(data: EntityData, transmission: TransmissionType, columns: Columns) -> ActuatorCmd:
@@ -522,33 +502,80 @@ def delay_rows(
     return buffer.peek().split(widths, dim=1)
 
 
-# Actuator groups.
+# Actuators that share a delay line.
+
+
+@dataclass
+class SharedDelay:
+    """Actuators delayed by one line, hence with one lag per environment."""
+
+    actuators: list[Actuator]
+    line: DelayBuffer
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
+        """Write the controls of all actuators; see `Actuator.apply_controls`."""
+        commands = [actuator.get_command(data) for actuator in self.actuators]
+        targets = (
+            target
+            for cmd in commands
+            for target in (cmd.position_target, cmd.velocity_target, cmd.effort_target)
+        )
+        delayed = iter(delay_rows(self.line, tuple(targets), env_ids))
+        for actuator, cmd in zip(self.actuators, commands, strict=True):
+            late = ActuatorCmd(next(delayed), next(delayed), next(delayed), cmd.pos, cmd.vel)
+            actuator.write_controls(data, late, env_ids)
+
+
+@dataclass
+class ActuatorGroup:
+    """Actuators of an entity, of which those with equal delays share a line.
+
+    Delays are equal for actuators of the same class, transmission and delay settings.
+    """
+
+    _actuators: list[Any] = field(default_factory=list)
+    _writers: list[Actuator | SharedDelay] = field(default_factory=list)
+
+    def initialize(self, num_envs: int, device: str) -> None:
+        """Create the delay lines. The actuators must be initialized."""
+        self._writers = [actuator for actuator in self._actuators if not actuator.has_delay]
+        members: dict[Any, list[Actuator]] = {}
+        for actuator in self._actuators:
+            if actuator.has_delay:
+                members.setdefault(self._delay_settings(actuator), []).append(actuator)
+        for sharing in members.values():
+            line = sharing[0].make_delay_buffer(num_envs, device)
+            for k, actuator in enumerate(sharing):
+                actuator.share_delay(line, resets=k == 0)
+            self._writers.append(SharedDelay(sharing, line) if len(sharing) > 1 else sharing[0])
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
+        """Write the controls of all actuators in the group.
+
+        With `env_ids` (environments just reset), other environments are unchanged.
+        """
+        for writer in self._writers:
+            writer.apply_controls(data, env_ids)
+
+    def _delay_settings(self, actuator: Actuator) -> tuple[Any, ...]:
+        """Return the settings that must agree for actuators to share a delay line."""
+        cfg = actuator.cfg
+        return (
+            type(actuator),
+            actuator.transmission_type,
+            cfg.delay_min_lag,
+            cfg.delay_max_lag,
+            cfg.delay_hold_prob,
+            cfg.delay_update_period,
+            cfg.delay_per_env_phase,
+        )
+
 
 _METHODS = ("compute", "compute_after_reset", "get_command", "apply_delay", "apply_controls")
 
 
 def acts_like(actuator: Actuator, base: type[Actuator]) -> bool:
-    """Return True if the actuator's class does not override the methods that groups bypass."""
-    return all(getattr(type(actuator), name) is getattr(base, name) for name in _METHODS)
-
-
-def delay_settings(actuator: Actuator) -> tuple[Any, ...]:
-    """Return the settings that must agree for actuators to share a delay buffer."""
-    cfg = actuator.cfg
-    return (
-        type(actuator),
-        actuator.transmission_type,
-        cfg.delay_min_lag,
-        cfg.delay_max_lag,
-        cfg.delay_hold_prob,
-        cfg.delay_update_period,
-        cfg.delay_per_env_phase,
+    """Return True if the class of an actuator is a `base` that changes at most its control law."""
+    return isinstance(actuator, base) and all(
+        getattr(type(actuator), name) is getattr(base, name) for name in _METHODS
     )
-
-
-def share_line(members: Sequence[Actuator], num_envs: int, device: str) -> DelayBuffer:
-    """Create one delay buffer for actuators with equal settings. The first actuator resets it."""
-    line = members[0].make_delay_buffer(num_envs, device)
-    for k, actuator in enumerate(members):
-        actuator.join_group(line, resets_delay=k == 0)
-    return line

@@ -49,11 +49,10 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
     configured values.
 
     Subclasses with a different force law override `control_law`, add the names of their parameters
-    to `param_names`, and create them in `initialize` as tensors, (N, n). Actuators of such a class
-    are then evaluated together.
+    to `param_names`, and create them in `initialize` as tensors, (N, n).
     """
 
-    _transient = {"default_stiffness", "default_damping", "default_force_limit", "_model", "_fused"}
+    _transient = {"default_stiffness", "default_damping", "default_force_limit", "_model"}
 
     param_names: ClassVar[tuple[str, ...]] = ("stiffness", "damping", "force_limit")
 
@@ -70,20 +69,6 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
         """See `Actuator`."""
         super().__init__(cfg, entity, target_ids, target_names)
         self._model: Any = None
-        self._fused = False
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # Fused actuators hold their parameters in one tensor. Replacing this actuator's part by
-        # another tensor would silently have no effect.
-        if name in self.param_names and self.__dict__.get("_fused"):
-            self.__dict__[name].copy_(value)
-        else:
-            super().__setattr__(name, value)
-
-    def share_parameters(self, parts: dict[str, torch.Tensor]) -> None:
-        """Replace the parameters by views of larger tensors with the same values."""
-        self.__dict__.update(parts)
-        self._fused = True
 
     def edit_spec(self, spec: mujoco.MjSpec, target_names: list[str]) -> None:
         """Add one motor per target.
@@ -109,7 +94,7 @@ class IdealPdActuator(Actuator[IdealPdCfgT], Generic[IdealPdCfgT]):
     def initialize(self, mj_model: mujoco.MjModel, model: Any, data: Any, device: str) -> None:
         """See `Actuator`; also allocates per-environment gains and limits."""
         super().initialize(mj_model, model, data, device)
-        self._model, self._fused = model, False
+        self._model = model
         shape = (data.nworld, len(self._target_ids_list))
         for name, value in (
             ("stiffness", self.cfg.stiffness),

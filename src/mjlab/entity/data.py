@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 from mjlab.compat import offers_older_attributes, older_names
 from mjlab.entity.indexing import Addresses, EntityIndexing, Ids
 from mjlab.utils.errors import UnsupportedError
-from mjlab.utils.indexing import EnvIds, as_ids, as_index
+from mjlab.utils.indexing import EnvIds, as_ids, as_index, read_columns
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse, quat_from_matrix, quat_mul
 from mjlab.utils.state import stateful
 
@@ -46,7 +46,7 @@ class EntityData:
     """
 
     _transient = {
-        "indexing", "data", "model", "device", "_views", "gravity_vec_w", "forward_vec_b",
+        "indexing", "data", "model", "device", "gravity_vec_w", "forward_vec_b",
         "moved_envs",
     }  # fmt: skip
 
@@ -100,7 +100,6 @@ class EntityData:
     moved_envs: torch.Tensor | None = None
     """(N,) bool, environments whose pose or joint positions were written since the last substep.
     None: no environment."""
-    _views: dict[Any, torch.Tensor] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         ix, device = self.indexing, self.device
@@ -117,7 +116,6 @@ class EntityData:
         self._tendons = Addresses(ix.tendon_ids, device)
         self._ctrl = Addresses(ix.ctrl_ids, device)
         self._forces = Addresses(ix.force_ids, device)
-        self._root = Addresses([ix.root_body_id], device)
         # Addresses of a free joint are always contiguous.
         start_q, start_v = ix.free_joint_q_adr[:1].tolist(), ix.free_joint_v_adr[:1].tolist()
         self._free_q = slice(start_q[0], start_q[0] + 7) if start_q else slice(0, 0)
@@ -292,12 +290,15 @@ class EntityData:
 
         Faster than indexing `body_link_lin_vel_w`, which computes all links.
         """
-        ids = self._bodies.tensor[bodies]
-        if self._body_trees.constant == self.indexing.root_body_id:
-            com = self._columns("subtree_com", self._root)
-        else:
-            com = self.data.subtree_com.index_select(1, self._body_trees.tensor[bodies])
-        pos, cvel = (field.index_select(1, ids) for field in (self.data.xpos, self.data.cvel))
+        ids, trees = self._bodies.tensor[bodies], self._body_trees.tensor[bodies]
+        pos, com, cvel = (
+            field.index_select(1, columns)
+            for field, columns in (
+                (self.data.xpos, ids),
+                (self.data.subtree_com, trees),
+                (self.data.cvel, ids),
+            )
+        )
         return _linear_velocity(pos, com, cvel)
 
     def link_ang_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
@@ -306,7 +307,9 @@ class EntityData:
 
     def _linear_at(self, pos: torch.Tensor, trees: Addresses, bodies: Addresses) -> torch.Tensor:
         """Return the linear velocities of points `pos`, (N, n, 3), of `bodies` in `trees`."""
-        return _linear_velocity(pos, self._tree_com(trees), self._columns("cvel", bodies))
+        return _linear_velocity(
+            pos, self._columns("subtree_com", trees), self._columns("cvel", bodies)
+        )
 
     @property
     def body_external_wrench(self) -> torch.Tensor:
@@ -448,7 +451,7 @@ class EntityData:
         """
         # Not `qfrc_smooth` minus its other parts: MuJoCo computes these at different stages.
         force, torque = self._columns("xfrc_applied", self._bodies).split(3, dim=-1)
-        arm = self._columns("xipos", self._bodies) - self._tree_com(self._body_trees)
+        arm = self._columns("xipos", self._bodies) - self._columns("subtree_com", self._body_trees)
         wrench = torch.cat((torque + torch.linalg.cross(arm, force), force), dim=-1)
         # A sum, because matrix products may be rounded to TF32.
         below = (self.indexing.moved_bodies[..., None] * wrench[:, None]).sum(dim=2)
@@ -656,34 +659,11 @@ class EntityData:
     # Simulation fields.
 
     def _columns(self, name: str, at: Addresses) -> torch.Tensor:
-        """Return the entity's columns of a data field, as a cached view if they are contiguous."""
-        key = (name, id(at))
-        view = self._views.get(key)
-        if view is not None:
-            return view
-        field = getattr(self.data, name)
-        if isinstance(at.all, torch.Tensor):
-            # Several times faster than indexing with the tensor.
-            return field.index_select(1, at.all)
-        # Views can be cached: tensors of data fields live as long as the simulation.
-        view = self._views[key] = field[:, at.all]
-        return view
+        """Return the entity's columns of a data field, as a view if they are contiguous."""
+        return read_columns(getattr(self.data, name), at.all)
 
     def _root_row(self, name: str) -> torch.Tensor:
-        key = (name, "root")
-        view = self._views.get(key)
-        if view is None:
-            view = self._views[key] = getattr(self.data, name)[:, self.indexing.root_body_id]
-        return view
-
-    def _tree_com(self, trees: Addresses) -> torch.Tensor:
-        """Return centers of mass of trees, (N, n, 3), or (N, 1, 3) if all are the root's tree.
-
-        An entity with several top-level bodies has several trees, each with a separate center of mass.
-        """
-        if trees.constant == self.indexing.root_body_id:
-            return self._columns("subtree_com", self._root)
-        return self._columns("subtree_com", trees)
+        return getattr(self.data, name)[:, self.indexing.root_body_id]
 
 
 def compute_velocity_from_cvel(

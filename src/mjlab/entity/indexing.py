@@ -132,7 +132,6 @@ class Addresses:
         self._device = device
         self.tensor = torch.tensor(self._host, dtype=torch.int64, device=device)
         self.all: slice | torch.Tensor = as_columns(self._host, device)
-        self.constant = self._host[0] if len(set(self._host)) == 1 else None
 
     def __len__(self) -> int:
         return len(self._host)

@@ -6,9 +6,6 @@ import copy
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Generator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -31,9 +28,6 @@ _PLAIN = (0.5, 0.5, 0.5, 1.0)
 
 # Minimum bytes per pixel: heights in the spec, the model and the host data's model, and color.
 BYTES_PER_PIXEL = 14
-
-# The signature of `SubTerrainCfg.function` has no argument for the cell.
-_CELL: ContextVar[tuple[int, int] | None] = ContextVar("cell", default=None)
 
 
 @dataclass
@@ -225,8 +219,7 @@ class TerrainGenerator:
     ) -> None:
         sub = self._sub_terrains[name]
         try:
-            with naming_cell(row, col):
-                output = sub.function(difficulty, spec, self.np_rng)
+            output = sub.function(difficulty, spec, self.np_rng)
             check_output(output, self.flat_patches)
             fields = [part.hfield for part in output.geometries if part.hfield is not None]
             self._num_pixels += sum(field.nrow * field.ncol for field in fields)
@@ -261,29 +254,15 @@ class TerrainGenerator:
             kept[row, col, : len(found)] = found + corner
 
 
-@contextmanager
-def naming_cell(row: int, col: int) -> Generator[None]:
-    """Make `asset_name` return names of this cell inside the context."""
-    token = _CELL.set((row, col))
-    try:
-        yield
-    finally:
-        _CELL.reset(token)
-
-
 def asset_name(spec: mujoco.MjSpec, kind: str) -> str:
-    """Return a name for an asset of a sub-terrain, `<kind>_<row>_<column>` in a generated grid.
+    """Return an unused name for an asset of a sub-terrain: `<kind>_<number of assets in the spec>`.
 
-    Outside a grid the name ends with the number of assets in the spec, so that it is unique after
-    each added asset. Names are reproducible across processes.
+    Names are reproducible across processes.
 
     Args:
         spec: Spec that will hold the asset.
-        kind: Asset type, e.g. `hfield`. Different for each asset of one sub-terrain.
+        kind: Asset type, e.g. `hfield`.
     """
-    cell = _CELL.get()
-    if cell is not None:
-        return f"{kind}_{cell[0]}_{cell[1]}"
     count = len(spec.hfields) + len(spec.meshes) + len(spec.textures) + len(spec.materials)
     return f"{kind}_{count}"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 
 import torch
@@ -43,21 +42,15 @@ def as_columns(
     """Return contiguous `ids` as a slice, other ids as an int64 tensor.
 
     Slices and tensors are returned unchanged. Slices avoid a gather: reads are views, writes are
-    plain copies. Tensors are cached by their ids, so never write to them.
+    plain copies.
     """
     if isinstance(ids, (slice, torch.Tensor)):
         return ids
-    return _cached_columns((ids,) if isinstance(ids, int) else tuple(ids), device)
-
-
-@functools.lru_cache(maxsize=4096)
-def _cached_columns(ids: tuple[int, ...], device: torch.device | str) -> Columns:
+    ids = (ids,) if isinstance(ids, int) else tuple(ids)
     first = ids[0] if ids else 0
     if first >= 0 and ids == tuple(range(first, first + len(ids))):
         return slice(first, first + len(ids))
-    # Autograd cannot save inference tensors, and the first call may be in inference mode.
-    with torch.inference_mode(mode=False):
-        return torch.tensor(ids, dtype=torch.int64, device=device)
+    return torch.tensor(ids, dtype=torch.int64, device=device)
 
 
 def num_selected(ids: Sequence[int] | torch.Tensor | slice | int, count: int) -> int:
