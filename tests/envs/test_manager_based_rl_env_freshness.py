@@ -389,25 +389,21 @@ class Lift(CommandTerm):
 def test_a_command_that_places_a_robot_computes_what_follows_for_it_alone(make, monkeypatch):
     env, reference = make(commands={"lift": LiftCfg(resampling_time_range=(1.0, 1.0))})
     calls = []
-    forward, after_reset = env.sim.forward, env.sim.forward_after_reset
+    forward = env.sim.forward
 
     def count(ids=None, stage="acc"):
         calls.append((None if ids is None else ids.tolist(), stage))
         forward(ids, stage)
 
-    def count_after_reset(ids):
-        calls.append((ids.tolist(), "after reset"))
-        after_reset(ids)
-
     monkeypatch.setattr(env.sim, "forward", count)
-    monkeypatch.setattr(env.sim, "forward_after_reset", count_after_reset)
     observed = act(env)
     check(env, observed, reference.of_forward, (*FORCES, *MOTION), [0])
     assert not observed["contact"][0].any()
     check(env, observed, reference.of_last_substep, FORCES, [1, 2])
     env.reset(env_ids=torch.tensor([1]))
     of_command = ([0], "acc")
-    assert calls == [(None, "vel"), of_command, ([1], "after reset"), of_command]
+    all_moved = (None, "vel")
+    assert calls == [all_moved, of_command, all_moved, ([1], "acc"), of_command]
 
 
 # Resuming.

@@ -21,7 +21,7 @@ from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
 from mjlab.managers import EventTermCfg, SceneEntityCfg
 from mjlab.scene import SceneCfg
 from mjlab.sim.config import MujocoCfg, SimulationCfg
-from mjlab.sim.engine import ROTATION_MATRICES, Engine, EngineUnavailableError, RayQuery
+from mjlab.sim.engine import ROTATION_MATRICES, EngineUnavailableError, RayQuery
 from mjlab.sim.randomization import expand_model_fields
 from mjlab.sim.sim_data import TorchArray, WarpBridge
 from mjlab.sim.warp.engine import WarpEngine, offered_data_fields
@@ -456,28 +456,6 @@ def test_a_saved_state_holds_results_that_were_not_read_before() -> None:
     for name in ("qacc", "qfrc_constraint", "qacc_smooth"):
         assert torch.equal(second.data_field(name), engine.data_field(name)), name
     assert engine.data_field("qfrc_constraint").any()
-
-
-def test_a_forward_after_a_reset_is_one_pass_and_computes_what_two_do() -> None:
-    fields = ("qacc", "qfrc_constraint", "xpos", "cvel", "sensordata", "qpos", "qvel", "time")
-    engines = [on_the_floor(make_engine(LANDING_BOX, num_envs=3)) for _ in range(2)]
-    for engine in engines:
-        for name in fields:
-            engine.data_field(name)
-        engine.step(3)
-        engine.reset(torch.tensor([1]))
-    launched: list[str] = []
-    one, two = engines
-    launch = one.launch
-    one.launch = lambda name, *args: (launched.append(name), launch(name, *args))  # type: ignore[method-assign]
-    acting = one.data_field("qacc").clone()
-    one.forward_after_reset(torch.tensor([1]))
-    Engine.forward_after_reset(two, torch.tensor([1]))
-    assert launched == ["acc"]
-    for name in fields:
-        torch.testing.assert_close(one.data_field(name), two.data_field(name), msg=name)
-    assert torch.equal(one.data_field("qacc")[[0, 2]], acting[[0, 2]])
-    assert not torch.equal(one.data_field("qacc")[1], acting[1])
 
 
 def test_a_forward_leaves_delay_lines_alone() -> None:

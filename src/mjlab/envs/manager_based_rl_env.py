@@ -601,10 +601,10 @@ class ManagerBasedRlEnv(Tabular):
         # Before the first substep, the data holds no forces to preserve.
         if len(full) == self.num_envs or self._sim_step_counter == 0:
             self.sim.forward()
-        elif len(full) > 0:
-            self.sim.forward_after_reset(full)
-        else:
-            self.sim.forward(stage="vel")
+            return
+        self.sim.forward(stage="vel")
+        if len(full) > 0:
+            self.sim.forward(full)
 
     def _compute_commands(self, reset_ids: torch.Tensor) -> None:
         dt: float | torch.Tensor = self.step_dt

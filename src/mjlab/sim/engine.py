@@ -332,11 +332,6 @@ class Engine(ABC):
         later stages keep their values.
         """
 
-    def forward_after_reset(self, reset_ids: torch.Tensor) -> None:
-        """Run `forward(reset_ids)`, and `forward(stage="vel")` for the other environments."""
-        self.forward(None, "vel")
-        self.forward(reset_ids)
-
     @abstractmethod
     def look_ahead(self, env_ids: torch.Tensor) -> Any:
         """Run `forward(env_ids, "vel")`; return the previous derived fields, for `look_back`.

@@ -420,16 +420,6 @@ class Simulation:
         self._engine.forward(self.resolve_ids(env_ids), stage)
         self._notify_forward(stage)
 
-    def forward_after_reset(self, env_ids: torch.Tensor) -> None:
-        """Run `forward(env_ids)`, and `forward(stage="vel")` for the other environments.
-
-        On Warp this costs one forward pass instead of two.
-        """
-        resolved = self.resolve_ids(env_ids)
-        assert resolved is not None
-        self._engine.forward_after_reset(resolved)
-        self._notify_forward("acc")
-
     @contextlib.contextmanager
     def looking_ahead(self, env_ids: torch.Tensor) -> Generator[None]:
         """Compute positions and velocities of `env_ids` for the duration of the `with` block.

@@ -402,35 +402,21 @@ class WarpEngine(Engine):
             mjwarp.fwd_kinematics(self.wp_model, self.wp_data)
             mjwarp.com_vel(self.wp_model, self.wp_data)
 
-    def forward_after_reset(self, reset_ids: torch.Tensor) -> None:
-        # One full pass: a pass of some environments costs the same as a pass of all.
-        self.forward(reset_ids, kept_from="acc")
-
-    def forward(
-        self, env_ids: torch.Tensor | None, stage: Stage = "acc", kept_from: Stage = "pos"
-    ) -> None:
-        """Compute stages up to `stage`; other environments keep results from `kept_from` on.
+    def forward(self, env_ids: torch.Tensor | None, stage: Stage = "acc") -> None:
+        """Compute stages up to `stage`; other environments keep their results.
 
         Warp computes all environments and uses fields of later stages as scratch. These fields are
         restored: values that are one substep old stay so, as on native.
-
-        Args:
-            env_ids: Environments. None: all.
-            stage: Last stage to compute.
-            kept_from: First stage whose results other environments keep, "pos" (all) or "acc".
         """
         others = self._rows_except(env_ids)
-        results = ACCELERATION_FIELDS if kept_from == "acc" else self._data_tensors.keys()
         kept: list[tuple[torch.Tensor, torch.Tensor | None]] = []
         for name, tensor in self._data_tensors.items():
             if name == "sensordata":
                 mask = (self._sensor_stages > STAGES[stage])[None]
-                if others is not None:
-                    mask = mask | (others[:, None] & (self._sensor_stages >= STAGES[kept_from]))
-                kept.append((tensor, mask))
+                kept.append((tensor, mask if others is None else mask | others[:, None]))
             elif name in _OVERWRITTEN[stage]:
                 kept.append((tensor, None))
-            elif others is not None and name in results and name not in _STATE_FIELDS:
+            elif others is not None and name not in _STATE_FIELDS:
                 kept.append((tensor, others))
         with _restoring(kept):
             if not _STATIC_POSE.isdisjoint(self.model_fields):
