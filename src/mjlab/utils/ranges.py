@@ -131,6 +131,7 @@ def _numbers(value: Any) -> Iterator[Real]:
         yield from _numbers(item)
 
 
+# Cached: 0.03 s instead of 0.75 s for the configs of a velocity task.
 @functools.cache
 def _ranges(kind: type) -> dict[str, Range]:
     """Return the ranges of the fields of a class: of each, that of the most derived class with one."""

@@ -105,7 +105,6 @@ def write_settings(spec: mujoco.MjSpec, values: dict[str, Any]) -> None:
         setattr(read_setting(spec, block) if block else spec, name, value)
 
 
-@functools.cache
 def _setting_paths() -> tuple[str, ...]:
     spec = mujoco.MjSpec()
     blocks = (*(f"visual.{block}" for block in _VISUAL_BLOCKS), "stat")

@@ -32,11 +32,8 @@ _ROW_DIMS = {("CircularBuffer", "_buffer"): 1}
 _SEQUENCES = (list, tuple, deque)
 
 
-class _Skip:
-    """Sentinel for values that are not state."""
-
-
-SKIP = _Skip()
+SKIP = object()
+"""Stands for values that are not state."""
 
 
 def stateful(cls: C) -> C:

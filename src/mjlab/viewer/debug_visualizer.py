@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -26,6 +26,7 @@ class DebugVisualizer(ABC):
 
     Drawings last for one displayed frame: the viewer clears them and calls `debug_vis` again.
     `label` documents an item in the code; viewers do not show it. `add_legend` explains colors.
+    Subclasses define `meansize`, `add_ghost_mesh`, `clear`, `_place` and `_connect`.
     """
 
     env_idx: int = 0
@@ -44,7 +45,6 @@ class DebugVisualizer(ABC):
     def meansize(self) -> float:
         """Typical size of a body in the model (m), to scale drawings."""
 
-    @abstractmethod
     def add_arrow(
         self,
         start: np.ndarray,
@@ -54,14 +54,14 @@ class DebugVisualizer(ABC):
         label: str | None = None,
     ) -> None:
         """Draw an arrow between two points (3,); `width` is the radius of the shaft."""
+        self._connect("arrow", start, end, width, color)
 
-    @abstractmethod
     def add_sphere(
         self, center: np.ndarray, radius: float, color: Color, label: str | None = None
     ) -> None:
         """Draw a sphere."""
+        self._place("sphere", center, np.full(3, radius), np.eye(3), color)
 
-    @abstractmethod
     def add_cylinder(
         self,
         start: np.ndarray,
@@ -71,8 +71,8 @@ class DebugVisualizer(ABC):
         label: str | None = None,
     ) -> None:
         """Draw a cylinder with flat ends centered on two points (3,)."""
+        self._connect("cylinder", start, end, radius, color)
 
-    @abstractmethod
     def add_ellipsoid(
         self,
         center: np.ndarray,
@@ -82,8 +82,8 @@ class DebugVisualizer(ABC):
         label: str | None = None,
     ) -> None:
         """Draw an ellipsoid with semi-axes `size` (3,) along the columns of `mat` (3, 3)."""
+        self._place("ellipsoid", center, size, mat, color)
 
-    @abstractmethod
     def add_box(
         self,
         center: np.ndarray,
@@ -93,6 +93,7 @@ class DebugVisualizer(ABC):
         label: str | None = None,
     ) -> None:
         """Draw a box with half-extents `size` (3,) along the columns of `mat` (3, 3)."""
+        self._place("box", center, size, mat, color)
 
     @abstractmethod
     def add_ghost_mesh(
@@ -133,6 +134,28 @@ class DebugVisualizer(ABC):
         for axis, (red, green, blue) in enumerate(axis_colors or DEFAULT_AXIS_COLORS):
             end = position + scale * rotation[:, axis]
             self.add_arrow(position, end, (red, green, blue, alpha), axis_radius, label)
+
+    def _place(
+        self,
+        shape: Literal["sphere", "ellipsoid", "box"],
+        center: np.ndarray,
+        size: np.ndarray,
+        mat: np.ndarray,
+        color: Color,
+    ) -> None:
+        """Draw a shape with half-extents `size` (3,) along the columns of `mat` (3, 3)."""
+        raise NotImplementedError(f"{type(self).__name__} must define _place, or each add_*.")
+
+    def _connect(
+        self,
+        shape: Literal["arrow", "cylinder"],
+        start: np.ndarray,
+        end: np.ndarray,
+        radius: float,
+        color: Color,
+    ) -> None:
+        """Draw a shape between two points (3,)."""
+        raise NotImplementedError(f"{type(self).__name__} must define _connect, or each add_*.")
 
 
 class NullDebugVisualizer:

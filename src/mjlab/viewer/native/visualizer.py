@@ -12,6 +12,11 @@ from mjlab.viewer.model_sync import compute_poses
 
 log = logging.getLogger(__name__)
 
+_SHAPES = {
+    shape: int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"))
+    for shape in ("arrow", "box", "cylinder", "ellipsoid", "sphere")
+}
+
 
 class MujocoNativeDebugVisualizer(DebugVisualizer):
     """Debug visualizer that appends geoms to a MuJoCo scene.
@@ -52,52 +57,6 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
     def clear(self) -> None:
         self.scn.ngeom = self._first_geom
 
-    def add_arrow(
-        self,
-        start: np.ndarray,
-        end: np.ndarray,
-        color: Color,
-        width: float = 0.015,
-        label: str | None = None,
-    ) -> None:
-        self._add_connector(mujoco.mjtGeom.mjGEOM_ARROW, start, end, width, color)
-
-    def add_cylinder(
-        self,
-        start: np.ndarray,
-        end: np.ndarray,
-        radius: float,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        self._add_connector(mujoco.mjtGeom.mjGEOM_CYLINDER, start, end, radius, color)
-
-    def add_sphere(
-        self, center: np.ndarray, radius: float, color: Color, label: str | None = None
-    ) -> None:
-        size = np.full(3, radius)
-        self._add_geom(mujoco.mjtGeom.mjGEOM_SPHERE, size, center, np.eye(3), color)
-
-    def add_ellipsoid(
-        self,
-        center: np.ndarray,
-        size: np.ndarray,
-        mat: np.ndarray,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        self._add_geom(mujoco.mjtGeom.mjGEOM_ELLIPSOID, size, center, mat, color)
-
-    def add_box(
-        self,
-        center: np.ndarray,
-        size: np.ndarray,
-        mat: np.ndarray,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        self._add_geom(mujoco.mjtGeom.mjGEOM_BOX, size, center, mat, color)
-
     def add_ghost_mesh(
         self,
         qpos: np.ndarray,
@@ -131,38 +90,28 @@ class MujocoNativeDebugVisualizer(DebugVisualizer):
             )
         return full
 
-    def _add_geom(
-        self,
-        kind: mujoco.mjtGeom,
-        size: np.ndarray,
-        center: np.ndarray,
-        mat: np.ndarray,
-        color: Color,
+    def _place(
+        self, shape: str, center: np.ndarray, size: np.ndarray, mat: np.ndarray, color: Color
     ) -> None:
         if self._is_full():
             return
         geom = self.scn.geoms[self.scn.ngeom]
         self.scn.ngeom += 1
         vectors = (np.asarray(value, dtype=np.float64).ravel() for value in (size, center, mat))
-        mujoco.mjv_initGeom(geom, int(kind), *vectors, np.asarray(color, dtype=np.float32))
+        mujoco.mjv_initGeom(geom, _SHAPES[shape], *vectors, np.asarray(color, dtype=np.float32))
         geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
 
-    def _add_connector(
-        self,
-        kind: mujoco.mjtGeom,
-        start: np.ndarray,
-        end: np.ndarray,
-        radius: float,
-        color: Color,
+    def _connect(
+        self, shape: str, start: np.ndarray, end: np.ndarray, radius: float, color: Color
     ) -> None:
         start = np.asarray(start, dtype=np.float64).reshape(3)
         end = np.asarray(end, dtype=np.float64).reshape(3)
         if np.linalg.norm(end - start) < MIN_LENGTH:
             return
         before = self.scn.ngeom
-        self._add_geom(kind, np.zeros(3), np.zeros(3), np.eye(3), color)
+        self._place(shape, np.zeros(3), np.zeros(3), np.eye(3), color)
         if self.scn.ngeom > before:
-            mujoco.mjv_connector(self.scn.geoms[before], int(kind), radius, start, end)
+            mujoco.mjv_connector(self.scn.geoms[before], _SHAPES[shape], radius, start, end)
 
 
 def add_moving_geoms(

@@ -64,60 +64,6 @@ class ViserDebugVisualizer(DebugVisualizer):
             handle.remove()
         self._debug_handles.clear()
 
-    def add_arrow(
-        self,
-        start: Array,
-        end: Array,
-        color: Color,
-        width: float = 0.015,
-        label: str | None = None,
-    ) -> None:
-        arrows = self._arrows
-        arrows.starts.append(np.array(to_numpy(start), dtype=float))
-        arrows.ends.append(np.array(to_numpy(end), dtype=float))
-        arrows.widths.append(width)
-        arrows.colors.append(color)
-
-    def add_cylinder(
-        self,
-        start: Array,
-        end: Array,
-        radius: float,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        start, end = to_numpy(start).reshape(3), to_numpy(end).reshape(3)
-        vector = end.astype(float) - start
-        length = float(np.linalg.norm(vector))
-        if length >= MIN_LENGTH:
-            [wxyz] = rotations_of_z(vector[None] / length)
-            self._add("shaft", start + 0.5 * vector, wxyz, (radius, radius, length), color)
-
-    def add_sphere(
-        self, center: Array, radius: float, color: Color, label: str | None = None
-    ) -> None:
-        self._add("sphere", center, (1.0, 0.0, 0.0, 0.0), (radius, radius, radius), color)
-
-    def add_ellipsoid(
-        self,
-        center: Array,
-        size: Array,
-        mat: Array,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        self._add("sphere", center, _wxyz(mat), size, color)
-
-    def add_box(
-        self,
-        center: Array,
-        size: Array,
-        mat: Array,
-        color: Color,
-        label: str | None = None,
-    ) -> None:
-        self._add("box", center, _wxyz(mat), size, color)
-
     def add_ghost_mesh(
         self,
         qpos: Array,
@@ -195,6 +141,23 @@ class ViserDebugVisualizer(DebugVisualizer):
             if handle.visible != (key in self._batches):
                 handle.visible = not handle.visible
 
+    def _place(self, shape: str, center: Array, size: Array, mat: Array, color: Color) -> None:
+        wxyz = vtf.SO3.from_matrix(to_numpy(mat).astype(float).reshape(3, 3)).wxyz
+        self._add("box" if shape == "box" else "sphere", center, wxyz, size, color)
+
+    def _connect(self, shape: str, start: Array, end: Array, radius: float, color: Color) -> None:
+        start, end = (
+            to_numpy(start).reshape(3).astype(float),
+            to_numpy(end).reshape(3).astype(float),
+        )
+        if shape == "arrow":
+            self._arrows.add(start, end, radius, color)
+            return
+        length = float(np.linalg.norm(end - start))
+        if length >= MIN_LENGTH:
+            [wxyz] = rotations_of_z((end - start)[None] / length)
+            self._add("shaft", 0.5 * (start + end), wxyz, (radius, radius, length), color)
+
     def _add(self, key: str, position, wxyz, scale, color: Color) -> None:
         self._batches.setdefault(key, _Batch()).add(position, wxyz, scale, color)
 
@@ -243,6 +206,12 @@ class _Arrows:
     widths: list[float] = field(default_factory=list)
     colors: list[Color] = field(default_factory=list)
 
+    def add(self, start: np.ndarray, end: np.ndarray, width: float, color: Color) -> None:
+        self.starts.append(start)
+        self.ends.append(end)
+        self.widths.append(width)
+        self.colors.append(color)
+
     def add_to(self, shafts: _Batch, heads: _Batch) -> None:
         """Add the shafts and heads of the arrows that have a direction."""
         starts = np.array(self.starts, dtype=float).reshape(-1, 3)
@@ -265,10 +234,6 @@ class _Arrows:
 def _geom_rgba(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
     material = model.geom_matid[geom_id]
     return model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom_id]
-
-
-def _wxyz(mat: Array) -> np.ndarray:
-    return vtf.SO3.from_matrix(to_numpy(mat).astype(float).reshape(3, 3)).wxyz
 
 
 def rotations_of_z(axes: np.ndarray) -> np.ndarray:
