@@ -16,6 +16,7 @@ from mjlab.cli import display
 from mjlab.cli.display import TrainingDisplay, usual_iteration
 from mjlab.cli.results import next_commands
 from mjlab.cli.train_config import parse_train_flags
+from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.evaluation import EvaluationResult, MeanAndInterval
 from mjlab.rl.progress import ProgressCfg, sparkline
 from mjlab.rl.run_logger import IterationStats
@@ -76,7 +77,11 @@ class Shown:
         self._out = io.TextIOWrapper(io.BytesIO(), encoding=encoding, write_through=True)
         console = Console(file=self._out, force_terminal=terminal, width=90, color_system=None)
         cfg = ProgressCfg(
-            title=SWINGUP, evaluation=evaluation, step_seconds=0.02, episode_steps=1000, **facts
+            title=SWINGUP,
+            evaluation=EvaluationCfg(**evaluation),
+            step_seconds=0.02,
+            episode_steps=1000,
+            **facts,
         )
         self.panel = TrainingDisplay(cfg, console)
         self.panel.on_start(0, 10)
@@ -172,7 +177,9 @@ def test_dumb_terminals_get_lines(monkeypatch):
 
 
 def test_a_run_that_fails_before_it_starts_is_shown_as_failed(capsys):
-    TrainingDisplay(ProgressCfg(evaluation={}), Console(file=sys.stdout)).on_end("failed")
+    TrainingDisplay(ProgressCfg(evaluation=EvaluationCfg()), Console(file=sys.stdout)).on_end(
+        "failed"
+    )
     assert capsys.readouterr().out == "Failed before the first iteration.\n"
 
 

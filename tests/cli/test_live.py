@@ -23,6 +23,7 @@ from mjlab.cli import live
 from mjlab.cli.live import live_view
 from mjlab.cli.live_view import Exchange, LiveJob, NewestWeights
 from mjlab.rl.checkpoint import load_checkpoint
+from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.evaluation import EvaluationResult
 from mjlab.rl.progress import ProgressCfg, TrainingProgress
 from mjlab.rl.run_logger import IterationStats
@@ -60,7 +61,7 @@ def process(code: str):
 
 def progress(**evaluation: float) -> TrainingProgress:
     """Return the progress of a run of nine iterations."""
-    progress = TrainingProgress(ProgressCfg(evaluation=evaluation))
+    progress = TrainingProgress(ProgressCfg(evaluation=EvaluationCfg(**evaluation)))
     progress.on_start(0, 9)
     return progress
 

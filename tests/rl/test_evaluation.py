@@ -115,7 +115,7 @@ def test_episodes_are_cut_off_and_counted_as_unfinished():
 
 def test_figures_are_read_back():
     metrics = {"one": lambda env: torch.ones(4)}
-    result = evaluate_policy(counting(), still, success_is_survival=True, metrics=metrics)
+    result = evaluate_policy(counting(), still, success="survival", metrics=metrics)
     again = EvaluationResult.from_dict({"task": "counting", **result.to_dict()})
     assert again == dataclasses.replace(result, returns=())
     assert again.judged("failure_rate") == result.judged("failure_rate")
@@ -124,9 +124,9 @@ def test_figures_are_read_back():
 @pytest.mark.parametrize(
     "success",
     [
-        {"success_is_survival": True},
-        {"success_return": 0.5},
-        {"success_func": lambda env: torch.ones(4, dtype=torch.bool)},
+        {"success": "survival"},
+        {"success": 0.5},
+        {"success": lambda env: torch.ones(4, dtype=torch.bool)},
     ],
     ids=lambda success: next(iter(success)),
 )
@@ -138,7 +138,7 @@ def test_an_unfinished_episode_is_no_success(success):
 def test_an_episode_of_the_full_length_is_finished_without_a_time_out():
     env = counting()
     env.max_episode_length = 3
-    result = evaluate_policy(env, still, success_return=0.5)
+    result = evaluate_policy(env, still, success=0.5)
     assert result.returns == (1.0, 3.0, 6.0, 6.0)
     assert (result.num_unfinished, result.success_rate) == (0, 1.0)
 
@@ -198,13 +198,13 @@ def test_so_many_episodes_without_a_failure_show_a_rate_and_one_less_does_not(ra
 
 
 def test_success_is_by_return_or_by_function():
-    result = evaluate_policy(counting(), still, success_return=6.0)
+    result = evaluate_policy(counting(), still, success=6.0)
     assert result.success_rate == 0.5
     assert result.success_interval == wilson_interval(0.5, 4)
     # The function is asked before each step, so the last answer is that of the terminal state's
     # predecessor: environment i has made i steps then.
     by_function = evaluate_policy(
-        counting(), still, success_func=lambda env: env.episode_length_buf >= 3
+        counting(), still, success=lambda env: env.episode_length_buf >= 3
     )
     assert by_function.success_rate == 0.25
 
@@ -255,7 +255,7 @@ def test_a_figure_is_found_by_name_and_an_unknown_one_is_refused():
 
 
 def test_json_has_the_figures_without_the_single_returns():
-    values = json.loads(evaluate_policy(counting(), still, success_return=6.0).to_json())
+    values = json.loads(evaluate_policy(counting(), still, success=6.0).to_json())
     assert values["mean_return"] == 5.0
     assert values["success_rate"] == 0.5
     assert len(values["return_interval"]) == 2

@@ -60,9 +60,9 @@ def failing_env(seed: int) -> RslRlVecEnvWrapper:
     return RslRlVecEnvWrapper(FailingEnv(FakeEnvCfg(scene=scene, seed=seed, episode_steps=1)))
 
 
-def evaluation(**changes) -> dict:
+def evaluation(**changes) -> EvaluationCfg:
     values = {"solved_below": {"failure_rate": BOUND}, "min_interval": 1, "num_episodes": EPISODES}
-    return asdict(EvaluationCfg(**{**values, **changes}))
+    return EvaluationCfg(**{**values, **changes})
 
 
 class Told(TrainingObserver):
@@ -77,7 +77,7 @@ class Told(TrainingObserver):
 
 
 def learner(seed: int, log_dir: Path | None = None, **changes) -> tuple[MjlabOnPolicyRunner, Told]:
-    cfg = runner_cfg(evaluation=evaluation(**changes), seed=seed, save_interval=100)
+    cfg = runner_cfg(evaluation=asdict(evaluation(**changes)), seed=seed, save_interval=100)
     runner = MjlabOnPolicyRunner(failing_env(seed), cfg, None if log_dir is None else str(log_dir))
     told = Told()
     runner.observers.append(told)
@@ -216,7 +216,7 @@ def test_a_learner_that_was_lucky_is_found_out():
 def test_bounds_that_so_few_episodes_cannot_meet_are_told(caplog):
     def check(episodes: int, **bounds) -> str:
         caplog.clear()
-        changes = {"solved_below": {}, "num_episodes": episodes, "success_is_survival": True}
+        changes = {"solved_below": {}, "num_episodes": episodes, "success": "survival"}
         SolvedCheck(failing_env(1), Still(), evaluation(**changes | bounds), 1)
         return caplog.text
 

@@ -1,61 +1,42 @@
-"""Description of the success criterion."""
+"""Success of an episode, and its description."""
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import pytest
-import torch
 
 from mjlab.rl import EvaluationCfg
-from mjlab.rl.evaluation import required_return, success_definition
-from mjlab.tasks.manipulation.config.yam.rl_cfg import placed_at_goal
+from mjlab.rl.evaluation import success_definition
 
 
-def upright(env: Any) -> torch.Tensor:
-    """Return whether the pole stands within 10 degrees, (num_envs,) bool.
-
-    More is said here.
-    """
-    return torch.ones(env.num_envs, dtype=torch.bool)
-
-
-def unexplained(env: Any) -> torch.Tensor:
-    return upright(env)
+def upright(env: Any) -> Any:
+    return None
 
 
 @pytest.mark.parametrize(
-    ("fields", "words"),
+    ("fields", "criterion", "words"),
     [
-        ({}, None),
-        ({"solved_return": 900.0}, "return of at least 900"),
-        ({"solved_return": 900.0, "success_return": 700.0}, "return of at least 700"),
+        ({}, None, None),
+        ({"solved_return": 900.0}, 900.0, "return of at least 900"),
+        ({"solved_return": 900.0, "success": 700.0}, 700.0, "return of at least 700"),
+        ({"success": 0.0}, 0.0, "return of at least 0"),
         (
-            {"success_func": upright, "solved_return": 900.0},
-            "the pole stands within 10 degrees (upright), one step before the end",
+            {"success": f"{__name__}:upright", "solved_return": 9.0},
+            upright,
+            "upright, one step before the end",
         ),
-        ({"success_func": unexplained}, "unexplained, one step before the end"),
-        (
-            {"success_func": functools.partial(upright)},
-            "the pole stands within 10 degrees (upright), one step before the end",
-        ),
-        (
-            {"success_func": placed_at_goal},
-            "the object is at its goal, or was at the last one if time ran out on a new one "
-            "(placed_at_goal), one step before the end",
-        ),
-        (
-            {"success_is_survival": True},
-            "no termination before the time limit",
-        ),
+        ({"success": "survival"}, "survival", "no termination before the time limit"),
     ],
 )
-def test_the_definition_is_put_in_words(fields: dict[str, Any], words: str | None) -> None:
-    assert success_definition(EvaluationCfg(**fields)) == words
+def test_one_field_defines_success(fields: dict[str, Any], criterion: Any, words: str | None):
+    cfg = EvaluationCfg(**fields)
+    assert cfg.criterion == criterion
+    assert success_definition(cfg) == words
 
 
-def test_a_return_decides_only_where_nothing_else_does() -> None:
-    assert required_return(EvaluationCfg(solved_return=3.0)) == 3.0
-    assert required_return(EvaluationCfg(solved_return=3.0, success_func=upright)) is None
-    assert required_return(EvaluationCfg(solved_return=3.0, success_is_survival=True)) is None
+def test_a_config_is_read_from_a_dict():
+    cfg = EvaluationCfg(solved_return=3.0, num_episodes=7)
+    assert EvaluationCfg.of({"solved_return": 3.0, "num_episodes": 7, "of_later": 1}) == cfg
+    assert EvaluationCfg.of(cfg) is cfg
+    assert EvaluationCfg.of(None) == EvaluationCfg()

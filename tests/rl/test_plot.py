@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.plot import (
     DEFAULT_TAG,
     LABELS,
@@ -21,12 +22,12 @@ from mjlab.rl.plot import (
     visible_range,
 )
 
-EVALUATION = {"solved_return": 900.0, "num_episodes": 256}
-WALK = {
-    "solved_below": {"speed_error": 0.25, "failure_rate": 0.05},
-    "units": {"speed_error": "m/s"},
-    "num_episodes": 200,
-}
+EVALUATION = EvaluationCfg(solved_return=900.0)
+WALK = EvaluationCfg(
+    solved_below={"speed_error": 0.25, "failure_rate": 0.05},
+    units={"speed_error": "m/s"},
+    num_episodes=200,
+)
 
 
 def write_run(
@@ -273,7 +274,7 @@ def test_a_run_is_solved_where_all_goals_are_met(tmp_path: Path):
         return {f"{group}/{k}": (np.arange(len(v)), np.array(v)) for k, v in values.items()}
 
     returns = [800.0, 910.0, 890.0, 920.0]
-    to_the_end = {**EVALUATION, "stop_when_solved": False}
+    to_the_end = EvaluationCfg(solved_return=900.0, stop_when_solved=False)
     assert solved_at(curves("Evaluation", mean_return=returns), to_the_end) == 2
     # Evaluations of runs that stop when solved are confirmed.
     assert solved_at(curves("Evaluation", mean_return=returns), EVALUATION) is None
@@ -281,4 +282,4 @@ def test_a_run_is_solved_where_all_goals_are_met(tmp_path: Path):
     # 10 failures in 200 episodes count as 5.8 %, 8 as 4.9 %.
     walked = curves("Confirmation", speed_error=[0.3, 0.2, 0.2], failure_rate=[0.01, 0.05, 0.04])
     assert solved_at(walked, WALK) == 3
-    assert solved_at(walked, {}) is None
+    assert solved_at(walked, EvaluationCfg()) is None

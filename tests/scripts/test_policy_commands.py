@@ -255,7 +255,7 @@ def test_success_that_the_task_defines_is_told_with_its_definition(run, with_ima
     figures = json.loads(run("evaluate", with_images, *argv, "--json").out)
     low, high = figures["success_interval"]
     assert low < figures["success_rate"] < high
-    definition = "the cart stands right of the middle (leans_right), one step before the end"
+    definition = "leans_right, one step before the end"
     assert figures["success_definition"] == definition
     table = run("evaluate", with_images, *argv).out
     assert f"Success      {figures['success_rate']:.1%}" in table
@@ -285,7 +285,7 @@ def with_images():
         for model in (cfg.actor, cfg.critic):
             model.class_name = "mjlab.rl.spatial_softmax:SpatialSoftmaxCNNModel"
             model.cnn_cfg = {"output_channels": [4], "kernel_size": [3], "padding": "zeros"}
-        cfg.evaluation.success_func = leans_right
+        cfg.evaluation.success = f"{__name__}:leans_right"
         return cfg
 
     registry.register_mjlab_task("Test-With-Images", env_cfg, rl_cfg=rl_cfg)

@@ -282,7 +282,7 @@ def test_goals_in_returns_neither_rank_nor_stop(sweep, machine, folder):
     argv = ("--over", "env.rewards.smooth-reward.weight=1,10", "--folder", str(folder))
     outcome = sweep(*argv, f"{stop}=True")
     assert outcome.status == 0, outcome.err
-    assert "define success_func or metrics" in outcome.out
+    assert "define success or metrics" in outcome.out
     assert "return of 900" in outcome.out
     assert "Best" not in outcome.out
     assert all(flags_of(command)[stop] == "False" for command in machine.commands)
@@ -370,7 +370,7 @@ def test_what_enters_a_return_is_not_compared_by_it(changed):
     assert not objective.is_ranked
     assert next(iter(changed)) in objective.reason
     for cfg in cfgs:
-        cfg.agent.evaluation = EvaluationCfg(success_func=len, solved_return=900.0)
+        cfg.agent.evaluation = EvaluationCfg(success="builtins:len", solved_return=900.0)
     assert choose_objective(TASK, cfgs).tag == "Evaluation/success_rate"
 
 
@@ -386,9 +386,9 @@ def test_parameters_and_time_steps_enter_the_return():
 @pytest.mark.parametrize(
     ("evaluation", "tag", "is_low"),
     [
-        (EvaluationCfg(success_return=900.0), None, False),
-        (EvaluationCfg(solved_above={"success_rate": 0.9}, success_return=1.0), None, False),
-        (EvaluationCfg(success_is_survival=True), "Evaluation/success_rate", False),
+        (EvaluationCfg(success=900.0), None, False),
+        (EvaluationCfg(solved_above={"success_rate": 0.9}, success=1.0), None, False),
+        (EvaluationCfg(success="survival"), "Evaluation/success_rate", False),
         (EvaluationCfg(metrics={"lag_error": len}), "Evaluation/lag_error", True),
         (EvaluationCfg(metrics={"lag": len}, solved_below={"lag": 1.0}), "Evaluation/lag", True),
         (
@@ -420,7 +420,7 @@ def test_endless_episodes_are_not_ranked():
     cfgs = [weighted(TASK, 1.0), weighted(TASK, 10.0)]
     for cfg in cfgs:
         cfg.env.episode_length_s = 1e9
-        cfg.agent.evaluation = EvaluationCfg(success_func=len)
+        cfg.agent.evaluation = EvaluationCfg(success="builtins:len")
     objective = choose_objective(TASK, cfgs)
     assert not objective.is_ranked
     assert "episode_length_s" in objective.reason

@@ -43,7 +43,7 @@ _PLACEMENT = {
         n: f"tasks.manipulation.config.yam.rl_cfg:{n}" for n in ("position_error", "at_goal")
     },
     "units": {"position_error": "m"},
-    "success_func": "tasks.manipulation.config.yam.rl_cfg:placed_at_goal",
+    "success": "mjlab.tasks.manipulation.config.yam.rl_cfg:placed_at_goal",
 }
 for task in (
     "Mjlab-Lift-Cube-Yam",
@@ -83,7 +83,7 @@ _MOTION_EVALUATION = {
     "_": "EvaluationCfg",
     "metrics": _MOTION_ERRORS,
     "units": dict(zip(_MOTION_ERRORS, ("m", "m", "rad/s", "m", "rad"), strict=True)),
-    "success_is_survival": True,
+    "success": "survival",
     "prepare_env": "tasks.tracking.mdp.metrics:play_motions_once",
 }
 for variant in ("", "-No-State-Estimation"):

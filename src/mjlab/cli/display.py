@@ -109,7 +109,7 @@ class TrainingDisplay(TrainingProgress):
             metrics = [
                 f"return {number(result.mean_return)} in {counted(result.num_episodes, 'episode')}"
             ]
-            units = self._cfg.evaluation.get("units") or {}
+            units = self._cfg.evaluation.units
             metrics += [
                 f"{label(name)} {number(value.mean)} {units.get(name, '')}".rstrip()
                 for name, value in result.metrics.items()
@@ -166,7 +166,7 @@ def usual_iteration(task: str, cfg: TrainConfig) -> int | None:
     parts = ("algorithm", "actor", "critic", "num_steps_per_env")
     if any(getattr(agent, part, None) != getattr(default, part, None) for part in parts):
         return None
-    if Bound.all_of(vars(agent.evaluation)) != Bound.all_of(vars(default.evaluation)):
+    if Bound.all_of(agent.evaluation) != Bound.all_of(default.evaluation):
         return None
     env = load_env_cfg(task, profile=cfg.profile)
     parts = ("rewards", "episode_length_s", "decimation")

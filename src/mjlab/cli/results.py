@@ -62,7 +62,7 @@ def write_results(
 
     # A run solved at resume has no iterations.
     with beside_results("learning curve"), contextlib.suppress(ValueError):
-        plot_run(parts_of(run_dir), title=task, evaluation=vars(cfg.agent.evaluation))
+        plot_run(parts_of(run_dir), title=task, evaluation=cfg.agent.evaluation)
     run = Run(run_dir, task)
     checkpoint = run.newest
     if cfg.result_video and checkpoint is not None:

@@ -16,7 +16,6 @@ from mjlab.cli.resume import run_to_continue
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import EvaluationCfg, RslRlBaseRunnerCfg
 from mjlab.rl.distributed import STORE_VARIABLE
-from mjlab.rl.evaluation import required_return
 from mjlab.rl.learners import Learner, learner_of
 from mjlab.runs import Run
 from mjlab.runs.settings import differences
@@ -246,7 +245,8 @@ def goal_return(evaluation: EvaluationCfg) -> float | None:
     if evaluation.solved_return is not None:
         return evaluation.solved_return
     by_rate = "success_rate" in {**evaluation.solved_above, **evaluation.solved_below}
-    return required_return(evaluation) if by_rate else None
+    criterion = evaluation.criterion
+    return criterion if by_rate and isinstance(criterion, int | float) else None
 
 
 def return_differences(env: ManagerBasedRlEnvCfg, other: ManagerBasedRlEnvCfg) -> list[str]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import math
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
 from mjlab.compat import accepts_older_fields
@@ -205,7 +207,7 @@ class RslRlDistillationAlgorithmCfg:
 
 @dataclass
 class EvaluationCfg:
-    """Success criteria, and schedule of evaluations during training.
+    """Conditions of a solved task, success of an episode, and schedule of evaluations in training.
 
     The return of an episode is the sum of its weighted rewards BEFORE they are multiplied by the
     environment step: with rewards in [0, 1], an episode of 1000 steps has at most 1000.
@@ -241,19 +243,38 @@ class EvaluationCfg:
     """Minimum number of iterations between evaluations."""
     first_iteration: CountOrZero = 0
     """Minimum number of iterations before the first evaluation."""
-    success_return: Number | None = None
-    """Minimum return of a successful episode. None: `solved_return`."""
-    success_func: Callable[[Any], Any] | None = None
-    """Success function, instead of a return: `func(env) -> (num_envs,) bool`, read one step before
-    the end of an episode, because the environment has reset when the last step returns."""
-    success_is_survival: bool = False
-    """Count episodes as successes unless a termination ended them before the time limit. Not
-    together with another success condition."""
+    success: Number | str | None = None
+    """Success of an episode: a minimum return; `survival`, no termination before the time limit; or
+    `module:function`, a function `func(env) -> (num_envs,) bool`, read one step before the end, because the
+    environment has reset when the last step returns. None: a return of `solved_return`."""
     prepare_env: Callable[[Any], None] | None = None
     """Function that edits, in place, a copy of the training environments' config for evaluation, if
     training makes the task easier. None: same config. Curriculum terms that the function removes are
     off, and so are their edits; others are in their present state. Evaluations in training apply it to the config
     of the run; `evaluate` applies it before flags and `TaskOptions`, which take precedence."""
+
+    @staticmethod
+    def of(values: EvaluationCfg | Mapping[str, Any] | None) -> EvaluationCfg:
+        """Return the config of a dict, such as that of a runner or a recorded one. None: the default."""
+        if isinstance(values, EvaluationCfg):
+            return values
+        known = {field.name for field in fields(EvaluationCfg)}
+        return EvaluationCfg(**{k: v for k, v in (values or {}).items() if k in known})
+
+    @property
+    def criterion(self) -> Callable[[Any], Any] | str | float | None:
+        """Success of an episode: `success`, with a function for its name, or else `solved_return`."""
+        if isinstance(self.success, str) and self.success != "survival":
+            return pkgutil.resolve_name(self.success)
+        return self.solved_return if self.success is None else self.success
+
+    @property
+    def trigger(self) -> float | None:
+        """Return of the training data, at full length, that triggers an evaluation. None: any."""
+        trigger = self.trigger_return
+        if trigger is None and self.solved_return is not None:
+            trigger = self.trigger_fraction * self.solved_return
+        return None if trigger == -math.inf else trigger
 
 
 @dataclass

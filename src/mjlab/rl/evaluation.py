@@ -11,14 +11,12 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
-import inspect
 import json
 import logging
 import math
 import operator
-import re
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +37,8 @@ logger = logging.getLogger(__name__)
 Policy = Callable[[Any], torch.Tensor]
 PerEnv = Callable[[Any], torch.Tensor]
 """`func(env) -> (num_envs,)`: per-environment value, read at every step."""
+Success = PerEnv | str | float | None
+"""Success of an episode: a function, `survival`, or a minimum return; see `EvaluationCfg.success`."""
 Progress = Callable[[int, float], None]
 """`func(num_finished, fraction)`: progress of an evaluation."""
 RESULT_FIELDS = ("mean_return", "mean_length", "success_rate", "failure_rate")
@@ -53,9 +53,6 @@ _MANY_EPISODES = 200
 _MOST_CURRICULA = 6
 # Two-sided 95 % quantile of the normal distribution.
 _Z95 = 1.959964
-# Parts of a success function's docstring that describe the tensor.
-_OPENING = re.compile(r"^Return (?:where|whether|if) ")
-_SHAPE = re.compile(r",? \([^()]*,\)(?: bool)?\.?$")
 
 
 def evaluate_policy(
@@ -64,9 +61,7 @@ def evaluate_policy(
     num_episodes: int | None = None,
     *,
     max_steps: int | None = None,
-    success_return: float | None = None,
-    success_func: PerEnv | None = None,
-    success_is_survival: bool = False,
+    success: Success = None,
     metrics: Mapping[str, PerEnv] | None = None,
     seed: int | None = None,
     progress: Progress | None = None,
@@ -90,11 +85,8 @@ def evaluate_policy(
         num_episodes: Number of episodes to score; None: one per environment.
         max_steps: Number of steps until episodes are truncated; None: the task's episode length,
             after which episodes count as finished.
-        success_return: Minimum return of a successful episode.
-        success_func: Success function, instead: `func(env) -> (num_envs,) bool`, read one step
-            before the end of an episode.
-        success_is_survival: Count episodes as successes, instead, unless a termination ended them
-            before the time limit.
+        success: Success of an episode: a minimum return; `survival`, no termination before the time
+            limit; or `func(env) -> (num_envs,) bool`, read one step before the end. None: not defined.
         metrics: Functions by name, `func(env) -> (num_envs,)`, read before every step and averaged
             over the steps of an episode.
         seed: Seed of the evaluation; None: generators are not seeded. With the same seed,
@@ -121,6 +113,7 @@ def evaluate_policy(
         env.seed(seed)
     start = time.perf_counter()
     rounds, levels = [], set()
+    success_func: Any = success if callable(success) else None
     terrain = getattr(getattr(env.unwrapped, "scene", None), "terrain", None)
     with (
         threads_for_policy(policy, env.num_envs, env.device),
@@ -150,13 +143,13 @@ def evaluate_policy(
                 )
             )
     episodes = functools.reduce(operator.add, rounds)
-    successes = episodes.succeeded if success_func is not None else None
-    if successes is None and success_is_survival:
-        successes = ~episodes.failed
-    if successes is None and success_return is not None:
-        successes = episodes.returns >= success_return
-    if successes is not None:
-        successes = successes & episodes.finished
+    successes = None
+    if success_func is not None:
+        successes = episodes.succeeded & episodes.finished
+    elif success == "survival":
+        successes = ~episodes.failed & episodes.finished
+    elif success is not None:
+        successes = (episodes.returns >= float(success)) & episodes.finished
     if levels:
         curricula["terrain_levels"] = [min(levels), max(levels)]
     result = summarize(episodes, successes, time.perf_counter() - start)
@@ -314,13 +307,12 @@ class Bound:
         return value <= self.limit if self.is_upper else value >= self.limit
 
     @staticmethod
-    def all_of(cfg: Mapping[str, Any]) -> list[Bound]:
-        """Return the bounds of an `EvaluationCfg` as a dict, the return first."""
-        target = cfg.get("solved_return")
+    def all_of(cfg: EvaluationCfg) -> list[Bound]:
+        """Return the bounds that a solved task meets, that of the return first."""
+        target = cfg.solved_return
         bounds = [] if target is None else [Bound("mean_return", target, is_upper=False)]
-        units = {"mean_length": "steps", **(cfg.get("units") or {})}
-        for field, is_upper in (("solved_below", True), ("solved_above", False)):
-            limits = cfg.get(field) or {}
+        units = {"mean_length": "steps", **cfg.units}
+        for limits, is_upper in ((cfg.solved_below, True), (cfg.solved_above, False)):
             bounds += [Bound(n, v, is_upper, units.get(n, "")) for n, v in limits.items()]
         return bounds
 
@@ -332,49 +324,28 @@ class SolvedCheck:
     `last_iteration` is the number of iterations finished at the last evaluation.
     """
 
-    def __init__(self, env: Any, algorithm: Any, cfg: dict[str, Any], seed: int) -> None:
+    def __init__(self, env: Any, algorithm: Any, cfg: EvaluationCfg, seed: int) -> None:
         """Set up the check.
 
         Args:
             env: Environments of the run.
             algorithm: Algorithm of the run.
-            cfg: An `EvaluationCfg` as a dict.
+            cfg: Conditions and schedule.
             seed: Seed of the run.
 
         Raises:
             ValueError: a condition names an unknown metric.
         """
+        self.cfg = cfg
         self._env = env
         self._algorithm = algorithm
-        self._cfg = cfg
         self._seed = seed
         self._bounds = Bound.all_of(cfg)
-        below: dict[str, float] = cfg.get("solved_below") or {}
-        above: dict[str, float] = cfg.get("solved_above") or {}
-        self._min_interval = int(cfg.get("min_interval", 3))
-        self._num_episodes = int(cfg.get("num_episodes", 256))
-        self._prepare_env = cfg.get("prepare_env")
-        known = {*(cfg.get("metrics") or {}), *RESULT_FIELDS}
-        defining_success = ("success_func", "success_return", "solved_return")
-        is_defined = any(cfg.get(name) is not None for name in defining_success)
-        if not is_defined and not cfg.get("success_is_survival"):
+        known = {*cfg.metrics, *RESULT_FIELDS}
+        if cfg.criterion is None:
             known.discard("success_rate")
-        for name in (*below, *above):
-            if name not in known:
-                raise ValueError(
-                    f"EvaluationCfg solved_below, solved_above: {name!r} is not measured; "
-                    f"{suggest(name, sorted(known))} Others must be in `metrics`."
-                )
-        # Bounds on rates that this number of episodes cannot meet, even without a failure.
-        allowed = {"failure_rate": below.get("failure_rate", 1.0)}
-        allowed["success_rate"] = 1.0 - above.get("success_rate", 0.0)
-        for name, failures in allowed.items():
-            if failures > 0.0 and self._num_episodes < (needed := episodes_to_show(failures)):
-                logger.warning(
-                    "EvaluationCfg: %d episodes never meet the bound on %s: they are too few to show "
-                    "failures as rare as %.3g %%; use num_episodes >= %d.",
-                    self._num_episodes, name, 100.0 * failures, needed,
-                )  # fmt: skip
+        for bound in self._bounds:
+            check_measured(bound, cfg, known)
         self._eval_env: Any = None
         self.last_iteration = 0
 
@@ -386,22 +357,17 @@ class SolvedCheck:
             mean_step_reward: Mean weighted reward per step of the last iteration, before scaling by
                 the step's duration.
         """
-        is_wanted = bool(self._bounds) or self._cfg.get("trigger_return") is not None
-        if not is_wanted or iteration - self.last_iteration < self._min_interval:
+        cfg, trigger = self.cfg, self.cfg.trigger
+        is_wanted = bool(self._bounds) or cfg.trigger_return is not None
+        if not is_wanted or iteration - self.last_iteration < cfg.min_interval:
             return False
-        if iteration < self._cfg.get("first_iteration", 0):
+        if iteration < cfg.first_iteration:
             return False
-        trigger = trigger_return(self._cfg)
         return trigger is None or mean_step_reward * int(self._env.max_episode_length) >= trigger
 
     def is_solved_by(self, result: EvaluationResult) -> bool:
         """Return True if `result` meets all conditions of the config."""
         return bool(self._bounds) and all(bound.is_met(result) for bound in self._bounds)
-
-    @property
-    def stops_training(self) -> bool:
-        """True if training ends when the task is solved."""
-        return bool(self._cfg.get("stop_when_solved", True))
 
     def evaluate(self, is_stopped: Callable[[], bool] = bool) -> EvaluationResult:
         """Score the policy in separate environments, built at the first call.
@@ -433,7 +399,8 @@ class SolvedCheck:
         # Building cannot be stopped, and may take long.
         if is_stopped():
             raise EvaluationStopped
-        return make_evaluation_env(self._env, self._num_episodes, seed, self._prepare_env)
+        cfg = self.cfg
+        return make_evaluation_env(self._env, cfg.num_episodes, seed, cfg.prepare_env)
 
     def _score(self, env: Any, seed: int, is_stopped: Callable[[], bool]) -> EvaluationResult:
         training: Any = self._env.unwrapped
@@ -443,19 +410,14 @@ class SolvedCheck:
             env.unwrapped.common_step_counter = training.common_step_counter
         policy = self._algorithm.get_policy()
         hidden_state = policy.get_hidden_state()
-        success_return = self._cfg.get("success_return")
-        if success_return is None:
-            success_return = self._cfg.get("solved_return")
         self._algorithm.eval_mode()
         try:
             with preserved_rng():
                 return evaluate_policy(
                     env,
                     policy,
-                    success_return=success_return,
-                    success_func=self._cfg.get("success_func"),
-                    success_is_survival=bool(self._cfg.get("success_is_survival")),
-                    metrics=self._cfg.get("metrics"),
+                    success=self.cfg.criterion,
+                    metrics=self.cfg.metrics,
                     seed=seed,
                     is_stopped=is_stopped,
                 )
@@ -470,15 +432,25 @@ class SolvedCheck:
             self._eval_env = None
 
 
-def trigger_return(cfg: Mapping[str, Any]) -> float | None:
-    """Return the return of the training data, at full length, that triggers an evaluation.
+def check_measured(bound: Bound, cfg: EvaluationCfg, known: Collection[str]) -> None:
+    """Raise ValueError if evaluations do not measure the value of `bound`, and warn if they never meet it.
 
-    `cfg` is an `EvaluationCfg` as a dict. None: evaluations do not depend on it.
+    Too few episodes never meet a bound on a rate, even without a failure.
     """
-    trigger = cfg.get("trigger_return")
-    if trigger is None and cfg.get("solved_return") is not None:
-        trigger = cfg["trigger_fraction"] * cfg["solved_return"]
-    return None if trigger == -math.inf else trigger
+    if bound.name not in known:
+        raise ValueError(
+            f"EvaluationCfg solved_below, solved_above: {bound.name!r} is not measured; "
+            f"{suggest(bound.name, sorted(known))} Others must be in `metrics`."
+        )
+    failures = 1.0
+    if bound.is_rate and bound.is_upper == (bound.name == "failure_rate"):
+        failures = bound.limit if bound.is_upper else 1.0 - bound.limit
+    if failures > 0.0 and cfg.num_episodes < (needed := episodes_to_show(failures)):
+        logger.warning(
+            "EvaluationCfg: %d episodes never meet the bound on %s: they are too few to show failures "
+            "as rare as %.3g %%; use num_episodes >= %d.",
+            cfg.num_episodes, bound.name, 100.0 * failures, needed,
+        )  # fmt: skip
 
 
 def curricula_text(curricula: Mapping[str, Any]) -> str:
@@ -495,28 +467,16 @@ def curricula_text(curricula: Mapping[str, Any]) -> str:
 
 
 def success_definition(cfg: EvaluationCfg) -> str | None:
-    """Return a description of the success criterion, None if the task does not define success.
-
-    A success function is described by the first line of its docstring, without the tensor shape.
-    """
-    if (func := cfg.success_func) is not None:
-        while isinstance(func, functools.partial):
-            func = func.func
-        name = getattr(func, "__name__", type(func).__name__)
-        first_line = (inspect.getdoc(func) or "").split("\n")[0].strip()
-        words = _OPENING.sub("", _SHAPE.sub("", first_line)).rstrip(".")
-        return f"{f'{words} ({name})' if words else name}, one step before the end"
-    if cfg.success_is_survival:
-        return "no termination before the time limit"
-    target = required_return(cfg)
-    return None if target is None else f"return of at least {target:g}"
-
-
-def required_return(cfg: EvaluationCfg) -> float | None:
-    """Return the minimum return of a successful episode, None if the return does not decide."""
-    if cfg.success_func is not None or cfg.success_is_survival:
+    """Return a description of the success of an episode, None if the task does not define it."""
+    criterion = cfg.criterion
+    if criterion is None:
         return None
-    return cfg.solved_return if cfg.success_return is None else cfg.success_return
+    if callable(criterion):
+        name = getattr(criterion, "__name__", type(criterion).__name__)
+        return f"{name}, one step before the end"
+    if criterion == "survival":
+        return "no termination before the time limit"
+    return f"return of at least {float(criterion):g}"
 
 
 # Episodes.

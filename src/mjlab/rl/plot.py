@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjlab.rl.config import EvaluationCfg
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.os import files_in, naming
 from mjlab.utils.string import counted, suggest
@@ -127,23 +128,22 @@ def default_tag(runs: Sequence[Mapping[str, Curve]]) -> str:
     return DEFAULT_TAG
 
 
-def solved_at(curves: Mapping[str, Curve], evaluation: Mapping[str, Any]) -> int | None:
+def solved_at(curves: Mapping[str, Curve], evaluation: EvaluationCfg) -> int | None:
     """Return the number of iterations until a task was solved, None if it was not.
 
     Args:
         curves: Result of `read_all_scalars`.
-        evaluation: `EvaluationCfg` of the run as a dict. If its training stops when solved, the
-            confirmation counts.
+        evaluation: Conditions of the run. If its training stops when solved, the confirmation counts.
     """
     from mjlab.rl.evaluation import Bound, wilson_interval
 
     bounds = Bound.all_of(evaluation)
-    group = "Confirmation" if evaluation.get("stop_when_solved", True) else "Evaluation"
+    group = "Confirmation" if evaluation.stop_when_solved else "Evaluation"
     met: dict[int, int] = {}
     for bound in bounds:
         for iteration, value in zip(*curves.get(f"{group}/{bound.name}", ((), ())), strict=True):
-            if bound.name in ("failure_rate", "success_rate"):
-                value = sum(wilson_interval(value, int(evaluation["num_episodes"]))) / 2
+            if bound.is_rate:
+                value = sum(wilson_interval(value, evaluation.num_episodes)) / 2
             is_met = value <= bound.limit if bound.is_upper else value >= bound.limit
             met[iteration] = met.get(iteration, 0) + int(is_met)
     solved = [iteration for iteration, count in met.items() if count == len(bounds)]
@@ -178,7 +178,7 @@ def plot_run(
     *,
     tag: str | None = None,
     title: str | None = None,
-    evaluation: Mapping[str, Any] | None = None,
+    evaluation: EvaluationCfg | Mapping[str, Any] | None = None,
 ) -> Path:
     """Plot the learning curve of one run.
 
@@ -188,8 +188,8 @@ def plot_run(
         tag: Tag to plot, as in the event files. None: the return of the exploring policy and of
             evaluations.
         title: Title of the figure; None: the folder's name.
-        evaluation: `EvaluationCfg` of the run as a dict: without `tag`, its goals are drawn, each
-            besides the return on its own axes.
+        evaluation: `EvaluationCfg` of the run, or its fields by name: without `tag`, the bounds of a
+            solved task are drawn, each besides that of the return on its own axes.
 
     Returns:
         Path of the PNG file.
@@ -203,7 +203,7 @@ def plot_run(
     folder, curves = _folders(run)[-1], read_all_scalars(run)
     shown = default_tag([curves]) if tag is None else tag
     iterations, values = _curve(run, curves, shown)
-    bounds = Bound.all_of(evaluation or {}) if tag is None else []
+    bounds = Bound.all_of(EvaluationCfg.of(evaluation)) if tag is None else []
     others = [b for b in bounds if b.name != "mean_return" and f"Evaluation/{b.name}" in curves]
     figure, top, below = _new_figure(len(others))
     top.plot(iterations + 1, values, color="tab:blue", label="exploring policy")

@@ -11,7 +11,7 @@ import io
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from mjlab.rl.evaluation import Bound, EvaluationResult, curricula_text, trigger_return
+from mjlab.rl.config import EvaluationCfg
+from mjlab.rl.evaluation import Bound, EvaluationResult, curricula_text
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.utils.string import clock, counted, duration, escaped, number
 
@@ -43,8 +44,8 @@ class ProgressCfg:
 
     title: str = "Training"
     """First line: the task and the number of environments."""
-    evaluation: Mapping[str, Any]
-    """`EvaluationCfg` as a dict."""
+    evaluation: EvaluationCfg
+    """Conditions of a solved task."""
     step_seconds: float | None = None
     """Duration of an environment step (s)."""
     episode_steps: float | None = None
@@ -60,7 +61,7 @@ class ProgressCfg:
         env = runner.env
         return ProgressCfg(
             title=f"{title}, {counted(env.num_envs, 'environment')}",
-            evaluation=runner.cfg.get("evaluation") or {},
+            evaluation=EvaluationCfg.of(runner.cfg.get("evaluation")),
             step_seconds=getattr(env.unwrapped, "step_dt", None),
             episode_steps=getattr(env, "max_episode_length", None),
             usual_iteration=usual_iteration,
@@ -174,9 +175,8 @@ class TrainingProgress(TrainingObserver):
             return None
         cfg = self._cfg.evaluation
         last = self._evaluations[-1][0] if self._evaluations else 0
-        after = max(last + int(cfg.get("min_interval", 3)), cfg.get("first_iteration", 0))
-        trigger = trigger_return(cfg)
-        stats = self.stats
+        after = max(last + cfg.min_interval, cfg.first_iteration)
+        trigger, stats = cfg.trigger, self.stats
         # Evaluations are triggered by the return at full length, without failures.
         at_full_length = stats.mean_step_reward * (self._cfg.episode_steps or 0.0)
         if trigger is None or at_full_length >= trigger:

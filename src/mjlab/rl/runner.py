@@ -44,6 +44,7 @@ from mjlab.rl.checkpoint import (
     start_episodes,
     term_shapes,
 )
+from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.distributed import join_processes
 from mjlab.rl.divergence import RolloutWatch
 from mjlab.rl.evaluation import (
@@ -152,9 +153,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._owes_evaluation = False
         # Path and content of the checkpoint written last.
         self._written: tuple[str, dict[str, Any]] | None = None
-        self._solved_check = SolvedCheck(
-            env, self.alg, self.cfg.get("evaluation") or {}, int(self.cfg.get("seed", 0))
-        )
+        evaluation = EvaluationCfg.of(self.cfg.get("evaluation"))
+        self._solved_check = SolvedCheck(env, self.alg, evaluation, int(self.cfg.get("seed", 0)))
         self._num_threads = self._resolve_threads()
         # Waiting OpenMP threads slow down the threads of the physics.
         on_cpu = torch.device(self.device).type == "cpu"
@@ -494,7 +494,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             is_good = check.is_solved_by(result)
             self._notify("on_evaluation", iteration, result, is_good)
             self.logger.write_evaluation(result, iteration - 1)
-            if is_good and check.stops_training:
+            if is_good and check.cfg.stop_when_solved:
                 with stop.interruptible():
                     result = check.confirm(iteration, lambda: stop.requested)
                 self.last_evaluation, solved = result, check.is_solved_by(result)

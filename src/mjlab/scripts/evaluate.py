@@ -67,7 +67,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     number is `cfg.num_envs`. If None, it is that of `cfg.env` if it differs from the task or if
     `keep_num_envs`, else `num_episodes`.
     """
-    from mjlab.rl.evaluation import evaluate_policy, required_return, success_definition
+    from mjlab.rl.evaluation import evaluate_policy, success_definition
 
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
@@ -90,9 +90,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
                 policy,
                 cfg.num_episodes,
                 max_steps=cfg.max_steps,
-                success_return=required_return(solved),
-                success_func=solved.success_func,
-                success_is_survival=solved.success_is_survival,
+                success=solved.criterion,
                 metrics=solved.metrics,
                 seed=cfg.seed,
                 progress=progress.update,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mjlab.cli.main import run_alias
+from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.plot import (
     DEFAULT_TAG,
     Curve,
@@ -64,9 +65,10 @@ class Seed:
         )
 
     @property
-    def evaluation(self) -> dict[str, Any]:
-        """`EvaluationCfg` as recorded; empty if it was not."""
-        return self.run.params["agent"].get("evaluation") or {}
+    def evaluation(self) -> EvaluationCfg | None:
+        """Conditions of a solved task, as recorded; None if they were not."""
+        recorded = self.run.params["agent"].get("evaluation")
+        return EvaluationCfg.of(recorded) if recorded else None
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -155,7 +157,10 @@ def common_goal(seeds: Sequence[Seed], tag: str) -> float | None:
 
     name = "mean_return" if tag == DEFAULT_TAG else tag.removeprefix("Evaluation/")
     goals = {
-        next((b.limit for b in Bound.all_of(seed.evaluation) if b.name == name), None)
+        next(
+            (b.limit for b in Bound.all_of(EvaluationCfg.of(seed.evaluation)) if b.name == name),
+            None,
+        )
         for seed in seeds
     }
     return goals.pop() if len(goals) == 1 else None
@@ -170,8 +175,8 @@ def seeds_table(groups: Mapping[str, Sequence[Seed]], tag: str) -> Table:
     rows: list[list[Any]] = []
     for name, seeds in groups.items():
         at, mean, std = mean_and_std([seed.curves[tag] for seed in seeds])
-        goals = [seed for seed in seeds if seed.evaluation]
-        solved = [n for s in goals if (n := solved_at(s.curves, s.evaluation)) is not None]
+        goals = [(seed, cfg) for seed in seeds if (cfg := seed.evaluation) is not None]
+        solved = [n for seed, cfg in goals if (n := solved_at(seed.curves, cfg)) is not None]
         listed = [_joined(seed.numbers) for seed in seeds if seed.numbers]
         is_short = 0 < len(listed) == len(seeds) <= _LISTED_SEEDS
         rows.append(

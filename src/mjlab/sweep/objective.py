@@ -102,7 +102,7 @@ def choose_objective(
         use = f"use --objective Evaluation/{metrics[0]}, with --minimize if low values are good"
         tag, others = tag or f"Evaluation/{metrics[0]}", tuple(metrics[1:])
     else:
-        use = "define success_func or metrics in the task's EvaluationCfg"
+        use = "define success or metrics in the task's EvaluationCfg"
     reason = f"not ranked, {why}; {use}"
     return Objective(tag or _default_tag(first), minimize, False, reason, goal, others)
 
@@ -115,7 +115,8 @@ def _measures(task: str, cfg: TrainConfig, changes: Iterable[str]) -> dict[str, 
         return measures
     # Of episodes that end by other conditions, neither length nor failures can be compared.
     ends_alike = not any(name.startswith("terminations.") for name in changes)
-    if evaluation.success_func is not None or (evaluation.success_is_survival and ends_alike):
+    success = evaluation.criterion
+    if callable(success) or (success == "survival" and ends_alike):
         measures["success_rate"] = False
     ends = {"failure_rate"} if ends_alike else set()
     if all(name.startswith(("rewards.", "curriculum.")) for name in changes):
@@ -123,7 +124,7 @@ def _measures(task: str, cfg: TrainConfig, changes: Iterable[str]) -> dict[str, 
     # Goals tell which direction is good; some tasks have goals under a profile only.
     profiles = [load_rl_cfg(task, profile=profile).evaluation for profile in list_profiles(task)]
     for goals in (evaluation, *profiles):
-        for bound in Bound.all_of(vars(goals)):
+        for bound in Bound.all_of(goals):
             if bound.name in evaluation.metrics or bound.name in ends:
                 measures.setdefault(bound.name, bound.is_upper)
     for name in evaluation.metrics:
@@ -145,6 +146,6 @@ def _contains_return(tag: str) -> bool:
 
 def _default_tag(cfg: TrainConfig) -> str:
     """Return the tag to compare: of evaluations if the task has them, else the exploring return."""
-    if Bound.all_of(vars(cfg.agent.evaluation)):
+    if Bound.all_of(cfg.agent.evaluation):
         return EVALUATED
     return EXPLORED if cfg.env.episode_length_s < _LONGEST_EPISODE_S else DEFAULT_TAG

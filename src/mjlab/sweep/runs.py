@@ -299,7 +299,7 @@ def _evaluations(sweep: Sweep, setting: Setting) -> list[str]:
     agent = train_config(sweep, setting).agent
     total, interval = agent.max_iterations, max(1, agent.max_iterations // _EVALUATIONS)
     # A trigger also evaluates tasks without a goal.
-    if not (sweep.objective.is_evaluated or Bound.all_of(vars(agent.evaluation))):
+    if not (sweep.objective.is_evaluated or Bound.all_of(agent.evaluation)):
         return []
     settings = {
         "stop-when-solved": False,

@@ -27,7 +27,7 @@ def test_all_four_tasks_are_registered_with_a_profile_for_a_few_cores():
         env, rl = load_env_cfg(task, profile="cpu"), load_rl_cfg(task, profile="cpu")
         assert env.scene.num_envs > 1
         assert rl.evaluation.solved_above["success_rate"] > 0.8
-        assert rl.evaluation.success_func is not None
+        assert rl.evaluation.success is not None
 
 
 def test_the_profile_rewards_fingers_around_the_cube_and_has_simple_contacts():

@@ -91,10 +91,10 @@ def test_evaluations_report_success_errors_and_the_time_at_the_goal(make_env, me
 
     env = RslRlVecEnvWrapper(make_env(edit=edit, num_envs=6))
     evaluation = load_rl_cfg(LIFT).evaluation
-    assert evaluation.success_func is placed_at_goal
+    assert evaluation.criterion is placed_at_goal
     assert evaluation.metrics == PLACEMENT
     result = evaluate_policy(
-        env, still, 6, success_func=evaluation.success_func, metrics=evaluation.metrics, seed=0
+        env, still, 6, success=evaluation.criterion, metrics=evaluation.metrics, seed=0
     )
     assert result.success_rate == float(met)
     low, high = result.success_interval
@@ -130,10 +130,10 @@ def test_a_goal_that_comes_just_before_the_end_costs_no_success(make_env):
         cube.write_root_link_velocity_to_sim(torch.zeros(3, 6))
         return torch.zeros(3, 7)
 
-    result = evaluate_policy(wrapped, put_at_goal, 3, success_func=placed_at_goal, seed=0)
+    result = evaluate_policy(wrapped, put_at_goal, 3, success=placed_at_goal, seed=0)
     assert result.success_rate == 1.0
     literal = evaluate_policy(
-        wrapped, put_at_goal, 3, success_func=lambda e: lifting(e).compute_success(), seed=0
+        wrapped, put_at_goal, 3, success=lambda e: lifting(e).compute_success(), seed=0
     )
     assert literal.success_rate == 0.0
 

@@ -38,7 +38,7 @@ def evaluated(motion, policy=None, num_envs=4, edit=None, seed=3, **kwargs):
             RslRlVecEnvWrapper(env),
             policy or (lambda observations: zero),
             metrics=TRACKING_ERRORS,
-            success_is_survival=True,
+            success="survival",
             seed=seed,
             **kwargs,
         )
@@ -51,7 +51,7 @@ def test_the_task_measures_these_and_calls_survival_success():
     assert list(evaluation.metrics) == [
         "mpkpe", "r_mpkpe", "joint_vel_error", "ee_pos_error", "ee_ori_error",
     ]  # fmt: skip
-    assert evaluation.success_is_survival
+    assert evaluation.success == "survival"
     assert evaluation.prepare_env is play_motions_once
     # Settings passed by a training run.
     assert asdict(evaluation)["metrics"] == TRACKING_ERRORS

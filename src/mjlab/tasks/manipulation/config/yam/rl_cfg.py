@@ -63,7 +63,9 @@ def yam_lift_cube_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
         save_interval=100,
         max_iterations=5_000,
         evaluation=EvaluationCfg(
-            success_func=placed_at_goal, metrics=dict(PLACEMENT), units={"position_error": "m"}
+            success=f"{__name__}:placed_at_goal",
+            metrics=dict(PLACEMENT),
+            units={"position_error": "m"},
         ),
     )
 
@@ -98,7 +100,9 @@ def _vision(experiment_name: str) -> RslRlOnPolicyRunnerCfg:
         save_interval=100,
         max_iterations=3_000,
         evaluation=EvaluationCfg(
-            success_func=placed_at_goal, metrics=dict(PLACEMENT), units={"position_error": "m"}
+            success=f"{__name__}:placed_at_goal",
+            metrics=dict(PLACEMENT),
+            units={"position_error": "m"},
         ),
     )
 

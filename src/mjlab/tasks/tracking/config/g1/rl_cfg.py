@@ -54,7 +54,7 @@ def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
             metrics=dict(TRACKING_ERRORS),
             units=dict(UNITS),
             prepare_env=play_motions_once,
-            success_is_survival=True,
+            success="survival",
         ),
     )
 
