@@ -113,7 +113,7 @@ def evaluate_policy(
         env.seed(seed)
     start = time.perf_counter()
     rounds, levels = [], set()
-    success_func: Any = success if callable(success) else None
+    success_func = None if isinstance(success, str | int | float) else success
     terrain = getattr(getattr(env.unwrapped, "scene", None), "terrain", None)
     with (
         threads_for_policy(policy, env.num_envs, env.device),
@@ -144,12 +144,12 @@ def evaluate_policy(
             )
     episodes = functools.reduce(operator.add, rounds)
     successes = None
-    if success_func is not None:
-        successes = episodes.succeeded & episodes.finished
-    elif success == "survival":
+    if success == "survival":
         successes = ~episodes.failed & episodes.finished
+    elif isinstance(success, int | float):
+        successes = (episodes.returns >= success) & episodes.finished
     elif success is not None:
-        successes = (episodes.returns >= float(success)) & episodes.finished
+        successes = episodes.succeeded & episodes.finished
     if levels:
         curricula["terrain_levels"] = [min(levels), max(levels)]
     result = summarize(episodes, successes, time.perf_counter() - start)
