@@ -108,6 +108,7 @@ def test_packages_that_fail_to_import_are_reported_and_do_not_hurt_others(tmp_pa
     assert all(error.splitlines()[0] in table for error in (first, second, fourth))
 
 
+@pytest.mark.slow
 def test_a_task_that_fails_or_crashes_leaves_the_others_alone(tmp_path, package):
     status, trials, _ = run_tool(tmp_path, package("mixed", MIXED), "--engines", "native")
     assert status == 1

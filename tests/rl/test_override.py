@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -108,6 +109,11 @@ class Run:
         }
         groups = saved["optimizer_state_dict"]["param_groups"]
         return {**found, "rates": torch.tensor([group["lr"] for group in groups])}
+
+    @functools.cached_property
+    def unchanged(self) -> dict[str, torch.Tensor]:
+        """What is learned under the settings of the run."""
+        return self.learned({})
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +250,7 @@ def cases(table: dict[str, Settings]) -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("learner", "name"), cases(ACTING), ids=lambda part: part)
 def test_a_setting_typed_on_resume_acts(runs, learner, name):
     run = runs[learner]
-    assert not same(run.learned({name: ACTING[learner][name]}), run.learned({}))
+    assert not same(run.learned({name: ACTING[learner][name]}), run.unchanged)
 
 
 @pytest.mark.parametrize("name", TAUGHT)
@@ -338,8 +344,8 @@ def test_a_typed_seed_draws_new_numbers(runs, learner):
     assert same(of_5, again)
     assert not same(of_5, of_6)
     # A seed that is not typed, and one that is to be drawn by `train`, draw nothing.
-    assert same(run.learned({"seed": 5}, typed=False), run.learned({}))
-    assert same(run.learned({"seed": -1}), run.learned({}))
+    assert same(run.learned({"seed": 5}, typed=False), run.unchanged)
+    assert same(run.learned({"seed": -1}), run.unchanged)
 
 
 def test_rates_of_sac_are_set_one_by_one(runs):

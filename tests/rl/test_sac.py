@@ -261,7 +261,7 @@ def test_a_policy_learns_what_its_teacher_shows():
     runner = make_runner(
         teacher="actor", imitation=((0, 100.0),), actor_learning_rate=3e-3, num_updates=8
     )
-    runner.learn(60)
+    runner.learn(30)
     shown = TensorDict({"actor": torch.empty(50, 2).uniform_(-0.8, 0.8)}, [50])
     distance = (runner.alg.get_policy()(shown) - shown["actor"]).abs().mean()
     assert distance < 0.1

@@ -1,4 +1,4 @@
-"""`--learner`: SAC in place of PPO, from the command line to the run folder and back."""
+"""`train --learner`: SAC, and distillation from a teacher of PPO to a student."""
 
 from __future__ import annotations
 
@@ -6,19 +6,16 @@ import json
 import shutil
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import onnxruntime
 import pytest
 import torch
 import yaml
-from commands import TASK
+from commands import SMALL, TASK
 from process_runs import ProcessRun
 
 from mjlab.cli import training as environments
-from mjlab.cli.live import _view_env_cfg
-from mjlab.cli.live_view import Exchange, LiveJob
 from mjlab.cli.policy_flags import env_cfg_of
 from mjlab.cli.train_config import parse_train_flags
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
@@ -29,6 +26,7 @@ from mjlab.runs.policy import agent_cfg_of, load_policy, make_env
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.train import TrainConfig
 from mjlab.tasks import registry
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.processes import ProcessRank
 
 SAC = (
@@ -193,12 +191,9 @@ def test_a_run_of_another_learner_is_refused_and_named(run, first):
 def test_play_and_evaluate_need_not_be_told(run, of_sac, tmp_path):
     common = ("--log-root", str(of_sac.parents[1]), "--device", "cpu")
     short = ("--num-episodes", "4", "--max-steps", "3", "--json")
-    for flags in ((), ("--learner", "sac")):
-        outcome = run("evaluate", TASK, *short, *common, *flags)
-        assert outcome.status == 0, outcome.err
-        assert json.loads(outcome.out)["policy"] == str(of_sac / "model_1.pt")
-    outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common)
+    outcome = run("evaluate", TASK, *short, *common)
     assert outcome.status == 0, outcome.err
+    assert json.loads(outcome.out)["policy"] == str(of_sac / "model_1.pt")
     named = ("--checkpoint-file", str(of_sac / "model_1.pt"), "--learner", "ppo")
     outcome = run("play", TASK, "--viewer", "none", "--num-steps", "2", *common, *named)
     assert outcome.status == 1
@@ -248,35 +243,15 @@ def test_its_policy_is_that_of_its_export_and_takes_neither_thread_nor_replay(of
     torch.testing.assert_close(ours, actions, atol=1e-5, rtol=0.0)
 
 
-def test_the_live_view_shows_it(tmp_path, monkeypatch):
-    import viser
-
-    from mjlab.cli.live_view import make_viewer
-    from mjlab.rl import MjlabOnPolicyRunner
-
-    cfg = TrainConfig.from_task(TASK, learner="sac")
-    cfg.env.scene.num_envs = 2
-    server = viser.ViserServer(host="127.0.0.1", port=18331, verbose=False)
-    monkeypatch.setattr(server, "get_clients", lambda: {0: SimpleNamespace()})
-    try:
-        job = LiveJob(TASK, _view_env_cfg(cfg), cfg.agent, MjlabOnPolicyRunner)
-        exchange = Exchange(tmp_path)
-        viewer = make_viewer(job, exchange, server, exchange.ready.touch)
-        network = viewer._take_progress.__self__._network
-        state = {name: value.clone() + 1 for name, value in network.state_dict().items()}
-        exchange.write_weights(SimpleNamespace(state_dict=lambda: state), 5, None)
-        viewer.run(num_steps=2)
-        assert all(torch.equal(network.state_dict()[name], state[name]) for name in state)
-        viewer.env.close()
-    finally:
-        server.stop()
-
-
 # Other tasks and several processes.
 
 
 @pytest.mark.parametrize(
-    "task", ["Mjlab-Tracking-Flat-Unitree-G1", "Mjlab-Velocity-Flat-Unitree-Go1"]
+    "task",
+    [
+        "Mjlab-Tracking-Flat-Unitree-G1",
+        pytest.param("Mjlab-Velocity-Flat-Unitree-Go1", marks=pytest.mark.slow),
+    ],
 )
 def test_tasks_with_runners_of_their_own_learn_by_it(run, tmp_path, task):
     common = ("--log-root", str(tmp_path), "--device", "cpu")
@@ -298,3 +273,96 @@ def test_two_processes_hold_the_same_networks(tmp_path):
     first, second = pair.probe(0)["weights"], pair.probe(1)["weights"]
     assert [name for name in first if not torch.equal(first[name], second[name])] == []
     assert not torch.equal(pair.probe(0)["qpos"], pair.probe(1)["qpos"])
+
+
+# Distillation.
+
+
+STUDENT = ("--learner", "distillation")
+
+
+@pytest.fixture(scope="module")
+def student(run, train, tmp_path_factory):
+    """Return the runs of a teacher of another size than the task's, and of its student."""
+    logs = tmp_path_factory.mktemp("distillation") / "logs"
+    teacher = train(logs, 2, "--agent.actor.hidden-dims", "16,24")
+    checkpoint = str([c.path for c in Run(teacher).checkpoints][-1])
+    return teacher, train(logs, 2, *STUDENT, "--agent.teacher-checkpoint", checkpoint)
+
+
+def test_the_teacher_has_the_network_of_its_run(student):
+    agent = yaml.safe_load((student[1] / "params" / "agent.yaml").read_text())
+    assert agent["teacher"]["hidden_dims"] == [16, 24]
+    assert agent["student"]["hidden_dims"] == [64, 64]
+
+
+def test_a_student_is_resumed_evaluated_and_played_from_both_files(run, train, student):
+    logs = student[1].parents[1]
+    argv = ["--log-root", str(logs), "--device", "cpu"]
+    resumed = train(logs, 3, "--agent.resume", "True", "--agent.load-run", student[1].name)
+    outputs = []
+    for path in ([c.path for c in Run(resumed).checkpoints][-1], next(resumed.glob("*.onnx"))):
+        flags = ["--checkpoint-file", str(path), "--num-episodes", "4", "--seed", "3"]
+        outcome = run("evaluate", TASK, *argv, *flags, "--env.episode-length-s", "2")
+        assert outcome.status == 0, outcome.err
+        outputs.append(next(line for line in outcome.out.splitlines() if "eturn" in line))
+    assert outputs[0] == outputs[1]
+
+
+def test_a_teacher_that_ppo_did_not_train_is_refused(run, student, tmp_path):
+    argv = [TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT, "--agent.teacher-checkpoint"]
+    outcome = run("train", *argv, str([c.path for c in Run(student[1]).checkpoints][-1]))
+    assert outcome.status == 1
+    assert "expected a checkpoint of the learner 'ppo'" in outcome.message
+
+
+def test_flags_that_would_teach_nothing_are_refused(run, student, tmp_path):
+    teacher = str([c.path for c in Run(student[0]).checkpoints][-1])
+    argv = [TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT]
+    outcome = run("train", *argv, "--agent.algorithm.gradient-length", "9")
+    assert "gradient-length: expected at most 8" in outcome.message
+    other = ["Mjlab-Cartpole-Balance", *argv[1:], "--agent.teacher-checkpoint", teacher]
+    assert f"expected a checkpoint of Mjlab-Cartpole-Balance, got {teacher}" in (
+        run("train", *other).message
+    )
+    logs = ["--log-root", str(student[1].parents[1]), "--agent.resume", "True"]
+    argv = [TASK, *SMALL, *logs, *STUDENT, "--agent.load-run", student[1].name]
+    outcome = run("train", *argv, "--agent.teacher-checkpoint", "another.pt")
+    assert f"expected {teacher} of the resumed run, got another.pt" in outcome.message
+
+
+@pytest.mark.slow
+def test_a_blind_student_follows_a_teacher_with_a_scan(run, tmp_path):
+    task = "Mjlab-Velocity-Rough-Unitree-Go1"
+    argv = [task, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "2"]
+    for flags in (
+        ["--profile", "cpu"],
+        ["--profile", "blind", "--agent.teacher-checkpoint", f"{tmp_path}/go1_velocity/model_1.pt"],
+    ):
+        outcome = run("train", *argv, *flags)
+        assert outcome.status == 0, outcome.err
+    checkpoint = Run(max((tmp_path / "go1_velocity").iterdir())).newest.path
+    for path in (checkpoint, next(checkpoint.parent.glob("*.onnx"))):
+        flags = ["--checkpoint-file", str(path), "--num-episodes", "2", "--device", "cpu"]
+        outcome = run("evaluate", task, *flags, "--env.episode-length-s", "1", "--seed", "1")
+        assert outcome.status == 0, outcome.err
+
+
+def test_a_student_without_a_teacher_is_told_so(run, tmp_path):
+    outcome = run("train", TASK, *SMALL, "--log-root", str(tmp_path), *STUDENT)
+    assert outcome.status == 1
+    assert "expected a teacher, got none" in outcome.message
+    assert not list(tmp_path.glob("*/*"))
+
+
+def test_the_blind_student_of_rough_ground_sees_all_but_the_ground():
+    task = "Mjlab-Velocity-Rough-Unitree-Go1"
+    groups = load_env_cfg(task, profile="blind").observations
+    assert set(groups["actor"].terms) - set(groups["student"].terms) == {"height_scan"}
+    cfg = load_rl_cfg(task, profile="blind")
+    assert cfg.obs_groups == {"student": ("student",), "teacher": ("actor",)}
+    teacher = load_rl_cfg(task, profile="cpu").actor
+    assert cfg.teacher == teacher
+    # The teacher's own learner under the student's profile, for playing the teacher in it.
+    ppo = load_rl_cfg(task, profile="blind", learner="ppo")
+    assert ppo.obs_groups == load_rl_cfg(task).obs_groups

@@ -1,9 +1,11 @@
-"""Resume: selection of the run, number of environments, finished runs."""
+"""`train --agent.resume`: choice of the run, its environments, and flags typed again."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -72,9 +74,8 @@ def test_a_seed_to_be_drawn_is_the_one_of_the_run_that_is_resumed(first, resume,
     assert f"Seed:    {says}" in outcome.out
 
 
-@pytest.mark.parametrize("flag", ["--num-envs", "--env.scene.num-envs"])
-def test_a_number_of_environments_that_is_given_wins(first, resume, flag):
-    assert resume(flag, "5").status == 0
+def test_a_typed_number_of_environments_wins(first, resume):
+    assert resume("--num-envs", "5").status == 0
     assert num_envs(new_run(first)) == 5
 
 
@@ -98,13 +99,6 @@ def test_runs_of_other_tasks_are_passed_over(first, resume):
     write_info(other, task=OTHER)
     outcome = resume()
     assert outcome.status == 0
-    assert f"Resumed: {first / 'model_1.pt'}" in outcome.out
-
-
-def test_a_run_that_names_no_task_is_of_any(first, resume):
-    (first / "run.json").unlink()
-    outcome = resume(task=OTHER)
-    assert outcome.status == 0, outcome.err
     assert f"Resumed: {first / 'model_1.pt'}" in outcome.out
 
 
@@ -138,9 +132,8 @@ def test_a_pattern_that_is_none_is_told(resume, flag):
     assert "'*'" in outcome.message
 
 
-@pytest.mark.parametrize("iterations", [1, 2])
-def test_a_finished_run_says_so_and_makes_no_folder(first, resume, iterations):
-    outcome = resume(iterations=iterations)
+def test_a_finished_run_says_so_and_makes_no_folder(first, resume):
+    outcome = resume(iterations=2)
     assert outcome.status == 0
     assert "has finished 2 iterations" in outcome.out
     assert "--agent.max-iterations" in outcome.out
@@ -156,3 +149,99 @@ def test_a_checkpoint_that_is_refused_leaves_no_folder(first, resume, spoilt):
     assert outcome.status == 1
     assert str(first / "model_1.pt") in outcome.message
     assert list(first.parent.iterdir()) == [first]
+
+
+# Flags typed on resume: each acts, or is an error that names it.
+
+
+SAC = (
+    "--learner", "sac", "--agent.algorithm.batch-size", "64", "--agent.algorithm.num-updates", "1",
+    "--agent.algorithm.learning-starts", "2", "--agent.algorithm.replay-steps", "40",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def of_sac(train, tmp_path_factory) -> Path:
+    return train(tmp_path_factory.mktemp("sac"), 2, *SAC)
+
+
+@pytest.fixture
+def resumed(run, trained, tmp_path) -> Callable[..., Any]:
+    """Return a function that resumes a copy of a run: outcome, content and config of the new one."""
+    number = 0
+
+    def resumed(*flags: str, of: Path = trained) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+        nonlocal number
+        number += 1
+        first = shutil.copytree(of, tmp_path / str(number) / "cartpole" / of.name)
+        root = ("--log-root", str(first.parents[1]), "--agent.max-iterations", "3")
+        outcome = run("train", TASK, "--device", "cpu", "--agent.resume", "True", *root, *flags)
+        new = [path for path in first.parent.iterdir() if path != first]
+        if not new:
+            return outcome, {}, {}
+        params = {
+            name: yaml.safe_load((new[0] / "params" / f"{name}.yaml").read_text())
+            for name in ("env", "agent")
+        }
+        return outcome, load_checkpoint(new[0] / "model_2.pt"), params
+
+    return resumed
+
+
+def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Return True if all weights of two checkpoints are equal."""
+    pairs = [
+        (value, other[part][name])
+        for part in ("actor_state_dict", "critic_state_dict")
+        for name, value in one[part].items()
+    ]
+    return all(torch.equal(value, its) for value, its in pairs)
+
+
+def rates(content: dict[str, Any]) -> list[float]:
+    return [group["lr"] for group in content["optimizer_state_dict"]["param_groups"]]
+
+
+def test_rates_and_seeds_act(resumed):
+    flags = ("--agent.algorithm.schedule", "fixed")
+    found = []
+    for rate, seed in (("1e-5", "5"), ("1e-6", "6")):
+        typed = (*flags, "--agent.algorithm.learning-rate", rate, "--agent.seed", seed)
+        outcome, content, params = resumed(*typed)
+        assert outcome.status == 0, outcome.err
+        assert rates(content) == [float(rate)] == [params["agent"]["algorithm"]["learning_rate"]]
+        assert params["agent"]["seed"] == params["env"]["seed"] == int(seed)
+        found.append(content)
+    assert not same(*found)
+
+
+def test_flags_of_the_run_typed_again_change_nothing(resumed):
+    """Job scripts repeat their command."""
+    plain = resumed()[1]
+    typed = ("--agent.seed", "7", "--agent.algorithm.learning-rate", "1e-3", "--num-envs", "16")
+    outcome, content, _ = resumed(*typed)
+    assert same(content, plain)
+    assert "restart" not in outcome.err
+
+
+def test_a_flag_that_cannot_act_is_an_error(resumed, of_sac):
+    outcome, content, _ = resumed("--agent.actor.distribution-cfg.init-std", "0.3", of=of_sac)
+    assert outcome.status == 1
+    assert "distribution-cfg.init-std" in outcome.message
+    # Without a run folder.
+    assert not content
+
+
+def test_a_replay_of_another_run_is_an_error(resumed, of_sac, train, tmp_path):
+    other = train(tmp_path / "other", 2, *SAC)
+    mixed = shutil.copytree(of_sac, tmp_path / "mixed")
+    shutil.copy(other / "replay_model_1.pt", mixed)
+    outcome, content, _ = resumed(of=mixed)
+    assert outcome.status == 1
+    assert "replay_model_1.pt" in outcome.message
+    assert "delete this file" in outcome.message
+    assert not content
+    (mixed / "replay_model_1.pt").unlink()
+    outcome, content, _ = resumed(of=mixed)
+    assert outcome.status == 0
+    assert "replay starts empty" in outcome.err

@@ -39,6 +39,7 @@ def test_a_library_that_mujoco_does_not_know_is_told_to_those_who_draw():
     assert "\n" not in told
 
 
+@pytest.mark.slow
 def test_a_library_that_is_not_installed_is_told_to_those_who_draw():
     if ctypes.util.find_library("OSMesa") is not None:
         pytest.skip("OSMesa is installed")

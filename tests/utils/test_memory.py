@@ -159,9 +159,9 @@ print((after - before) / large.num_envs, large.sim._engine.bytes_each)
 @pytest.mark.parametrize(
     ("task", "engine", "num_envs"),
     [
-        (CARTPOLE, "native", 32_768),
-        ("Mjlab-Velocity-Flat-Unitree-Go1", "native", 2048),
-        (CARTPOLE, "warp", 2048),
+        pytest.param(CARTPOLE, "native", 32_768, marks=pytest.mark.slow),
+        ("Mjlab-Velocity-Flat-Unitree-Go1", "native", 512),
+        pytest.param(CARTPOLE, "warp", 2048, marks=pytest.mark.slow),
     ],
 )
 def test_environments_take_what_is_reserved(task, engine, num_envs):

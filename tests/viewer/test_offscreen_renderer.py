@@ -112,8 +112,8 @@ def test_the_scenes_own_model_is_left_alone() -> None:
 
 
 @pytest.mark.usefixtures("gl")
-@pytest.mark.parametrize("chosen_first", [None, "disable"])
-def test_it_renders_without_a_display_although_mujoco_was_imported_before_mjlab(
+@pytest.mark.parametrize("chosen_first", [None, pytest.param("disable", marks=pytest.mark.slow)])
+def test_it_renders_without_a_display(
     chosen_first,
 ) -> None:
     code = (
