@@ -30,69 +30,46 @@ _COMPAT = "mjlab.compat."
 # Names.
 
 
-def _older(*names: str, module: str = "mjlab.compat.older") -> dict[str, str]:
-    return {name: f"{module}:{name}" for name in names}
+def _at(module: str, names: str) -> dict[str, str]:
+    """Return the paths of `names` in a module, by name."""
+    return {name: f"{module}:{name}" for name in names.split()}
 
 
-_MATH = _older(
-    "apply_delta_pose",
-    "matrix_from_quat",
-    "quat_apply",
-    "quat_apply_inverse",
-    "quat_error_magnitude",
-    "quat_from_euler_xyz",
-    "quat_from_matrix",
-    "quat_inv",
-    "quat_mul",
-    "sample_gaussian",
-    "sample_log_uniform",
-    "sample_uniform",
-    "subtract_frame_transforms",
-    "wrap_to_pi",
-    "yaw_quat",
-    module="mjlab.utils.lab_api.math",
+_OLDER, _SCRIPTS = f"{_COMPAT}older", f"{_COMPAT}older_scripts"
+_CUBES = "mjlab.tasks.manipulation.mdp.commands"
+_MATH = _at(
+    "mjlab.utils.lab_api.math",
+    "apply_delta_pose matrix_from_quat quat_apply quat_apply_inverse quat_error_magnitude "
+    "quat_from_euler_xyz quat_from_matrix quat_inv quat_mul sample_gaussian sample_log_uniform "
+    "sample_uniform subtract_frame_transforms wrap_to_pi yaw_quat",
 )
+_REQUIRES = _at("mjlab.managers.event_manager", "requires_model_fields")
+_SENSORS = "BuiltinSensor CameraSensor ContactSensor RayCastSensor TerrainHeightSensor"
+_LOADERS = "list_tasks load_env_cfg load_rl_cfg load_runner_cls"
 # Names that modules of these releases import for internal use, and packages import from there. Found
 # in every module with `older_names`, without a warning.
 _PASSED_ON = {
     **_MATH,
-    "BuiltinSensor": "mjlab.sensor:BuiltinSensor",
-    "CameraSensor": "mjlab.sensor:CameraSensor",
-    "CommandTerm": "mjlab.managers:CommandTerm",
-    "CommandTermCfg": "mjlab.managers:CommandTermCfg",
-    "ContactSensor": "mjlab.sensor:ContactSensor",
-    "DebugVisualizer": "mjlab.viewer.debug_visualizer:DebugVisualizer",
-    "Entity": "mjlab.entity:Entity",
-    "EntityIndexing": "mjlab.entity:EntityIndexing",
-    "LiftingCommand": "mjlab.tasks.manipulation.mdp.commands:LiftingCommand",
-    "MJLAB_SRC_PATH": "mjlab:MJLAB_SRC_PATH",
-    "ManagerBasedRlEnv": "mjlab.envs:ManagerBasedRlEnv",
-    "MjlabOnPolicyRunner": "mjlab.rl:MjlabOnPolicyRunner",
-    "MotionCommand": "mjlab.tasks.tracking.mdp.commands:MotionCommand",
-    "MotionCommandCfg": "mjlab.tasks.tracking.mdp.commands:MotionCommandCfg",
-    "MultiCubeLiftingCommand": "mjlab.tasks.manipulation.mdp.commands:MultiCubeLiftingCommand",
-    "RayCastSensor": "mjlab.sensor:RayCastSensor",
-    "RewardTermCfg": "mjlab.managers:RewardTermCfg",
-    "RslRlVecEnvWrapper": "mjlab.rl:RslRlVecEnvWrapper",
-    "TerrainHeightSensor": "mjlab.sensor:TerrainHeightSensor",
-    "UniformVelocityCommandCfg": "mjlab.tasks.velocity.mdp:UniformVelocityCommandCfg",
-    "VideoRecorder": "mjlab.utils.wrappers:VideoRecorder",
-    "get_checkpoint_path": "mjlab.utils.os:get_checkpoint_path",
-    "get_wandb_checkpoint_path": "mjlab.utils.os:get_wandb_checkpoint_path",
-    "list_tasks": "mjlab.tasks.registry:list_tasks",
-    "load_env_cfg": "mjlab.tasks.registry:load_env_cfg",
-    "load_rl_cfg": "mjlab.tasks.registry:load_rl_cfg",
-    "load_runner_cls": "mjlab.tasks.registry:load_runner_cls",
-    "requires_model_fields": "mjlab.managers.event_manager:requires_model_fields",
+    **_REQUIRES,
+    **_at("mjlab", "MJLAB_SRC_PATH"),
+    **_at("mjlab.entity", "Entity EntityIndexing"),
+    **_at("mjlab.envs", "ManagerBasedRlEnv"),
+    **_at("mjlab.managers", "CommandTerm CommandTermCfg RewardTermCfg"),
+    **_at("mjlab.rl", "MjlabOnPolicyRunner RslRlVecEnvWrapper"),
+    **_at("mjlab.sensor", _SENSORS),
+    **_at(_CUBES, "LiftingCommand MultiCubeLiftingCommand"),
+    **_at("mjlab.tasks.registry", _LOADERS),
+    **_at("mjlab.tasks.tracking.mdp.commands", "MotionCommand MotionCommandCfg"),
+    **_at("mjlab.tasks.velocity.mdp", "UniformVelocityCommandCfg"),
+    **_at("mjlab.utils.os", "get_checkpoint_path get_wandb_checkpoint_path"),
+    **_at("mjlab.utils.wrappers", "VideoRecorder"),
+    **_at("mjlab.viewer.debug_visualizer", "DebugVisualizer"),
 }
-_EVENTS = _older(
-    "FieldSpec",
-    "randomize_effort_limits",
-    "randomize_encoder_bias",
-    "randomize_field",
-    "randomize_pd_gains",
-    "sync_actuator_delays",
+_RANDOMIZE = (
+    "randomize_effort_limits randomize_encoder_bias randomize_field randomize_pd_gains "
+    "sync_actuator_delays"
 )
+_EVENTS = _at(_OLDER, f"FieldSpec {_RANDOMIZE}")
 _XML_ACTUATORS = {
     f"Xml{kind}Actuator{suffix}": f"mjlab.actuator.xml_actuator:XmlActuator{suffix}"
     for kind in ("Motor", "Position", "Velocity", "Muscle")
@@ -100,75 +77,57 @@ _XML_ACTUATORS = {
 }
 _DELAYED_ACTUATORS = {
     "DelayedActuator": "mjlab.actuator.actuator:Actuator",
-    **_older("DelayedActuatorCfg"),
+    **_at(_OLDER, "DelayedActuatorCfg"),
 }
-_REWARD_WEIGHT = _older("RewardWeightStage", "reward_weight")
+_REWARD_WEIGHT = _at(_OLDER, "RewardWeightStage reward_weight")
 _TERRAIN_IMPORTER = {
     "TerrainImporter": "mjlab.terrains.terrain_entity:TerrainEntity",
     "TerrainImporterCfg": "mjlab.terrains.terrain_entity:TerrainEntityCfg",
 }
+_MESHES = (
+    "create_primitive_mesh create_site_mesh get_body_name get_geom_texture_id get_site_name "
+    "group_geoms_by_visual_compat is_fixed_body merge_geoms merge_sites rotation_matrix_from_vectors"
+)
 _VISER = {
-    **_older(
-        "create_primitive_mesh",
-        "create_site_mesh",
-        "get_body_name",
-        "get_geom_texture_id",
-        "get_site_name",
-        "group_geoms_by_visual_compat",
-        "is_fixed_body",
-        "merge_geoms",
-        "merge_sites",
-        "rotation_matrix_from_vectors",
-        module="mjviser.conversions",
-    ),
-    **_older("rotation_quat_from_vectors"),
+    **_at("mjviser.conversions", _MESHES),
+    **_at(_OLDER, "rotation_quat_from_vectors"),
 }
+_DEMO = "ensure_asset_downloaded ensure_default_checkpoint ensure_default_motion"
 
 # Replacement of each legacy name, as "module:name", by module.
 _NAMES: dict[str, dict[str, str]] = {
     "mjlab.actuator": {**_XML_ACTUATORS, **_DELAYED_ACTUATORS},
     "mjlab.actuator.xml_actuator": _XML_ACTUATORS,
     "mjlab.actuator.delayed_actuator": _DELAYED_ACTUATORS,
-    "mjlab.asset_zoo.robots.i2rt_yam.yam_constants": _older("get_assets"),
-    "mjlab.asset_zoo.robots.unitree_g1.g1_constants": _older("get_assets"),
-    "mjlab.asset_zoo.robots.unitree_go1.go1_constants": _older("get_assets"),
-    "mjlab.envs.mdp": {
-        **_EVENTS,
-        **_MATH,
-        "requires_model_fields": _PASSED_ON["requires_model_fields"],
-    },
+    "mjlab.asset_zoo.robots.i2rt_yam.yam_constants": _at(_OLDER, "get_assets"),
+    "mjlab.asset_zoo.robots.unitree_g1.g1_constants": _at(_OLDER, "get_assets"),
+    "mjlab.asset_zoo.robots.unitree_go1.go1_constants": _at(_OLDER, "get_assets"),
+    "mjlab.envs.mdp": {**_EVENTS, **_MATH, **_REQUIRES},
     "mjlab.envs.mdp.events": _EVENTS,
-    "mjlab.envs.mdp.dr": _older("sync_actuator_delays"),
-    "mjlab.envs.mdp.dr.actuator": _older("sync_actuator_delays"),
-    "mjlab.scripts.cli": {"main": "mjlab.cli.main:main"},
-    "mjlab.scripts.csv_to_npz": _older("run_sim", module="mjlab.compat.older_scripts"),
-    "mjlab.scripts.gcs": _older(
-        "ensure_asset_downloaded",
-        "ensure_default_checkpoint",
-        "ensure_default_motion",
-        module="mjlab.compat.older_scripts",
-    ),
-    "mjlab.scripts.profile_env": {
-        name: f"mjlab.envs.profiling:{name}" for name in ("StepProfile", "profiled_steps")
-    },
+    "mjlab.envs.mdp.dr": _at(_OLDER, "sync_actuator_delays"),
+    "mjlab.envs.mdp.dr.actuator": _at(_OLDER, "sync_actuator_delays"),
+    "mjlab.scripts.cli": _at("mjlab.cli.main", "main"),
+    "mjlab.scripts.csv_to_npz": _at(_SCRIPTS, "run_sim"),
+    "mjlab.scripts.gcs": _at(_SCRIPTS, _DEMO),
+    "mjlab.scripts.profile_env": _at("mjlab.envs.profiling", "StepProfile profiled_steps"),
     "mjlab.tasks.manipulation.mdp": {**_EVENTS, **_REWARD_WEIGHT},
     "mjlab.tasks.manipulation.mdp.curriculums": _REWARD_WEIGHT,
     "mjlab.tasks.registry": {"_REGISTRY": "mjlab.compat.older_scripts:REGISTRY"},
     "mjlab.tasks.tracking.mdp": _EVENTS,
-    "mjlab.tasks.velocity.mdp": {**_EVENTS, **_REWARD_WEIGHT, **_older("flat_orientation")},
+    "mjlab.tasks.velocity.mdp": {**_EVENTS, **_REWARD_WEIGHT, **_at(_OLDER, "flat_orientation")},
     "mjlab.tasks.velocity.mdp.curriculums": _REWARD_WEIGHT,
-    "mjlab.tasks.velocity.mdp.rewards": _older("flat_orientation"),
+    "mjlab.tasks.velocity.mdp.rewards": _at(_OLDER, "flat_orientation"),
     "mjlab.terrains": _TERRAIN_IMPORTER,
     "mjlab.terrains.heightfield_terrains": {
         "_compute_flat_patches": "mjlab.compat.older:compute_flat_patches"
     },
     "mjlab.terrains.terrain_importer": _TERRAIN_IMPORTER,
-    "mjlab.utils.os": _older("update_assets"),
-    "mjlab.utils.spec": _older("disable_collision"),
-    "mjlab.viewer.base": _older("Timer"),
+    "mjlab.utils.os": _at(_OLDER, "update_assets"),
+    "mjlab.utils.spec": _at(_OLDER, "disable_collision"),
+    "mjlab.viewer.base": _at(_OLDER, "Timer"),
     "mjlab.viewer.viser": {
         **_VISER,
-        "mujoco_mesh_to_trimesh": "mjlab.viewer.viser.conversions:mujoco_mesh_to_trimesh",
+        **_at("mjlab.viewer.viser.conversions", "mujoco_mesh_to_trimesh"),
     },
     "mjlab.viewer.viser.conversions": _VISER,
 }
@@ -232,7 +191,7 @@ def older_function(function: Any, name: str | None = None, path: str = _COMPAT) 
 
     if name is not None:
         # Pickled by its path.
-        older.__module__, older.__qualname__ = f"{_COMPAT}older", name
+        older.__module__, older.__qualname__ = _OLDER, name
     return older
 
 
