@@ -16,6 +16,7 @@ from mjlab.compat import accepts_older_fields, offers_older_attributes
 from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, label_errors
 from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.sim.engine import FIXED_CONSTANTS, INERTIAL_CONSTANTS
 from mjlab.sim.randomization import RecomputeLevel
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_ids, is_empty
@@ -80,8 +81,8 @@ class EventManager(TermFunctionSwitches, TermListManager):
             if term.mode == "reset":
                 never = torch.full((self.num_envs,), _NEVER, dtype=torch.long, device=self.device)
                 self._last_reset_step[name] = never
-            bounds = term.interval_range_s
             if term.mode == "interval":
+                bounds = term.interval_range_s
                 with label_errors(f"{self._label(name)} interval_range_s"):
                     if bounds is None:
                         raise ValueError("expected (shortest, longest) in seconds, got None.")
@@ -95,7 +96,6 @@ class EventManager(TermFunctionSwitches, TermListManager):
                         UserWarning,
                         stacklevel=2,
                     )
-            if term.mode == "interval":
                 if term.is_global_time:
                     # Sampled on the host: reading a GPU sample would synchronize.
                     self._timers[name] = self._sample_interval(term, 1, "cpu").item()
@@ -230,17 +230,6 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
 # Model fields that events declare.
 
-_DERIVED = {
-    RecomputeLevel.set_const_fixed: ("body_subtreemass",),
-    RecomputeLevel.set_const_0: (
-        "dof_invweight0",
-        "body_invweight0",
-        "tendon_length0",
-        "tendon_invweight0",
-        "actuator_acc0",
-    ),
-}
-
 
 def requires_model_fields(
     *fields: str, recompute: RecomputeLevel = RecomputeLevel.none
@@ -262,7 +251,8 @@ def requires_model_fields(
 
 def derived_fields(level: RecomputeLevel) -> tuple[str, ...]:
     """Return the model fields recomputed at `level`."""
-    return tuple(f for part, fields in _DERIVED.items() if level & part for f in fields)
+    fixed = FIXED_CONSTANTS if level & RecomputeLevel.set_const_fixed else ()
+    return (*fixed, *(INERTIAL_CONSTANTS if level & RecomputeLevel.set_const_0 else ()))
 
 
 def combined_level(cfgs: Iterable[EventTermCfg]) -> RecomputeLevel:

@@ -61,8 +61,12 @@ ACCELERATION_FIELDS = frozenset(
 
 # Fields that `mj_setConst` writes: sums over the tree, and values that depend on qpos0.
 FIXED_CONSTANTS = ("body_subtreemass",)
-CONSTANTS_AT_QPOS0 = (
+# Those of bodies, joints, tendons and actuators that events declare beside their own fields.
+INERTIAL_CONSTANTS = (
     *("dof_invweight0", "body_invweight0", "tendon_length0", "tendon_invweight0", "actuator_acc0"),
+)
+CONSTANTS_AT_QPOS0 = (
+    *INERTIAL_CONSTANTS,
     *("actuator_biasprm", "eq_data"),
     *("cam_pos0", "cam_poscom0", "cam_mat0", "light_pos0", "light_poscom0", "light_dir0"),
 )
