@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from mjlab.managers.manager_base import NullManager, plain_values, write_changes
+from mjlab.managers.manager_base import NullManager, config_items
 from mjlab.utils.state import (
     CLASS_KEY,
     SKIP,
@@ -77,16 +77,16 @@ def managers_of(env: ManagerBasedRlEnv) -> dict[str, Any]:
 def begin(env: ManagerBasedRlEnv) -> None:
     """Record the state before the first reset of `env`, and what each curriculum term edits in it.
 
-    Evaluations leave out terms that only ease training, and with them their edits.
+    Does nothing if it is recorded. Evaluations leave out terms that only ease training, and with them their edits.
     """
-    env._built_state = lasting_state(env)
-    before = {"config": _configs(env), **env._built_state}
+    if env._built_state:
+        return
+    before = env._built_state = lasting_state(env)
 
     def record(name: str) -> None:
         nonlocal before
-        now = {"config": _configs(env), **lasting_state(env)}
-        edits = changed_part(before, now)
-        env._term_edits[name] = {} if edits is SKIP else edits
+        now = lasting_state(env)
+        env._term_edits[name] = _changes(before, now)
         before = now
 
     env.curriculum_manager.after_term = record
@@ -94,18 +94,19 @@ def begin(env: ManagerBasedRlEnv) -> None:
 
 def curriculum_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
     """Return the curriculum state of `env`, as plain data."""
+    begin(env)
     terrain = env.scene.terrain
     levels = None if terrain is None else terrain.terrain_levels
-    configs = {name: one.config_changes() for name, one in managers_of(env).items()}
-    changed = changed_part(env._built_state or {}, lasting_state(env))
+    now = lasting_state(env)
+    changed = _changes(env._built_state, now)
     return {
         "num_envs": env.num_envs,
         "counters": {name: getattr(env, name) for name in COUNTERS},
         # Edits of term configs, and the values that they replaced.
-        "config_edits": {name: edits for name, (edits, _) in configs.items()},
-        "config_built": {name: replaced for name, (_, replaced) in configs.items()},
+        "config_edits": changed.pop("config", {}),
+        "config_built": _changes(now["config"], env._built_state["config"]),
         # Attributes and settings.
-        "changed": {} if changed is SKIP else changed,
+        "changed": changed,
         "term_edits": env._term_edits,
         "terrain_levels": None if levels is None else levels.clone(),
         "num_terrain_levels": 0 if terrain is None else terrain.max_terrain_level,
@@ -119,28 +120,28 @@ def load_curriculum_state(env: ManagerBasedRlEnv, state: dict[str, Any]) -> list
     - What a curriculum term edits that `env` lacks has the value of the config, and of other terms.
     - Edits of values that the config of `env` sets differently are left out.
     """
+    begin(env)
     state = to_device(state, env.device)
     fit = Fit(state["num_envs"], env.num_envs)
     load_counters(env, state)
-    changed, edits, own = state["changed"], state["config_edits"], {}
-    known = env.curriculum_manager.active_terms
-    gone = {name: one for name, one in state["term_edits"].items() if name not in known}
+    changed = {"config": state["config_edits"], **state["changed"]}
+    known, own = env.curriculum_manager.active_terms, {}
+    gone = {name: edits for name, edits in state["term_edits"].items() if name not in known}
     fit.left_out += [f"curriculum_manager.{name}" for name in gone]
-    missing = list(gone.values())
-    for one in missing:
-        edits = _outside(edits, None if one is None else one.get("config", {}))
-        changed = _outside(changed, one)
-    if known and missing:
+    for edits in gone.values():
+        changed = _outside(changed, edits)
+    if known and gone:
         # Other terms may edit the same values, as a function of the step.
         _undo(env)
         with nullcontext() if env.scene.terrain is None else env.scene.terrain.levels_held():
             env.curriculum_manager.compute(torch.arange(env.num_envs, device=env.device))
-        after = {name: one.config_edits() for name, one in managers_of(env).items()}
-        for one in missing:
-            own = _merged(own, _inside(after, (one or {}).get("config", {})))
+        edited = _changes(env._built_state["config"], _configs(env))
+        for edits in gone.values():
+            own = _merged(own, _inside(edited, (edits or {}).get("config", {})))
     # Resets of `env` may have changed what the saved run had not changed.
     _undo(env)
-    load_config_edits(env, {**state, "config_edits": edits}, fit, own)
+    fitting = fit.config_edits(changed.get("config", {}), state["config_built"], env)
+    _write_configs(env, _merged(fitting, own))
     _load_terms(env, changed, fit)
     load_attributes(env, changed, fit)
     levels, terrain = state["terrain_levels"], env.scene.terrain
@@ -153,25 +154,19 @@ def load_curriculum_state(env: ManagerBasedRlEnv, state: dict[str, Any]) -> list
     return list(dict.fromkeys(fit.left_out))
 
 
+def load_exact_state(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
+    """Restore configs, attributes and settings in a `curriculum_state` of the same task and size."""
+    begin(env)
+    fit = Fit(env.num_envs, env.num_envs)
+    _write_configs(env, fit.config_edits(state["config_edits"], state["config_built"], env))
+    load_attributes(env, state["changed"], fit)
+
+
 def load_counters(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
     """Restore the step counters in the state of an environment."""
     for name in COUNTERS:
         # States of earlier versions lack the last one.
         setattr(env, name, state["counters"].get(name, state["counters"][COUNTERS[0]]))
-
-
-def load_config_edits(
-    env: ManagerBasedRlEnv,
-    state: dict[str, Any],
-    fit: Fit | None = None,
-    own: dict[str, Any] | None = None,
-) -> None:
-    """Restore the edits of term configs in a `curriculum_state`, and `own`, edits of `env` itself."""
-    fit = fit or Fit(state["num_envs"], env.num_envs)
-    for name, manager in managers_of(env).items():
-        edits = state["config_edits"].get(name, {})
-        fitting = fit.edits(edits, state["config_built"].get(name, {}), manager, name)
-        manager.apply_config_edits(_merged(fitting, (own or {}).get(name, {})))
 
 
 def load_attributes(env: ManagerBasedRlEnv, changed: dict[str, Any], fit: Fit) -> None:
@@ -195,11 +190,10 @@ def _load_terms(env: ManagerBasedRlEnv, changed: dict[str, Any], fit: Fit) -> No
 
 def _undo(env: ManagerBasedRlEnv) -> None:
     """Restore configs, attributes and settings as they were before the first reset."""
-    for manager in managers_of(env).values():
-        manager.apply_config_edits({})
-    fit, built = Fit(env.num_envs, env.num_envs), env._built_state or {}
-    _load_terms(env, built, fit)
-    load_attributes(env, built, fit)
+    fit = Fit(env.num_envs, env.num_envs)
+    _write_configs(env, {})
+    _load_terms(env, env._built_state, fit)
+    load_attributes(env, env._built_state, fit)
 
 
 def _configs(env: ManagerBasedRlEnv) -> dict[str, Any]:
@@ -209,17 +203,26 @@ def _configs(env: ManagerBasedRlEnv) -> dict[str, Any]:
     }
 
 
+def _write_configs(env: ManagerBasedRlEnv, edits: dict[str, Any]) -> None:
+    """Restore the configs of terms as they were before the first reset, except for `edits`."""
+    built = env._built_state["config"]
+    for name, manager in managers_of(env).items():
+        for label, cfg in manager.live_cfgs().items():
+            undone = _changes(plain_values(cfg), built[name][label])
+            write_values(cfg, copy.deepcopy(undone))
+            write_values(cfg, edits.get(name, {}).get(label, {}))
+
+
 def config_as_built(env: ManagerBasedRlEnv) -> Any:
     """Return a copy of the config of `env`, without the edits of commands and settings by curricula."""
-    cfg = copy.deepcopy(env.cfg)
-    for section, manager in (
-        (cfg.commands, env.command_manager),
-        (cfg.actions, env.action_manager),
-    ):
-        for label, values in manager.config_changes()[1].items():
+    begin(env)
+    cfg, built = copy.deepcopy(env.cfg), env._built_state
+    undone = _changes(_configs(env), built["config"])
+    for section, name in ((cfg.commands, "command_manager"), (cfg.actions, "action_manager")):
+        for label, values in undone.get(name, {}).items():
             # Configs of commands and actions are those of the environment, or copies of them.
-            write_changes(section[label], copy.deepcopy(values))
-    for name, value in (env._built_state or {}).get("settings", {}).items():
+            write_values(section[label], copy.deepcopy(values))
+    for name, value in built["settings"].items():
         setattr(cfg, name, value)
     return cfg
 
@@ -232,12 +235,12 @@ def curricula_in_use(env: ManagerBasedRlEnv) -> dict[str, Any]:
     first one.
     """
     shown: dict[str, Any] = {}
-    state = changed_part(env._built_state or {}, lasting_state(env))
-    changed = {} if state is SKIP else state
+    begin(env)
+    changed = _changes(env._built_state, lasting_state(env))
     for name, manager in managers_of(env).items():
         kind = name.removesuffix("_manager")
         section = kind if hasattr(env.cfg, kind) else f"{kind}s"
-        for label, edit in manager.config_edits().items():
+        for label, edit in changed.get("config", {}).get(name, {}).items():
             shown |= _numbers(edit, f"{section}.{label.replace('/', '.')}")
         if manager is env.curriculum_manager:
             continue
@@ -308,6 +311,7 @@ def lasting_state(env: ManagerBasedRlEnv) -> dict[str, Any]:
     }
     settings = {name: plain_scalar(getattr(env.cfg, name)) for name in _SETTINGS}
     return {
+        "config": _configs(env),
         "managers": managers,
         "attributes": capture_values(attributes),
         "settings": settings,
@@ -324,34 +328,26 @@ class Fit:
         self.left_out: list[str] = []
         self._num_saved, self._num_envs = num_saved, num_envs
 
-    def edits(
-        self, edits: dict[str, Any], was: dict[str, Any], manager: Any, path: str
-    ) -> dict[str, dict[str, Any]]:
-        """Return the edits of term configs that fit `manager`.
+    def config_edits(
+        self, edits: dict[str, Any], was: dict[str, Any], env: ManagerBasedRlEnv
+    ) -> dict[str, Any]:
+        """Return the edits of term configs that fit those of `env`.
 
         Args:
-            edits: Edits of the saved run, by label.
+            edits: Edits of the saved run, by manager and label.
             was: Values that they replaced.
-            manager: Manager with configs of these labels, or some of them.
-            path: Name of the manager.
+            env: Environment with configs of these labels, or some of them.
         """
-        fitting: dict[str, dict[str, Any]] = {}
-        live = manager.live_cfgs()
-        for label, edit in edits.items():
-            where = f"{path}.{label}"
-            if label not in live:
-                self.left_out.append(where)
-                continue
-            cfg, built = live[label], manager._built_values[label]
-            edit = self._as_built(edit, was.get(label, {}), built, where)
-            fields = {key: getattr(cfg, key) for key in edit if hasattr(cfg, key)}
-            self.left_out += [f"{where}.{key}" for key in edit if key not in fields]
-            edit = {key: edit[key] for key in fields}
-            fitting[label] = self.entries(edit, fields, where, spreads=True)
-            params = fitting[label].get("params", {})
-            for key in [key for key in params if not _takes(cfg, key)]:
-                self.left_out.append(f"{where}.params.{key}")
-                del params[key]
+        fitting: dict[str, Any] = {}
+        for name, manager in managers_of(env).items():
+            live, built = manager.live_cfgs(), env._built_state["config"][name]
+            same = self._as_built(edits.get(name, {}), was.get(name, {}), built, name)
+            fitting[name] = self.entries(same, live, name, spreads=True, depth=1)
+            for label, edit in fitting[name].items():
+                params = edit.get("params", {})
+                for key in [key for key in params if not _takes(live[label], key)]:
+                    self.left_out.append(f"{name}.{label}.params.{key}")
+                    del params[key]
         return fitting
 
     def _as_built(
@@ -467,6 +463,50 @@ def _takes(cfg: Any, key: str) -> bool:
 
 
 # Nested dicts.
+
+
+def plain_values(cfg: Any) -> dict[str, Any]:
+    """Return a copy of the plain values of a config, as nested dicts by field or key.
+
+    Plain values: numbers, strings, None, tensors, and lists and tuples of plain values.
+    """
+    values: dict[str, Any] = {}
+    for key, value in config_items(cfg) or ():
+        if callable(value):
+            continue
+        plain = _plain(value) if config_items(value) is None else plain_values(value)
+        if plain is not SKIP:
+            values[key] = plain
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """Return a copy of a plain value in exactly the built-in types, or SKIP."""
+    if isinstance(value, torch.Tensor):
+        return value.clone()
+    if isinstance(value, (list, tuple)):
+        items = [_plain(item) for item in value]
+        if any(item is SKIP for item in items):
+            return SKIP
+        return items if isinstance(value, list) else tuple(items)
+    return plain_scalar(value)
+
+
+def write_values(cfg: Any, values: dict[str, Any]) -> None:
+    """Write a part of `plain_values` into a config."""
+    current = dict(config_items(cfg) or ())
+    for key, value in values.items():
+        if isinstance(value, dict) and config_items(current.get(key)) is not None:
+            write_values(current[key], value)
+        elif isinstance(cfg, dict):
+            cfg[key] = value
+        else:
+            setattr(cfg, key, value)
+
+
+def _changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    changed = changed_part(before, now)
+    return {} if changed is SKIP else changed
 
 
 def changed_part(before: Any, now: Any) -> Any:

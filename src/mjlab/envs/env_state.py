@@ -12,11 +12,9 @@ import torch
 
 from mjlab.envs.curriculum_state import (
     COUNTERS,
-    Fit,
     curriculum_state,
-    load_attributes,
-    load_config_edits,
     load_counters,
+    load_exact_state,
     managers_of,
 )
 from mjlab.utils.os import to_plain
@@ -65,9 +63,7 @@ def load_state_dict(env: ManagerBasedRlEnv, state: dict[str, Any]) -> None:
         getattr(env, name).copy_(value)
     for name, manager in managers_of(env).items():
         restore_state(manager, state["managers"][name])
-    curricula = curricula_in(state)
-    load_config_edits(env, curricula)
-    load_attributes(env, curricula["changed"], Fit(env.num_envs, env.num_envs))
+    load_exact_state(env, curricula_in(state))
     restore_state(env.scene, state["scene"])
     # Physics comes last, because some entity buffers are views of simulation fields.
     env.sim.load_state_dict(state["sim"])

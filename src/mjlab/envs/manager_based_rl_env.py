@@ -178,7 +178,7 @@ class ManagerBasedRlEnv(Tabular):
         # Value of the counter after the last step or load; it differs if the user has set the counter.
         self._stepped_to = 0
         # State before the first reset, and its edits by curriculum term.
-        self._built_state: dict[str, Any] | None = None
+        self._built_state: dict[str, Any] = {}
         self._term_edits: dict[str, Any] = {}
         self._sim_step_counter = 0
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long, device=device)
@@ -349,8 +349,7 @@ class ManagerBasedRlEnv(Tabular):
         ids = all_ids if env_ids is None else all_ids[env_ids].flatten()
         if seed is not None:
             self.seed(seed)
-        if self._built_state is None:
-            curriculum_state.begin(self)
+        curriculum_state.begin(self)
         self._clear_extras()
         stepped = ids[self.episode_length_buf[ids] > 0]
         if len(stepped) > 0:

@@ -24,7 +24,7 @@ import torch
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.utils.errors import UnknownNameError, UnsupportedError, WrongTypeError, check_exists
 from mjlab.utils.indexing import as_index
-from mjlab.utils.state import SKIP, mark_stateful, plain_scalar, stateful
+from mjlab.utils.state import mark_stateful, stateful
 from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, Tabular, function_name
 
@@ -86,7 +86,7 @@ class ManagerTermBase:
 class ManagerBase(Tabular, ABC):
     """Base class of managers. Subclasses build their terms in `_prepare_terms`."""
 
-    _transient = {"cfg", "_term_names", "_value_shape", "_live_cfgs", "_built_values"}
+    _transient = {"cfg", "_term_names", "_value_shape", "_live_cfgs"}
     # Name of the table of terms.
     _title = "terms"
 
@@ -98,7 +98,6 @@ class ManagerBase(Tabular, ABC):
         # Config read by each term, by label.
         self._live_cfgs: dict[str, Any] = {}
         self._prepare_terms()
-        self._built_values = {label: plain_values(cfg) for label, cfg in self._live_cfgs.items()}
 
     def __repr__(self) -> str:
         count = sum(len(table.rows) for table in self.tables())
@@ -141,35 +140,6 @@ class ManagerBase(Tabular, ABC):
     def live_cfgs(self) -> dict[str, Any]:
         """Return the config that each term reads, by label."""
         return self._live_cfgs
-
-    def config_edits(self) -> dict[str, Any]:
-        """Return the changes of term configs since the terms were built.
-
-        The changes are run-time state (e.g. the stage of a curriculum) for `apply_config_edits`:
-        nested dicts of numbers, strings, tensors and sequences of those. Unchanged values are left
-        out, because a resumed run may override them on purpose.
-        """
-        return self.config_changes()[0]
-
-    def config_changes(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return `config_edits`, and the values at build time that they replaced."""
-        edits, replaced = {}, {}
-        for label, cfg in self.live_cfgs().items():
-            built, now = self._built_values[label], plain_values(cfg)
-            if edit := changes(built, now):
-                edits[label], replaced[label] = edit, changes(now, built)
-        return edits, replaced
-
-    def apply_config_edits(self, edits: Mapping[str, Any]) -> None:
-        """Restore configs to their state when `config_edits` returned `edits`.
-
-        Values not in `edits` are restored to their values at build time, because later edits (e.g.
-        by a first reset) may have changed them. Edits of terms that no longer exist are skipped.
-        """
-        for label, cfg in self.live_cfgs().items():
-            undone = changes(plain_values(cfg), self._built_values[label])
-            write_changes(cfg, copy.deepcopy(undone))
-            write_changes(cfg, edits.get(label, {}))
 
     # Hooks and helpers of subclasses.
 
@@ -238,7 +208,7 @@ class ManagerBase(Tabular, ABC):
         if isinstance(value, (list, tuple)):
             inner = list(enumerate(value))
         else:
-            inner = list(value.items()) if isinstance(value, dict) else _items(value) or ()
+            inner = list(value.items()) if isinstance(value, dict) else config_items(value) or ()
         for key, item in inner:
             self._resolve_selections(f"{label}[{key!r}]", item, is_nested=True)
 
@@ -377,7 +347,7 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
 
     def _prepare_terms(self) -> None:
         for name, term_cfg in self._enabled(self.cfg, self._cfg_type):
-            for key, value in _items(term_cfg) or ():
+            for key, value in config_items(term_cfg) or ():
                 self._resolve_selections(
                     f"{self._label(name)}, field {key!r}", value, is_nested=True
                 )
@@ -427,76 +397,10 @@ def label_errors(label: str) -> Generator[None]:
         raise labeled from error
 
 
-# Config edits.
-
-
-def plain_values(cfg: Any) -> dict[str, Any]:
-    """Return a copy of the plain values of a config, as nested dicts by field or key.
-
-    Plain values: numbers, strings, None, tensors, and lists and tuples of plain values.
-    """
-    values: dict[str, Any] = {}
-    for key, value in _items(cfg) or ():
-        if callable(value):
-            continue
-        plain = _plain(value) if _items(value) is None else plain_values(value)
-        if plain is not SKIP:
-            values[key] = plain
-    return values
-
-
-def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of `now` that differ from `before`; both are results of `plain_values`."""
-    changed: dict[str, Any] = {}
-    for key, value in now.items():
-        old = before.get(key)
-        if isinstance(value, dict) and isinstance(old, dict):
-            inner = changes(old, value)
-            if inner:
-                changed[key] = inner
-        elif key not in before or not _same(old, value):
-            changed[key] = value
-    return changed
-
-
-def write_changes(cfg: Any, changed: Mapping[str, Any]) -> None:
-    """Write a result of `changes` into a config."""
-    current = dict(_items(cfg) or ())
-    for key, value in changed.items():
-        if isinstance(value, Mapping) and _items(current.get(key)) is not None:
-            write_changes(current[key], value)
-        elif isinstance(cfg, dict):
-            cfg[key] = value
-        else:
-            setattr(cfg, key, value)
-
-
-def _items(cfg: Any) -> list[tuple[str, Any]] | None:
+def config_items(cfg: Any) -> list[tuple[str, Any]] | None:
     """Return the string keys of a dict or the fields of a config, with values; else None."""
     if isinstance(cfg, dict):
         return [(key, value) for key, value in cfg.items() if isinstance(key, str)]
     if dataclasses.is_dataclass(cfg) and not isinstance(cfg, type):
         return [(field.name, getattr(cfg, field.name)) for field in dataclasses.fields(cfg)]
     return None
-
-
-def _plain(value: Any) -> Any:
-    """Return a copy of a plain value in exactly the built-in types, or SKIP."""
-    if isinstance(value, torch.Tensor):
-        return value.clone()
-    if isinstance(value, (list, tuple)):
-        items = [_plain(item) for item in value]
-        if any(item is SKIP for item in items):
-            return SKIP
-        return items if isinstance(value, list) else tuple(items)
-    return plain_scalar(value)
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        return torch.equal(a, b)
-    if type(a) in (list, tuple) and type(b) in (list, tuple):
-        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
-    if isinstance(a, torch.Tensor) or isinstance(b, torch.Tensor):
-        return False
-    return bool(a == b)
