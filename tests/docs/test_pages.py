@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -55,6 +56,27 @@ _OTHERS = {
     "task",
 }
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
+
+
+_TITLE = re.compile(r"mjlab(\.\w+)*")
+_ENTRY = re.compile(r"^(#{1,2}) (.+)|^\.\. auto(\w+):: (\S+)", re.MULTILINE)
+
+
+def _documented(page: Path) -> Iterator[tuple[str, str, str]]:
+    """Yield the entries of an API page: package to import from, module and name."""
+    package = title = ""
+    for level, heading, kind, path in _ENTRY.findall(page.read_text()):
+        if level == "#":
+            package = title = heading
+        elif level:
+            package = heading if _TITLE.fullmatch(heading) else title
+        elif kind == "module":
+            module = importlib.import_module(path)
+            own = [n for n, v in vars(module).items() if getattr(v, "__module__", "") == path]
+            public = [name for name in own if not name.startswith("_")]
+            yield from ((package, path, name) for name in getattr(module, "__all__", public))
+        else:
+            yield package, *path.rsplit(".", 1)
 
 
 def _ids(page: Path) -> str:
@@ -230,6 +252,18 @@ def _resolve(name: str) -> object:
     except ImportError:
         module, _, attribute = name.rpartition(".")
         return getattr(importlib.import_module(module), attribute)
+
+
+API = [page for page in PAGES if page.parent.name == "api" and page.name != "index.md"]
+
+
+@pytest.mark.parametrize("page", API, ids=[page.stem for page in API])
+def test_names_are_imported_from_the_title_above(page: Path) -> None:
+    entries = list(_documented(page))
+    assert entries
+    for package, module, name in entries:
+        found = getattr(importlib.import_module(package), name)
+        assert found is getattr(importlib.import_module(module), name)
 
 
 def test_the_randomization_table_is_that_of_the_code() -> None:

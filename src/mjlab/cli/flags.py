@@ -1,8 +1,8 @@
 """Flags of the commands: from `argv` to a config.
 
 - tyro reads the flags of a dataclass; `--env.rewards.<term> None` switches a term off.
-- `--profile` and `--learner` are parsed first, because the other flags and their defaults depend on
-  them. A command that resumes a run uses those of the run.
+- `--profile` and `--learner` are read first, because the other flags and their defaults depend on
+  them. A command that resumes a run uses those of the run. All other flags are parsed once.
 - Tasks can add flags (`mjlab.tasks.registry.TaskOptions`).
 """
 
@@ -43,7 +43,6 @@ C = TypeVar("C")
 
 CPU_PROFILE = "cpu"
 """Name of the profile that `train` suggests on a CPU."""
-_CHOICES = ("profile", "learner")
 # Field of the task options.
 _FIELD = "options"
 
@@ -52,13 +51,14 @@ def parse_flags(config_type: type[C], default: C, flags: list[str], prog: str) -
     """Return `default` updated by `flags`; exits on an unknown flag, and after `--help [TOPIC]`.
 
     `--env.rewards.<term> None` removes the term (same for all other kinds of terms). `None` also
-    removes a nested config if the field may be None, such as the noise of a term.
+    removes a nested config if the field may be None, such as the noise of a term. A bare `--video`
+    is `--video True`.
 
     Raises:
         ValueError: a typed number is out of its range.
     """
     config = _parsed(config_type, default, flags, prog)
-    check_ranges(config, typed_names(flags))
+    check_ranges(config, typed_values(flags))
     return config
 
 
@@ -67,46 +67,63 @@ def _parsed(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
     if topic is not None:
         print_help(default, topic, prog)
         sys.exit(0)
-    arguments = _arguments(config_type, default, flags, prog)
-    return tyro.cli(config_type, **arguments)
-
-
-def parse_known_flags(
-    config_type: type[C], default: C, flags: list[str], prog: str
-) -> tuple[C, list[str]]:
-    """Return the result of `parse_flags`, and the ignored unknown flags."""
-    arguments = _arguments(config_type, default, flags, prog)
-    return tyro.cli(config_type, return_unknown_args=True, **arguments)
-
-
-def _arguments(config_type: Any, default: Any, flags: list[str], prog: str) -> dict[str, Any]:
-    """Return the arguments of `tyro.cli`. A bare `--video` becomes `--video True`."""
-    edited, flags = switch_terms_off(default, flags)
-    fields = dataclasses.fields(config_type)
-    switches = {"--" + f.name.replace("_", "-") for f in fields if f.type in ("bool", bool)}
+    edited, remaining = switch_terms_off(default, flags)
+    own: Any = config_type
+    switches = {field.name for field in dataclasses.fields(own) if field.type in ("bool", bool)}
     words: list[str] = []
-    for flag, following in pairwise([*flags, "--"]):
-        words.append(flag)
-        if flag.replace("_", "-") in switches and following.startswith("--"):
+    for word, following in pairwise([*remaining, "--"]):
+        words.append(word)
+        if _name_of(word) in switches and "=" not in word and following.startswith("--"):
             words.append("True")
-    return {
-        "default": edited,
-        "args": words,
-        "prog": prog,
-        "config": mjlab.TYRO_FLAGS,
-        "registry": flag_rules(),
-    }
+    return tyro.cli(
+        config_type,
+        default=edited,
+        args=words,
+        prog=prog,
+        config=mjlab.TYRO_FLAGS,
+        registry=flag_rules(),
+    )
+
+
+def _name_of(word: str) -> str:
+    """Return the name of the setting in a flag, such as `agent.seed`; "" for other words."""
+    name = word.partition("=")[0]
+    return name.removeprefix("--").replace("-", "_") if name.startswith("--") else ""
+
+
+def typed_values(flags: list[str]) -> dict[str, str]:
+    """Return the texts in the command line `flags` by name of the setting, such as `agent.seed`.
+
+    The text of a switch without a value is "True".
+    """
+    texts = {}
+    for word, following in pairwise([*flags, "--"]):
+        _, equals, value = word.partition("=")
+        if name := _name_of(word):
+            texts[name] = value if equals else "True" if following.startswith("--") else following
+    return texts
 
 
 def is_given(flag: str, flags: list[str]) -> bool:
     """Return True if the command line `flags` sets `flag`, spelled with `-` or `_`."""
-    return any(word.partition("=")[0].replace("_", "-") == flag for word in flags)
+    return _name_of(flag) in typed_values(flags)
 
 
-def typed_names(flags: list[str]) -> set[str]:
-    """Return the names of the settings in the command line `flags`, such as `agent.seed`."""
-    names = (word.partition("=")[0].replace("-", "_") for word in flags)
-    return {name.removeprefix("__") for name in names if name.startswith("__")}
+def previewed(default: C, flags: list[str]) -> C:
+    """Return a copy of `default` with the texts of its flags outside `env` as values.
+
+    For choices by names, patterns and switches that the defaults of all flags depend on; the parser
+    reads and checks all flags later.
+    """
+    own: Any = copy.copy(default)
+    agent = getattr(own, "agent", None)
+    if is_dataclass(agent):
+        own.agent = agent = copy.copy(agent)
+    for path, text in typed_values(flags).items():
+        holder, name = (agent, path[6:]) if path.startswith("agent.") else (own, path)
+        if name in vars(holder):
+            setattr(holder, name, {"True": True, "False": False, "None": None}.get(text, text))
+    return own
 
 
 def read_count(flag: str, text: str) -> int:
@@ -135,7 +152,7 @@ def parse_for_run(
     Args:
         make_default: Function of the keywords `run`, and `profile` and `learner` if in `flags`, that
             returns the defaults: with the settings of the run, or those of the task without a run.
-        select: Function that returns the run selected by the flags; None without a run.
+        select: Function of the previewed flags that returns the run they select; None without a run.
         flags: Command line.
         prog: Name of the command, for messages.
 
@@ -143,32 +160,13 @@ def parse_for_run(
         UnknownProfileError: unknown profile; the message lists the profiles of the task.
         ValueError: unknown learner.
     """
-    requested = requested_choices(flags)
+    texts = typed_values(flags)
+    choices = {name: texts[name] for name in ("profile", "learner") if name in texts}
+    requested = {name: None if text == "None" else text for name, text in choices.items()}
     default = make_default(run=None, **requested)
-    if requested_topic(flags) is not None:
-        return _parsed(type(default), default, flags, prog)
-    # The learner of the selected run may have flags that the task's learner lacks.
-    cfg, unknown = parse_known_flags(type(default), default, flags, prog)
-    run = select(cfg)
-    if run is None and not unknown:
-        return cfg
-    default = make_default(run=run, **requested)
+    if requested_topic(flags) is None and (run := select(previewed(default, flags))) is not None:
+        default = make_default(run=run, **requested)
     return _parsed(type(default), default, flags, prog)
-
-
-def requested_choices(flags: list[str]) -> dict[str, str | None]:
-    """Return the profile and learner set by `flags`; None for the value `None`."""
-    choices: dict[str, str | None] = {}
-    for position, flag in enumerate(flags):
-        name, equals, value = flag.partition("=")
-        name = name.removeprefix("--")
-        if name not in _CHOICES or name == flag:
-            continue
-        if not equals:
-            # The parser reports a missing value.
-            value = flags[position + 1] if position + 1 < len(flags) else "None"
-        choices[name] = None if value == "None" else value
-    return choices
 
 
 def suggest_profile(task: str, profile: str | None, device: str) -> None:

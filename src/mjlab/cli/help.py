@@ -1,6 +1,7 @@
 """Help of the commands with hundreds of flags: one screen, or one topic in full.
 
-- `train TASK --help` prints the flags people use, by purpose (`SCREENS`), with the defaults of the task.
+- `train TASK --help` prints the flags that `mjlab.utils.screen.shown` marks, by purpose, with the
+  defaults of the task.
 - `train TASK --help TOPIC` prints every flag of a branch of the config (`agent`, `rewards`, `env.sim`),
   one flag (`learning-rate`), the flags without a dot (`train`), or every flag (`all`).
 
@@ -23,7 +24,8 @@ TOPICS = ("rewards", "env.sim")
 """Topics named on every screen, beside the branches of the config."""
 ALL = "all"
 """Topic of all flags."""
-_FLAG_COLUMN, _NOTE_COLUMN = 10, 53
+_HEADINGS = ("run", "watch", "policy", "save", "resume", "record", "learning", "task")
+_FLAG_COLUMN, _DEFAULT_COLUMN = 10, 53
 MISSING = object()
 """Value of `lookup` for an unknown path."""
 OPTIONS = "options"
@@ -36,164 +38,6 @@ TERM_DICTS = frozenset(
 # Branches whose parts can be named without the branch: `rewards` for `env.rewards`.
 # `seed` is that of the agent, which sets the environment's.
 _SHORTENED = ("", f"{OPTIONS}.", "agent.", "env.")
-
-
-@dataclass(frozen=True)
-class Row:
-    """Line of a help screen: one flag."""
-
-    path: str
-    """Path of the flag in the config. `*` is the first entry of a dict."""
-    value: str = ""
-    """Placeholder of the value. Empty for a switch."""
-    note: str = ""
-    """Meaning, in a few words."""
-    default: str | None = None
-    """Default in words. None: value in the config."""
-    source: str | None = None
-    """Attribute with the default if the config has None at `path`."""
-    learner: str | None = None
-    """Learner that has the flag. None: all."""
-
-    @property
-    def flag(self) -> str:
-        """Flag of `path`."""
-        return _flag_of(self.path)
-
-
-Screen = Mapping[str, Sequence[Row]]
-"""Rows of a help screen, by heading."""
-
-_PROFILE = Row("profile", "NAME", "cpu, ... (see list-envs)", "")
-_DEVICE = Row("device", "cpu|cuda:0", "", "a GPU if available")
-_NUM_ENVS = Row("num_envs", "N", "environments", source="env.scene.num_envs")
-_ENGINE = Row("engine", "auto|native|warp", "", source="env.sim.engine")
-_TASK = (
-    Row("env.episode_length_s", "X", "seconds"),
-    Row("env.rewards.*.weight", "X", "any term"),
-)
-
-_RUN = (
-    _PROFILE,
-    Row("learner", "ppo|sac|distillation", "", source="learner_name"),
-    _NUM_ENVS,
-    _ENGINE,
-    _DEVICE,
-    Row("gpu_ids", "[0,1]|all", "one process each"),
-)
-_ITERATIONS = Row("agent.max_iterations", "N")
-_WATCH = (
-    Row("live", "", "page while it learns"),
-    Row("live_port", "N"),
-    Row("video", "", "clips while training"),
-    Row("result_video", "", "one clip at the end"),
-)
-_SAVE = (
-    Row("agent.save_interval", "N", "iterations"),
-    Row("agent.logger", "tensorboard|wandb"),
-)
-_LEARNING = (
-    Row("agent.algorithm.learning_rate", "X", learner="ppo"),
-    Row("agent.algorithm.entropy_coef", "X", learner="ppo"),
-    Row("agent.actor.hidden_dims", "[N,...]", learner="ppo"),
-    Row("agent.algorithm.actor_learning_rate", "X", learner="sac"),
-    Row("agent.algorithm.batch_size", "N", learner="sac"),
-    Row("agent.algorithm.num_updates", "N", "per step", learner="sac"),
-    Row("agent.actor.hidden_dims", "[N,...]", learner="sac"),
-    Row("agent.teacher_checkpoint", "FILE", "required", learner="distillation"),
-    Row("agent.algorithm.learning_rate", "X", learner="distillation"),
-    Row("agent.student.hidden_dims", "[N,...]", learner="distillation"),
-    Row("agent.num_steps_per_env", "N", "per iteration"),
-    Row("agent.evaluation.stop_when_solved", "False", "train to the end"),
-)
-_TRAINED_TASK = (*_TASK, Row("enable_nan_guard", "", "dump states before a NaN"))
-_POLICY = (
-    Row("agent", "trained|zero|random"),
-    Row("checkpoint_file", "FILE", ".pt or .onnx", "the newest"),
-    Row("log_root", "DIR"),
-    Row("wandb_run_path", "PATH", "entity/project/run"),
-    Row("learner", "ppo|sac|distillation", "", "any"),
-    Row("profile", "NAME", "", "that of the run"),
-)
-_PAGE = (
-    Row("viewer", "viser|native|none", "", "a page in the browser"),
-    Row("num_envs", "N", "environments", source="env.scene.num_envs"),
-    Row("num_steps", "N", "steps", "until stopped"),
-    Row("no_terminations", "", "episodes never end"),
-    Row("port", "N"),
-    Row("host", "ADDRESS"),
-    Row("open_browser", "False", "only print the address", ""),
-)
-_RECORD = (
-    Row("video", "", "record a clip instead"),
-    Row("video_length", "N", "frames"),
-    Row("video_format", "mp4|gif"),
-    Row("video_width", "N", "pixels", ""),
-    Row("video_height", "N", "pixels", ""),
-    Row("camera", "NAME", "", "the task's view"),
-)
-_MACHINE = (_ENGINE, _DEVICE)
-
-_PLAY: Screen = {
-    "watch": _PAGE,
-    "policy": _POLICY,
-    "record": _RECORD,
-    "run": _MACHINE,
-    "task": _TASK,
-}
-
-# Seeds and names of the runs are those of `--seeds`.
-_SEEDS: Screen = {
-    "run": (*_RUN, _ITERATIONS),
-    "watch": _WATCH,
-    "save": (Row("log_root", "DIR"), *_SAVE),
-    "learning": _LEARNING,
-    "task": _TRAINED_TASK,
-}
-
-SCREENS: Mapping[str, Screen] = {
-    "train": {
-        "run": (*_RUN, Row("agent.seed", "N", "-1 draws one"), _ITERATIONS),
-        "watch": _WATCH,
-        "save": (Row("log_root", "DIR"), Row("agent.run_name", "TEXT"), *_SAVE),
-        "resume": (
-            Row("agent.resume", "True"),
-            Row("agent.load_run", "REGEX", "", "the newest"),
-            Row("agent.load_checkpoint", "REGEX", "", "the newest"),
-        ),
-        "learning": _LEARNING,
-        "task": _TRAINED_TASK,
-    },
-    "train-seeds": _SEEDS,
-    "sweep": {**_SEEDS, "save": _SAVE},
-    "play": _PLAY,
-    "demo": _PLAY,
-    "evaluate": {
-        "run": (
-            Row("num_episodes", "N", "episodes"),
-            Row("num_envs", "N", "episodes at once", "all"),
-            Row("max_steps", "N", "episode", "the task's"),
-            Row("seed", "N"),
-            Row("json", "", "print only JSON"),
-            *_MACHINE,
-        ),
-        "policy": _POLICY,
-        "task": _TASK,
-    },
-    "profile-env": {
-        "run": (
-            Row("num_envs", "N", "environments"),
-            Row("steps", "N", "timed steps"),
-            Row("warm_up", "N", "steps before"),
-            Row("seed", "N"),
-            Row("json", "", "print only JSON"),
-            *_MACHINE,
-        ),
-        "policy": _POLICY,
-        "task": _TASK,
-    },
-}
-"""Help screens, by command."""
 
 
 def requested_topic(flags: Sequence[str]) -> str | None:
@@ -215,97 +59,96 @@ def print_help(default: Any, topic: str, prog: str) -> None:
 
     Args:
         default: Config of the command, a dataclass with the defaults.
-        topic: Topic, or "" for the screen. Commands without a screen then list their flags without a
-            dot.
+        topic: Topic, or "" for the screen. Commands without a screen then list all flags.
         prog: Command and task, for the first line.
 
     Raises:
         BadCallError: unknown topic; the message names the nearest ones.
     """
-    command = _command_of(prog)
-    if not topic and command in SCREENS:
-        print(screen_text(default, SCREENS[command], prog))
+    command = prog.split()[-2] if " " in prog else prog
+    rows = screen_rows(default)
+    if rows and not topic:
+        print(_screen_text(default, rows, prog, command))
         return
     branches = _branches(default)
-    if topic == ALL or (not topic and not branches):
+    if topic == ALL or not topic:
         _print_flags(type(default), default, prog, default.__doc__ or "")
-    elif not topic or topic == command:
+    elif topic == command:
         own = {name for name, _ in _entries(default)} - set(branches)
         _print_flags(*_restricted(default, own), prog, "Flags without a dot.")
-        if not topic:
-            print(f"{'more':<{_FLAG_COLUMN}}--help {' | '.join([*branches, ALL])}")
     else:
         _print_topic(default, topic, prog)
-
-
-def screen_text(default: Any, screen: Screen, prog: str) -> str:
-    """Return the help screen of a command, with the defaults in brackets."""
-    learner = getattr(default, "learner_name", None)
-    options = getattr(default, OPTIONS, None)
-    lines = [f"usage: {prog} [flags]", ""]
-    for heading, rows in screen.items():
-        shown = [row for row in rows if row.learner in (None, learner)]
-        if heading == "task":
-            shown += [Row(f"{OPTIONS}.{name}", "TEXT") for name, _ in _entries(options)]
-        texts = [text for row in shown if (text := _row_text(default, row)) is not None]
-        first = f"{heading:<{_FLAG_COLUMN}}"
-        lines += [(" " * _FLAG_COLUMN if n else first) + text for n, text in enumerate(texts)]
-    branches = _branches(default)
-    topics = " | ".join([_command_of(prog), *branches, *TOPICS, ALL])
-    fields = " and ".join(f"--{name}." for name in branches)
-    lines += [
-        f"{'more':<{_FLAG_COLUMN}}--help {topics}, or a flag",
-        "",
-        f"Defaults in brackets. {fields} lead to all fields of the config.",
-    ]
-    return "\n".join(lines)
-
-
-def flags_of(command: str) -> list[str]:
-    """Return the flags on the screen of a command, without those of single terms."""
-    rows = [row for rows in SCREENS.get(command, {}).values() for row in rows]
-    return list(dict.fromkeys(row.flag for row in rows if "*" not in row.path))
-
-
-def values_of(command: str, flag: str) -> list[str]:
-    """Return the values of a flag on the screen of a command, for flags with a few."""
-    rows = [row for rows in SCREENS.get(command, {}).values() for row in rows if row.flag == flag]
-    return [value for row in rows if "|" in row.value for value in row.value.split("|")]
 
 
 # Screen.
 
 
-def _command_of(prog: str) -> str:
-    """Return the command in `prog`, such as "mjlab train TASK", "play TASK" or "train"."""
-    words = prog.split()
-    return next((word for word in words if word in SCREENS), words[0] if words else "")
+@dataclass(frozen=True)
+class Row:
+    """Line of a help screen: one flag."""
+
+    heading: str
+    """Purpose of the flag."""
+    flag: str
+    """Flag with its dashes."""
+    placeholder: str
+    """Placeholder of the value. Empty for a switch."""
+    default: Any
+    """Default of the task."""
 
 
-def _row_text(default: Any, row: Row) -> str | None:
-    """Return a line of the screen, or None if the config lacks the flag."""
-    path, value = lookup(default, row.path)
-    if value is MISSING:
-        return None
-    if value is None and row.source is not None:
-        value = attrgetter(row.source)(default)
-    text = row.default if row.default is not None else _words(value)
-    if text and not text.startswith("["):
-        text = f"[{text}]"
-    left = f"{_flag_of(path)} {row.value}".rstrip()
-    note = f"{row.note} {text}".strip()
-    return f"{left:<{_NOTE_COLUMN - _FLAG_COLUMN - 2}}  {note}".rstrip()
+def screen_rows(default: Any) -> list[Row]:
+    """Return the flags of the screen of a command, by heading; empty if it has none."""
+    rows = [Row("task", _flag_of(f"{OPTIONS}.{name}"), "TEXT", value)
+            for name, value in _entries(getattr(default, OPTIONS, None))]  # fmt: skip
+    for path, field, value in _shown_fields(default):
+        heading, placeholder, source = field.metadata["screen"]
+        value = attrgetter(source)(default) if value is None and source else value
+        rows.append(Row(heading, _flag_of(path), placeholder, value))
+    # The command's own flags come before those of its branches.
+    return sorted(rows, key=lambda row: (_HEADINGS.index(row.heading), "." in row.flag))
 
 
-def _words(value: Any) -> str:
-    """Return a default in words; "" for empty texts, and for switches that are off."""
-    if value is None:
-        return "none"
-    if isinstance(value, float):
-        return f"{value:g}"
+def _shown_fields(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield path, field and value of the fields that `shown` marks; of a dict, in the first entry."""
+    if isinstance(config, Mapping):
+        for name, entry in [(n, e) for n, e in config.items() if is_dataclass(e)][:1]:
+            yield from _shown_fields(entry, f"{prefix}{name}.")
+    elif is_dataclass(config):
+        for field in dataclasses.fields(config):
+            value = getattr(config, field.name)
+            if "screen" in field.metadata:
+                yield f"{prefix}{field.name}", field, value
+            elif field.name != OPTIONS:
+                yield from _shown_fields(value, f"{prefix}{field.name}.")
+
+
+def _screen_text(default: Any, rows: Sequence[Row], prog: str, command: str) -> str:
+    lines, heading = [f"usage: {prog} [flags]", ""], ""
+    for row in rows:
+        left = f"{'' if row.heading == heading else row.heading:<{_FLAG_COLUMN}}"
+        heading = row.heading
+        left += f"{row.flag} {row.placeholder}"
+        lines.append(f"{left:<{_DEFAULT_COLUMN - 2}}  {_in_brackets(row.default)}".rstrip())
+    branches = _branches(default)
+    topics = " | ".join([command, *branches, *TOPICS, ALL])
+    fields = " and ".join(f"--{name}." for name in branches)
+    lines += [
+        f"{'more':<{_FLAG_COLUMN}}--help {topics}, or a flag",
+        "",
+        "Defaults in brackets; `--help FLAG` explains a flag.",
+        f"{fields} lead to all fields of the config.",
+    ]
+    return "\n".join(lines)
+
+
+def _in_brackets(value: Any) -> str:
+    """Return a default in brackets; "" for None, empty texts and switches that are off."""
+    if value is None or value is False or value == "":
+        return ""
     if isinstance(value, (list, tuple)):
         return f"[{','.join(map(str, value))}]"
-    return "" if value is False else str(value)
+    return f"[{value:g}]" if isinstance(value, float) else f"[{value}]"
 
 
 def lookup(config: Any, path: str) -> tuple[str, Any]:
@@ -316,8 +159,6 @@ def lookup(config: Any, path: str) -> tuple[str, Any]:
     names: list[str] = []
     for part in filter(None, path.split(".")):
         entries = dict(_entries(config))
-        if part == "*":
-            part = next((name for name, value in entries.items() if value is not None), part)
         # tyro prints `smooth_reward` as `smooth-reward` and accepts both.
         spelled = {name.replace("_", "-"): name for name in entries}
         name = part if part in entries else spelled.get(part.replace("_", "-"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -11,7 +11,7 @@ from mjlab.cli.flags import (
     is_given,
     parse_for_run,
     prepare_env_cfg,
-    typed_names,
+    typed_values,
     with_task_options,
 )
 from mjlab.envs import ManagerBasedRlEnvCfg
@@ -25,30 +25,35 @@ from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_list, print_notice
 from mjlab.utils.os import get_wandb_checkpoint_path
 from mjlab.utils.ranges import check_ranges
+from mjlab.utils.screen import shown
 
 
 @dataclass
 class PolicyFlags:
     """Flags that select the policy, the device and the engine."""
 
-    agent: Literal["zero", "random", "trained"] = "trained"
+    agent: Literal["zero", "random", "trained"] = field(
+        default="trained", metadata=shown("policy", "trained|zero|random")
+    )
     """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
-    checkpoint_file: str | None = None
+    checkpoint_file: str | None = field(default=None, metadata=shown("policy", "FILE"))
     """Checkpoint of the trained policy, its export (`.onnx`), or the folder of its run. None: last
     checkpoint of the newest run of the task."""
-    wandb_run_path: str | None = None
+    wandb_run_path: str | None = field(default=None, metadata=shown("policy", "PATH"))
     """Weights & Biases run of the policy, as entity/project/run."""
     wandb_checkpoint_name: str | None = None
     """Checkpoint of the Weights & Biases run. None: newest."""
-    device: str | None = None
+    device: str | None = field(default=None, metadata=shown("run", "cpu|cuda:0"))
     """Torch device. None: a GPU if available."""
-    engine: Literal["auto", "native", "warp"] | None = None
+    engine: Literal["auto", "native", "warp"] | None = field(
+        default=None, metadata=shown("run", "auto|native|warp", "env.sim.engine")
+    )
     """Physics engine."""
-    log_root: str = "logs/rsl_rl"
+    log_root: str = field(default="logs/rsl_rl", metadata=shown("policy", "DIR"))
     """Root folder of all runs."""
-    profile: str | None = None
+    profile: str | None = field(default=None, metadata=shown("policy", "NAME"))
     """Task profile, such as `cpu`. None: profile that the policy was trained with."""
-    learner: Learner | None = None
+    learner: Learner | None = field(default=None, metadata=shown("policy", "ppo|sac|distillation"))
     """Learner of the policy; selects its newest run. None: any."""
     as_registered: bool = False
     """Use the task as registered today, without the settings of the run that trained the policy."""
@@ -89,7 +94,7 @@ def parse_policy_flags(
     cfg = parse_for_run(
         make_default, lambda cfg: _run_of_policy(task, cfg), flags, f"{command} {task}"
     )
-    check_ranges(cfg, typed_names(flags))
+    check_ranges(cfg, typed_values(flags))
     # --wandb-run-path has a use with any agent: a task may read other files from the run.
     for flag in ("--checkpoint-file", "--wandb-checkpoint-name"):
         if cfg.agent != "trained" and is_given(flag, flags):

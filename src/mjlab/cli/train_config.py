@@ -27,6 +27,7 @@ from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, process_rank
 from mjlab.utils.random import process_seed
 from mjlab.utils.ranges import Count, CountOrZero, Range, check_ranges
+from mjlab.utils.screen import shown
 from mjlab.utils.wandb import check_wandb_login
 from mjlab.viewer.page_server import check_address
 
@@ -46,30 +47,34 @@ class TrainConfig:
     """Environment."""
     agent: RslRlBaseRunnerCfg
     """Learner."""
-    profile: str | None = None
+    profile: str | None = field(default=None, metadata=shown("run", "NAME"))
     """Task profile, such as `cpu`, that sets the defaults of all other flags; listed by `list-envs`.
     None: the defaults of the task, or the profile of the resumed run."""
-    learner: Learner | None = None
+    learner: Learner | None = field(
+        default=None, metadata=shown("run", "ppo|sac|distillation", "learner_name")
+    )
     """Learner: `ppo`, `sac` (soft actor-critic with a replay buffer) or `distillation` (a student of
     --agent.teacher-checkpoint). Determines the flags under --agent. None: learner of the resumed run, or
     of the profile or task."""
-    num_envs: Count | None = None
+    num_envs: Count | None = field(default=None, metadata=shown("run", "N", "env.scene.num_envs"))
     """Number of environments per process; short for --env.scene.num-envs."""
-    device: str | None = None
+    device: str | None = field(default=None, metadata=shown("run", "cpu|cuda:0"))
     """Torch device: cpu, cuda:0, ... None: a GPU if available; one GPU per process in multi-GPU runs."""
-    engine: Literal["auto", "native", "warp"] | None = None
+    engine: Literal["auto", "native", "warp"] | None = field(
+        default=None, metadata=shown("run", "auto|native|warp", "env.sim.engine")
+    )
     """Physics engine; short for --env.sim.engine."""
-    video: bool = False
+    video: bool = field(default=False, metadata=shown("watch"))
     """Record clips while training."""
     video_length: CountOrZero = 200
     """Number of frames per clip."""
     video_interval: Count = 2000
     """Number of environment steps between the starts of clips."""
-    result_video: bool = False
+    result_video: bool = field(default=False, metadata=shown("watch"))
     """Record a clip of the trained policy at the end."""
-    enable_nan_guard: bool = False
+    enable_nan_guard: bool = field(default=False, metadata=shown("task"))
     """Dump the states that led to a NaN."""
-    log_root: str = "logs/rsl_rl"
+    log_root: str = field(default="logs/rsl_rl", metadata=shown("save", "DIR"))
     """Root folder of all runs."""
     like: str | None = field(default=None, kw_only=True)
     """Run with the settings to start a new run with: its folder, or a checkpoint in it."""
@@ -88,13 +93,15 @@ class TrainConfig:
     """Seconds after Ctrl-C or SIGTERM in which the running iteration may finish; after them, or at a second
     signal, training stops with the one before. None: as long as it takes. For job queues that kill what
     still runs some time after a signal."""
-    live: bool = False
+    live: bool = field(default=False, metadata=shown("watch"))
     """Serve a page in the browser that shows the policy during training."""
-    live_port: int = 8080
+    live_port: int = field(default=8080, metadata=shown("watch", "N"))
     """Port of the live page; the next free port if taken."""
     live_host: str = field(default="127.0.0.1", kw_only=True)
     """Address of the live page. 0.0.0.0: all interfaces."""
-    gpu_ids: list[int] | Literal["all"] | None = field(default_factory=lambda: [0])
+    gpu_ids: list[int] | Literal["all"] | None = field(
+        default_factory=lambda: [0], metadata=shown("run", "[0,1]|all")
+    )
     """GPU indices, or `all`, used without --device; with several, one process per GPU is started.
     None: train on the CPU."""
 

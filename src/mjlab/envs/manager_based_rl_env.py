@@ -50,6 +50,7 @@ from mjlab.sim.divergence import DivergenceLog
 from mjlab.utils.errors import UnsupportedError, WrongStateError
 from mjlab.utils.indexing import as_ids
 from mjlab.utils.random import draw_seed, seed_rng
+from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
 from mjlab.viewer.viewer_config import ViewerConfig
 
@@ -87,7 +88,7 @@ class ManagerBasedRlEnvCfg:
     """Physics configuration."""
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     """Camera and size of rendered images."""
-    episode_length_s: float = 0.0
+    episode_length_s: float = field(default=0.0, metadata=shown("task", "X"))
     """Maximum episode length (s)."""
     rewards: dict[str, RewardTermCfg] = field(default_factory=dict)
     """Reward terms."""

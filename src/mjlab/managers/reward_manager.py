@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,6 +15,7 @@ from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, label_errors
 from mjlab.managers.nonfinite import NonFiniteWatch
 from mjlab.utils.indexing import as_index, is_empty
+from mjlab.utils.screen import shown
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 class RewardTermCfg(ManagerTermBaseCfg):
     """Reward term configuration: `func(env, **params)` returns one value per environment."""
 
-    weight: float
+    weight: float = field(metadata=shown("task", "X"))
     """Weight of the term. With weight 0 the function is not called."""
 
 

@@ -19,6 +19,7 @@ from mjlab.utils.ranges import (
     Range,
     Weight,
 )
+from mjlab.utils.screen import shown
 
 TorchCompileMode = Literal["default", "max-autotune-no-cudagraphs"]
 """Modes of `torch.compile` supported by rsl_rl's algorithms."""
@@ -43,7 +44,9 @@ def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[
 class RslRlModelCfg:
     """Network config: actor or critic."""
 
-    hidden_dims: Annotated[tuple[int, ...], Range(-1)] = (128, 128, 128)
+    hidden_dims: Annotated[tuple[int, ...], Range(-1)] = field(
+        default=(128, 128, 128), metadata=shown("learning", "[N,...]")
+    )
     """Width of each hidden layer; -1: that of the input."""
     activation: str = "elu"
     """Activation function between layers (rsl_rl's name: `elu`, `relu`, `tanh`, ...)."""
@@ -72,7 +75,7 @@ class RslRlPpoAlgorithmCfg:
     """Number of epochs per iteration."""
     num_mini_batches: Count = 4
     """Number of mini-batches per epoch."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = field(default=1e-3, metadata=shown("learning", "X"))
     """Learning rate; the initial value under the adaptive schedule."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """Learning rate schedule: `adaptive` keeps the KL divergence of updates near `desired_kl`."""
@@ -80,7 +83,9 @@ class RslRlPpoAlgorithmCfg:
     """Discount factor per environment step."""
     lam: Fraction = 0.95
     """Parameter lambda of generalized advantage estimation (GAE)."""
-    entropy_coef: Annotated[float, Range(ends="()")] = 0.005
+    entropy_coef: Annotated[float, Range(ends="()")] = field(
+        default=0.005, metadata=shown("learning", "X")
+    )
     """Weight of the entropy bonus; negative: a penalty."""
     desired_kl: Limit = 0.01
     """Target KL divergence per update, for the adaptive schedule."""
@@ -115,9 +120,9 @@ class RslRlSacAlgorithmCfg:
     The defaults are FastSAC's (Seo et al., arXiv 2512.01996), reduced for a few CPU cores.
     """
 
-    batch_size: Count = 2048
+    batch_size: Count = field(default=2048, metadata=shown("learning", "N"))
     """Number of transitions per update, mirrored ones included."""
-    num_updates: Count = 4
+    num_updates: Count = field(default=4, metadata=shown("learning", "N"))
     """Number of updates per step of all environments. Times `batch_size`, divided by the number of
     environments, this is the replay ratio: the number of times a transition is used."""
     replay_steps: Count = 500
@@ -139,7 +144,7 @@ class RslRlSacAlgorithmCfg:
     """Use the minimum of both critics instead of their mean."""
     policy_delay: Count = 4
     """Number of critic updates per policy update."""
-    actor_learning_rate: Positive = 3e-4
+    actor_learning_rate: Positive = field(default=3e-4, metadata=shown("learning", "X"))
     """Learning rate of the policy."""
     critic_learning_rate: Positive = 3e-4
     """Learning rate of the critics."""
@@ -191,7 +196,7 @@ class RslRlDistillationAlgorithmCfg:
     gradient_length: Count = 8
     """Number of environment steps per update, and of backpropagation through time of a recurrent
     student. Should divide epochs times steps of an iteration: remaining steps are not used."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Positive = field(default=1e-3, metadata=shown("learning", "X"))
     """Learning rate."""
     max_grad_norm: Limit | None = 1.0
     """Maximum gradient norm; larger gradients are rescaled. None: unlimited."""
@@ -228,7 +233,7 @@ class EvaluationCfg:
     episode."""
     units: dict[str, str] = field(default_factory=dict)
     """Units of `metrics` by name, shown beside their values."""
-    stop_when_solved: bool = True
+    stop_when_solved: bool = field(default=True, metadata=shown("learning", "False"))
     """Stop training once the task is solved and a second evaluation, on unused episodes, confirms
     it."""
     num_episodes: Count = 256
@@ -281,35 +286,37 @@ class EvaluationCfg:
 class RslRlBaseRunnerCfg:
     """Training run config."""
 
-    seed: Annotated[int, Range(-1, 2**32 - 1)] = 42
+    seed: Annotated[int, Range(-1, 2**32 - 1)] = field(default=42, metadata=shown("run", "N"))
     """Seed of the run and its environments; -1 draws a seed, printed and recorded. Other processes
     of the run derive their seeds from it."""
-    num_steps_per_env: Count = 24
+    num_steps_per_env: Count = field(default=24, metadata=shown("learning", "N"))
     """Number of steps per environment and iteration."""
-    max_iterations: CountOrZero = 300
+    max_iterations: CountOrZero = field(default=300, metadata=shown("run", "N"))
     """Total number of iterations; those before a resume count."""
     obs_groups: dict[str, tuple[str, ...]] = field(
         default_factory=lambda: {"actor": ("actor",), "critic": ("critic",)}
     )
     """Observation groups of each model, concatenated in this order."""
-    save_interval: Count = 50
+    save_interval: Count = field(default=50, metadata=shown("save", "N"))
     """Number of iterations between checkpoints."""
     experiment_name: str = "exp1"
     """Folder of the experiment, under the log root."""
-    run_name: str = ""
+    run_name: str = field(default="", metadata=shown("save", "TEXT"))
     """Suffix of the run folder's name, after the start time."""
-    logger: Literal["wandb", "tensorboard"] = "tensorboard"
+    logger: Literal["wandb", "tensorboard"] = field(
+        default="tensorboard", metadata=shown("save", "tensorboard|wandb")
+    )
     """Logging service: `tensorboard` writes to the run folder only; `wandb` also uploads to
     Weights & Biases. (mjlab 1.6 uploads by default.)"""
     wandb_project: str = "mjlab"
     """Weights & Biases project."""
     wandb_tags: tuple[str, ...] = ()
     """Weights & Biases tags of the run."""
-    resume: bool | Literal["auto"] = False
+    resume: bool | Literal["auto"] = field(default=False, metadata=shown("resume", "True|auto"))
     """Resume from a checkpoint. `auto`: if there is one, else start a new run, as job scripts need."""
-    load_run: str = ".*"
+    load_run: str = field(default=".*", metadata=shown("resume", "REGEX"))
     """Run folder to resume from: regular expression; the newest match is used."""
-    load_checkpoint: str = "model_.*.pt"
+    load_checkpoint: str = field(default="model_.*.pt", metadata=shown("resume", "REGEX"))
     """Checkpoint to resume from: regular expression; the newest match is used."""
     clip_actions: Limit | None = None
     """Bound c: actions are clipped to [-c, c] before the environment. SAC's actions are in (-1, 1);
@@ -389,7 +396,7 @@ class RslRlDistillationRunnerCfg(RslRlBaseRunnerCfg):
     """Teacher network, as trained. `train` takes its sizes and class from the teacher's run."""
     algorithm: RslRlDistillationAlgorithmCfg = field(default_factory=RslRlDistillationAlgorithmCfg)
     """Learning algorithm."""
-    teacher_checkpoint: str | None = None
+    teacher_checkpoint: str | None = field(default=None, metadata=shown("learning", "FILE"))
     """Teacher checkpoint, trained with PPO. Not needed to resume a run."""
     torch_compile_mode: TorchCompileMode | None = None
     """Mode of `torch.compile` for the networks; compilation delays the start. None: no compilation."""

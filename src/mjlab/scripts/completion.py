@@ -2,8 +2,21 @@
 
 from __future__ import annotations
 
-from mjlab.cli.help import ALL, SCREENS, TOPICS, flags_of, values_of
+import pkgutil
+
+from mjlab.cli.help import ALL, TOPICS, Row, screen_rows
 from mjlab.utils.errors import BadCallError
+
+# Configs of the commands with frequent flags.
+_CONFIGS = {
+    "train": "mjlab.cli.train_config:TrainConfig",
+    "train-seeds": "mjlab.cli.train_config:TrainConfig",
+    "sweep": "mjlab.cli.train_config:TrainConfig",
+    "play": "mjlab.scripts.play:PlayConfig",
+    "evaluate": "mjlab.scripts.evaluate:EvaluateConfig",
+    "profile-env": "mjlab.scripts.profile_env:ProfileConfig",
+    "describe": "mjlab.scripts.describe:DescribeConfig",
+}
 
 _USAGE = """\
 usage: mjlab completion bash|zsh|fish
@@ -56,14 +69,36 @@ def candidates(words: list[str]) -> list[str]:
 def _flag_candidates(before: list[str], partial: str) -> list[str]:
     """Return what may follow a command and its task: a value, a topic of `--help`, or a flag."""
     name, last = before[0], before[-1]
-    if name in SCREENS and last == "--help":
+    if name != "demo" and name not in _CONFIGS:
+        return []
+    if last == "--help":
         return [name, "agent", "env", *TOPICS, ALL]
-    if name in SCREENS and last == "--profile" and name != "demo":
+    if last == "--profile" and name != "demo":
         from mjlab.tasks.registry import list_profiles
 
         return list_profiles(before[1])
-    values = values_of(name, last)
-    return values or (["--help", *flags_of(name)] if partial.startswith("-") else [])
+    if not (partial.startswith("-") or last.startswith("-")):
+        return []
+    rows = _rows(name, before)
+    values = [
+        row.placeholder.split("|") for row in rows if row.flag == last and "|" in row.placeholder
+    ]
+    if values:
+        return values[0]
+    return ["--help", *(row.flag for row in rows)] if partial.startswith("-") else []
+
+
+def _rows(name: str, before: list[str]) -> list[Row]:
+    """Return the frequent flags of a command and its task."""
+    if name == "demo":
+        from mjlab.scripts.demo import DEMOS, demo_cfg
+
+        return screen_rows(demo_cfg(DEMOS["go1"]))
+    from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+
+    kind, task = pkgutil.resolve_name(_CONFIGS[name]), before[1]
+    agent = {"agent": load_rl_cfg(task)} if kind.__name__ == "TrainConfig" else {}
+    return screen_rows(kind(env=load_env_cfg(task), **agent))
 
 
 def command(argv: list[str], prog: str) -> None:

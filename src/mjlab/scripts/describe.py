@@ -5,19 +5,20 @@ from __future__ import annotations
 import copy
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from mjlab.cli.flags import (
     parse_flags,
-    parse_known_flags,
     prepare_env_cfg,
+    previewed,
     with_task_options,
 )
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.runs.run import registered_env_cfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
+from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
 from mjlab.utils.tables import WIDTH, json_value, tables_text
 
@@ -28,9 +29,9 @@ _MIN_WIDTH = 80
 class ConfigChoice:
     """Flags that select the config of a task."""
 
-    profile: str | None = None
+    profile: str | None = field(default=None, metadata=shown("run", "NAME"))
     """Task profile, such as `cpu`."""
-    play: bool = False
+    play: bool = field(default=False, metadata=shown("run"))
     """Describe the environment of `play` instead of that of `train`."""
 
 
@@ -38,9 +39,9 @@ class ConfigChoice:
 class DescribeConfig(ConfigChoice):
     """Flags of `describe`."""
 
-    json: bool = False
+    json: bool = field(default=False, metadata=shown("run"))
     """Print JSON, with all columns and lists in full."""
-    markdown: bool = False
+    markdown: bool = field(default=False, metadata=shown("run"))
     """Print Markdown."""
     env: ManagerBasedRlEnvCfg | None = None
     """Environment. None: config of the task."""
@@ -50,8 +51,7 @@ def command(argv: list[str], prog: str) -> None:
     """Run `describe`."""
     task, *flags = argv
     # The defaults of the other flags depend on these two.
-    words = [flag for flag in flags if flag not in ("-h", "--help")]
-    choice, _ = parse_known_flags(ConfigChoice, ConfigChoice(), words, f"{prog} {task}")
+    choice = previewed(ConfigChoice(), flags)
     env_cfg = _env_cfg(task, choice)
     default = with_task_options(DescribeConfig(choice.profile, choice.play, env=env_cfg), task)
     cfg = parse_flags(type(default), default, flags, f"{prog} {task}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
@@ -27,6 +27,7 @@ from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_p
 from mjlab.runs.run import registered_env_cfg
 from mjlab.utils.logging import print_notice
 from mjlab.utils.ranges import Count, Seed, check_ranges
+from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
 
 _SECONDS_BETWEEN_DRAWINGS = 0.25
@@ -38,17 +39,17 @@ _SECONDS_BETWEEN_LINES = 10.0
 class EvaluateConfig(PolicyFlags):
     """Flags of `evaluate`."""
 
-    num_episodes: Count = 256
+    num_episodes: Count = field(default=256, metadata=shown("run", "N"))
     """Number of episodes; in rounds if --num-envs is lower."""
-    num_envs: Count | None = None
+    num_envs: Count | None = field(default=None, metadata=shown("run", "N"))
     """Number of environments: episodes at once; short for --env.scene.num-envs. None: one environment
     per episode."""
-    max_steps: Count | None = None
+    max_steps: Count | None = field(default=None, metadata=shown("run", "N"))
     """Maximum episode length in steps; longer episodes are truncated and not a success. None: episode
     length of evaluations."""
-    seed: Seed = 0
+    seed: Seed = field(default=0, metadata=shown("run", "N"))
     """Seed of the evaluation."""
-    json: bool = False
+    json: bool = field(default=False, metadata=shown("run"))
     """Print only JSON."""
 
 

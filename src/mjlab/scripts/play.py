@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from mjlab.runs.policy import agent_cfg_of, load_policy, make_env, make_policy
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.ranges import Count, CountOrZero
+from mjlab.utils.screen import shown
 from mjlab.utils.torch import threads_for_policy
 from mjlab.viewer.base import run_headless
 from mjlab.viewer.page_server import check_address, open_browser
@@ -33,32 +34,34 @@ __getattr__ = older_names(__name__)
 class PlayConfig(PolicyFlags):
     """Flags of `play`."""
 
-    num_envs: Count | None = None
+    num_envs: Count | None = field(default=None, metadata=shown("watch", "N", "env.scene.num_envs"))
     """Number of environments. None: number of the task."""
-    video: bool = False
+    video: bool = field(default=False, metadata=shown("record"))
     """Record a clip instead of opening a viewer."""
-    video_length: CountOrZero = 200
+    video_length: CountOrZero = field(default=200, metadata=shown("record", "N"))
     """Frames of the clip."""
-    video_format: Literal["mp4", "gif"] = "mp4"
+    video_format: Literal["mp4", "gif"] = field(default="mp4", metadata=shown("record", "mp4|gif"))
     """Format of the clip."""
-    video_height: Count | None = None
+    video_height: Count | None = field(default=None, metadata=shown("record", "N"))
     """Height of the clip, in pixels."""
-    video_width: Count | None = None
+    video_width: Count | None = field(default=None, metadata=shown("record", "N"))
     """Width of the clip, in pixels."""
-    camera: int | str | None = None
+    camera: int | str | None = field(default=None, metadata=shown("record", "NAME"))
     """Model camera to record from, name or index. None: viewer camera of the task."""
-    viewer: Literal["auto", "native", "viser", "none"] = "auto"
+    viewer: Literal["auto", "native", "viser", "none"] = field(
+        default="auto", metadata=shown("watch", "viser|native|none")
+    )
     """Viewer: `viser` (page in the browser; also `auto`), `native` (MuJoCo's window) or `none`
     (headless)."""
-    num_steps: Count | None = None
+    num_steps: Count | None = field(default=None, metadata=shown("watch", "N"))
     """Number of environment steps. None: play until stopped."""
-    host: str = "127.0.0.1"
+    host: str = field(default="127.0.0.1", metadata=shown("watch", "ADDRESS"))
     """Address of the page. 0.0.0.0: all interfaces."""
-    port: int = 8080
+    port: int = field(default=8080, metadata=shown("watch", "N"))
     """Port of the page."""
-    open_browser: bool = True
+    open_browser: bool = field(default=True, metadata=shown("watch", "False"))
     """Open the page in a browser on this machine, if a display is available; not over SSH."""
-    no_terminations: bool = False
+    no_terminations: bool = field(default=False, metadata=shown("watch"))
     """Remove all terminations, including the time limit."""
 
 

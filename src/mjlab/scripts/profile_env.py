@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
@@ -21,6 +21,7 @@ from mjlab.compat import older_names
 from mjlab.envs.profiling import StepProfile, device_time, profiled_steps
 from mjlab.runs.policy import agent_cfg_of, make_env, make_policy
 from mjlab.utils.ranges import Count, CountOrZero, Seed
+from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
 from mjlab.utils.torch import threads_for_policy
 
@@ -34,17 +35,19 @@ _EXPENSIVE = 5.0
 class ProfileConfig(PolicyFlags):
     """Flags of `profile-env`."""
 
-    agent: Literal["zero", "random", "trained"] = "random"
+    agent: Literal["zero", "random", "trained"] = field(
+        default="random", metadata=shown("policy", "trained|zero|random")
+    )
     """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
-    num_envs: Count = 1024
+    num_envs: Count = field(default=1024, metadata=shown("run", "N"))
     """Number of environments."""
-    steps: Count = 100
+    steps: Count = field(default=100, metadata=shown("run", "N"))
     """Environment steps to time."""
-    warm_up: CountOrZero = 20
+    warm_up: CountOrZero = field(default=20, metadata=shown("run", "N"))
     """Environment steps before timing."""
-    seed: Seed = 0
+    seed: Seed = field(default=0, metadata=shown("run", "N"))
     """Seed of states and actions."""
-    json: bool = False
+    json: bool = field(default=False, metadata=shown("run"))
     """Print only JSON."""
 
 

@@ -22,7 +22,7 @@ import shlex
 import subprocess
 from pathlib import Path
 
-from mjlab.cli.flags import is_given, read_count, typed_names
+from mjlab.cli.flags import is_given, read_count, typed_values
 from mjlab.cli.help import lookup
 from mjlab.cli.train_config import (
     TrainConfig,
@@ -177,7 +177,7 @@ def check_settings(sweep: Sweep) -> list[TrainConfig]:
         try:
             cfg = train_config(sweep, setting)
             check_typed_flags(cfg, flags)
-            check_flags(cfg, typed_names(flags))
+            check_flags(cfg, typed_values(flags))
         except (UserError, ValueError) as error:
             raise BadCallError(f"{error} (In the setting {sweep.describe(setting)}.)") from error
         cfgs.append(cfg)

@@ -18,7 +18,7 @@ from mjlab.cli.flags import (
     prepare_env_cfg,
     report_untuned_learner,
     suggest_profile,
-    typed_names,
+    typed_values,
 )
 from mjlab.cli.main import run_alias
 from mjlab.cli.policy_flags import prepare_teacher
@@ -83,7 +83,7 @@ def command(argv: list[str], prog: str) -> None:
         if (stopped := train_until_stopped(task, cfg, flags)[1]) is not None:
             raise Interrupted(stopped)
         return
-    check_flags(cfg, typed_names(flags))
+    check_flags(cfg, typed_values(flags))
     # CUDA_VISIBLE_DEVICES restricts the workers to the selected GPUs.
     workers = [sys.executable, "-m", "mjlab.scripts.train", task, *flags, "--gpu-ids", "all"]
     launch_workers(workers, len(gpus), {"CUDA_VISIBLE_DEVICES": ",".join(map(str, gpus))})
@@ -123,7 +123,7 @@ def train_until_stopped(
     with joined_processes(device), output_of(rank) as output:
         with fail_together():
             # What a program of a package says counts as a package's config.
-            check_flags(cfg, typed_names(flags or []))
+            check_flags(cfg, typed_values(flags or []))
         return _train(task, cfg, flags, device, rank, output)
 
 

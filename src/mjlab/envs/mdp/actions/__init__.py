@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mjlab.envs.mdp.actions.actions import (
+    BaseActionCfg,
     JointEffortAction,
     JointEffortActionCfg,
     JointPositionAction,
@@ -26,6 +27,7 @@ from mjlab.envs.mdp.actions.differential_ik import (
 )
 
 __all__ = [
+    "BaseActionCfg",
     "DifferentialIKAction",
     "DifferentialIKActionCfg",
     "JointEffortAction",
