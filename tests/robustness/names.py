@@ -170,10 +170,12 @@ def _motion(server: Any, names: list[str]) -> list[str]:
         body_names=names[:2], robot_body_pos_w=bodies, body_pos_relative_w=bodies, body_pos_w=bodies,
         body_quat_relative_w=turns, robot_body_quat_w=turns,
     )  # fmt: skip
-    MotionPanel(
-        names[0], server, SimpleNamespace(names=[*names[2:], "\udcff"], lengths=[5, 5, 5]), 1, np.zeros(3), get_env_idx=lambda: 0,
-        get_frame=lambda index: (0, 1), set_frame=print, get_matching=lambda: frame, get_current=lambda: frame,
-    ).update()  # fmt: skip
+    command: Any = SimpleNamespace(
+        motion=SimpleNamespace(names=[*names[2:], "\udcff"], lengths=[5, 5, 5]), num_envs=1,
+        motion_ids=[0], time_steps=[1], matching_frame=frame,
+        drawing=SimpleNamespace(offset=np.zeros(3)),
+    )  # fmt: skip
+    MotionPanel(names[0], server, command, lambda: 0).update()
     return names[:2]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -243,10 +244,11 @@ def test_names_of_motions_and_bodies_are_text():
         body_quat_relative_w=turns, robot_body_quat_w=turns,
     )  # fmt: skip
     page, library = Page(), SimpleNamespace(names=["walk", "\udcff"], lengths=[9, 9])
-    panel = MotionPanel(
-        "motion", page, library, 1, np.zeros(3), get_env_idx=lambda: 0, get_frame=lambda _: (1, 2),
-        set_frame=lambda *_: None, get_matching=lambda: frame, get_current=lambda: frame,
+    command: Any = SimpleNamespace(
+        motion=library, num_envs=1, motion_ids=[1], time_steps=[2], matching_frame=frame,
+        drawing=SimpleNamespace(offset=np.zeros(3)),
     )  # fmt: skip
+    panel = MotionPanel("motion", page, command, lambda: 0)
     panel.update()
     # Sent as UTF-8.
     assert page.widgets["Motion"].value.encode()

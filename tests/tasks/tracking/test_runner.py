@@ -302,25 +302,3 @@ def test_any_command_named_motion_trains_with_the_terms_of_tracking(make_runner,
     assert not (tmp_path / "run" / "motion").exists()
     assert runner.onnx_metadata()["anchor_body_name"] == "torso_link"
     runner.load(str(tmp_path / "run" / "model_0.pt"))
-
-
-def test_a_term_that_lacks_what_a_motion_command_has_is_named(make_env):
-    class Bare(OwnMotion):
-        anchor_pos_w = property()
-
-        def __dir__(self):
-            return [name for name in super().__dir__() if name != "anchor_pos_w"]
-
-    @dataclass(kw_only=True)
-    class BareCfg(OwnMotionCfg):
-        def build(self, env):
-            return Bare(self, env)
-
-    def edit(cfg):
-        to_own_motion(cfg)
-        cfg.commands["motion"] = BareCfg(**vars(cfg.commands["motion"]))
-
-    with pytest.raises(
-        TypeError, match="'motion': expected a MotionCommand.* without anchor_pos_w"
-    ):
-        make_env(None, edit=edit)

@@ -16,11 +16,9 @@ from mjlab.entity.building import short_name
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.tasks.tracking.mdp.motion_library import (
     MotionFrame,
+    MotionLibrary,
+    MotionLoader,
     MotionReader,
-    read_library,
-)
-from mjlab.tasks.tracking.mdp.motion_library import (
-    MotionLoader as MotionLoader,
 )
 from mjlab.tasks.tracking.mdp.motion_panel import MotionPanel
 from mjlab.tasks.tracking.mdp.motion_sampling import (
@@ -30,7 +28,9 @@ from mjlab.tasks.tracking.mdp.motion_sampling import (
     draw_uniform,
     perturbed_start,
 )
-from mjlab.tasks.tracking.motion_order import Skeleton
+from mjlab.tasks.tracking.motion_file import check_rate, read_motion
+from mjlab.tasks.tracking.motion_order import Skeleton, arranged
+from mjlab.tasks.tracking.motion_sources import find_motions
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.lab_api.math import matrix_from_quat, quat_error_magnitude
@@ -175,13 +175,12 @@ class MotionCommand(MotionReader, CommandTerm):
         indexes, _ = self.robot.find_bodies(self.body_names, preserve_order=True)
         self.body_indexes = torch.tensor(indexes, device=self.device)
         self.anchor_body = indexes[self.anchor_index]
-        self.motion_files, self.motion = read_library(
-            cfg.motion_file,
-            Skeleton.of_entity(self.robot, env.sim.mj_model),
-            self.body_indexes,
-            env.step_dt,
-            self.device,
-        )
+        self.motion_files = tuple(find_motions(cfg.motion_file))
+        skeleton = Skeleton.of_entity(self.robot, env.sim.mj_model)
+        motions = [arranged(path, read_motion(path), skeleton) for path in self.motion_files]
+        for path, motion in zip(self.motion_files, motions, strict=True):
+            check_rate(path, motion, env.step_dt)
+        self.motion = MotionLibrary(self.motion_files, motions, self.body_indexes, self.device)
         self.time_steps = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.motion_ids = torch.zeros_like(self.time_steps)
         shape = (self.num_envs, len(indexes))
@@ -252,6 +251,11 @@ class MotionCommand(MotionReader, CommandTerm):
         if len(self.motion) == 1:
             return self.time_steps
         return self.time_steps + self.motion.starts.index_select(0, self.motion_ids)
+
+    @property
+    def current_frame(self) -> MotionFrame:
+        """Reference of the command, with current relative poses."""
+        return MotionFrame(self, self.frame_indexes)
 
     @property
     def matching_frame(self) -> MotionFrame:
@@ -417,25 +421,7 @@ class MotionCommand(MotionReader, CommandTerm):
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
         """Add a frame slider, a button to start there, and a table of body errors."""
-
-        def set_frame(env: int, motion: int, frame: int) -> None:
-            self.motion_ids[env], self.time_steps[env] = motion, frame
-            self.update_relative_body_poses()
-
-        self._panel = MotionPanel(
-            name,
-            server,
-            self.motion,
-            self.num_envs,
-            self.drawing.offset,
-            get_env_idx=get_env_idx,
-            get_frame=lambda env: (int(self.motion_ids[env]), int(self.time_steps[env])),
-            set_frame=set_frame,
-            get_matching=lambda: self.matching_frame,
-            get_current=lambda: MotionFrame(self, self.frame_indexes),
-            on_change=on_change,
-            request_action=request_action,
-        )
+        self._panel = MotionPanel(name, server, self, get_env_idx, on_change, request_action)
 
     def on_viewer_pause(self, paused: bool) -> None:
         """Enable the frame slider while the viewer is paused."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from mjlab.tasks.tracking.motion_file import (
@@ -13,11 +14,8 @@ from mjlab.tasks.tracking.motion_file import (
     PER_JOINT,
     Motion,
     MotionFileError,
-    check_rate,
     read_motion,
 )
-from mjlab.tasks.tracking.motion_order import Skeleton, arranged
-from mjlab.tasks.tracking.motion_sources import find_motions
 from mjlab.utils.lab_api.math import quat_inv, quat_mul, yaw_quat
 
 if TYPE_CHECKING:
@@ -25,11 +23,13 @@ if TYPE_CHECKING:
     from mjlab.scene import Scene
 
 
-class MotionLoader:
-    """Motion of T frames, reduced to K bodies `body_indexes`.
+class MotionLibrary:
+    """M motions, T frames in total, concatenated along the frame axis, with K of their bodies.
 
     Attributes:
-        fps: Frames per second; None if not in the file.
+        names: Names of the motions.
+        starts: (M,) int64, index of the first frame of each motion.
+        lengths: (M,) int64, number of frames of each motion.
         joint_pos, joint_vel: (T, nj).
         body_pos_w, body_lin_vel_w, body_ang_vel_w: (T, K, 3), without environment origins.
         body_quat_w: (T, K, 4).
@@ -44,105 +44,61 @@ class MotionLoader:
     body_ang_vel_w: torch.Tensor
 
     def __init__(
-        self, motion_file: str | Path, body_indexes: torch.Tensor, device: str = "cpu"
+        self,
+        files: Sequence[Path],
+        motions: Sequence[Motion],
+        body_indexes: torch.Tensor,
+        device: str,
     ) -> None:
-        """Read a file.
+        """Store motions of one robot.
 
         Args:
-            motion_file: The `.npz` file.
-            body_indexes: Robot body indices to keep, (K,) int64.
+            files: Files of the motions.
+            motions: The motions, in the same order.
+            body_indexes: Bodies to keep, as indices in the robot, (K,) int64.
             device: Device of the tensors.
 
         Raises:
-            MotionFileError: not a motion file, or fewer bodies.
+            MotionFileError: a motion has fewer bodies.
         """
-        motion = read_motion(motion_file)
-        _check_bodies(motion_file, motion, body_indexes)
-        self._take(motion, body_indexes, device)
-
-    @classmethod
-    def from_motion(
-        cls, motion: Motion, body_indexes: torch.Tensor, device: str = "cpu"
-    ) -> MotionLoader:
-        """Return the loader of a motion read earlier; other arguments as in `__init__`."""
-        loader = cls.__new__(cls)
-        loader._take(motion, body_indexes, device)
-        return loader
-
-    def _take(self, motion: Motion, body_indexes: torch.Tensor, device: str) -> None:
-        self.fps = motion.fps
-        for name in PER_JOINT:
-            setattr(self, name, torch.from_numpy(getattr(motion, name)).to(device))
+        for path, motion in zip(files, motions, strict=True):
+            bodies = motion.body_pos_w.shape[1]
+            unknown = [i for i in body_indexes.tolist() if not 0 <= i < bodies]
+            if unknown:
+                raise MotionFileError(
+                    f"Motion {path}: expected body indices in [0, {bodies - 1}], got {unknown}; it "
+                    f"has {bodies} bodies."
+                )
         columns = body_indexes.cpu().numpy()
-        for name in PER_BODY:
-            values = getattr(motion, name)[:, columns]
-            setattr(self, name, torch.from_numpy(values).to(device))
-        self.time_step_total = motion.num_frames
-
-
-class MotionLibrary:
-    """M motions, concatenated along the frame axis.
-
-    Attributes:
-        names: Names of the motions.
-        starts: (M,) int64, index of the first frame of each motion.
-        lengths: (M,) int64, number of frames of each motion.
-        time_step_total: Total number of frames.
-
-    The tensors are those of `MotionLoader`, over all frames.
-    """
-
-    joint_pos: torch.Tensor
-    joint_vel: torch.Tensor
-    body_pos_w: torch.Tensor
-    body_quat_w: torch.Tensor
-    body_lin_vel_w: torch.Tensor
-    body_ang_vel_w: torch.Tensor
-
-    def __init__(self, motions: Sequence[MotionLoader], names: Sequence[str]) -> None:
-        """Concatenate motions of the same robot."""
         for name in (*PER_JOINT, *PER_BODY):
-            setattr(self, name, torch.cat([getattr(motion, name) for motion in motions]))
-        device = self.joint_pos.device
-        self.names = tuple(names)
-        self.lengths = torch.tensor([m.time_step_total for m in motions], device=device)
+            values = [getattr(motion, name) for motion in motions]
+            if name in PER_BODY:
+                values = [value[:, columns] for value in values]
+            setattr(self, name, torch.from_numpy(np.concatenate(values)).to(device))
+        self.names = tuple(path.stem for path in files)
+        counts = [motion.num_frames for motion in motions]
+        self.lengths = torch.tensor(counts, device=device)
         self.starts = torch.cumsum(self.lengths, 0) - self.lengths
-        self.time_step_total = int(self.lengths.sum())
+        self.time_step_total = sum(counts)
 
     def __len__(self) -> int:
         return len(self.names)
 
 
-def read_library(
-    motion_file: str,
-    robot: Skeleton,
-    body_indexes: torch.Tensor,
-    step_dt: float,
-    device: str,
-) -> tuple[tuple[Path, ...], MotionLibrary]:
-    """Return the files selected by `motion_file`, and their motions in the order of the robot.
+class MotionLoader(MotionLibrary):
+    """Motion of a single file.
 
-    Raises:
-        MotionFileError: a file is not found, is not a motion, or does not match the robot.
+    Attributes:
+        fps: Frames per second; None if not in the file.
     """
-    files = tuple(find_motions(motion_file))
-    loaders = []
-    for path in files:
-        motion = arranged(path, read_motion(path), robot)
-        check_rate(path, motion, step_dt)
-        _check_bodies(path, motion, body_indexes)
-        loaders.append(MotionLoader.from_motion(motion, body_indexes, device))
-    return files, MotionLibrary(loaders, [path.stem for path in files])
 
-
-def _check_bodies(path: str | Path, motion: Motion, body_indexes: torch.Tensor) -> None:
-    bodies = motion.body_pos_w.shape[1]
-    unknown = [i for i in body_indexes.tolist() if not 0 <= i < bodies]
-    if unknown:
-        raise MotionFileError(
-            f"Motion {path}: expected body indices in [0, {bodies - 1}], got {unknown}; it has "
-            f"{bodies} bodies."
-        )
+    def __init__(
+        self, motion_file: str | Path, body_indexes: torch.Tensor, device: str = "cpu"
+    ) -> None:
+        """Read a file; arguments and errors are those of `MotionLibrary` and `read_motion`."""
+        motion = read_motion(motion_file)
+        super().__init__([Path(motion_file)], [motion], body_indexes, device)
+        self.fps = motion.fps
 
 
 class MotionReader:

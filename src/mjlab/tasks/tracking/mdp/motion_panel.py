@@ -12,10 +12,9 @@ from mjlab.utils.lab_api.math import quat_error_magnitude
 from mjlab.utils.string import encodable, escaped
 
 if TYPE_CHECKING:
-    import numpy as np
     import viser
 
-    from mjlab.tasks.tracking.mdp.motion_library import MotionLibrary, MotionReader
+    from mjlab.tasks.tracking.mdp.commands import MotionCommand
 
 _TABLE_PERIOD_S = 0.25
 _MAX_OFFSET = 2.0
@@ -33,15 +32,8 @@ class MotionPanel:
         self,
         name: str,
         server: viser.ViserServer,
-        motion: MotionLibrary,
-        num_envs: int,
-        ghost_offset: np.ndarray,
-        *,
+        command: MotionCommand,
         get_env_idx: Callable[[], int],
-        get_frame: Callable[[int], tuple[int, int]],
-        set_frame: Callable[[int, int, int], None],
-        get_matching: Callable[[], MotionReader],
-        get_current: Callable[[], MotionReader],
         on_change: Callable[[], None] | None = None,
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
@@ -50,20 +42,12 @@ class MotionPanel:
         Args:
             name: Title of the panel.
             server: Viser server.
-            motion: Motions to select from.
-            num_envs: Number of environments.
-            ghost_offset: (3,) drawing offset from the reference (m); the slider edits it.
+            command: Command whose reference is moved.
             get_env_idx: Returns the index of the displayed environment.
-            get_frame: Returns motion and frame of an environment.
-            set_frame: Moves the reference of an environment to a motion and a frame.
-            get_matching: Returns a reader of robot and reference at the time of the robot's state.
-            get_current: Returns a reader of robot and current reference.
             on_change: Called after every change, to redraw the scene.
             request_action: Queues a viewer action. None: no start button.
         """
-        self._library, self._num_envs = motion, num_envs
-        self._get_env_idx, self._get_frame, self._set_frame = get_env_idx, get_frame, set_frame
-        self._get_matching, self._get_current = get_matching, get_current
+        self._command, self._get_env_idx = command, get_env_idx
         self._on_change = on_change or (lambda: None)
         self._request_action = request_action
         self._paused = False
@@ -72,18 +56,18 @@ class MotionPanel:
         # True if the user moved the reference, which then is not one frame ahead of the robot.
         self._was_moved = False
         self._next_table = 0.0
-        names = [encodable(name) for name in motion.names]
+        names = [encodable(name) for name in command.motion.names]
         gui, self._names = server.gui, names
         with gui.add_folder(name.capitalize()):
             self._motion = gui.add_dropdown(
                 "Motion", names, initial_value=names[0], disabled=True, visible=len(names) > 1
             )
-            last = int(motion.lengths[0]) - 1
+            last = int(command.motion.lengths[0]) - 1
             self._frame = gui.add_slider("Frame", 0, last, 1, 0, disabled=True)
             button = gui.add_button("Start Here", visible=request_action is not None)
-            self._all_envs = gui.add_checkbox("All envs", True, visible=num_envs > 1)
+            self._all_envs = gui.add_checkbox("All envs", True, visible=command.num_envs > 1)
             beside = gui.add_slider(
-                "Ghost beside (m)", -_MAX_OFFSET, _MAX_OFFSET, 0.1, float(ghost_offset[1])
+                "Ghost beside (m)", -_MAX_OFFSET, _MAX_OFFSET, 0.1, float(command.drawing.offset[1])
             )
             with gui.add_folder("Errors", expand_by_default=False):
                 self._table = gui.add_markdown("")
@@ -93,7 +77,7 @@ class MotionPanel:
 
         @beside.on_update
         def _(_event: Any) -> None:
-            ghost_offset[1] = beside.value
+            command.drawing.offset[1] = beside.value
             self._on_change()
 
     def set_paused(self, paused: bool) -> None:
@@ -112,17 +96,18 @@ class MotionPanel:
 
     def update(self) -> None:
         """Move the reference to the slider while paused, else the slider to the reference."""
-        index = self._get_env_idx()
-        if not 0 <= index < self._num_envs:
+        command, index = self._command, self._get_env_idx()
+        if not 0 <= index < command.num_envs:
             return
         requested, self._requested = self._requested, None
         if requested is not None and self._paused:
-            self._set_frame(index, *requested)
+            command.motion_ids[index], command.time_steps[index] = requested
+            command.update_relative_body_poses()
             self._was_moved = True
         elif not self._paused:
             self._was_moved = False
-        motion, frame = self._get_frame(index)
-        last = int(self._library.lengths[motion]) - 1
+        motion, frame = int(command.motion_ids[index]), int(command.time_steps[index])
+        last = int(command.motion.lengths[motion]) - 1
         if self._frame.max != last:
             self._frame.max = last
         if self._frame.value != frame:
@@ -136,7 +121,8 @@ class MotionPanel:
 
     def _errors_of(self, index: int) -> str:
         """Return a Markdown table of the errors of each tracked body of an environment."""
-        frame = self._get_current() if self._was_moved else self._get_matching()
+        command = self._command
+        frame = command.current_frame if self._was_moved else command.matching_frame
         pos = frame.robot_body_pos_w[index]
         distance = torch.linalg.vector_norm(frame.body_pos_relative_w[index] - pos, dim=-1)
         in_world = torch.linalg.vector_norm(frame.body_pos_w[index] - pos, dim=-1)
@@ -158,7 +144,7 @@ class MotionPanel:
         if event.client is None or not self._paused:
             return
         motion = self._names.index(self._motion.value)
-        last = int(self._library.lengths[motion]) - 1
+        last = int(self._command.motion.lengths[motion]) - 1
         self._requested = motion, min(int(self._frame.value), last)
         self._on_change()
 
