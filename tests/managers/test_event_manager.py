@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -292,14 +294,14 @@ def test_terms_of_all_modes_are_reset_and_may_draw(env):
 
 
 @pytest.mark.parametrize("empty", [{"geom_names": ()}, {"geom_ids": []}])
-def test_an_event_for_nothing_is_told_by_name(env, caplog, empty):
+def test_selections_left_empty_warn(env, empty):
     params = {"asset_cfg": SceneEntityCfg("robot", **empty)}
     event = EventTermCfg(func=lambda env, env_ids, asset_cfg: None, mode="startup", params=params)
-    EventManager({"friction": event}, env)
-    assert "term 'friction', parameter 'asset_cfg': geom_names of entity 'robot'" in caplog.text
+    with pytest.warns(UserWarning, match="'friction', .*'asset_cfg': expected geom_names"):
+        EventManager({"friction": event}, env)
 
 
-def test_an_event_for_something_is_not_told(env, caplog):
+def test_selections_of_all_or_some_do_not_warn(env):
     selections = (SceneEntityCfg("robot"), SceneEntityCfg("robot", geom_names=("geom_a",)))
     for asset_cfg in selections:
         event = EventTermCfg(
@@ -307,5 +309,6 @@ def test_an_event_for_something_is_not_told(env, caplog):
             mode="startup",
             params={"asset_cfg": asset_cfg},
         )
-        EventManager({"friction": event}, env)
-    assert not caplog.records
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            EventManager({"friction": event}, env)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import logging
 import operator
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -15,7 +14,6 @@ import torch
 from mjlab.compat import accepts_older_fields, offers_older_attributes
 from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, label_errors
-from mjlab.managers.scene_entity_config import SceneEntityCfg
 from mjlab.sim.engine import FIXED_CONSTANTS, INERTIAL_CONSTANTS
 from mjlab.sim.randomization import RecomputeLevel
 from mjlab.utils.errors import check_one_of
@@ -26,7 +24,6 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
-logger = logging.getLogger(__name__)
 F = TypeVar("F", bound=Callable[..., Any])
 EventMode = Literal["startup", "reset", "interval", "step"]
 
@@ -211,16 +208,6 @@ class EventManager(TermFunctionSwitches, TermListManager):
                     stacklevel=2,
                 )
         super()._prepare_terms()
-        for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
-            for key, value in cfg.params.items():
-                # An empty selection is allowed and changes nothing; a forgotten one would otherwise
-                # go unnoticed.
-                for field in value.empty_selections() if isinstance(value, SceneEntityCfg) else ():
-                    logger.warning(
-                        "%s, parameter %r: %s of entity %r is empty, so the event changes nothing; "
-                        "name the elements to change, or set the term to None.",
-                        *(self._label(name), key, field, value.name),
-                    )
 
     def _sample_interval(
         self, cfg: EventTermCfg, count: int, device: str | None = None

@@ -204,6 +204,14 @@ class ManagerBase(Tabular, ABC):
                     UserWarning,
                     stacklevel=2,
                 )
+            # A nested selection may be empty on purpose.
+            for field in () if is_nested else value.empty_selections():
+                warnings.warn(
+                    f"{label}: expected {field} of entity {value.name!r}, got none; name the elements, "
+                    "or set the term to None.",
+                    UserWarning,
+                    stacklevel=2,
+                )
             return
         if isinstance(value, (list, tuple)):
             inner = list(enumerate(value))

@@ -115,10 +115,8 @@ def test_posture_pairs_each_joint_with_its_own_deviation(moving: Any, preserve_o
 
 
 def test_posture_wants_every_joint_covered(moving: Any) -> None:
-    with pytest.raises(ValueError, match=r"posture std: .*\['ankle'\]"):
+    with pytest.raises(ValueError, match=r"std: .*\['ankle'\]"):
         posture(moving, {"hip": 0.5, "knee": 2.0}, joint_names=(".*",))
-    with pytest.raises(ValueError, match="posture asset_cfg.joint_names"):
-        posture(moving, {".*": 0.5})
     with pytest.raises(ValueError, match="elbow"):
         posture(moving, {".*": 0.5, "elbow": 1.0}, joint_names=(".*",))
 

@@ -230,7 +230,6 @@ def test_posture_is_kept_as_loosely_as_the_command_is_fast():
         ({"std_walking": {"hip": 0.1, "thig": 0.2}}, "std_walking: These patterns match no name"),
         ({"std_running": {".*": 0.1, "hip": 0.2}}, "std_running: The name 'hip' is matched by sev"),
         ({"std_running": {"hip": 0.1}}, r"std_running: .*missing: \['thigh', 'c"),
-        ({"asset_cfg": SceneEntityCfg("robot")}, "asset_cfg.joint_names"),
     ],
 )
 def test_tables_that_do_not_fit_are_refused_when_the_term_is_built(changes, message):

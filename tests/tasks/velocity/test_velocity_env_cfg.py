@@ -103,11 +103,17 @@ def test_tolerances_left_empty_are_an_error(make_env):
 
 
 @pytest.mark.parametrize(
-    ("name", "field"), [("foot_friction", "geom_names"), ("base_com", "body_names")]
+    ("kind", "name", "field"),
+    [
+        ("events", "foot_friction", "geom_names"),
+        ("events", "base_com", "body_names"),
+        ("rewards", "foot_slip", "site_names"),
+    ],
 )
-def test_events_of_the_base_config_that_are_not_filled_in_are_told(make_env, caplog, name, field):
-    make_env(edit=take_from_base("events", name))
-    assert f"'{name}', parameter 'asset_cfg': {field} of entity 'robot' is empty" in caplog.text
+def test_selections_left_empty_warn_once(make_env, kind, name, field):
+    with pytest.warns(UserWarning, match=f"'{name}', .*'asset_cfg': expected {field}") as caught:
+        make_env(edit=take_from_base(kind, name))
+    assert len([one for one in caught if "got none" in str(one.message)]) == 1
 
 
 @pytest.mark.parametrize("sensor", [0, 1])

@@ -131,7 +131,7 @@ class posture:
     Params:
         std: Dict of joint name pattern, matched in full, to standard deviation (rad or m). Read
             once; must cover every selected joint.
-        asset_cfg: Entity and joints; `joint_names` must be set.
+        asset_cfg: Entity and joints; all joints without `joint_names`.
     """
 
     # Derived from the config; not checkpointed.
@@ -139,20 +139,7 @@ class posture:
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         asset_cfg: SceneEntityCfg = cfg.params["asset_cfg"]
-        if asset_cfg.joint_names is None:
-            raise ValueError(
-                "posture asset_cfg.joint_names: expected names, because std maps joint names to "
-                "values, got None; use ('.*',) for all joints."
-            )
-        # `joint_names` and `joint_ids` have the same order, whatever `preserve_order`.
-        names = list(asset_cfg.joint_names)
-        _, covered, values = resolve_matching_names_values(cfg.params["std"], names)
-        missing = [name for name in names if name not in covered]
-        if missing:
-            raise ValueError(
-                f"posture std: expected patterns that cover every selected joint, got "
-                f"{list(cfg.params['std'])} without {missing}."
-            )
+        values = values_of_joints(env, asset_cfg, "std", cfg.params["std"])
         self.std = torch.tensor(values, dtype=torch.float, device=env.device)
 
     def __call__(
@@ -162,6 +149,29 @@ class posture:
         joints = columns_of(asset_cfg, "joint", env)
         error = asset.data.joint_pos[:, joints] - asset.data.default_joint_pos[:, joints]
         return torch.exp(-(error / self.std).square().mean(dim=1))
+
+
+def values_of_joints(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg, name: str, table: dict[str, float]
+) -> list[float]:
+    """Return the value of each selected joint from `table`, a dict of joint name pattern to value.
+
+    Raises:
+        ValueError: a joint matches no pattern or several, or a pattern matches no joint. The message
+            starts with `name`.
+    """
+    # `joint_names` and `joint_ids` have the same order, whatever `preserve_order`.
+    joints = list(asset_cfg.joint_names or env.scene[asset_cfg.name].joint_names)
+    try:
+        _, covered, values = resolve_matching_names_values(table, joints)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    missing = [joint for joint in joints if joint not in covered]
+    if missing:
+        raise ValueError(
+            f"{name}: expected patterns for all selected joints, got {list(table)}; missing: {missing}."
+        )
+    return [float(value) for value in values]
 
 
 class electrical_power_cost:

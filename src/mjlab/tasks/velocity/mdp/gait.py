@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 import mujoco
 import torch
 
+from mjlab.envs.mdp.rewards import values_of_joints
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.tasks.velocity.mdp.rewards import command_speed, values_of_joints
+from mjlab.tasks.velocity.mdp.rewards import command_speed
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.torch import constant_tensor
 
@@ -217,12 +218,8 @@ class weighted_joint_deviation:
     _transient = {"_weights"}
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
-        weights: dict[str, float] = cfg.params["weights"]
         asset_cfg: SceneEntityCfg = cfg.params.get("asset_cfg", _DEFAULT_ASSET_CFG)
-        asset: Entity = env.scene[asset_cfg.name]
-        # Resolved names are in the order of the joint ids.
-        joints = list(asset_cfg.joint_names or asset.joint_names)
-        values = values_of_joints(joints, "weights", weights)
+        values = values_of_joints(env, asset_cfg, "weights", cfg.params["weights"])
         self._weights = torch.tensor(values, dtype=torch.float32, device=env.device)
 
     def __call__(

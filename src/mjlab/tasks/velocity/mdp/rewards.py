@@ -15,12 +15,12 @@ import torch
 
 from mjlab.compat import accepts_older_params, older_names
 from mjlab.envs.mdp.rewards import self_collision_cost as self_collision_cost
+from mjlab.envs.mdp.rewards import values_of_joints
 from mjlab.managers import RewardTermCfg, SceneEntityCfg
 from mjlab.managers.scene_entity_config import columns_of
 from mjlab.tasks.velocity.mdp.observations import check_same_feet
 from mjlab.tasks.velocity.mdp.terrain_utils import terrain_normal_from_sensors
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
-from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -211,7 +211,7 @@ class variable_posture:
             selected joint must match exactly one pattern, and every pattern a joint.
         std_walking: Standard deviations for walking.
         std_running: Standard deviations for running.
-        asset_cfg: Entity and joints; `joint_names` must be set.
+        asset_cfg: Entity and joints; all joints without `joint_names`.
         command_name: Velocity command.
         walking_threshold: Minimum commanded motion of walking.
         running_threshold: Minimum commanded motion of running.
@@ -224,19 +224,15 @@ class variable_posture:
 
     def __init__(self, cfg: RewardTermCfg, env: ManagerBasedRlEnv) -> None:
         params = cfg.params
-        # Resolved names are in the order of the joint ids.
-        joints = params["asset_cfg"].joint_names
-        if joints is None:
-            raise ValueError(
-                "asset_cfg.joint_names: expected joint names, got None; use ('.*',) for all joints."
-            )
-        tables = [f"std_{gait}" for gait in ("standing", "walking", "running")]
         stds = torch.tensor(
-            [values_of_joints(list(joints), name, params[name]) for name in tables],
+            [
+                values_of_joints(env, params["asset_cfg"], name, params[name])
+                for name in ("std_standing", "std_walking", "std_running")
+            ],
             dtype=torch.float32,
         )
-        # Weights of squared errors, (3, joints); 1 / len(joints) makes the sum a mean.
-        self._weights = (1.0 / (stds.square() * len(joints))).to(env.device)
+        # Weights of squared errors, (3, joints); 1 / joints makes the sum a mean.
+        self._weights = (1.0 / (stds.square() * stds.shape[1])).to(env.device)
 
     def __call__(
         self,
@@ -462,29 +458,6 @@ def tilt_of(quat: torch.Tensor) -> torch.Tensor:
     x, y = quat[:, 1], quat[:, 2]
     s = x * x + y * y
     return 4.0 * s * (1.0 - s)
-
-
-def values_of_joints(joints: list[str], name: str, table: dict[str, float]) -> list[float]:
-    """Return the value of each joint from `table`, a dict of name pattern to value.
-
-    Args:
-        joints: Joint names.
-        name: Parameter name for messages.
-        table: Dict of joint name pattern to value.
-
-    Raises:
-        ValueError: a joint matches no pattern or several, or a pattern matches no joint.
-    """
-    try:
-        _, covered, values = resolve_matching_names_values(table, joints)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    missing = [joint for joint in joints if joint not in covered]
-    if missing:
-        raise ValueError(
-            f"{name}: expected patterns for all selected joints, got {list(table)}; missing: {missing}."
-        )
-    return [float(value) for value in values]
 
 
 def site_speed(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> torch.Tensor:
