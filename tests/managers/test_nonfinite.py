@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import RewardTermCfg, TerminationTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
-from mjlab.rl.divergence import BrokenTermError
+from mjlab.rl.rollout_watch import BrokenTermError
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 NUM_ENVS, STEPS = 4, 20

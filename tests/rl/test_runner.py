@@ -17,7 +17,7 @@ from rl_fake_env import FakeEnv
 
 from mjlab.rl.checkpoint import CheckpointError, RunFolderError, load_checkpoint
 from mjlab.rl.config import EvaluationCfg
-from mjlab.rl.divergence import DivergedError
+from mjlab.rl.rollout_watch import DivergedError
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.utils.random import preserved_rng
 

@@ -23,7 +23,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from mjlab.cli.flags import parse_flags
 from mjlab.rl import MjlabOnPolicyRunner
 from mjlab.rl.checkpoint import load_checkpoint
-from mjlab.rl.divergence import RolloutWatch
+from mjlab.rl.rollout_watch import RolloutWatch
 from mjlab.runs import Run, folder
 from mjlab.runs.folder import NewRunFolder
 from mjlab.scripts import train

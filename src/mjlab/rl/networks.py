@@ -89,7 +89,7 @@ def check_mini_batches(num_envs: int, cfg: Mapping[str, Any]) -> None:
             f"agent.algorithm num_mini_batches: expected at most {most} ({of}{why}), got {parts}; use "
             "fewer mini-batches, or more environments.",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

@@ -46,7 +46,6 @@ from mjlab.rl.checkpoint import (
 )
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.distributed import join_processes
-from mjlab.rl.divergence import RolloutWatch
 from mjlab.rl.evaluation import (
     EvaluationResult,
     EvaluationStopped,
@@ -62,7 +61,8 @@ from mjlab.rl.networks import (
 )
 from mjlab.rl.progress import NotebookProgress, ProgressCfg, in_notebook
 from mjlab.rl.replay import ReplayFiles, ReplayStorage
-from mjlab.rl.run_logger import RunLogger, TrainingObserver
+from mjlab.rl.rollout_watch import RolloutWatch
+from mjlab.rl.run_logger import IterationStats, RunLogger, TrainingObserver
 from mjlab.utils.errors import UserError
 from mjlab.utils.memory import check_memory
 from mjlab.utils.processes import process_rank
@@ -188,25 +188,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             ValueError: the environment returned NaN, Weights & Biases did not start a run, a student
                 has no teacher, or mini-batches outnumber samples.
         """
-        if not getattr(self.alg, "teacher_loaded", True):
-            raise ValueError(
-                "Distillation: expected a teacher, got none; use --agent.teacher-checkpoint, or "
-                "load_teacher."
-            )
-        # Checked here, because runners are also built to play, in any number of environments.
-        check_mini_batches(self.env.num_envs, self.cfg)
-        groups = self.alg.optimizer.param_groups
-        weights = sum(weight.numel() for group in groups for weight in group["params"])
-        # Weights and gradients, and usually two moments.
-        check_memory(
-            "agent trained weights", weights, 8, self.device, "smaller hidden_dims", usual=2.0
-        )
-        if in_notebook() and not any(observer.shows_progress for observer in self.observers):
-            self.observers.append(NotebookProgress(ProgressCfg.of_runner(self)))
+        self._check_settings()
         first, total, reason = self.current_learning_iteration, num_learning_iterations, ""
-        num_steps = self.cfg["num_steps_per_env"]
-        check_every_step = self.cfg.get("check_for_nan", True)
-        uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
         with self._session() as stop, RunRescue(self._run_folder) as rescue:
             observations = self._initial_observations(init_at_random_ep_len)
             self._notify("on_start", first, total)
@@ -224,56 +207,24 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                         stop.interruptible(self._is_main_process),
                         self._watch.explaining(self.alg),
                     ):
-                        with torch.inference_mode():
-                            with using_torch_threads(self._num_collecting_threads):
-                                self._watch.start()
-                                for _ in range(num_steps):
-                                    actions = self.alg.act(observations).to(self.env.device)
-                                    observations, rewards, dones, extras = self.env.step(actions)
-                                    self._watch.update()
-                                    if check_every_step:
-                                        check_nan(observations, rewards, dones)
-                                    observations = observations.to(self.device)
-                                    rewards, dones = rewards.to(self.device), dones.to(self.device)
-                                    credited, infos = self._bootstrapped(
-                                        observations, rewards, extras
-                                    )
-                                    self.alg.process_env_step(observations, credited, dones, infos)
-                                    intrinsic = self.alg.intrinsic_rewards if uses_rnd else None
-                                    self.logger.process_env_step(rewards, dones, extras, intrinsic)
-                                self._watch.check(num_steps)
-                            collected = time.perf_counter()
-                            self.alg.compute_returns(observations)
-                        losses = self._update()
+                        observations = self._rollout(observations)
+                        collected = time.perf_counter()
+                        losses = self._update(observations)
                 except Interrupted as stopped:
                     self._give_up(last, stopped)
                     reason = "interrupted"
                     break
                 learned = time.perf_counter()
                 self._observations = observations
-                self.current_learning_iteration = iteration + 1
-                stats = self.logger.finish_iteration(
-                    iteration=iteration,
-                    first_iteration=first,
-                    total_iterations=total,
-                    collection_time=collected - begin,
-                    learning_time=learned - collected,
-                    losses=losses,
-                    learning_rate=self.alg.learning_rate,
-                    action_std=self.alg.get_policy().output_std.detach(),
-                    rnd_weight=rnd.weight if (rnd := getattr(self.alg, "rnd", None)) else None,
+                self.current_learning_iteration = done = iteration + 1
+                stats = self._report(losses, collected - begin, learned - collected, first, total)
+                self._owes_evaluation = self._solved_check.should_evaluate(
+                    done, stats.mean_step_reward
                 )
-                self._notify("on_iteration", stats)
-                self.logger.report_broken_losses(stats)
-                done = iteration + 1
-                check, step_reward = self._solved_check, stats.mean_step_reward
-                self._owes_evaluation = check.should_evaluate(done, step_reward)
                 rescue.check_folder(self.save, f"model_{iteration}.pt")
                 # Before the evaluation, which may take longer than there is time for.
                 is_saving = self._owes_evaluation or stop.requested or done == total
-                if self._run_folder is not None and (
-                    is_saving or iteration % self.cfg["save_interval"] == 0
-                ):
+                if is_saving or self._is_save_due(iteration):
                     self._save_checkpoint()
                     rescue.learned = None
                 is_solved = self._owes_evaluation and self._evaluate_solved(done, stop)
@@ -290,9 +241,29 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 )  # fmt: skip
             self.stop_reason = reason or "finished"
 
+    def _check_settings(self) -> None:
+        """Check what only training needs: runners are also built to play, in any number of environments."""
+        if not getattr(self.alg, "teacher_loaded", True):
+            raise ValueError(
+                "Distillation: expected a teacher, got none; use --agent.teacher-checkpoint, or "
+                "load_teacher."
+            )
+        check_mini_batches(self.env.num_envs, self.cfg)
+        # Weights and gradients, and usually two moments.
+        check_memory(
+            "agent trained weights",
+            self._num_weights,
+            8,
+            self.device,
+            "smaller hidden_dims",
+            usual=2.0,
+        )
+
     @contextlib.contextmanager
     def _session(self) -> Generator[StopRequest]:
-        """Prepare training within the block: log files, signal handlers, threads."""
+        """Prepare training within the block: progress, log files, signal handlers, threads."""
+        if in_notebook() and not any(observer.shows_progress for observer in self.observers):
+            self.observers.append(NotebookProgress(ProgressCfg.of_runner(self)))
         self.logger.init_logging_writer()
         self.stop_reason, self.stop_signal = "failed", None
         try:
@@ -373,6 +344,28 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         )  # fmt: skip
         return None
 
+    def _rollout(self, observations: TensorDict) -> TensorDict:
+        """Step the environments with the exploring policy; return the observations of the next action."""
+        num_steps = self.cfg["num_steps_per_env"]
+        checks_nan = self.cfg.get("check_for_nan", True)
+        uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
+        with torch.inference_mode(), using_torch_threads(self._num_collecting_threads):
+            self._watch.start()
+            for _ in range(num_steps):
+                actions = self.alg.act(observations).to(self.env.device)
+                observations, rewards, dones, extras = self.env.step(actions)
+                self._watch.update()
+                if checks_nan:
+                    check_nan(observations, rewards, dones)
+                observations = observations.to(self.device)
+                rewards, dones = rewards.to(self.device), dones.to(self.device)
+                credited, infos = self._bootstrapped(observations, rewards, extras)
+                self.alg.process_env_step(observations, credited, dones, infos)
+                intrinsic = self.alg.intrinsic_rewards if uses_rnd else None
+                self.logger.process_env_step(rewards, dones, extras, intrinsic)
+            self._watch.check(num_steps)
+        return observations
+
     def _bootstrapped(
         self, observations: TensorDict, rewards: torch.Tensor, extras: dict[str, Any]
     ) -> tuple[torch.Tensor, dict[str, Any]]:
@@ -403,11 +396,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         rewards = rewards.index_add(0, ids, (self.alg.gamma * values).to(rewards.dtype))
         return rewards, {**extras, "time_outs": time_outs.index_fill(0, ids, False)}
 
-    def _update(self) -> dict[str, float]:
-        """Update the networks from the rollout; return the losses.
+    def _update(self, observations: TensorDict) -> dict[str, float]:
+        """Update the networks from the rollout, which ended with `observations`; return the losses.
 
         rsl_rl's distillation resets the hidden state of a recurrent teacher; here it is restored.
         """
+        with torch.inference_mode():
+            self.alg.compute_returns(observations)
         algorithm: Any = self.alg
         teacher = getattr(algorithm, "teacher", None)
         if teacher is None or not teacher.is_recurrent:
@@ -418,6 +413,31 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         # Updates write to these, and the teacher's were created in inference mode.
         algorithm.last_hidden_states = (algorithm.last_hidden_states[0], None)
         return losses
+
+    def _report(
+        self,
+        losses: dict[str, float],
+        collection_time: float,
+        learning_time: float,
+        first: int,
+        total: int,
+    ) -> IterationStats:
+        """Write the statistics of the finished iteration, and tell the observers."""
+        rnd = getattr(self.alg, "rnd", None)
+        stats = self.logger.finish_iteration(
+            iteration=self.current_learning_iteration - 1,
+            first_iteration=first,
+            total_iterations=total,
+            collection_time=collection_time,
+            learning_time=learning_time,
+            losses=losses,
+            learning_rate=self.alg.learning_rate,
+            action_std=self.alg.get_policy().output_std.detach(),
+            rnd_weight=None if rnd is None else rnd.weight,
+        )
+        self._notify("on_iteration", stats)
+        self.logger.report_broken_losses(stats)
+        return stats
 
     def _snapshot(self) -> dict[str, Any]:
         """Return the entries of a checkpoint; further training does not change them."""
@@ -667,6 +687,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """True if the checkpoint of this iteration is in the run folder."""
         return self._written is not None and self._written[0] == self._checkpoint_path
 
+    def _is_save_due(self, iteration: int) -> bool:
+        # Runners without a folder need no interval.
+        return self._run_folder is not None and iteration % self.cfg["save_interval"] == 0
+
     def _save_checkpoint(self) -> None:
         """Write a checkpoint and the policy as ONNX into the run folder."""
         if self._run_folder is None:
@@ -796,14 +820,15 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         # Algorithms that learn concurrently with the physics set the number of threads.
         if (num_threads := getattr(self.alg, "num_threads", None)) is not None:
             return num_threads
-        parameters = sum(
-            parameter.numel()
-            for group in self.alg.optimizer.param_groups
-            for parameter in group["params"]
-        )
         rows = self.env.num_envs * self.cfg["num_steps_per_env"]
         parts = self.cfg["algorithm"].get("num_mini_batches", 1)
-        return torch_threads(parameters, rows // max(int(parts), 1))
+        return torch_threads(self._num_weights, rows // max(int(parts), 1))
+
+    @property
+    def _num_weights(self) -> int:
+        """Number of trained weights."""
+        groups = self.alg.optimizer.param_groups
+        return sum(weight.numel() for group in groups for weight in group["params"])
 
     def _notify(self, event: str, *args: Any) -> None:
         for observer in self.observers:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -21,7 +21,7 @@ _FINAL = ("final_obs", "final_info")
 
 
 class VectorEnvError(AssertionError):
-    """Violation of Gymnasium's vector interface; the message lists all faults."""
+    """Violation of Gymnasium's vector interface."""
 
 
 def check_vector_env(
@@ -40,98 +40,78 @@ def check_vector_env(
         action_limit: Bound of random actions if the space is unbounded.
 
     Raises:
-        VectorEnvError: the interface is violated; the message lists all faults.
+        VectorEnvError: the interface is violated; the message names the first fault.
         ValueError: no episode ended.
     """
-    check = _Check(env, action_limit)
-    first = check.run(steps, seed)
-    if not check.faults:
-        if not any(ended.any() for ended in check.ends):
-            raise ValueError(
-                f"No episode ended in {steps} steps, so resets were not checked; use more steps or "
-                "shorter episodes."
-            )
-        second = check.run(steps, seed)
-        for step, (one, other) in enumerate(zip(first, second, strict=True)):
-            if not _same(one, other):
-                check.fault("seed", f"two runs with seed {seed} differ from step {step} on")
-                break
-    if check.faults:
-        found = "\n".join(f"- {kind}: {text}" for kind, text in check.faults.items())
-        raise VectorEnvError(f"{env} breaks Gymnasium's vector interface:\n{found}")
+    for name in ("observation_space", "action_space"):
+        expected = batch_space(getattr(env, f"single_{name}"), env.num_envs)
+        if (found := getattr(env, name)) != expected:
+            _fail(env, name, f"expected batch_space(single_{name}, {env.num_envs}), got {found}")
+    first = _Run(env, steps, seed, action_limit)
+    if first.num_ends == 0:
+        raise ValueError(
+            f"No episode ended in {steps} steps, so resets were not checked; use more steps or shorter "
+            "episodes."
+        )
+    second = _Run(env, steps, seed, action_limit)
+    for step, (one, other) in enumerate(zip(first.returned, second.returned, strict=True)):
+        if not _same(one, other):
+            _fail(env, "seed", f"two runs with seed {seed} differ from step {step} on")
 
 
-class _Check:
-    """Runs of one environment, and the first fault of each kind."""
+def _fail(env: VectorEnv, kind: str, text: str) -> NoReturn:
+    raise VectorEnvError(f"{env} breaks Gymnasium's vector interface:\n- {kind}: {text}")
 
-    def __init__(self, env: VectorEnv, action_limit: float) -> None:
-        self.env = env
-        self.faults: dict[str, str] = {}
-        self.ends: list[np.ndarray] = []
-        self._limit = action_limit
-        # First four results of the last step, copies of them, and mask of ended episodes.
-        self._returned: Any = None
-        self._copies: Any = None
-        self._ended = np.zeros(0, dtype=bool)
+
+class _Run:
+    """Run of an environment from a seed, which checks each result."""
+
+    def __init__(self, env: VectorEnv, steps: int, seed: int, limit: float) -> None:
+        """Reset and step `env`; keep copies of all results in `returned`."""
+        self.env, self.num_ends = env, 0
         # True for each end with equal observations, by kind: terminations and time-outs.
         self._stale: dict[bool, list[bool]] = defaultdict(list)
         self._unreset: dict[bool, list[bool]] = defaultdict(list)
         self._still = False
         self._mode = env.metadata.get("autoreset_mode")
         if not isinstance(self._mode, AutoresetMode):
-            self.fault(
+            self._fail(
                 "autoreset_mode",
                 f"expected metadata['autoreset_mode'] of {list(AutoresetMode)}, got {self._mode!r}",
             )
-        for name in ("observation_space", "action_space"):
-            expected = batch_space(getattr(env, f"single_{name}"), env.num_envs)
-            if (found := getattr(env, name)) != expected:
-                self.fault(
-                    name, f"expected batch_space(single_{name}, {env.num_envs}), got {found}"
-                )
-
-    def fault(self, kind: str, text: str) -> None:
-        self.faults.setdefault(kind, text)
-
-    def run(self, steps: int, seed: int) -> list[Any]:
-        """Reset and step; return copies of all results, an empty list after a fault."""
-        if self.faults:
-            return []
-        actions = self.env.action_space
+        actions = env.action_space
         if isinstance(actions, gymnasium.spaces.Box):
             # Samples of unbounded spaces are too large for a robot.
             low, high = (
                 np.clip(end, actions.low, actions.high).astype(actions.dtype)
-                for end in (-self._limit, self._limit)
+                for end in (-limit, limit)
             )
             actions = gymnasium.spaces.Box(low, high, dtype=actions.dtype)
         actions.seed(seed)
-        self.ends = []
-        returned = [self._reset(seed=seed)]
+        self.returned = [self._reset(seed=seed)]
         for _ in range(steps):
-            if self.faults:
-                return []
             if self._mode is AutoresetMode.DISABLED and self._ended.any():
                 self._reset_ended()
-            returned.append(self._step(actions.sample()))
+            self.returned.append(self._step(actions.sample()))
         # Equal observations are faults only if observations change from step to step.
         if any(map(all, self._stale.values())) and not self._still:
-            self.fault("stale final_obs", "it is the observation before the last step")
+            self._fail("stale final_obs", "it is the observation before the last step")
         if any(map(all, self._unreset.values())) and not self._still:
-            self.fault("reset", "observations after an end are those before the reset")
-        return returned
+            self._fail("reset", "observations after an end are those before the reset")
+
+    def _fail(self, kind: str, text: str) -> NoReturn:
+        _fail(self.env, kind, text)
 
     def _reset(self, **kwargs: Any) -> Any:
         """Reset, check the results, and return a copy of the observations."""
         result = self.env.reset(**kwargs)
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
-            self.fault("reset", f"expected (observations, infos), got {_kind(result)}")
-            return None
-        for text in _mismatches(self.env.observation_space, result[0], "observations"):
-            self.fault("observations", f"{text}, in reset")
+            self._fail("reset", f"expected (observations, infos), got {_kind(result)}")
+        self._check_value(self.env.observation_space, result[0], "observations")
         self._check_masks(result[1])
-        self._returned = result[:1]
-        self._copies = copy.deepcopy(self._returned)
+        # First four results of the last step, copies of them, and mask of ended episodes.
+        self._last = result[:1]
+        self._copies = copy.deepcopy(self._last)
         self._ended = np.zeros(self.env.num_envs, dtype=bool)
         return self._copies[0]
 
@@ -139,15 +119,12 @@ class _Check:
         """Reset environments with ended episodes, and check that only their observations change."""
         ended, before = self._ended, self._rows(self._copies[0])
         self._reset(options={"reset_mask": ended.copy()})
-        if self.faults:
-            return
-        after = self._rows(self._copies[0])
-        for row in range(self.env.num_envs):
-            same = _same(before[row], after[row])
+        for row, after in enumerate(self._rows(self._copies[0])):
+            same = _same(before[row], after)
             if ended[row]:
                 self._unreset[True].append(same)
             elif not same:
-                self.fault(
+                self._fail(
                     "reset_mask",
                     "expected resets only of environments with a true mask, got one with a false mask",
                 )
@@ -156,62 +133,58 @@ class _Check:
         """Step, check the results, and return copies of the first four."""
         result = self.env.step(action)
         if not (isinstance(result, tuple) and len(result) == 5 and isinstance(result[4], dict)):
-            self.fault("step", f"expected five results, the last a dict, got {_kind(result)}")
-            return None
-        if not _same(self._returned, self._copies):
-            self.fault("aliasing", "the next step modifies returned arrays; return copies")
-        self._check_step(result)
-        if self.faults:
-            return None
+            self._fail("step", f"expected five results, the last a dict, got {_kind(result)}")
+        if not _same(self._last, self._copies):
+            self._fail("aliasing", "the next step modifies returned arrays; return copies")
+        observations, rewards, terminated, truncated, infos = result
+        self._check_value(self.env.observation_space, observations, "observations")
+        for name, value, kind in (
+            ("rewards", rewards, "f"),
+            ("terminations", terminated, "b"),
+            ("truncations", truncated, "b"),
+        ):
+            self._check_array(name, value, kind)
+        self._check_masks(infos)
         before, ended_before = self._rows(self._copies[0]), self._ended
-        self._returned, infos = result[:4], result[4]
-        self._copies = copy.deepcopy(self._returned)
+        self._last = result[:4]
+        self._copies = copy.deepcopy(self._last)
         after = self._rows(self._copies[0])
         rewards, terminated, truncated = map(_array, self._copies[1:])
         self._ended = ended = terminated | truncated
-        self.ends.append(ended)
+        self.num_ends += int(ended.sum())
         untouched = np.flatnonzero(~(ended | ended_before))
         self._still |= any(_same(before[row], after[row]) for row in untouched)
         if self._mode is AutoresetMode.SAME_STEP:
             self._check_final(infos, ended, terminated, before, after)
         elif "final_obs" in infos:
-            self.fault("final_obs", f"expected none with {self._mode}, got infos['final_obs']")
+            self._fail("final_obs", f"expected none with {self._mode}, got infos['final_obs']")
         if self._mode is AutoresetMode.NEXT_STEP:
             # The step after the end of an episode only resets.
             if (rewards[ended_before] != 0).any():
-                self.fault(
+                self._fail(
                     "autoreset", "expected reward 0 in the step after an end, which only resets"
                 )
             if (ended & ended_before).any():
-                self.fault("autoreset", "an episode ends in the step that only resets")
+                self._fail("autoreset", "an episode ends in the step that only resets")
         return self._copies
 
     def _rows(self, observations: Any) -> list[Any]:
         """Return the observation of each environment."""
         return list(iterate(self.env.observation_space, observations))
 
-    def _check_step(self, result: tuple[Any, ...]) -> None:
-        observations, rewards, terminated, truncated, infos = result
-        for text in _mismatches(self.env.observation_space, observations, "observations"):
-            self.fault("observations", f"{text}, in step")
-        shape = (self.env.num_envs,)
-        for name, value, kinds in (
-            ("rewards", rewards, "f"),
-            ("terminations", terminated, "b"),
-            ("truncations", truncated, "b"),
-        ):
-            expected = "floats" if kinds == "f" else "bool"
-            if not isinstance(value, np.ndarray | torch.Tensor):
-                self.fault(name, f"expected an array {shape} of {expected}, got {_kind(value)}")
-                continue
-            array = _array(value)
-            if array.shape != shape or array.dtype.kind not in kinds:
-                self.fault(
-                    name, f"expected {shape} of {expected}, got {array.shape} of {array.dtype}"
-                )
-            elif kinds == "f" and not np.isfinite(array).all():
-                self.fault(name, "expected finite numbers")
-        self._check_masks(infos)
+    def _check_value(self, space: gymnasium.Space, value: Any, name: str) -> None:
+        for text in _mismatches(space, value, name):
+            self._fail(name, text)
+
+    def _check_array(self, name: str, value: Any, kind: str) -> None:
+        shape, expected = (self.env.num_envs,), "floats" if kind == "f" else "bool"
+        if not isinstance(value, np.ndarray | torch.Tensor):
+            self._fail(name, f"expected an array {shape} of {expected}, got {_kind(value)}")
+        array = _array(value)
+        if array.shape != shape or array.dtype.kind != kind:
+            self._fail(name, f"expected {shape} of {expected}, got {array.shape} of {array.dtype}")
+        if kind == "f" and not np.isfinite(array).all():
+            self._fail(name, "expected finite numbers")
 
     def _check_masks(self, infos: dict[str, Any], path: str = "infos") -> None:
         """Check that each entry has a mask, and one value per environment.
@@ -228,13 +201,13 @@ class _Check:
                 and tuple(mask.shape) == (self.env.num_envs,)
                 and _array(mask).dtype == np.bool_
             ):
-                self.fault(
+                self._fail(
                     "infos", f"expected a mask ({self.env.num_envs},) bool '_{name}' of {entry}"
                 )
             if isinstance(value, dict):
                 self._check_masks(value, entry)
             elif len(getattr(value, "shape", ())) < 1 or value.shape[0] != self.env.num_envs:
-                self.fault("infos", f"expected an array of {self.env.num_envs} values in {entry}")
+                self._fail("infos", f"expected an array of {self.env.num_envs} values in {entry}")
 
     def _check_final(
         self,
@@ -249,25 +222,20 @@ class _Check:
             mask = infos.get(f"_{name}")
             shown = np.zeros_like(ended) if mask is None else _array(mask)
             if not np.array_equal(shown, ended):
-                self.fault(
+                self._fail(
                     name,
                     f"expected infos['_{name}'] to be true for ended episodes "
                     f"({np.flatnonzero(ended).tolist()}), got {np.flatnonzero(shown).tolist()}",
                 )
-                return
         if not ended.any():
             return
         final = infos["final_obs"]
         if not (isinstance(final, np.ndarray) and final.dtype == object):
-            self.fault("final_obs", f"expected an object array, got {_kind(final)}")
-            return
+            self._fail("final_obs", f"expected an object array, got {_kind(final)}")
         if any(final[row] is not None for row in np.flatnonzero(~ended)):
-            self.fault("final_obs", "expected None for episodes that did not end")
-        single = self.env.single_observation_space
+            self._fail("final_obs", "expected None for episodes that did not end")
         for row in np.flatnonzero(ended):
-            for text in _mismatches(single, final[row], "final_obs"):
-                self.fault("final_obs", text)
-                return
+            self._check_value(self.env.single_observation_space, final[row], "final_obs")
             self._stale[bool(terminated[row])].append(_same(final[row], before[row]))
             self._unreset[bool(terminated[row])].append(_same(final[row], after[row]))
 

@@ -19,7 +19,7 @@ from mjlab.managers import (
     TerminationTermCfg,
 )
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg, RslRlVecEnvWrapper
-from mjlab.rl.divergence import DivergedError, RolloutWatch
+from mjlab.rl.rollout_watch import DivergedError, RolloutWatch
 from mjlab.rl.run_logger import TrainingObserver
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
