@@ -251,15 +251,6 @@ def test_classes_declare_model_fields_too(env):
     assert env.sim.recomputed == [RecomputeLevel.set_const_fixed]
 
 
-def test_a_function_may_learn_its_field_from_its_params(env):
-    def randomize(env, env_ids, field):
-        pass
-
-    randomize.model_fields = lambda params: (params["field"],)
-    cfg = EventTermCfg(func=randomize, mode="startup", params={"field": "geom_rgba"})
-    assert EventManager({"a": cfg}, env).domain_randomization_fields == ("geom_rgba",)
-
-
 def test_the_field_of_older_releases_is_accepted():
     with pytest.warns(FutureWarning, match="domain_randomization"):
         cfg = EventTermCfg(func=Calls(), mode="startup", domain_randomization=True)

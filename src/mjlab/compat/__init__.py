@@ -422,6 +422,14 @@ def translate_older(cfg: Any) -> None:
     ]
     if feet:
         pkgutil.resolve_name("mjlab.compat.older_terms:use_older_foot_terms")(cfg, feet)
+    for event in cfg.events.values():
+        func = getattr(event, "func", None)
+        path = getattr(func, "__module__", ""), getattr(func, "__name__", "")
+        if path == (_OLDER, "randomize_field"):
+            _warn_once(
+                "randomize_field is deprecated; use the function of the field in mjlab.envs.mdp.dr."
+            )
+            pkgutil.resolve_name(f"{_OLDER}:use_field_term")(event)
 
 
 FOOT_SCAN = "foot_height_scan"

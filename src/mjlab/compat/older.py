@@ -18,16 +18,16 @@ import torch
 from mjlab.actuator import Actuator, ActuatorCfg
 from mjlab.compat import older_function
 from mjlab.envs.mdp import dr
-from mjlab.envs.mdp.dr._core import BODY, GEOM, ROBOT, SITE, FieldRow, randomize
+from mjlab.envs.mdp.dr._core import BODY, GEOM, ROBOT, SITE, FieldTerm, field_term
 from mjlab.envs.mdp.dr.actuator import selected_actuators
-from mjlab.managers.event_manager import RecomputeLevel, derived_fields
+from mjlab.managers.event_manager import RecomputeLevel
 from mjlab.utils.indexing import as_ids
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.envs.mdp.actions import DifferentialIKAction
-    from mjlab.managers import SceneEntityCfg
+    from mjlab.managers import EventTermCfg, SceneEntityCfg
     from mjlab.sensor import ContactSensor
 
 
@@ -68,32 +68,20 @@ class FieldSpec:
     valid_axes: list[int] | None = None
 
 
-# Legacy randomization of quaternions, component by component.
-_QUATERNIONS = {
-    row.name: row
-    for row in (
-        FieldRow("body_iquat", "body_iquat", BODY, recompute=RecomputeLevel.set_const),
-        FieldRow("geom_quat", "geom_quat", GEOM),
-        FieldRow("site_quat", "site_quat", SITE),
-    )
-}
-_FIELDS = (
-    "dof_armature",
-    "dof_frictionloss",
-    "dof_damping",
-    "jnt_range",
-    "jnt_stiffness",
-    "body_mass",
-    "body_ipos",
-    "geom_friction",
-    "geom_pos",
-    "geom_rgba",
-    "site_pos",
-    "qpos0",
+# Randomization of quaternions, component by component.
+_COMPONENTS = "Randomize the components of quaternions."
+body_iquat = field_term(
+    __name__, "body_iquat", BODY, _COMPONENTS, recompute=RecomputeLevel.set_const
 )
-_ROWS = {
-    **{field: getattr(dr, field).row for field in _FIELDS},
-    **_QUATERNIONS,
+geom_quat = field_term(__name__, "geom_quat", GEOM, _COMPONENTS)
+site_quat = field_term(__name__, "site_quat", SITE, _COMPONENTS)
+_FIELDS = (
+    "dof_armature dof_frictionloss dof_damping jnt_range jnt_stiffness body_mass body_ipos "
+    "geom_friction geom_pos geom_rgba site_pos qpos0"
+)
+_FIELD_TERMS = {
+    **{field: getattr(dr, field) for field in _FIELDS.split()},
+    **{"body_iquat": body_iquat, "geom_quat": geom_quat, "site_quat": site_quat},
 }
 
 
@@ -105,44 +93,32 @@ def randomize_field(
     ranges: Any,
     distribution: str = "uniform",
     operation: str = "abs",
-    asset_cfg: SceneEntityCfg | None = None,
+    asset_cfg: SceneEntityCfg = ROBOT,
     axes: list[int] | None = None,
     shared_random: bool = False,
 ) -> None:
     """Randomize the model field called `field`. Replaced by one function per field.
 
-    Expands the field if no term has declared it, and recomputes dependent constants. Raises
-    `ValueError` for an unknown field.
+    Expands the field if no event has declared it. Raises `ValueError` for an unknown field.
     """
-    row = _row(field)
-    env.sim.expand_model_fields(row.fields)
-    randomize(
-        row,
-        env,
-        env_ids,
-        ranges,
-        ROBOT if asset_cfg is None else asset_cfg,
-        distribution,
-        operation,
-        axes,
-        shared_random,
-    )
+    term = _field_term(field)
+    env.sim.expand_model_fields(term.row.fields)
+    term(env, env_ids, ranges, asset_cfg, distribution, operation, axes, shared_random)
 
 
-def _row(field: str) -> FieldRow:
-    if field not in _ROWS:
-        raise ValueError(f"randomize_field: unknown field {field!r}. Available: {sorted(_ROWS)}.")
-    return _ROWS[field]
+def use_field_term(event: EventTermCfg) -> None:
+    """Replace `randomize_field` by the function of its field, which declares what it changes."""
+    event.func = _field_term(event.params.pop("field"))
+    event.params.setdefault("operation", "abs")
 
 
-def _fields_of(params: dict[str, Any]) -> tuple[str, ...]:
-    row = _row(params["field"])
-    return (*row.fields, *derived_fields(row.recompute))
+def _field_term(field: str) -> FieldTerm:
+    if field not in _FIELD_TERMS:
+        raise ValueError(
+            f"randomize_field: unknown field {field!r}. Available: {sorted(_FIELD_TERMS)}."
+        )
+    return _FIELD_TERMS[field]
 
-
-# Callables, because the fields of the event depend on its parameters.
-setattr(randomize_field, "model_fields", _fields_of)  # noqa: B010
-setattr(randomize_field, "recompute", lambda params: _row(params["field"]).recompute)  # noqa: B010
 
 randomize_effort_limits = older_function(
     dr.effort_limits, "randomize_effort_limits", "mjlab.envs.mdp.dr.effort_limits"

@@ -112,7 +112,9 @@ class EventManager(TermFunctionSwitches, TermListManager):
     @property
     def domain_randomization_fields(self) -> tuple[str, ...]:
         """Model fields that need per-environment values, without duplicates."""
-        fields = (field for cfg in self._term_cfgs for field in declared(cfg, "model_fields", ()))
+        fields = (
+            field for cfg in self._term_cfgs for field in getattr(cfg.func, "model_fields", ())
+        )
         return tuple(dict.fromkeys(fields))
 
     @property
@@ -244,15 +246,5 @@ def derived_fields(level: RecomputeLevel) -> tuple[str, ...]:
 
 def combined_level(cfgs: Iterable[EventTermCfg]) -> RecomputeLevel:
     """Return the recompute level that covers all events of `cfgs`."""
-    levels = (declared(cfg, "recompute", RecomputeLevel.none) for cfg in cfgs)
+    levels = (getattr(cfg.func, "recompute", RecomputeLevel.none) for cfg in cfgs)
     return RecomputeLevel(functools.reduce(operator.or_, levels, 0))
-
-
-def declared(cfg: EventTermCfg, name: str, default: Any) -> Any:
-    """Return a declaration of an event's function: `model_fields` or the level `recompute`.
-
-    Functions whose fields depend on their parameters declare a callable:
-    `function.model_fields(params)`.
-    """
-    value = getattr(cfg.func, name, default)
-    return value(cfg.params) if callable(value) else value

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from mjlab import compat
 from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.compat import older
 from mjlab.envs import mdp
@@ -16,21 +18,20 @@ from mjlab.managers.scene_entity_config import SceneEntityCfg
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning")
 
 
-def test_randomize_field_as_an_event_declares_and_recomputes(make_world: Any) -> None:
+def test_randomize_field_becomes_the_function_of_its_field(make_world: Any) -> None:
     world = make_world()
-    feet = SceneEntityCfg("robot", body_names=("foot",))
-    manager = world.events(
-        com=EventTermCfg(
-            func=mdp.randomize_field,
-            mode="startup",
-            params={
-                "asset_cfg": feet,
-                "field": "body_ipos",
-                "ranges": {0: (0.1, 0.1)},
-                "operation": "add",
-            },
-        ),
+    event = EventTermCfg(
+        func=mdp.randomize_field,
+        mode="startup",
+        params={
+            "asset_cfg": SceneEntityCfg("robot", body_names=("foot",)),
+            "field": "body_ipos",
+            "ranges": {0: (0.1, 0.1)},
+            "operation": "add",
+        },
     )
+    compat.translate_older(SimpleNamespace(observations={}, rewards={}, events={"com": event}))
+    manager = world.events(com=event)
     assert {"body_ipos", "dof_invweight0"} <= set(manager.domain_randomization_fields)
     before = world.sim.model.dof_invweight0.clone()
     manager.apply("startup")
