@@ -86,21 +86,20 @@ def test_the_run_says_its_profile_and_holds_its_settings(profiled):
     assert params(profiled, "env")["decimation"] == 3
 
 
-def shorten_episodes(env_cfg) -> None:
+def shorten_episodes(env_cfg, rl_cfg) -> None:
     env_cfg.episode_length_s = 0.1
 
 
-def easier_in_training(env_cfg, rl_cfg) -> None:
+def ease(env_cfg, rl_cfg) -> None:
     env_cfg.episode_length_s = 5.0
-    rl_cfg.evaluation.prepare_env = shorten_episodes
 
 
-def test_policies_are_shown_as_evaluations_have_it_and_not_as_the_profile_trains():
+def test_only_training_is_eased():
     registry.register_mjlab_task(
         "Test-Easier",
         registry._tasks[TASK].env_cfg,
         rl_cfg=registry._tasks[TASK].rl_cfg,
-        profiles={"cpu": easier_in_training},
+        profiles={"cpu": registry.Profile(shorten_episodes, ease)},
     )
     assert (
         parse_train_flags("Test-Easier", ["--profile", "cpu"], "train").env.episode_length_s == 5.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any
@@ -41,10 +42,6 @@ def eases(env: Any, env_ids: Any) -> None:
     env.eased = True
 
 
-def leave_out(cfg: Any) -> None:
-    cfg.curriculum.pop("eases", None)
-
-
 def start(env: Any) -> tuple[float, float]:
     return env.unwrapped.event_manager.get_term_cfg("reset_slider").params["position_range"]
 
@@ -71,7 +68,7 @@ def make() -> Iterator[Callable[..., RslRlVecEnvWrapper]]:
 def agent() -> dict[str, Any]:
     cfg = asdict(load_rl_cfg(TASK))
     cfg["num_steps_per_env"] = STEPS
-    cfg["evaluation"] = {"num_episodes": 4, "prepare_env": leave_out}
+    cfg["evaluation"] = {"num_episodes": 4}
     for model in ("actor", "critic"):
         cfg[model]["hidden_dims"] = (4,)
     return cfg
@@ -126,6 +123,9 @@ def test_what_only_eases_training_is_off(make, tmp_path):
         cfg.curriculum["eases"] = CurriculumTermCfg(func=eases)
 
     runner = MjlabOnPolicyRunner(make(2, edit), agent(), str(tmp_path))
+    as_evaluated = copy.deepcopy(runner.env.cfg)
+    del as_evaluated.curriculum["eases"]
+    runner.evaluate_in(as_evaluated)
     runner.learn(2)
     curricula = runner.evaluate().curricula
     assert not any("weight" in name or "eased" in name for name in curricula)
@@ -134,7 +134,7 @@ def test_what_only_eases_training_is_off(make, tmp_path):
     )
     weight = runner.env.unwrapped.reward_manager.get_term_cfg("smooth_reward").weight
     assert weight == 0.25
-    full = make_evaluation_env(runner.env, 2, 3, leave_out)
+    full = make_evaluation_env(runner.env, 2, 3, as_evaluated)
     load_curricula(full, runner.env.unwrapped.curriculum_state())
     assert full.unwrapped.reward_manager.get_term_cfg("smooth_reward").weight == 1.0
     full.close()
@@ -248,10 +248,9 @@ def test_each_column_of_a_terrain_is_even(make):
 
 
 def test_rough_terrain_of_a_robot_is_evaluated_on_all_levels():
-    cfg: Any = load_env_cfg("Mjlab-Velocity-Rough-Unitree-Go1", profile="cpu")
+    cfg = load_env_cfg("Mjlab-Velocity-Rough-Unitree-Go1", profile="cpu", evaluate=True)
     cfg.scene.num_envs, cfg.seed = 10, 1
     cfg.sim.engine = "native"
-    load_rl_cfg("Mjlab-Velocity-Rough-Unitree-Go1", profile="cpu").evaluation.prepare_env(cfg)  # ty: ignore
     env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
     env.unwrapped.common_step_counter = 5000 * 24
     result = evaluate_policy(env, lambda _: torch.zeros(10, 12), max_steps=2)
@@ -272,11 +271,10 @@ def test_rough_terrain_of_a_robot_is_evaluated_on_all_levels():
     ],
 )
 def test_profiles_ease_training_only(task, eased):
-    cfg: Any = load_env_cfg(task, profile="cpu")
+    cfg = load_env_cfg(task, profile="cpu")
     cfg.scene.num_envs, cfg.seed, cfg.sim.engine = 2, 1, "native"
     env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
-    prepare = load_rl_cfg(task, profile="cpu").evaluation.prepare_env
-    evaluated = make_evaluation_env(env, 3, 1, prepare)
+    evaluated = make_evaluation_env(env, 3, 1, load_env_cfg(task, profile="cpu", evaluate=True))
     state = env.unwrapped.curriculum_state()
     load_curricula(evaluated, state)
     assert {name for name, edits in state["config_edits"].items() if edits} == eased

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 import types
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -620,15 +620,12 @@ def test_a_trigger_evaluates_without_a_goal(make_runner, tmp_path: Path):
     assert (seconds > 0.0).all()
 
 
-def shorten_episodes(env_cfg) -> None:
-    env_cfg.episode_steps = 1
-
-
 def test_evaluations_may_be_harder_than_training(make_runner):
     cfg = {"num_episodes": 4, "min_interval": 1, "solved_below": {"mean_length": 3.0}}
     as_trained = make_runner(evaluation=asdict(EvaluationCfg(**cfg)))
     as_trained.learn(2)
-    prepared = make_runner(evaluation=asdict(EvaluationCfg(prepare_env=shorten_episodes, **cfg)))
+    prepared = make_runner(evaluation=asdict(EvaluationCfg(**cfg)))
+    prepared.evaluate_in(replace(prepared.env.cfg, episode_steps=1))
     prepared.learn(2)
     assert prepared.last_evaluation.mean_length < as_trained.last_evaluation.mean_length
     assert prepared.env.cfg.episode_steps == as_trained.env.cfg.episode_steps

@@ -10,12 +10,13 @@ from mjlab.cli.flags import parse_flags
 from mjlab.rl.config import RslRlDistillationRunnerCfg
 from mjlab.runs import Run, newest_run, runs_in
 from mjlab.runs.folder import write_info, write_params
-from mjlab.runs.settings import apply_settings, differences, typed_settings
+from mjlab.runs.settings import apply_settings, differences, typed_settings, with_changes
 from mjlab.scripts.train import TrainConfig
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.os import to_plain
 
 GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
+G1 = "Mjlab-Velocity-Flat-Unitree-G1"
 CARTPOLE = "Mjlab-Cartpole-Balance"
 CALF = "std_walking..*(FR|FL|RR|RL)_calf_joint.*"
 
@@ -145,3 +146,33 @@ def test_odd_parameters_do_not_stop_a_command(tmp_path):
     for text in ("obs_groups: {actor: 5}", "obs_groups: {actor: [[1]]}"):
         (tmp_path / "params" / "agent.yaml").write_text(text)
         Run(tmp_path, CARTPOLE).check_terms(cfg, ("actor", "critic"))
+
+
+def test_changes_reach_what_both_configs_have():
+    registered, changed = (load_env_cfg(G1, profile="cpu") for _ in range(2))
+    changed.rewards["foot_slip"].weight = -3.0
+    changed.rewards["linear"].weight = 7.0
+    changed.rewards["mine"] = changed.rewards["alive"]
+    del changed.rewards["soft_landing"]
+    changed.rewards["foot_clearance"] = None  # ty: ignore
+    changed.terminations["fell_over"].params["limit_angle"] = 0.5
+    changed.scene.sensors[0].debug_vis = False
+    changed.scene.entities["robot"].collisions = ()
+    cfg = load_env_cfg(G1, profile="cpu", evaluate=True)
+    made = with_changes(cfg, changed, registered)
+    assert list(made.rewards) == [*(n for n in cfg.rewards if n != "soft_landing"), "mine"]
+    assert made.rewards["foot_slip"].weight == -3.0
+    assert made.rewards["foot_clearance"] is None
+    assert made.rewards["action_rate_l2"] == cfg.rewards["action_rate_l2"]
+    assert made.terminations["fell_over"].params["limit_angle"] == 0.5
+    assert not made.scene.sensors[0].debug_vis
+    assert made.scene.entities["robot"].collisions == ()
+    assert made.decimation == 4
+    assert to_plain(cfg) == to_plain(load_env_cfg(G1, profile="cpu", evaluate=True))
+
+
+@pytest.mark.parametrize("task", [G1, GO1, CARTPOLE])
+def test_without_changes_a_config_is_the_same(task):
+    registered, cfg = load_env_cfg(task), load_env_cfg(task, play=True)
+    assert to_plain(with_changes(cfg, load_env_cfg(task), registered)) == to_plain(cfg)
+    assert to_plain(with_changes(registered, cfg, registered)) == to_plain(cfg)

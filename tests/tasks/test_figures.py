@@ -84,7 +84,6 @@ _MOTION_EVALUATION = {
     "metrics": _MOTION_ERRORS,
     "units": dict(zip(_MOTION_ERRORS, ("m", "m", "rad/s", "m", "rad"), strict=True)),
     "success": "survival",
-    "prepare_env": "tasks.tracking.mdp.metrics:play_motions_once",
 }
 for variant in ("", "-No-State-Estimation"):
     DEVIATIONS[f"Mjlab-Tracking-Flat-Unitree-G1{variant}"] = {

@@ -17,6 +17,7 @@ from mjlab.rl.learners import with_learner
 from mjlab.scene import SceneCfg
 from mjlab.tasks import registry
 from mjlab.tasks.registry import (
+    Profile,
     TaskImportError,
     UnknownProfileError,
     UnknownTaskError,
@@ -108,6 +109,32 @@ def test_a_profile_edits_copies_of_both_configs_also_of_those_to_play_with():
         assert load_rl_cfg("Test", profile="cpu").num_steps_per_env == 3
     assert load_env_cfg("Test").decimation == env.decimation == 1
     assert load_rl_cfg("Test") == rl == RslRlOnPolicyRunnerCfg()
+
+
+def test_only_training_is_eased():
+    def ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+        env_cfg.scene.num_envs, env_cfg.episode_length_s = 64, 9.0
+        rl_cfg.max_iterations = 4
+
+    env = env_cfg(1)
+    profiles = {"cpu": Profile(small, ease)}
+    register_mjlab_task("Test", env, env_cfg(2), RslRlOnPolicyRunnerCfg(), profiles=profiles)
+    trained, played = load_env_cfg("Test", profile="cpu"), load_env_cfg("Test", True, "cpu")
+    evaluated = load_env_cfg("Test", profile="cpu", evaluate=True)
+    assert (trained.decimation, evaluated.decimation, played.decimation) == (6, 6, 7)
+    assert (trained.episode_length_s, trained.scene.num_envs) == (9.0, 64)
+    assert replace(evaluated, decimation=1) == env
+    assert load_rl_cfg("Test", profile="cpu").max_iterations == 4
+
+
+def test_evaluations_may_have_other_configs():
+    def make(evaluate: bool = False) -> ManagerBasedRlEnvCfg:
+        return env_cfg(3 if evaluate else 1)
+
+    register_mjlab_task("Test", make, rl_cfg=RslRlOnPolicyRunnerCfg())
+    assert load_env_cfg("Test").decimation == 1
+    assert load_env_cfg("Test", play=True).decimation == 1
+    assert load_env_cfg("Test", evaluate=True).decimation == 3
 
 
 def test_profiles_are_listed_without_importing_them():

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
 from itertools import pairwise
@@ -40,6 +41,11 @@ if TYPE_CHECKING:
     from mjlab.runs import Run
 
 C = TypeVar("C")
+
+# Terms that are switched off are None.
+warnings.filterwarnings(
+    "ignore", r"The field `.*` is annotated with type `dict\[str, mjlab\.", module="tyro"
+)
 
 CPU_PROFILE = "cpu"
 """Name of the profile that `train` suggests on a CPU."""

@@ -19,7 +19,7 @@ from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import Learner
 from mjlab.runs import Checkpoint, Run, newest_run, resolve_checkpoint, runs_in
 from mjlab.runs.run import Purpose, RunCfg, registered_env_cfg
-from mjlab.runs.settings import apply_to_unchanged
+from mjlab.runs.settings import apply_settings, with_changes
 from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_list, print_notice
@@ -186,7 +186,7 @@ def env_cfg_of(
     registered = registered_env_cfg(task, flags.profile, purpose)
     cfg = registered if flags.env is None else copy.deepcopy(flags.env)
     if run is not None and (flags.env is None or (is_fetched and flags.wandb_run_path)):
-        cfg = apply_to_unchanged(cfg, registered, run.settings, "env")
+        cfg = with_changes(apply_settings(registered, run.settings, "env")[0], cfg, registered)
     path = None if checkpoint is None else checkpoint.path
     prepare_env_cfg(task, flags, cfg, path, flags.wandb_run_path if is_fetched else None)
     return cfg

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Generator
+import copy
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +11,8 @@ from mjlab import rl
 from mjlab.cli.flags import options_of
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.rl.learners import learner_of, train_dict
-from mjlab.runs.settings import Settings, apply_settings
-from mjlab.tasks.registry import load_runner_cls, task_source
+from mjlab.runs.settings import Settings, apply_settings, with_changes
+from mjlab.tasks.registry import load_env_cfg, load_runner_cls, task_source
 from mjlab.utils.config_fields import check_fields_exist
 from mjlab.utils.processes import ProcessRank, cores_per_process
 from mjlab.utils.random import seed_rng
@@ -27,10 +27,14 @@ def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank
     """Return the wrapped training environment; with `--video`, record clips into `run_dir`."""
     prepare_torch(device)
     records = cfg.video and rank.is_first
-    with _reserve_learner_core(cfg, device, rank):
-        env: Any = ManagerBasedRlEnv(
-            cfg.env, device=device, render_mode="rgb_array" if records else None
-        )
+    env_cfg, is_sac = copy.copy(cfg.env), learner_of(cfg.agent) == "sac"
+    if env_cfg.sim.num_threads == 0 and is_sac and device == "cpu" and rank.is_alone:
+        # SAC learns during collection, on one core.
+        num_threads = max(1, min(cores_per_process() - 1, env_cfg.scene.num_envs))
+        env_cfg.sim = dataclasses.replace(env_cfg.sim, num_threads=num_threads)
+    env: Any = ManagerBasedRlEnv(
+        env_cfg, device=device, render_mode="rgb_array" if records else None
+    )
     if records:
         from mjlab.utils.wrappers import VideoRecorder
 
@@ -44,30 +48,28 @@ def training_env(cfg: TrainConfig, device: str, run_dir: Path, rank: ProcessRank
     return rl.RslRlVecEnvWrapper(env, clip_actions=cfg.agent.clip_actions)
 
 
-@contextlib.contextmanager
-def _reserve_learner_core(cfg: TrainConfig, device: str, rank: ProcessRank) -> Generator[None]:
-    """Reserve one core for SAC, which learns during collection, in physics built within the block.
+def evaluation_env_cfg(task: str, cfg: TrainConfig, settings: Settings) -> ManagerBasedRlEnvCfg:
+    """Return the environment config of evaluations during training.
 
-    The config is restored afterwards: evaluations do not learn, and use all cores.
+    Config of the task and profile for evaluations, with the changes of the training config `cfg.env`
+    and the `settings` of the run: a typed value counts even if it is that of the profile.
     """
-    sim = cfg.env.sim
-    if sim.num_threads != 0 or learner_of(cfg.agent) != "sac":
-        yield
-        return
-    if device == "cpu" and rank.is_alone:
-        sim.num_threads = max(1, min(cores_per_process() - 1, cfg.env.scene.num_envs))
-    try:
-        yield
-    finally:
-        sim.num_threads = 0
+    evaluated = load_env_cfg(task, profile=cfg.profile, evaluate=True)
+    changed = with_changes(evaluated, cfg.env, load_env_cfg(task, profile=cfg.profile))
+    return apply_settings(changed, settings, "env")[0]
 
 
 def training_runner(
-    task: str, cfg: TrainConfig, env: Any, run_dir: Path, device: str, settings: Settings
+    task: str,
+    cfg: TrainConfig,
+    env: Any,
+    run_dir: Path,
+    device: str,
+    evaluated: ManagerBasedRlEnvCfg,
 ) -> rl.MjlabOnPolicyRunner:
     """Return the runner of `task`, with newly initialized networks.
 
-    Evaluations have the `settings` of the run, also where the profile eases the task for training.
+    `evaluated` is the environment config of evaluations.
 
     Raises:
         ValueError: the agent config does not fit the environments.
@@ -80,17 +82,10 @@ def training_runner(
     # to build the environment.
     seed_rng(cfg.agent.seed)
     runner_kwargs = options_of(task, cfg).runner_kwargs()
-    train_cfg = train_dict(cfg.agent)
-    if (prepare := cfg.agent.evaluation.prepare_env) is not None:
-
-        def prepare_with_settings(env_cfg: ManagerBasedRlEnvCfg) -> None:
-            prepare(env_cfg)
-            vars(env_cfg).update(vars(apply_settings(env_cfg, settings, "env")[0]))
-
-        train_cfg["evaluation"]["prepare_env"] = prepare_with_settings
-    runner = runner_cls(env, train_cfg, str(run_dir), device, **runner_kwargs)
+    runner = runner_cls(env, train_dict(cfg.agent), str(run_dir), device, **runner_kwargs)
     if isinstance(runner, rl.MjlabOnPolicyRunner):
         runner.task = task
+        runner.evaluate_in(evaluated)
     if (source := task_source(task)) is not None and hasattr(runner, "add_git_repo_to_log"):
         runner.add_git_repo_to_log(source)
     return runner

@@ -18,17 +18,15 @@ from mjlab.envs.curriculum_state import (
     managers_of,
 )
 from mjlab.utils.os import to_plain
+from mjlab.utils.setting_paths import OF_THE_MACHINE, is_below
 from mjlab.utils.state import capture_state, restore_state, shape_differences
 from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from mjlab.envs.manager_based_rl_env import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 
-# Settings of the machine and of output; `num_envs` and the engine are compared by themselves.
-_OF_THE_MACHINE = (
-    *("seed", "viewer", "recorders", "scene.num_envs", "sim.engine", "sim.num_threads"),
-    *("sim.nan_guard", "sim.nconmax", "sim.njmax"),
-)
+# Settings that the state does not depend on; `num_envs` and the engine are compared by themselves.
+_WITHOUT_EFFECT = (*OF_THE_MACHINE, "viewer", "recorders", "sim.nconmax", "sim.njmax")
 _PATH = "<path>"
 _BUFFERS = ("episode_length_buf", "_pending_reset", "_nan_resets")
 
@@ -91,7 +89,7 @@ def settings_of(cfg: ManagerBasedRlEnvCfg) -> dict[str, str]:
     return {
         path: text
         for path, text in _leaves(to_plain(cfg), "")
-        if not any(path == own or path.startswith(f"{own}.") for own in _OF_THE_MACHINE)
+        if not is_below(path, _WITHOUT_EFFECT)
     }
 
 

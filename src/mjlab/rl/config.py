@@ -252,11 +252,6 @@ class EvaluationCfg:
     """Success of an episode: a minimum return; `survival`, no termination before the time limit; or
     `module:function`, a function `func(env) -> (num_envs,) bool`, read one step before the end, because the
     environment has reset when the last step returns. None: a return of `solved_return`."""
-    prepare_env: Callable[[Any], None] | None = None
-    """Function that edits, in place, a copy of the training environments' config for evaluation, if
-    training makes the task easier. None: same config. Curriculum terms that the function removes are
-    off, and so are their edits; others are in their present state. Evaluations in training apply it to the config
-    of the run; `evaluate` applies it before flags and `TaskOptions`, which take precedence."""
 
     @staticmethod
     def of(values: EvaluationCfg | Mapping[str, Any] | None) -> EvaluationCfg:

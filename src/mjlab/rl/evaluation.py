@@ -29,6 +29,7 @@ from mjlab.utils.string import suggest
 from mjlab.utils.torch import threads_for_policy
 
 if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
     from mjlab.rl.config import EvaluationCfg
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
 
@@ -321,7 +322,8 @@ class SolvedCheck:
     """Evaluation of the policy during a run, in separate environments, when it may have solved the
     task.
 
-    `last_iteration` is the number of iterations finished at the last evaluation.
+    `last_iteration` is the number of iterations finished at the last evaluation, and `env_cfg` the
+    config of the environments. None: that of the run's environments.
     """
 
     def __init__(self, env: Any, algorithm: Any, cfg: EvaluationCfg, seed: int) -> None:
@@ -347,6 +349,7 @@ class SolvedCheck:
         for bound in self._bounds:
             check_measured(bound, cfg, known)
         self._eval_env: Any = None
+        self.env_cfg: ManagerBasedRlEnvCfg | None = None
         self.last_iteration = 0
 
     def should_evaluate(self, iteration: int, mean_step_reward: float) -> bool:
@@ -399,8 +402,7 @@ class SolvedCheck:
         # Building cannot be stopped, and may take long.
         if is_stopped():
             raise EvaluationStopped
-        cfg = self.cfg
-        return make_evaluation_env(self._env, cfg.num_episodes, seed, cfg.prepare_env)
+        return make_evaluation_env(self._env, self.cfg.num_episodes, seed, self.env_cfg)
 
     def _score(self, env: Any, seed: int, is_stopped: Callable[[], bool]) -> EvaluationResult:
         training: Any = self._env.unwrapped
@@ -486,11 +488,11 @@ def make_evaluation_env(
     env: RslRlVecEnvWrapper,
     num_envs: int,
     seed: int,
-    prepare: Callable[[Any], None] | None = None,
+    cfg: ManagerBasedRlEnvCfg | None = None,
 ) -> RslRlVecEnvWrapper:
-    """Build separate environments with the config of `env`, to evaluate during training.
+    """Build separate environments of `cfg` to evaluate during training in `env`.
 
-    `prepare` edits a copy of the config in place first. Curricula are at their beginning.
+    `cfg` of None is the config of `env`. Curricula are at their beginning.
 
     The state of the random number generators is preserved, so that evaluation does not change the
     course of a run.
@@ -498,12 +500,12 @@ def make_evaluation_env(
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
 
     unwrapped = env.unwrapped
-    has_curricula = hasattr(unwrapped, "curriculum_state")
-    cfg = config_as_built(unwrapped) if has_curricula else copy.deepcopy(unwrapped.cfg)
+    if cfg is None:
+        has_curricula = hasattr(unwrapped, "curriculum_state")
+        cfg = config_as_built(unwrapped) if has_curricula else unwrapped.cfg
+    cfg = copy.deepcopy(cfg)
     cfg.seed = seed
     cfg.scene = dataclasses.replace(cfg.scene, num_envs=num_envs)
-    if prepare is not None:
-        prepare(cfg)
     with preserved_rng():
         eval_env = type(unwrapped)(cfg=cfg, device=unwrapped.device)
         return RslRlVecEnvWrapper(eval_env, clip_actions=env.clip_actions)

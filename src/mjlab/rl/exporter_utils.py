@@ -421,7 +421,7 @@ def load_onnx_policy(
         path: ONNX file.
         env: Wrapped environment.
         device: Torch device of the policy.
-        trained: Training config of the task, whose physics may be another. None: that of `env`.
+        trained: Training config of the task, whose physics a profile may ease. None: that of `env`.
 
     Raises:
         OnnxPolicyError: the policy cannot be run, or not in this environment.
@@ -594,7 +594,7 @@ class OnnxPolicy:
         """Check that observations and actions of `env` are those of the training.
 
         Other differences from what the file records are one warning: physics, delays, gains, ...
-        Timesteps of the physics that `trained`, the training config of the task, prescribes are expected.
+        Timesteps of the physics may also be those of `trained`, the training config of the task.
 
         Raises:
             OnnxPolicyError: observations or actions differ; the message lists all differences.
@@ -609,15 +609,16 @@ class OnnxPolicy:
         ]
         if not differences:
             expected = metadata_texts(get_base_metadata(env, "", self._named_groups))
+            eased = {}
             if trained is not None:
-                cfg = trained.sim.mujoco
-                usual = {"physics_dt": _shortest(cfg.timestep), "decimation": trained.decimation}
-                alike = all(_alike(self.metadata.get(k, ""), str(v)) for k, v in usual.items())
-                expected |= {k: self.metadata[k] for k in usual} if alike else {}
+                eased = {
+                    "physics_dt": trained.sim.mujoco.timestep,
+                    "decimation": trained.decimation,
+                }
             known = {*expected, *_INTERFACE}.intersection(self.metadata).difference(_UNCOMPARED)
             for key in sorted({*known, *_CLOCK}):
                 value, now = self.metadata.get(key, ""), expected.get(key, "")
-                if not _alike(value, now):
+                if not _alike(value, now) and not _alike(value, str(eased.get(key, now))):
                     kind = differences if key in (*_INTERFACE, *_CLOCK) else others
                     kind.append(
                         f"{key}: the policy has {value or 'none'}, the environment {now or 'none'}"

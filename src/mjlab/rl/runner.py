@@ -17,7 +17,7 @@ import time
 import warnings
 from collections.abc import Generator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -69,6 +69,9 @@ from mjlab.utils.processes import process_rank
 from mjlab.utils.random import process_seed, seed_rng, session_seed
 from mjlab.utils.signals import Interrupted, StopRequest
 from mjlab.utils.torch import torch_threads, using_torch_threads
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnvCfg
 
 logger = logging.getLogger(__name__)
 
@@ -488,6 +491,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         return "solved" if code else ""
 
     # Evaluation.
+
+    def evaluate_in(self, env_cfg: ManagerBasedRlEnvCfg) -> None:
+        """Evaluate in environments of `env_cfg`, because the training environments are easier.
+
+        Such as `load_env_cfg(task, profile="cpu", evaluate=True)`.
+        """
+        self._solved_check.env_cfg = env_cfg
 
     def evaluate(self) -> EvaluationResult:
         """Score the policy in separate environments; the run is not affected."""

@@ -85,7 +85,7 @@ def load_policy(
     if checkpoint.path.suffix == ".onnx":
         from mjlab.rl.exporter_utils import load_onnx_policy
 
-        # Environments to evaluate and play undo what a profile simplifies.
+        # The profile may ease the physics of training.
         trained = registered_env_cfg(task, profile, "train")
         return load_onnx_policy(checkpoint.path, env, device, trained)
     from mjlab.rl import MjlabOnPolicyRunner

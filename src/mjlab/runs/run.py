@@ -420,27 +420,13 @@ def _short(value: Any) -> str:
 def registered_env_cfg(task: str, profile: str | None, purpose: Purpose) -> ManagerBasedRlEnvCfg:
     """Return the environment config of `task` for a policy trained under `profile`.
 
-    The number of environments is that of the task without the profile, except to train: a number
-    chosen for learning is unrelated to the number to play.
-
     Args:
         task: Name of the task.
         profile: Profile, or None.
-        purpose: `train` for the training config; `evaluate` for that of evaluations in training;
-            `play` for the play config of the task, with simplifications of the profile undone as in
-            evaluations.
+        purpose: `train` for the training config; `evaluate` for that of evaluations; `play` for the
+            play config of the task.
     """
-    play = purpose == "play"
-    cfg = load_env_cfg(task, play=play, profile=profile)
-    if purpose == "train":
-        return cfg
-    if profile is not None:
-        cfg.scene.num_envs = load_env_cfg(task, play=play).scene.num_envs
-    if purpose == "evaluate" or profile is not None:
-        prepare = load_rl_cfg(task, profile=profile).evaluation.prepare_env
-        if prepare is not None:
-            prepare(cfg)
-    return cfg
+    return load_env_cfg(task, purpose == "play", profile, evaluate=purpose == "evaluate")
 
 
 # Choice among runs.

@@ -18,6 +18,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from mjlab.utils.os import regular_file, to_plain
+from mjlab.utils.setting_paths import OF_THE_MACHINE, is_below
 
 C = TypeVar("C")
 Settings = dict[str, Any]
@@ -33,7 +34,7 @@ class Unread:
 
 # Flags of the machine, the session and its log, and not of the policy.
 _OF_THE_SESSION = (
-    "env.scene.num_envs", "env.seed", "env.sim.engine", "env.sim.num_threads", "env.sim.nan_guard",
+    *(f"env.{path}" for path in OF_THE_MACHINE),
     "agent.seed", "agent.resume", "agent.load_run", "agent.load_checkpoint", "agent.run_name",
     "agent.experiment_name", "agent.logger", "agent.wandb_project", "agent.wandb_tags",
     "agent.neptune_project", "agent.upload_model", "agent.save_git_diff", "agent.upload_git_diff",
@@ -54,7 +55,7 @@ class Difference:
 
 def is_of_the_session(path: str) -> bool:
     """Return True for flags of the machine, the session and its log, and not of the policy."""
-    return any(path == own or path.startswith(f"{own}.") for own in _OF_THE_SESSION)
+    return is_below(path, _OF_THE_SESSION)
 
 
 def differences(cfg: Any, recorded: Any, path: str) -> Iterator[Difference]:
@@ -192,18 +193,31 @@ def apply_settings(cfg: C, settings: Mapping[str, Any], path: str) -> tuple[C, d
     return cfg, left_out
 
 
-def apply_to_unchanged(cfg: C, registered: Any, settings: Mapping[str, Any], path: str) -> C:
-    """Return a copy of `cfg` with the settings below `path`, except those that `cfg` changed.
+def with_changes(cfg: Any, changed: Any, registered: Any) -> Any:
+    """Return a copy of `cfg` with the changes from `registered` to `changed`, in depth.
 
-    Args:
-        cfg: Config.
-        registered: Config of the task.
-        settings: Settings.
-        path: Path of the configs: "env" or "agent".
+    Changed entries of dicts that `cfg` lacks, such as rewards for training only, are left out.
     """
-    changed = {one.path for one in differences(cfg, to_plain(registered), path)}
-    rest = {name: value for name, value in settings.items() if name not in changed}
-    return apply_settings(cfg, rest, path)[0]
+    if is_dataclass(cfg) and type(cfg) is type(changed) is type(registered):
+        made = copy.copy(cfg)
+        for field in dataclasses.fields(cfg):
+            parts = (getattr(one, field.name) for one in (cfg, changed, registered))
+            # Also fields of frozen dataclasses.
+            object.__setattr__(made, field.name, with_changes(*parts))
+        return made
+    if isinstance(cfg, dict) and isinstance(changed, dict) and isinstance(registered, dict):
+        removed = registered.keys() - changed.keys()
+        made = {key: value for key, value in cfg.items() if key not in removed}
+        for key, value in changed.items():
+            if key not in registered:
+                made[key] = copy.deepcopy(value)
+            elif key in made:
+                made[key] = with_changes(made[key], value, registered[key])
+        return made
+    is_list = _holds_configs(cfg) and type(cfg) is type(changed) is type(registered)
+    if is_list and len(cfg) == len(changed) == len(registered):
+        return type(cfg)(map(with_changes, cfg, changed, registered))
+    return copy.deepcopy(cfg if to_plain(changed) == to_plain(registered) else changed)
 
 
 def _updated(holder: Any, declared: Any, parts: list[str], value: Any) -> Any:

@@ -63,8 +63,7 @@ def command(argv: list[str], prog: str) -> None:
 def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False) -> dict[str, Any]:
     """Evaluate a policy of `task`, print the metrics, and return them.
 
-    Environments are those of evaluations in training (`EvaluationCfg.prepare_env`), or those of the
-    training config if the task defines none, because the time limit is part of the task. Their
+    Environments are those of evaluations in training, because the time limit is part of the task. Their
     number is `cfg.num_envs`. If None, it is that of `cfg.env` if it differs from the task or if
     `keep_num_envs`, else `num_episodes`.
     """

@@ -38,7 +38,7 @@ from mjlab.cli.train_config import (
     parse_train_flags,
     report_moved_goal,
 )
-from mjlab.cli.training import training_env, training_runner
+from mjlab.cli.training import evaluation_env_cfg, training_env, training_runner
 from mjlab.compat import older_names
 from mjlab.rl.distributed import (
     ProcessOutput,
@@ -188,14 +188,15 @@ def _train(
                 from mjlab.cli.live import live_view
 
                 view = stack.enter_context(live_view(task, cfg))
+            settings = settings_to_record(task, requested, typed, run)
+            evaluated = evaluation_env_cfg(task, cfg, settings)
             env = training_env(cfg, device, folder.path, rank)
         try:
             print_heading(task, cfg, env, rank)
             if rank.is_first:
                 _report_settings(cfg, run or like)
             with fail_together():
-                settings = settings_to_record(task, requested, typed, run)
-                runner = training_runner(task, cfg, env, folder.path, device, settings)
+                runner = training_runner(task, cfg, env, folder.path, device, evaluated)
                 if checkpoint is not None and run is not None:
                     checkpoint.load_into(runner)
                     _override(runner, typed, run)

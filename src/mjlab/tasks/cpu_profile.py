@@ -5,26 +5,25 @@
 A few cores simulate about 10,000 environment steps per second, a hundredth of a GPU. Therefore batches
 and networks are small, the KL target is larger, and the discount factor is smaller. Further
 simplifications depend on the task: cheaper contacts, longer physics timesteps, delayed pushes, mirror
-images. None of them makes the task easier to pass: evaluations, `evaluate` and `play` undo them.
+images. None of them makes the task easier to pass: evaluations, `evaluate` and `play` use the task's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
+
+from mjlab.tasks.registry import Profile
 
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
-    from mjlab.rl.config import RslRlOnPolicyRunnerCfg
-    from mjlab.tasks.easing import Undo
-    from mjlab.tasks.registry import Profile
-
-    TaskEdit = Callable[[ManagerBasedRlEnvCfg, RslRlOnPolicyRunnerCfg], Undo | None]
+    from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlOnPolicyRunnerCfg
+    from mjlab.tasks.registry import ProfileEdit
 
 
 def cpu_profile(
-    task: TaskEdit | None = None,
+    easing: ProfileEdit | None = None,
     *,
+    policy: ProfileEdit | None = None,
     num_envs: int = 512,
     num_steps_per_env: int = 12,
     hidden_dims: tuple[int, ...] = (128, 64),
@@ -42,9 +41,9 @@ def cpu_profile(
     """Return a profile for PPO training on a few cores.
 
     Args:
-        task: Function that applies task-specific edits to both configs in place; called last. Returns
-            a function that undoes the edits for evaluations, or None. Curriculum terms of
-            `mjlab.tasks.easing` are removed in any case.
+        easing: Task-specific easing, as in `Profile`; called after that of the other arguments.
+        policy: Task-specific settings of the policy, as in `Profile`; called after those of the other
+            arguments.
         num_envs: Number of environments.
         num_steps_per_env: Number of environment steps per iteration.
         hidden_dims: Hidden layer widths of actor and critic.
@@ -63,26 +62,12 @@ def cpu_profile(
             `mjlab.tasks.velocity.symmetry:mirror_left_right`. None: no mirror images.
     """
 
-    def profile(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-        # Imported here, because registering a task must not import torch.
+    # Functions import modules, because registering a task must not import torch.
+    def set_policy(
+        env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg
+    ) -> RslRlBaseRunnerCfg | None:
         from mjlab.rl.config import gaussian_distribution
-        from mjlab.tasks.easing import (
-            coarsen_physics,
-            drop_easing,
-            ease_pushes,
-            simplify_contacts,
-            undo_all,
-        )
 
-        env_cfg.scene.num_envs = num_envs
-        undos = [drop_easing]
-        if physics_steps is not None:
-            undos.append(coarsen_physics(env_cfg, physics_steps))
-        if simple_contacts:
-            undos.append(simplify_contacts(env_cfg))
-        if unpushed_samples is not None:
-            # Curricula count steps of the vectorized environment.
-            ease_pushes(env_cfg, unpushed_samples // num_envs)
         rl_cfg.actor.hidden_dims = rl_cfg.critic.hidden_dims = hidden_dims
         if init_std is not None:
             rl_cfg.actor.distribution_cfg = gaussian_distribution(init_std)
@@ -96,7 +81,21 @@ def cpu_profile(
                 "data_augmentation_func": mirror,
                 "use_data_augmentation": True,
             }
-        undo = None if task is None else task(env_cfg, rl_cfg)
-        rl_cfg.evaluation.prepare_env = undo_all(undos if undo is None else [*undos, undo])
+        return None if policy is None else policy(env_cfg, rl_cfg)
 
-    return profile
+    def ease(
+        env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg
+    ) -> RslRlBaseRunnerCfg | None:
+        from mjlab.tasks.easing import coarsen_physics, ease_pushes, simplify_contacts
+
+        env_cfg.scene.num_envs = num_envs
+        if physics_steps is not None:
+            coarsen_physics(env_cfg, physics_steps)
+        if simple_contacts:
+            simplify_contacts(env_cfg)
+        if unpushed_samples is not None:
+            # Curricula count steps of the vectorized environment.
+            ease_pushes(env_cfg, unpushed_samples // num_envs)
+        return None if easing is None else easing(env_cfg, rl_cfg)
+
+    return Profile(set_policy, ease)

@@ -1,15 +1,12 @@
-"""Curricula and config edits that ease the start of training, for `cpu` profiles, and their inverses.
+"""Curricula and config edits that ease training, for the easing of a `Profile`.
 
 Curriculum terms ease weights, pushes, commands and noise. They edit the live settings of the
-managers and not the config, so flags set the final values, and removing the terms restores the
-task.
+managers and not the config, so flags set the final values.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -17,7 +14,6 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.managers.manager_base import ManagerTermBase
-from mjlab.managers.reward_manager import RewardTermCfg
 from mjlab.utils.noise import (
     ConstantNoiseCfg,
     GaussianNoiseCfg,
@@ -25,9 +21,6 @@ from mjlab.utils.noise import (
     NoiseModelCfg,
     UniformNoiseCfg,
 )
-
-Undo = Callable[[ManagerBasedRlEnvCfg], None]
-"""Function that undoes an edit in the edited config or in a copy of it."""
 
 Ranges = dict[str, tuple[float, float]]
 
@@ -71,92 +64,36 @@ def grow_difficulty(
     env_cfg.curriculum["difficulty"] = CurriculumTermCfg(func=GrowingDifficulty, params=params)
 
 
-def drop_easing(env_cfg: ManagerBasedRlEnvCfg) -> None:
-    """Remove all curriculum terms derived from `Easing` from a config."""
-    for name, term in list(env_cfg.curriculum.items()):
-        func = None if term is None else term.func
-        if isinstance(func, type) and issubclass(func, Easing):
-            del env_cfg.curriculum[name]
-
-
-def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> Undo:
+def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> None:
     """Reduce the decimation to `num_steps` and lengthen the physics timestep to match.
 
-    Histories of contact sensors keep their number of substeps. The returned function does not undo
-    values that flags have changed since.
+    Histories of contact sensors keep their number of substeps.
 
     Raises:
         ValueError: `num_steps` is not less than the decimation.
     """
-    fine = (env_cfg.sim.mujoco.timestep, env_cfg.decimation)
     if not 1 <= num_steps < env_cfg.decimation:
         raise ValueError(
             f"num_steps: expected 1 to {env_cfg.decimation - 1} physics steps, fewer than the task's "
             f"{env_cfg.decimation}, got {num_steps}."
         )
-    coarse = (fine[0] * fine[1] / num_steps, num_steps)
-    env_cfg.sim.mujoco.timestep, env_cfg.decimation = coarse
-
-    def undo(eased: ManagerBasedRlEnvCfg) -> None:
-        if (eased.sim.mujoco.timestep, eased.decimation) == coarse:
-            eased.sim.mujoco.timestep, eased.decimation = fine
-
-    return undo
+    mujoco = env_cfg.sim.mujoco
+    mujoco.timestep = mujoco.timestep * env_cfg.decimation / num_steps
+    env_cfg.decimation = num_steps
 
 
-def simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> Undo:
+def simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> None:
     """Use pyramidal friction cones, and remove torsional and rolling friction of the robot.
 
-    Halves the physics time of a walking Go1. Edits the config in place; returns a function that
-    restores the contacts of the config or of a copy.
+    Halves the physics time of a walking Go1.
     """
-    cone = env_cfg.sim.mujoco.cone
-    collisions = env_cfg.scene.entities[_ROBOT].collisions
-    condim = [collision.condim for collision in collisions]
     env_cfg.sim.mujoco.cone = "pyramidal"
-    for collision in collisions:
+    for collision in env_cfg.scene.entities[_ROBOT].collisions:
         dims = collision.condim
         if isinstance(dims, dict):
             collision.condim = {name: min(dim, _SLIDING) for name, dim in dims.items()}
         elif dims is not None:
             collision.condim = min(dims, _SLIDING)
-
-    def undo(simple: ManagerBasedRlEnvCfg) -> None:
-        simple.sim.mujoco.cone = cone
-        for collision, dims in zip(simple.scene.entities[_ROBOT].collisions, condim, strict=True):
-            collision.condim = dims
-
-    return undo
-
-
-def replace_rewards(env_cfg: ManagerBasedRlEnvCfg, rewards: dict[str, RewardTermCfg]) -> Undo:
-    """Replace the task's reward terms by `rewards`.
-
-    The returned function restores the task's terms. Terms that flags have changed or removed since
-    keep the changed weight or None.
-    """
-    before = dict(env_cfg.rewards)
-    weights = {name: term.weight for name, term in rewards.items() if term is not None}
-    env_cfg.rewards = dict(rewards)
-
-    def undo(eased: ManagerBasedRlEnvCfg) -> None:
-        now, eased.rewards = eased.rewards, copy.deepcopy(before)
-        for name in before.keys() & weights.keys():
-            term = now.get(name)
-            if term is None or term.weight != weights[name]:
-                eased.rewards[name] = term  # ty: ignore
-
-    return undo
-
-
-def undo_all(undos: Sequence[Undo]) -> Undo:
-    """Return a function that calls `undos` in order."""
-
-    def undo(eased: ManagerBasedRlEnvCfg) -> None:
-        for undo_one in undos:
-            undo_one(eased)
-
-    return undo
 
 
 class Easing(ManagerTermBase):
@@ -318,8 +255,7 @@ class GrowingDifficulty(Easing):
         for name, bounds in self._command_ranges(command_name).items():
             if bounds != _scaled(self._ranges[name], self._command_part):
                 self._ranges[name] = bounds
-            cfg: Any = env.command_manager.get_term_cfg(command_name)
-            setattr(cfg.ranges, name, _scaled(self._ranges[name], part))
+            setattr(self._live_ranges(command_name), name, _scaled(self._ranges[name], part))
         self._command_part = part
         if self._pushes is not None:
             part = push_from + (1.0 - push_from) * d
@@ -364,8 +300,11 @@ class GrowingDifficulty(Easing):
     def _command_ranges(self, command_name: str) -> Ranges:
         if self._env.cfg.commands.get(command_name) is None:
             return {}
-        cfg: Any = self._env.command_manager.get_term_cfg(command_name)
-        return {name: tuple(getattr(cfg.ranges, name)) for name in _COMMAND_RANGES}
+        ranges = self._live_ranges(command_name)
+        return {name: tuple(getattr(ranges, name)) for name in _COMMAND_RANGES}
+
+    def _live_ranges(self, command_name: str) -> Any:
+        return vars(self._env.command_manager.get_term_cfg(command_name))["ranges"]
 
     def _noise_cfgs(self, group: str) -> list[tuple[NoiseCfg, dict[str, Any]]]:
         """Return the live noise configs of a group, each with its sizes as built."""

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from mjlab.rl.config import RslRlBaseRunnerCfg
     from mjlab.rl.learners import Learner
 
-    Profile = Callable[[Any, Any], RslRlBaseRunnerCfg | None]
+    ProfileEdit = Callable[[Any, Any], RslRlBaseRunnerCfg | None]
 
 logger = logging.getLogger(__name__)
 # Modules that 1.x releases depend on, and that are an extra here.
@@ -55,23 +55,21 @@ def register_mjlab_task(
     play_env_cfg: ManagerBasedRlEnvCfg | Callable[..., ManagerBasedRlEnvCfg] | str | None = None,
     rl_cfg: RslRlBaseRunnerCfg | Callable[[], RslRlBaseRunnerCfg] | str | None = None,
     runner_cls: type | str | None = None,
-    profiles: Mapping[str, Profile | str] | None = None,
+    profiles: Mapping[str, Profile | ProfileEdit | str] | None = None,
     options: type[TaskOptions] | str | None = None,
 ) -> None:
     """Register a task under `task_id`.
 
     Args:
         task_id: Unique name, such as `Mjlab-Cartpole-Swingup`.
-        env_cfg: Training environment config: a config, a function that returns one, or the name of the
-            function as `module:function`. Names are imported on first use.
-        play_env_cfg: Play environment config, in the forms of `env_cfg`. None: the function of
-            `env_cfg`, called with `play=True` if it has that parameter, or the config of `env_cfg`.
+        env_cfg: Environment config: a config, a function that returns one, or the name of the function
+            as `module:function`. Names are imported on first use. The function is called with
+            `play=True` to play, and with `evaluate=True` for evaluations, if it has that parameter.
+        play_env_cfg: Play environment config, in the forms of `env_cfg`. None: `env_cfg`.
         rl_cfg: Learner config, in the forms of `env_cfg`. None: the default PPO, with a warning.
         runner_cls: Runner class, or its name as `module:Class`. None: the default runner.
-        profiles: Named variants of the configs, such as `cpu` for training on a few cores. Each is a
-            function `(env_cfg, rl_cfg)`, or its name as `module:function`, that edits copies of
-            the task's configs in place. A profile may return the config of another learner to use
-            instead of `rl_cfg`, such as `with_learner(rl_cfg, "sac")` of `mjlab.rl.learners`.
+        profiles: Named variants of the configs, such as `cpu` for training on a few cores: a `Profile`,
+            the function of a profile that eases nothing, or the name of either as `module:name`.
             Command-line flags override profiles. Profiles must keep `rl_cfg.experiment_name`,
             because runs of the task are found by it.
         options: Dataclass of further command-line flags that also prepares the environment config (see
@@ -112,11 +110,12 @@ def list_profiles(task_name: str) -> list[str]:
 
 
 def load_env_cfg(
-    task_name: str, play: bool = False, profile: str | None = None
+    task_name: str, play: bool = False, profile: str | None = None, *, evaluate: bool = False
 ) -> ManagerBasedRlEnvCfg:
-    """Return a copy of the environment config of a task, for training or for `play`.
+    """Return a copy of the environment config of a task: to train, to `play`, or to `evaluate`.
 
-    `profile` is the name of a task profile to apply. None: no profile.
+    `profile` is the name of a task profile to apply, without what eases training if the config is
+    not to train. None: no profile.
 
     Raises:
         UnknownTaskError: unknown task.
@@ -124,13 +123,12 @@ def load_env_cfg(
         TaskImportError: importing the config's function by name failed.
     """
     if profile is not None:
-        return _with_profile(task_name, profile, play)[0]
+        return _with_profile(task_name, profile, play, evaluate)[0]
     task = _find(task_name)
-    if not play:
-        return _make_cfg(task_name, task.env_cfg)
-    if task.play_env_cfg is not None:
+    if play and task.play_env_cfg is not None:
         return _make_cfg(task_name, task.play_env_cfg)
-    return _make_cfg(task_name, task.env_cfg, play=True)
+    purpose = {"play": True} if play else {"evaluate": True} if evaluate else {}
+    return _make_cfg(task_name, task.env_cfg, **purpose)
 
 
 def load_rl_cfg(
@@ -156,7 +154,7 @@ def load_rl_cfg(
     if profile is None:
         cfg = task_cfg = _make_cfg(task_name, _find(task_name).rl_cfg)
     else:
-        _, cfg, task_cfg = _with_profile(task_name, profile, play=False)
+        _, cfg, task_cfg = _with_profile(task_name, profile)
     if learner is None or learner_of(cfg) == learner:
         return cfg
     if learner_of(task_cfg) == learner:
@@ -174,8 +172,8 @@ def load_options_cls(task_name: str) -> type[TaskOptions] | None:
     return _resolve(task_name, _find(task_name).options)
 
 
-def require_profile(task_name: str, profile: str) -> Profile | str:
-    """Return the function of a profile, or its name as registered.
+def require_profile(task_name: str, profile: str) -> Profile | ProfileEdit | str:
+    """Return a profile as registered.
 
     Raises:
         UnknownTaskError: unknown task.
@@ -203,6 +201,25 @@ def task_source(task_name: str) -> str | None:
     """
     module = sys.modules[_find(task_name).package or "__main__"]
     return getattr(module, "__file__", None)
+
+
+# Profiles: alternative settings.
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Alternative settings of a task: edits of its configs, in place, as functions `(env_cfg, rl_cfg)`.
+
+    Each may return the config of another learner to use instead of `rl_cfg`, such as
+    `with_learner(rl_cfg, "sac")` of `mjlab.rl.learners`.
+    """
+
+    policy: ProfileEdit
+    """Sets what the policy is: observations, actions, networks, commands such as a clock. Applied in
+    training, evaluations, play and on the robot."""
+    easing: ProfileEdit | None = None
+    """Eases training: physics, contacts, rewards, terminations, curricula. Applied to the training
+    environments only, after `policy`. None: training is not eased."""
 
 
 # Options: task-specific command-line flags.
@@ -280,7 +297,7 @@ class _Task:
 
 
 def _with_profile(
-    task_name: str, profile: str, play: bool
+    task_name: str, profile: str, play: bool = False, evaluate: bool = False
 ) -> tuple[ManagerBasedRlEnvCfg, RslRlBaseRunnerCfg, RslRlBaseRunnerCfg]:
     """Return copies of both configs of a task with `profile` applied, and the edited task config.
 
@@ -288,11 +305,18 @@ def _with_profile(
     """
     from mjlab.rl.config import RslRlBaseRunnerCfg
 
-    edit = _resolve(task_name, require_profile(task_name, profile))
-    env_cfg, task_cfg = load_env_cfg(task_name, play), load_rl_cfg(task_name)
-    experiment = task_cfg.experiment_name
-    returned = edit(env_cfg, task_cfg)
-    rl_cfg = task_cfg if returned is None else returned
+    found = _resolve(task_name, require_profile(task_name, profile))
+    edits = found if isinstance(found, Profile) else Profile(policy=found)
+    env_cfg = load_env_cfg(task_name, play, evaluate=evaluate)
+    rl_cfg = task_cfg = load_rl_cfg(task_name)
+    num_envs, experiment = env_cfg.scene.num_envs, task_cfg.experiment_name
+    # Copied, because a profile may return a module constant.
+    rl_cfg = copy.deepcopy(edits.policy(env_cfg, rl_cfg)) or rl_cfg
+    if play or evaluate:
+        # A number chosen for learning is unrelated to the number to play.
+        env_cfg.scene.num_envs = num_envs
+    elif edits.easing is not None:
+        rl_cfg = copy.deepcopy(edits.easing(env_cfg, rl_cfg)) or rl_cfg
     owner = f"Profile {profile!r} of task {task_name!r}"
     if not isinstance(rl_cfg, RslRlBaseRunnerCfg):
         raise ValueError(
@@ -306,8 +330,7 @@ def _with_profile(
         )
     for cfg in (env_cfg, rl_cfg):
         check_fields_exist(type(cfg).__name__, cfg)
-    # Copied, because a profile may return a module constant.
-    return env_cfg, rl_cfg if rl_cfg is task_cfg else copy.deepcopy(rl_cfg), task_cfg
+    return env_cfg, rl_cfg, task_cfg
 
 
 def _find(task_name: str) -> _Task:

@@ -13,11 +13,12 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import RslRlVecEnvWrapper
 from mjlab.rl.evaluation import evaluate_policy
 from mjlab.scripts.evaluate import EvaluateConfig, run_evaluate
-from mjlab.tasks.registry import load_rl_cfg
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, play_motions_once
 from mjlab.tasks.tracking.motion_file import read_motion
 from mjlab.tasks.tracking.motion_sources import shipped_motions
 from mjlab.tasks.tracking.options import MotionOptions
+from mjlab.utils.os import to_plain
 
 
 @pytest.fixture
@@ -52,9 +53,16 @@ def test_the_task_measures_these_and_calls_survival_success():
         "mpkpe", "r_mpkpe", "joint_vel_error", "ee_pos_error", "ee_ori_error",
     ]  # fmt: skip
     assert evaluation.success == "survival"
-    assert evaluation.prepare_env is play_motions_once
     # Settings passed by a training run.
     assert asdict(evaluation)["metrics"] == TRACKING_ERRORS
+
+
+@pytest.mark.parametrize("profile", [None, "cpu"])
+@pytest.mark.parametrize("task", [G1, f"{G1}-No-State-Estimation"])
+def test_evaluations_play_motions_once(task, profile):
+    cfg = load_env_cfg(task)
+    play_motions_once(cfg)
+    assert to_plain(load_env_cfg(task, profile=profile, evaluate=True)) == to_plain(cfg)
 
 
 def test_each_episode_is_the_motion_from_its_start_to_its_end(short):

@@ -14,7 +14,7 @@ earn. The profile makes the task easier to learn, not easier to pass:
 - Batches and networks are small, the KL target is larger, and the discount factor is smaller: leg motion has
   its effect within a second.
 
-Evaluations, `play` and `evaluate` undo the first two and run the original task.
+Evaluations, `play` and `evaluate` run the original task, without the first two.
 
 The `blind` profile trains a student without height scan on rough terrain. A teacher with height scan is
 trained first, with the profile `cpu`. The student then learns to imitate the teacher from a history of the
@@ -41,6 +41,7 @@ from mjlab.rl.config import (
 from mjlab.rl.learners import with_learner
 from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.tasks.easing import ease_weight
+from mjlab.tasks.registry import Profile
 
 _STUDENT = "student"
 _SCAN = "height_scan"
@@ -96,7 +97,7 @@ UNITS = {"lin_vel_error": "m/s", "ang_vel_error": "rad/s"}
 # Profiles.
 
 
-def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
     for name, term in env_cfg.rewards.items():
         if term is None or (term.weight >= 0 and name != _AIR_TIME):
             continue
@@ -125,11 +126,12 @@ cpu = cpu_profile(
 """The `cpu` profile of the velocity tasks."""
 
 
-def blind(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslRlBaseRunnerCfg:
-    """Apply `cpu`, add a blind student, and return the distillation config."""
-    cpu(env_cfg, rl_cfg)
+def _add_student(
+    env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg
+) -> RslRlBaseRunnerCfg:
+    """Add a blind student to `cpu`, and return the distillation config."""
+    cpu.policy(env_cfg, rl_cfg)
     student = copy.deepcopy(env_cfg.observations["actor"])
-    assert student is not None
     del student.terms[_SCAN]
     student.history_length = _BLIND_HISTORY
     env_cfg.observations[_STUDENT] = student
@@ -137,3 +139,7 @@ def blind(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> RslR
     cfg = with_learner(rl_cfg, "distillation")
     cfg.obs_groups["student"] = (_STUDENT,)
     return cfg
+
+
+blind = Profile(_add_student, cpu.easing)
+"""The `blind` profile: `cpu`, with a student instead."""

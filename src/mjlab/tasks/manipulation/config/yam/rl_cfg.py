@@ -27,7 +27,6 @@ from mjlab.rl.config import (
     gaussian_distribution,
 )
 from mjlab.tasks.cpu_profile import cpu_profile
-from mjlab.tasks.easing import Undo
 
 _REACH, _NARROW_REACH = "lift", "lift_narrow"
 _NARROW_STD = 0.04
@@ -140,19 +139,14 @@ is at its goal."""
 # Profiles.
 
 
-def _reward_narrow_reach(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo:
+def _reward_narrow_reach(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
     wide = env_cfg.rewards[_REACH]
-    if wide is not None:
-        params: dict[str, Any] = {**wide.params, "reaching_std": _NARROW_STD}
-        env_cfg.rewards[_NARROW_REACH] = RewardTermCfg(
-            func=wide.func, weight=wide.weight, params=params
-        )
+    env_cfg.rewards[_NARROW_REACH] = RewardTermCfg(
+        func=wide.func,
+        weight=wide.weight,
+        params={**wide.params, "reaching_std": _NARROW_STD},
+    )
     _evaluate(env_cfg, rl_cfg)
-
-    def undo(cfg: ManagerBasedRlEnvCfg) -> None:
-        cfg.rewards.pop(_NARROW_REACH, None)
-
-    return undo
 
 
 def _evaluate(

@@ -39,14 +39,15 @@ _FOOT_GEOMS = r"^(left|right)_foot[1-7]_collision$"
 
 
 def unitree_g1_flat_tracking_env_cfg(
-    has_state_estimation: bool = True, play: bool = False
+    has_state_estimation: bool = True, play: bool = False, evaluate: bool = False
 ) -> ManagerBasedRlEnvCfg:
-    """Return the config of the task, for training or `play`.
+    """Return the config of the task, for training, to `play`, or to `evaluate`.
 
     Args:
         has_state_estimation: Let the policy observe its base velocity and the position of the
             reference anchor, which a real robot must estimate.
         play: Start at the first frame without perturbation; no noise, no pushes.
+        evaluate: Play each motion once, from start to end, without pushes.
     """
     cfg = make_tracking_env_cfg()
     action, motion = cfg.actions["joint_pos"], cfg.commands["motion"]
@@ -85,11 +86,13 @@ def unitree_g1_flat_tracking_env_cfg(
         motion.velocity_range = {}
         motion.joint_position_range = (0.0, 0.0)
         motion.sampling_mode = "start"
+    elif evaluate:
+        mdp.metrics.play_motions_once(cfg)
     return cfg
 
 
 def unitree_g1_flat_tracking_no_state_estimation_env_cfg(
-    play: bool = False,
+    play: bool = False, evaluate: bool = False
 ) -> ManagerBasedRlEnvCfg:
     """Return the config of the task without observations of base velocity and anchor position."""
-    return unitree_g1_flat_tracking_env_cfg(has_state_estimation=False, play=play)
+    return unitree_g1_flat_tracking_env_cfg(False, play, evaluate)

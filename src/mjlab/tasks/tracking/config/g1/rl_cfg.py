@@ -10,7 +10,7 @@ balance takes most of the training. The profile makes the task easier to learn, 
 - Batches and networks are smaller, the desired KL divergence is larger, and the discount factor is
   smaller.
 
-Evaluations, `play` and `evaluate` undo the first two and run the original task.
+Evaluations, `play` and `evaluate` run the original task, without the first two.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from mjlab.rl.config import (
     gaussian_distribution,
 )
 from mjlab.tasks.cpu_profile import cpu_profile
-from mjlab.tasks.easing import Easing, Undo, ease_weight
+from mjlab.tasks.easing import Easing, ease_weight
 from mjlab.tasks.tracking.mdp.commands import motion_command
-from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, UNITS, play_motions_once
+from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS, UNITS
 
 _COMMAND = "motion"
 _ACTION_RATE = "action_rate_l2"
@@ -53,7 +53,6 @@ def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
         evaluation=EvaluationCfg(
             metrics=dict(TRACKING_ERRORS),
             units=dict(UNITS),
-            prepare_env=play_motions_once,
             success="survival",
         ),
     )
@@ -62,11 +61,9 @@ def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
 # `cpu` profile.
 
 
-def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo:
-    penalty = env_cfg.rewards[_ACTION_RATE]
-    if penalty is not None:
-        first = _ACTION_RATE_AT_FIRST * penalty.weight
-        ease_weight(env_cfg, _ACTION_RATE, first, _ACTION_RATE_SAMPLES // _NUM_ENVS)
+def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+    first = _ACTION_RATE_AT_FIRST * env_cfg.rewards[_ACTION_RATE].weight
+    ease_weight(env_cfg, _ACTION_RATE, first, _ACTION_RATE_SAMPLES // _NUM_ENVS)
     params = {"command_name": _COMMAND, "steps": _CALM_SAMPLES // _NUM_ENVS}
     env_cfg.curriculum["eased_starts"] = CurriculumTermCfg(func=GrowingStarts, params=params)
     rl_cfg.actor.class_name = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"
@@ -75,7 +72,6 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> Undo
     evaluation.min_interval = 150
     evaluation.solved_below = {"r_mpkpe": 0.05}
     evaluation.solved_above = {"success_rate": 0.9}
-    return play_motions_once
 
 
 class GrowingStarts(Easing):
