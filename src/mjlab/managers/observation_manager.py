@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import torch
@@ -234,7 +232,8 @@ class ObservationManager(ManagerBase):
     def preview(self) -> dict[str, Observation]:
         """Return the result of `compute(update_history=True)` without side effects."""
         terms = _terms(self._groups)
-        with preserved_rng(), changes_undone([*terms, *_stateful_parts(terms)]):
+        parts = [part for term in terms for part in term.stateful_parts()]
+        with preserved_rng(), changes_undone([*terms, *parts]):
             return {name: group.compute(True, None) for name, group in self._groups.items()}
 
     def compute_group(
@@ -289,38 +288,24 @@ class ObservationManager(ManagerBase):
         if update_history and (ids is None or len(ids.unique()) == self.num_envs):
             return {name: group.compute(True, ids) for name, group in groups.items()}
         terms = _terms(groups)
-        parts = _stateful_parts(terms)
-        with contextlib.ExitStack() as stack:
-            if update_history:
-                # Delays and histories fill only rows `ids` by themselves.
-                undone = changes_undone(parts, ids, self.num_envs, generators=False)
-            else:
-                stack.enter_context(preserved_rng())
-                undone = changes_undone([*parts, *terms])
-            before = stack.enter_context(undone)
-            computed = {name: group.compute(update_history, ids) for name, group in groups.items()}
-        # Also those with the same state as before: differences to the last call would be zero.
-        with_state = [part for part, state in zip(parts, before, strict=False) if state]
-        if with_state and (update_history or self._is_current):
-            self._show_last(groups, computed, with_state, ids)
+        parts = [part for term in terms for part in term.stateful_parts()]
+        if update_history:
+            # Delays and histories fill only rows `ids` by themselves.
+            with changes_undone(parts, ids, self.num_envs, generators=False):
+                computed = {name: group.compute(True, ids) for name, group in groups.items()}
+        else:
+            with preserved_rng(), changes_undone([*parts, *terms]):
+                computed = {name: group.compute(False, None) for name, group in groups.items()}
+        if update_history or self._is_current:
+            # Differences to the last call would be zero: show those of the last step.
+            others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+            others[[] if ids is None else ids] = False
+            for name in groups.keys() & self._obs_buffer.keys():
+                now, last = (groups[name].split(obs[name]) for obs in (computed, self._obs_buffer))
+                for key, term in groups[name].terms.items():
+                    if term.stateful_parts():
+                        now[key][others] = last[key][others]
         return computed
-
-    def _show_last(
-        self,
-        groups: Mapping[str, ObservationGroup],
-        computed: dict[str, Observation],
-        with_state: list[Any],
-        ids: torch.Tensor | None,
-    ) -> None:
-        """Put the last values of terms `with_state` into rows other than `ids`."""
-        others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        if ids is not None:
-            others[ids] = False
-        for name in groups.keys() & self._obs_buffer.keys():
-            now, last = (groups[name].split(obs[name]) for obs in (computed, self._obs_buffer))
-            for key, term in groups[name].terms.items():
-                if any(part is own for part in with_state for own in _stateful_parts([term])):
-                    now[key][others] = last[key][others]
 
     def _prepare_terms(self) -> None:
         for name, group_cfg in self._enabled(self.cfg, ObservationGroupCfg):
@@ -457,11 +442,15 @@ class ObservationTerm:
             value = cfg.func(env, **cfg.params)
         self._check_first(value)
         self._raw_shape = value.shape
-        if cfg.clip is not None:
-            self._check_clip(cfg.clip)
-        if cfg.scale is not None:
-            cfg.scale = scale_tensor(self._name, cfg.scale, self._raw_shape, env.device)
         with label_errors(self._name):
+            low, high = (None, None) if cfg.clip is None else cfg.clip[:2]
+            bounded = low is not None and high is not None
+            if bounded and not bool((torch.as_tensor(low) <= high).all()):
+                _warn(
+                    f"{self._name} clip: expected (low, high) with low <= high, got {cfg.clip!r}."
+                )
+            if cfg.scale is not None:
+                cfg.scale = scale_tensor(self._name, cfg.scale, self._raw_shape, env.device)
             self._noise_model = self._build_noise_model()
             self._delay = self._build_delay()
             self._history = None
@@ -547,6 +536,10 @@ class ObservationTerm:
             if part is not None:
                 part.reset(env_ids)
 
+    def stateful_parts(self) -> list[Any]:
+        """Return the objects that a call may change, except for delay and history."""
+        return [part for part in (self.cfg.func, self._noise_model) if is_stateful(part)]
+
     def _call(self) -> torch.Tensor:
         value = self.cfg.func(self._env, **self.cfg.params)
         if not isinstance(value, torch.Tensor):
@@ -574,17 +567,6 @@ class ObservationTerm:
             )
         if value.shape[0] != self._env.num_envs:
             _warn(f"{self._name}: expected shape {expected}, got {tuple(value.shape)}.")
-
-    def _check_clip(self, clip: Any) -> None:
-        expected = (
-            f"{self._name} clip: expected (low, high) with low <= high, or None, got {clip!r}"
-        )
-        bounds = clip[:2] if isinstance(clip, (tuple, list)) else ()
-        numbers = [bound for bound in bounds if isinstance(bound, (Real, torch.Tensor))]
-        if len(bounds) < 2 or not numbers or len(numbers) + list(bounds).count(None) < 2:
-            raise ValueError(f"{expected}.")
-        if len(clip) > 2 or not numbers[0] <= numbers[-1]:
-            _warn(f"{expected}; torch.clamp gets the first two values.")
 
     def _build_noise_model(self) -> Any:
         noise = self.cfg.noise
@@ -623,27 +605,15 @@ def _terms(groups: Mapping[str, ObservationGroup]) -> list[ObservationTerm]:
     return [term for group in groups.values() for term in group.terms.values()]
 
 
-def _stateful_parts(terms: Sequence[ObservationTerm]) -> list[Any]:
-    """Return the objects that a call of the terms may change, but for delays and histories."""
-    parts = [part for term in terms for part in (term.cfg.func, term._noise_model)]
-    return [part for part in parts if is_stateful(part)]
-
-
 def scale_tensor(name: str, scale: Any, raw_shape: torch.Size, device: str) -> torch.Tensor:
     """Return `scale` as a tensor that multiplies values of `raw_shape` (num_envs, ...).
 
     Tensors are returned unchanged, other values as float32 on `device`.
 
-    Raises `ValueError` if `scale` is not numeric or does not broadcast to `raw_shape`.
+    Raises `ValueError` if `scale` does not broadcast to `raw_shape`.
     """
-    tensor = scale
-    if not isinstance(scale, torch.Tensor):
-        try:
-            tensor = torch.tensor(scale, dtype=torch.float32, device=device)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(
-                f"{name} scale: expected one number, one per component, or None, got {scale!r}."
-            ) from error
+    is_tensor = isinstance(scale, torch.Tensor)
+    tensor = scale if is_tensor else torch.tensor(scale, dtype=torch.float32, device=device)
     try:
         # The scale must not expand the observation.
         fits = torch.broadcast_shapes(tensor.shape, raw_shape) == raw_shape
