@@ -451,6 +451,14 @@ _FIELDS = {
 }  # fmt: skip
 
 
+_TARGETS = {"position": 0, "velocity": 1, "effort": 2}
+
+
+def target_field(transmission: TransmissionType, command: CommandField) -> str | None:
+    """Return the EntityData field of a kind of target, or None."""
+    return _FIELDS[transmission][_TARGETS[command]]
+
+
 def read_command(data: EntityData, transmission: TransmissionType, columns: Columns) -> ActuatorCmd:
     """Return command and feedback of `columns`; views of live data if `columns` is a slice."""
     names = _FIELDS[transmission]
@@ -511,6 +519,7 @@ class SharedDelay:
 
     actuators: list[Actuator]
     line: DelayBuffer
+    has_delay = True
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
         """Write the controls of all actuators; see `Actuator.apply_controls`."""

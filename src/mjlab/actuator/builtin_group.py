@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
-from mjlab.actuator.actuator import Actuator, ActuatorGroup, DirectActuator, acts_like
+from mjlab.actuator.actuator import (
+    Actuator,
+    ActuatorGroup,
+    DirectActuator,
+    acts_like,
+    target_field,
+)
 from mjlab.actuator.builtin_actuator import (
     BuiltinMotorActuator,
     BuiltinMuscleActuator,
     BuiltinPositionActuator,
     BuiltinVelocityActuator,
 )
+from mjlab.utils.indexing import Columns, EnvIds, as_columns, read_columns, write_columns
+
+if TYPE_CHECKING:
+    from mjlab.entity.data import EntityData
 
 BuiltinActuatorType = (
     BuiltinMotorActuator | BuiltinMuscleActuator | BuiltinPositionActuator | BuiltinVelocityActuator
@@ -28,14 +38,50 @@ class BuiltinActuatorGroup(ActuatorGroup):
     `compute` are not in the group.
     """
 
+    # Field of targets, columns to read in it, and columns of the controls to write, without delay.
+    _copies: list[tuple[str, Columns, Columns]] = field(default_factory=list)
+
     @staticmethod
     def process(
         actuators: Sequence[Actuator],
     ) -> tuple[BuiltinActuatorGroup, tuple[Actuator, ...]]:
         """Return a group of the actuators without computation, and all other actuators in order."""
-        members = [actuator for actuator in actuators if acts_like(actuator, DirectActuator)]
+        members = [
+            actuator
+            for actuator in actuators
+            if isinstance(actuator, DirectActuator)
+            and acts_like(actuator, DirectActuator)
+            # Sites have no position or velocity targets; `compute` returns zeros for these.
+            and all(target_field(actuator.transmission_type, f) for f in actuator.command_fields)
+        ]
         others = tuple(actuator for actuator in actuators if actuator not in members)
         return BuiltinActuatorGroup(members), others
+
+    def initialize(self, num_envs: int, device: str) -> None:
+        """Create the delay lines, and plan the copies. The actuators must be initialized."""
+        super().initialize(num_envs, device)
+        self._writers = [writer for writer in self._writers if writer.has_delay]
+        self._copies = [
+            (
+                str(target_field(actuator.transmission_type, command)),
+                as_columns(actuator.target_ids.tolist(), device),
+                as_columns(ctrl_ids.tolist(), device),
+            )
+            for actuator in self._actuators
+            if not actuator.has_delay
+            for command, ctrl_ids in zip(
+                actuator.command_fields,
+                actuator.global_ctrl_ids.split(len(actuator.target_ids)),
+                strict=True,
+            )
+        ]
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
+        """See `ActuatorGroup`."""
+        for name, source, columns in self._copies:
+            values = read_columns(getattr(data, name), source)
+            write_columns(data.data.ctrl, columns, values, env_ids)
+        super().apply_controls(data, env_ids)
 
     def _delay_settings(self, actuator: Any) -> tuple[Any, ...]:
         own = None if actuator.shares_delay else id(actuator)
