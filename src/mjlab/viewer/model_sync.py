@@ -9,61 +9,32 @@ import mujoco
 import numpy as np
 
 VIEWER_MODEL_FIELDS = frozenset(
-    {
+    (
         "qpos0",
         # Appearance and shape of geoms, materials and sites.
-        "geom_dataid",
-        "geom_matid",
-        "geom_rgba",
-        "geom_size",
-        "geom_rbound",
-        "geom_aabb",
-        "geom_pos",
-        "geom_quat",
-        "mat_rgba",
-        "mat_texid",
-        "mat_texrepeat",
-        "mat_emission",
-        "mat_specular",
-        "mat_shininess",
-        "mat_reflectance",
-        "site_pos",
-        "site_quat",
-        "site_size",
-        "site_rgba",
+        *("geom_dataid", "geom_matid", "geom_rgba", "geom_size", "geom_rbound", "geom_aabb"),
+        *("geom_pos", "geom_quat", "mat_rgba", "mat_texid", "mat_texrepeat", "mat_emission"),
+        *("mat_specular", "mat_shininess", "mat_reflectance"),
+        *("site_pos", "site_quat", "site_size", "site_rgba"),
         # Collision filters: geoms that an environment lacks must not show contacts.
-        "geom_contype",
-        "geom_conaffinity",
+        *("geom_contype", "geom_conaffinity"),
         # Frames and inertia of bodies, for inertia boxes and the center of mass.
-        "body_pos",
-        "body_quat",
-        "body_ipos",
-        "body_iquat",
-        "body_mass",
-        "body_inertia",
-        "body_subtreemass",
+        *("body_pos", "body_quat", "body_ipos", "body_iquat"),
+        *("body_mass", "body_inertia", "body_subtreemass"),
         # Cameras and lights.
-        "cam_pos",
-        "cam_quat",
-        "cam_fovy",
-        "cam_intrinsic",
-        "cam_pos0",
-        "cam_poscom0",
-        "cam_mat0",
-        "light_pos",
-        "light_dir",
-        "light_pos0",
-        "light_poscom0",
-        "light_dir0",
-        "light_active",
-        "light_castshadow",
-        "light_ambient",
-        "light_diffuse",
-        "light_specular",
-        "light_attenuation",
-        "light_cutoff",
-        "light_exponent",
-    }
+        *(
+            "cam_pos",
+            "cam_quat",
+            "cam_fovy",
+            "cam_intrinsic",
+            "cam_pos0",
+            "cam_poscom0",
+            "cam_mat0",
+        ),
+        *("light_pos", "light_dir", "light_pos0", "light_poscom0", "light_dir0", "light_active"),
+        *("light_castshadow", "light_ambient", "light_diffuse", "light_specular"),
+        *("light_attenuation", "light_cutoff", "light_exponent"),
+    )
 )
 """Per-environment model fields that affect rendering; viewers copy only these."""
 
