@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -39,6 +40,9 @@ class FakeEnv:
         self.step_dt = 0.5
         self.max_episode_length = cfg.episode_steps
         self.action_manager = SimpleNamespace(total_action_dim=2)
+        self.command_manager = self.termination_manager = SimpleNamespace(active_terms=[])
+        self.scene = SimpleNamespace(terrain=None)
+        self.curricula_in_use, self.curricula_held = dict, nullcontext
         self.common_step_counter = 0
         self.position = torch.zeros(self.num_envs, 2)
         self.drift = torch.zeros(self.num_envs, 2)

@@ -17,7 +17,7 @@ import math
 import operator
 import time
 from collections.abc import Callable, Collection, Generator, Mapping
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -115,23 +115,22 @@ def evaluate_policy(
     start = time.perf_counter()
     rounds, levels = [], set()
     success_func = None if isinstance(success, str | int | float) else success
-    terrain = getattr(getattr(env.unwrapped, "scene", None), "terrain", None)
+    unwrapped = env.unwrapped
+    terrain = unwrapped.scene.terrain
     with (
         threads_for_policy(policy, env.num_envs, env.device),
         torch.inference_mode(),
         _preserved_state(env),
     ):
-        show: Any = getattr(env.unwrapped, "curricula_in_use", dict)
-        curricula = show()
+        curricula = unwrapped.curricula_in_use()
         for first in range(0, num_episodes, env.num_envs):
             count = min(env.num_envs, num_episodes - first)
             if terrain is not None and terrain.terrain_levels is not None:
                 terrain.spread_levels(first)
                 levels |= set(terrain.terrain_levels[:count].tolist())
             # Commands that take turns, such as motions, continue their order over all rounds.
-            manager: Any = getattr(env.unwrapped, "command_manager", None)
-            for name in manager.active_terms if manager is not None else ():
-                manager.get_term(name).take_turns_from(first)
+            for name in unwrapped.command_manager.active_terms:
+                unwrapped.command_manager.get_term(name).take_turns_from(first)
 
             def report(running: int, step: int, first: int = first, count: int = count) -> None:
                 if progress is not None:
@@ -549,21 +548,19 @@ def _preserved_state(env: RslRlVecEnvWrapper) -> Generator[None]:
     State that outlives a reset, such as counters of terms, would make evaluations depend on earlier
     ones.
     """
-    unwrapped: Any = env.unwrapped
-    state = unwrapped.state_dict() if hasattr(unwrapped, "state_dict") else None
-    held: Any = getattr(unwrapped, "curricula_held", nullcontext)
+    unwrapped = env.unwrapped
+    state = unwrapped.state_dict()
     try:
-        with held():
+        with unwrapped.curricula_held():
             yield
     finally:
-        if state is not None:
-            try:
-                unwrapped.load_state_dict(state)
-            except ValueError as error:
-                logger.warning(
-                    "The state of the evaluated environments was not restored; another evaluation in "
-                    "them may differ. %s", error,
-                )  # fmt: skip
+        try:
+            unwrapped.load_state_dict(state)
+        except ValueError as error:
+            logger.warning(
+                "The state of the evaluated environments was not restored; another evaluation in them "
+                "may differ. %s", error,
+            )  # fmt: skip
 
 
 def _play_round(
@@ -590,8 +587,8 @@ def _play_round(
     returns, lengths = zeros(torch.float64), zeros(torch.long)
     failed, succeeded = zeros(torch.bool), zeros(torch.bool)
     sums = {name: zeros(torch.float64) for name in metrics}
-    manager: Any = getattr(unwrapped, "termination_manager", None)
-    terminations = {name: zeros(torch.bool) for name in (manager.active_terms if manager else ())}
+    manager = unwrapped.termination_manager
+    terminations = {name: zeros(torch.bool) for name in manager.active_terms}
     reset_policy = getattr(policy, "reset", None)
     observations, _ = env.reset()
     if reset_policy is not None:
