@@ -100,7 +100,7 @@ class RolloutWatch:
     def explaining(self, algorithm: Any) -> Generator[None]:
         """Raise `DivergedError` instead of errors about NaN, and after a block that left NaN or infinity.
 
-        Checked are weights, statistics and moments of the optimizer, as when a checkpoint is loaded.
+        Checked are weights, statistics and moments of the optimizer.
         The cause is a joint that was too fast for the physics timestep, or else the learning. Errors of
         a network with finite weights pass if no joint was too fast.
 
