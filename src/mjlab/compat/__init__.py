@@ -90,7 +90,7 @@ _MESHES = (
 )
 _VISER = {
     **_at("mjviser.conversions", _MESHES),
-    **_at(_OLDER, "rotation_quat_from_vectors"),
+    **_at(_OLDER, "merge_geoms_global mujoco_mesh_to_trimesh rotation_quat_from_vectors"),
 }
 _DEMO = "ensure_asset_downloaded ensure_default_checkpoint ensure_default_motion"
 
@@ -125,10 +125,7 @@ _NAMES: dict[str, dict[str, str]] = {
     "mjlab.utils.os": _at(_OLDER, "update_assets"),
     "mjlab.utils.spec": _at(_OLDER, "disable_collision"),
     "mjlab.viewer.base": _at(_OLDER, "Timer"),
-    "mjlab.viewer.viser": {
-        **_VISER,
-        **_at("mjlab.viewer.viser.conversions", "mujoco_mesh_to_trimesh"),
-    },
+    "mjlab.viewer.viser": _VISER,
     "mjlab.viewer.viser.conversions": _VISER,
 }
 

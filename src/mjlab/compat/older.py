@@ -24,6 +24,9 @@ from mjlab.managers.event_manager import RecomputeLevel
 from mjlab.utils.indexing import as_ids
 
 if TYPE_CHECKING:
+    import mujoco
+    import trimesh
+
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.envs.mdp.actions import DifferentialIKAction
@@ -93,7 +96,7 @@ def randomize_field(
     ranges: Any,
     distribution: str = "uniform",
     operation: str = "abs",
-    asset_cfg: SceneEntityCfg = ROBOT,
+    asset_cfg: SceneEntityCfg | None = None,
     axes: list[int] | None = None,
     shared_random: bool = False,
 ) -> None:
@@ -103,13 +106,15 @@ def randomize_field(
     """
     term = _field_term(field)
     env.sim.expand_model_fields(term.row.fields)
-    term(env, env_ids, ranges, asset_cfg, distribution, operation, axes, shared_random)
+    term(env, env_ids, ranges, asset_cfg or ROBOT, distribution, operation, axes, shared_random)
 
 
 def use_field_term(event: EventTermCfg) -> None:
     """Replace `randomize_field` by the function of its field, which declares what it changes."""
     event.func = _field_term(event.params.pop("field"))
     event.params.setdefault("operation", "abs")
+    if event.params.get("asset_cfg", ROBOT) is None:
+        del event.params["asset_cfg"]
 
 
 def _field_term(field: str) -> FieldTerm:
@@ -213,6 +218,36 @@ def update_assets(
 def get_assets(meshdir: str) -> dict[str, bytes]:
     """Return an empty dict: the robots use primitive shapes instead of mesh files."""
     return {}
+
+
+@older_function
+def merge_geoms_global(
+    mj_model: mujoco.MjModel, mj_data: mujoco.MjData, geom_ids: list[int]
+) -> trimesh.Trimesh:
+    """Return one mesh of the geoms in the world frame, at the body poses of `mj_data`."""
+    import trimesh
+    from mjviser.conversions import merge_geoms
+
+    merged: list[trimesh.Trimesh] = []
+    for geom_id in geom_ids:
+        body_id = mj_model.geom_bodyid[geom_id]
+        pose = np.eye(4)
+        pose[:3, :3] = mj_data.xmat[body_id].reshape(3, 3)
+        pose[:3, 3] = mj_data.xpos[body_id]
+        merged.append(merge_geoms(mj_model, [geom_id]).apply_transform(pose))
+    mesh = trimesh.util.concatenate(merged)
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh
+
+
+@older_function
+def mujoco_mesh_to_trimesh(
+    mj_model: mujoco.MjModel, geom_idx: int, verbose: bool = False
+) -> trimesh.Trimesh:
+    """Return the mesh of a mesh geom, in the geom's frame; `verbose` has no effect."""
+    from mjviser import conversions
+
+    return conversions.mujoco_mesh_to_trimesh(mj_model, geom_idx)
 
 
 @older_function
