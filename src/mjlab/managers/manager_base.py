@@ -176,11 +176,36 @@ class ManagerBase(Tabular, ABC):
             leading: Names of the positional arguments of the call, before the parameters.
         """
         self._resolve_params(name, cfg)
-        if not callable(cfg.func):
-            raise WrongTypeError(
-                f"{self._label(name)} func: expected a function or a class, got {cfg.func!r}."
-            )
-        self._make_callable(name, cfg, leading)
+        with label_errors(self._label(name)):
+            if inspect.isclass(cfg.func):
+                cfg.func = cfg.func(cfg=cfg, env=self._env)
+            self._check_call(cfg, leading)
+        if not inspect.isroutine(cfg.func):
+            # Plain classes have run-time state too.
+            mark_stateful(cfg.func, self.num_envs)
+            self._class_terms[name] = cfg.func
+
+    def _check_call(self, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
+        """Raise the `TypeError` of the call now: events and curricula are called late."""
+        try:
+            # Of a decorated term, that of the decorator's function.
+            signature = inspect.signature(cfg.func, follow_wrapped=False)
+        except ValueError:
+            return  # Compiled functions may have none.
+        try:
+            signature.bind(*leading, **cfg.params)
+        except TypeError as error:
+            raise WrongTypeError(f"params: {error}; the term takes {signature}.") from error
+        for name, parameter in signature.parameters.items():
+            default = parameter.default
+            is_used = name not in cfg.params and isinstance(default, SceneEntityCfg)
+            if is_used and default.selected_kinds():
+                warnings.warn(
+                    f"Parameter {name!r} of {function_name(cfg.func)}: expected a selection in params, "
+                    "got the default, which is not resolved; the term uses all elements.",
+                    UserWarning,
+                    stacklevel=2,
+                )
 
     def _resolve_params(self, name: str, cfg: ManagerTermBaseCfg) -> None:
         """Resolve the `SceneEntityCfg` parameters in the scene, also those within containers."""
@@ -220,56 +245,15 @@ class ManagerBase(Tabular, ABC):
         for key, item in inner:
             self._resolve_selections(f"{label}[{key!r}]", item, is_nested=True)
 
-    def _make_callable(self, name: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Replace a class by its instance, and check that the term takes its parameters."""
-        label = self._label(name)
-        if inspect.isclass(cfg.func):
-            with label_errors(label):
-                cfg.func = cfg.func(cfg=cfg, env=self._env)
-            if not callable(cfg.func):
-                raise WrongTypeError(f"{label}: {type(cfg.func).__name__} has no __call__.")
-        self._check_call(label, cfg, leading)
-        if not inspect.isroutine(cfg.func):
-            # Plain classes have run-time state too.
-            mark_stateful(cfg.func, self.num_envs)
-            self._class_terms[name] = cfg.func
-
-    def _check_call(self, label: str, cfg: ManagerTermBaseCfg, leading: Sequence[str]) -> None:
-        """Raise the `TypeError` of the call now: events and curricula are called late."""
-        try:
-            # Of a decorated term, that of the decorator's function.
-            signature = inspect.signature(cfg.func, follow_wrapped=False)
-        except ValueError:
-            return  # Compiled functions may have none.
-        try:
-            signature.bind(*leading, **cfg.params)
-        except TypeError as error:
-            raise WrongTypeError(f"{label} params: {error}; the term takes {signature}.") from error
-        for name, parameter in signature.parameters.items():
-            default = parameter.default
-            if name in cfg.params or not isinstance(default, SceneEntityCfg):
-                continue
-            if default.selected_kinds():
-                warnings.warn(
-                    f"{label}: expected {name!r} in params, got its default, a selection that is not "
-                    "resolved; the term uses all elements.",
-                    UserWarning,
-                    stacklevel=2,
-                )
-
     def _evaluate(self, name: str, cfg: ManagerTermBaseCfg) -> torch.Tensor:
         """Call a term. Raises unless it returns a tensor with one value per environment."""
         value = cfg.func(self._env, **cfg.params)
-        if not isinstance(value, torch.Tensor):
-            raise WrongTypeError(
-                f"{self._label(name)}: expected a tensor of shape {tuple(self._value_shape)}, got "
-                f"{type(value).__name__}: {value!r}."
-            )
-        if value.shape != self._value_shape:
+        shape = getattr(value, "shape", None)
+        if shape != self._value_shape:
             raise ValueError(
-                f"{self._label(name)}: expected shape {tuple(self._value_shape)}, one value per "
-                f"environment, got {tuple(value.shape)}; reduce the other dimensions (sum, mean, "
-                "squeeze) in the term."
+                f"{self._label(name)}: expected a tensor of shape {tuple(self._value_shape)}, one value "
+                f"per environment, got {repr(value) if shape is None else tuple(shape)}; reduce other "
+                "dimensions (sum, mean, squeeze) in the term."
             )
         return value
 

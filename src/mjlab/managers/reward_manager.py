@@ -131,10 +131,10 @@ class RewardManager(TermFunctionSwitches, TermListManager):
             for name, mean in zip(self._term_names, means, strict=True)
         }
 
-    def _check_call(self, label: str, cfg: Any, leading: Sequence[str]) -> None:
+    def _check_call(self, cfg: Any, leading: Sequence[str]) -> None:
         # Terms of weight 0 are not called.
         if cfg.weight != 0.0:
-            super()._check_call(label, cfg, leading)
+            super()._check_call(cfg, leading)
 
     def get_active_iterable_terms(self, env_idx: int) -> Sequence[tuple[str, Sequence[float]]]:
         """Return the weighted rate of each term in the last step of one environment."""
