@@ -72,6 +72,8 @@ class FakeEnv:
         self.sim = FakeSim()
         self.extras: dict[str, Any] = {}
         self.value = torch.zeros(num_envs)
+        self.diverged = torch.zeros(num_envs, dtype=torch.bool)
+        self.common_step_counter = 0
 
 
 @pytest.fixture

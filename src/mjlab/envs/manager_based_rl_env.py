@@ -295,7 +295,6 @@ class ManagerBasedRlEnv(Tabular):
         self.metrics_manager = (
             MetricsManager(cfg.metrics, self) if cfg.metrics else NullMetricsManager()
         )
-        self.metrics_manager.excluded = self.diverged
         self.recorder_manager = (
             RecorderManager(cfg.recorders, self) if cfg.recorders else NullRecorderManager()
         )
@@ -387,7 +386,7 @@ class ManagerBasedRlEnv(Tabular):
         """
         self._check_no_reset_is_due()
         self._clear_extras()
-        self._process_action(action)
+        self.action_manager.process_action(action)
         self._run_physics()
         self._advance_counters()
         self._compute_terminations()
@@ -459,10 +458,6 @@ class ManagerBasedRlEnv(Tabular):
         for name in ("final_observations", "final_ids"):
             self.extras.pop(name, None)
 
-    def _process_action(self, action: torch.Tensor) -> None:
-        self.action_manager.nonfinite.begin_step(self.diverged, self.common_step_counter + 1)
-        self.action_manager.process_action(action)
-
     def _run_physics(self) -> None:
         self._divergence_log.begin_step()
         substeps = self.cfg.decimation
@@ -492,7 +487,6 @@ class ManagerBasedRlEnv(Tabular):
         """Evaluate the terminations; episodes whose physics diverged terminate."""
         manager = self.termination_manager
         self.diverged.copy_(self.sim.bad_states())
-        manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
         self.reset_buf = manager.compute()
         self.reset_terminated = manager.terminated
         self.reset_time_outs = manager.time_outs
@@ -504,7 +498,6 @@ class ManagerBasedRlEnv(Tabular):
 
     def _compute_rewards(self) -> None:
         manager = self.reward_manager
-        manager.nonfinite.begin_step(self.diverged, self.common_step_counter)
         self.reward_buf = manager.compute(dt=self.step_dt)
         # Covers rewards added by subclasses of the manager.
         self.reward_buf.masked_fill_(self.diverged, 0.0)

@@ -93,9 +93,7 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         self._history = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._action, self._prev_action, self._prev_prev_action = self._history
         self._action_parts = self._action.split(self.action_term_dim, dim=1)
-        self.nonfinite = NonFiniteWatch(
-            ["Action"], "NaN or infinite", "reaches the physics", self.num_envs, self.device
-        )
+        self.nonfinite = NonFiniteWatch(["Action"], "NaN or infinite", "reaches the physics", env)
 
     def tables(self) -> list[Table]:
         """Return the table of the active terms; `targets` are the driven joints, tendons or sites."""
@@ -177,7 +175,8 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         self._prev_action.copy_(self._action)
         self._action.copy_(action)
         # x - x is NaN unless x is finite; a sum of large values may overflow.
-        self.nonfinite.check((self._action - self._action).sum(dim=1).unsqueeze(0))
+        nans = (self._action - self._action).sum(dim=1).unsqueeze(0)
+        self.nonfinite.check(nans, self._env.common_step_counter + 1)
         for term, part in zip(self._terms.values(), self._action_parts, strict=True):
             term.process_actions(part)
 

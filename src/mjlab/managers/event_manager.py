@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 EventMode = Literal["startup", "reset", "interval", "step"]
+_MODES = get_args(EventMode)
 
 # Timers count down in steps; rounding must not delay an event by one step.
 _TIMER_TOLERANCE = 1e-6
@@ -142,7 +143,8 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
         Raises `ValueError` for a missing or disallowed argument, or an unknown mode.
         """
-        check_one_of("Event mode", mode, get_args(EventMode))
+        if mode not in _MODES:
+            check_one_of("Event mode", mode, _MODES)
         if mode in ("interval", "step") and dt is None:
             raise ValueError(f"Event mode {mode!r}: expected dt, the time since the last call (s).")
         if mode == "interval" and env_ids is not None:
@@ -169,8 +171,7 @@ class EventManager(TermFunctionSwitches, TermListManager):
             if not is_empty(due):
                 cfg.func(self._env, due, **cfg.params)
                 fired.append(cfg)
-        level = combined_level(fired)
-        if level != RecomputeLevel.none:
+        if fired and (level := combined_level(fired)) != RecomputeLevel.none:
             self._env.sim.recompute_constants(level, reset_ids)
 
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> dict[str, Any]:
@@ -202,9 +203,9 @@ class EventManager(TermFunctionSwitches, TermListManager):
 
     def _prepare_terms(self) -> None:
         for name, cfg in self.cfg.items():
-            if getattr(cfg, "mode", "step") not in get_args(EventMode):
+            if getattr(cfg, "mode", "step") not in _MODES:
                 warnings.warn(
-                    f"{self._label(name)} mode: expected one of {get_args(EventMode)}, got "
+                    f"{self._label(name)} mode: expected one of {_MODES}, got "
                     f"{cfg.mode!r}; the event never happens.",
                     UserWarning,
                     stacklevel=2,

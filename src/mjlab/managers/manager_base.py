@@ -334,7 +334,8 @@ class BuiltTermsManager(ManagerBase, Generic[TermT]):
 
     def get_term(self, name: str) -> TermT:
         """Return the term `name`. Raises `KeyError`, listing the valid names, if unknown."""
-        check_exists(f"{type(self).__name__} term", name, self._terms, UnknownNameError)
+        if name not in self._terms:
+            check_exists(f"{type(self).__name__} term", name, self._terms, UnknownNameError)
         return self._terms[name]
 
     def _prepare_terms(self) -> None:

@@ -41,7 +41,7 @@ class MetricsManager(TermListManager):
     _cfg_type = MetricsTermCfg
     _title = "metrics"
     _shown = {"reduction": "reduce", "per substep": "per_substep"}
-    _transient = {"_rows", "_substep_rows", "_terms_by_reduce", "excluded"}
+    _transient = {"_rows", "_substep_rows", "_terms_by_reduce"}
 
     def __init__(self, cfg: Mapping[str, MetricsTermCfg | None], env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
@@ -51,8 +51,6 @@ class MetricsManager(TermListManager):
         self._max = torch.full(size, -torch.inf, dtype=torch.float32, device=self.device)
         self._steps = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._last)
-        # Environments whose physics diverged in the step, (num_envs,) bool.
-        self.excluded: torch.Tensor | None = None
         substep_terms = [k for k, c in enumerate(self._term_cfgs) if c.per_substep]
         self._substep_sums = torch.zeros(
             len(substep_terms), self.num_envs, dtype=torch.float32, device=self.device
@@ -92,9 +90,8 @@ class MetricsManager(TermListManager):
         if self._substep_rows:
             self._substep_sums.zero_()
             self._substeps = 0
-        if self.excluded is not None:
-            # Means leave out NaN.
-            self._last.masked_fill_(self.excluded, torch.nan)
+        # Means leave out NaN.
+        self._last.masked_fill_(self._env.diverged, torch.nan)
         self._sum.add_(self._last)
         if "max" in self._terms_by_reduce:
             torch.maximum(self._max, self._last, out=self._max)

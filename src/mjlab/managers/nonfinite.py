@@ -5,10 +5,14 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 
 from mjlab.utils.string import counted
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
 
 logger = logging.getLogger(__name__)
 
@@ -20,38 +24,28 @@ class NonFiniteWatch:
         labels: Name of each term in messages.
         fault: Description of bad values in messages, e.g. "NaN or infinite".
         outcome: Effect of bad values in messages, e.g. "counts as 0".
-        num_envs: Number of environments N.
-        device: Device of the values.
+        env: The environment. Values where its physics diverged are not counted.
 
     Attributes:
         fault: Description of bad values in messages.
-        excluded: Environments whose bad values are not counted, because the physics diverged,
-            (N,) bool.
         count: Number of bad values in the last step, () int64.
     """
 
     def __init__(
-        self, labels: Sequence[str], fault: str, outcome: str, num_envs: int, device: str
+        self, labels: Sequence[str], fault: str, outcome: str, env: ManagerBasedRlEnv
     ) -> None:
         self._labels, self.fault, self._outcome = labels, fault, outcome
+        self._env, terms, device = env, len(labels), env.device
         self._on_cpu = torch.device(device).type == "cpu"
-        self.excluded = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self.count = torch.zeros((), dtype=torch.long, device=device)
-        self._none = self.count
-        self._step = 0
-        terms = len(labels)
+        self.count = self._none = torch.zeros((), dtype=torch.long, device=device)
         # Consecutive steps with a bad value in every environment, by term.
         self._streaks = torch.zeros(terms, dtype=torch.long, device=device)
         self._first_steps = torch.full((terms,), -1, dtype=torch.long, device=device)
         self._first_counts = torch.zeros(terms, dtype=torch.long, device=device)
         self._named: set[int] = set()
 
-    def begin_step(self, excluded: torch.Tensor, step: int) -> None:
-        """Set `excluded`, and the step number for messages."""
-        self.excluded, self._step, self.count = excluded, step, self._none
-
-    def check(self, values: torch.Tensor) -> torch.Tensor | None:
-        """Return a mask of NaN and infinite values of a step, (terms, N).
+    def check(self, values: torch.Tensor, step: int) -> torch.Tensor | None:
+        """Return a mask of NaN and infinite values, (terms, N), of environment step `step`.
 
         On a CPU, None if all values are finite.
         """
@@ -59,15 +53,15 @@ class NonFiniteWatch:
         if self._on_cpu and math.isfinite(values.sum().item()):
             # Not in place: the tensor may have been created in inference mode.
             self._streaks = torch.zeros_like(self._streaks)
+            self.count = self._none
             return None
-        bad = ~torch.isfinite(values)
-        counted = bad & ~self.excluded
-        counts = counted.sum(dim=1)
+        bad, diverged = ~torch.isfinite(values), self._env.diverged
+        counts = (bad & ~diverged).sum(dim=1)
         found = counts > 0
-        everywhere = found & (bad | self.excluded).all(dim=1)
+        everywhere = found & (bad | diverged).all(dim=1)
         self._streaks = (self._streaks + 1) * everywhere
         is_first = found & (self._first_steps < 0)
-        self._first_steps = torch.where(is_first, self._step, self._first_steps)
+        self._first_steps = torch.where(is_first, step, self._first_steps)
         self._first_counts = torch.where(is_first, counts, self._first_counts)
         self.count = counts.sum()
         if self._on_cpu:
@@ -83,7 +77,7 @@ class NonFiniteWatch:
             logger.warning(
                 "%s was %s in %d of %s in step %d and %s; not logged again.",
                 self._labels[k], self.fault, int(self._first_counts[k]),
-                counted(len(self.excluded), "environment"), step, self._outcome,
+                counted(self._env.num_envs, "environment"), step, self._outcome,
             )  # fmt: skip
 
     def streaks(self) -> dict[str, int]:

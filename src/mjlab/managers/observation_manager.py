@@ -222,12 +222,15 @@ class ObservationManager(ManagerBase):
                 "ObservationManager.compute env_ids: expected update_history=True, because env_ids "
                 "fills histories, got False."
             )
+        if self._is_current and not update_history:
+            return self._obs_buffer
+        if update_history and env_ids is None:
+            computed = {name: group.compute(True, None) for name, group in self._groups.items()}
+        else:
+            computed = self._compute(self._groups, update_history, env_ids)
         if update_history:
-            self._obs_buffer = self._compute(self._groups, True, env_ids)
-            self._is_current = True
-        elif not self._is_current:
-            return self._compute(self._groups, False, None)
-        return self._obs_buffer
+            self._obs_buffer, self._is_current = computed, True
+        return computed
 
     def preview(self) -> dict[str, Observation]:
         """Return the result of `compute(update_history=True)` without side effects."""
@@ -475,8 +478,13 @@ class ObservationTerm:
             env_ids: Environments that start an episode: their delay and history are filled with
                 the value; other environments keep theirs. None: a step of all environments.
         """
-        value = self._call()
         cfg = self.cfg
+        value = cfg.func(self._env, **cfg.params)
+        if getattr(value, "shape", None) != self._raw_shape:
+            self._check_shape(value)
+        if value.dtype == torch.float64:
+            # Policies are float32, whatever torch's default dtype.
+            value = value.float()
         if cfg.noise is not None:
             # In-place noise must not change simulation memory.
             value = value.clone()
@@ -540,18 +548,14 @@ class ObservationTerm:
         """Return the objects that a call may change, except for delay and history."""
         return [part for part in (self.cfg.func, self._noise_model) if is_stateful(part)]
 
-    def _call(self) -> torch.Tensor:
-        value = self.cfg.func(self._env, **self.cfg.params)
+    def _check_shape(self, value: Any) -> None:
         if not isinstance(value, torch.Tensor):
             self._check_first(value)
-        elif value.shape != self._raw_shape:
-            logger.warning(
-                "%s: expected shape %s, as before, got %s.",
-                *(self._name, tuple(self._raw_shape), tuple(value.shape)),
-            )
-            self._raw_shape = value.shape
-        # Policies are float32, whatever torch's default dtype.
-        return value.float() if value.dtype == torch.float64 else value
+        logger.warning(
+            "%s: expected shape %s, as before, got %s.",
+            *(self._name, tuple(self._raw_shape), tuple(value.shape)),
+        )
+        self._raw_shape = value.shape
 
     def _check_first(self, value: Any) -> None:
         expected = f"({self._env.num_envs}, ...), with one or more dimensions after the first"

@@ -73,9 +73,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
         labels = [self._label(name) for name in self._term_names]
-        self.nonfinite = NonFiniteWatch(
-            labels, "NaN or infinite", "counts as 0", self.num_envs, self.device
-        )
+        self.nonfinite = NonFiniteWatch(labels, "NaN or infinite", "counts as 0", env)
         # Weighted rates of the last step, not multiplied by dt, (num_envs, terms).
         self._step_reward = self._rates.t()
 
@@ -83,7 +81,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         """Return the reward of a step of `dt` seconds, (num_envs,), in a buffer reused every step.
 
         NaN and infinite term values count as 0 and are logged once per term. All terms are 0 in
-        environments whose physics diverged (`nonfinite.excluded`). Raises `ValueError` if a term
+        environments whose physics diverged. Raises `ValueError` if a term
         returns a shape other than (num_envs,).
         """
         for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
@@ -91,8 +89,8 @@ class RewardManager(TermFunctionSwitches, TermListManager):
                 row.zero_()
                 continue
             torch.mul(self._evaluate(name, cfg), cfg.weight, out=row)
-        self._rates.masked_fill_(self.nonfinite.excluded, 0.0)
-        bad = self.nonfinite.check(self._rates)
+        self._rates.masked_fill_(self._env.diverged, 0.0)
+        bad = self.nonfinite.check(self._rates, self._env.common_step_counter)
         if bad is not None:
             self._rates.masked_fill_(bad, 0.0)
         scale = dt if self._scale_by_dt else 1.0

@@ -50,9 +50,7 @@ class TerminationManager(TermListManager):
         self._rows = list(self._values)
         self._terminated, self._time_outs, self._dones = falses(), falses(), falses()
         labels = [self._label(name) for name in self._term_names]
-        self.nonfinite = NonFiniteWatch(
-            labels, "neither 0 nor 1", "counts as true", self.num_envs, self.device
-        )
+        self.nonfinite = NonFiniteWatch(labels, "neither 0 nor 1", "counts as true", env)
         # Index of a term that returns floats to NaN if the value is neither 0 nor 1, else 0,
         # (num_envs,).
         self._numeric: dict[int, torch.Tensor] = {}
@@ -96,7 +94,7 @@ class TerminationManager(TermListManager):
         if self._numeric:
             none = torch.zeros(self.num_envs, device=self.device)
             rows = [self._numeric.get(k, none) for k in range(len(self._term_names))]
-            self.nonfinite.check(torch.stack(rows))
+            self.nonfinite.check(torch.stack(rows), self._env.common_step_counter)
         return torch.logical_or(self._terminated, self._time_outs, out=self._dones)
 
     def get_term(self, name: str) -> torch.Tensor:
