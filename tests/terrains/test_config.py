@@ -49,13 +49,6 @@ def test_a_preset_registers_under_its_name_once(monkeypatch):
         del ALL_TERRAIN_PRESETS["my_ground"]
 
 
-def test_an_unknown_preset_is_answered_with_the_known_ones():
-    with pytest.raises(KeyError, match="terrain preset 'stares'.*'random_stairs'"):
-        ALL_TERRAIN_PRESETS["stares"]
-    assert ALL_TERRAIN_PRESETS.get("stares") is None
-    assert "stares" not in ALL_TERRAIN_PRESETS
-
-
 def test_the_sets_are_those_of_the_reference():
     for cfg in (ROUGH_TERRAINS_CFG, ALL_TERRAINS_CFG, STAIRS_TERRAINS_CFG):
         assert (cfg.size, cfg.border_width, cfg.num_rows, cfg.add_lights) == ((8, 8), 20, 10, True)

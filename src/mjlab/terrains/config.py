@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 from mjlab.terrains.heightfield_terrains import (
     HfDiscreteObstaclesTerrainCfg,
@@ -26,20 +26,11 @@ from mjlab.terrains.primitive_terrains import (
     BoxTiltedGridTerrainCfg,
 )
 from mjlab.terrains.terrain_generator import SubTerrainCfg, TerrainGeneratorCfg
-from mjlab.utils.errors import UnknownNameError
-from mjlab.utils.string import suggest
 
 _F = TypeVar("_F", bound=Callable[..., SubTerrainCfg])
 
 
-class _Presets(dict[str, Callable[..., SubTerrainCfg]]):
-    """Presets by name."""
-
-    def __missing__(self, name: str) -> NoReturn:
-        raise UnknownNameError(f"Unknown terrain preset {name!r}; {suggest(name, self)}")
-
-
-ALL_TERRAIN_PRESETS: dict[str, Callable[..., SubTerrainCfg]] = _Presets()
+ALL_TERRAIN_PRESETS: dict[str, Callable[..., SubTerrainCfg]] = {}
 """Presets by name: functions that take fields to override."""
 
 
