@@ -14,7 +14,6 @@ from mjlab.managers import (
     CurriculumTermCfg,
     EventTermCfg,
     ObservationGroupCfg,
-    ObservationTermCfg,
     RewardTermCfg,
     SceneEntityCfg,
     TerminationTermCfg,
@@ -23,8 +22,8 @@ from mjlab.scene import SceneCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
 from mjlab.tasks.manipulation import mdp
+from mjlab.tasks.terms import observation
 from mjlab.terrains import TerrainEntityCfg
-from mjlab.utils.noise import UniformNoiseCfg
 from mjlab.viewer import ViewerConfig
 
 # Placeholders for robot-specific names.
@@ -102,27 +101,19 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
 
 # Config sections. `make_lift_cube_env_cfg` copies them.
 
-_TERMS: dict[str, ObservationTermCfg] = {
-    "joint_pos": ObservationTermCfg(
-        func=mdp.joint_pos_rel, noise=UniformNoiseCfg(n_min=-0.01, n_max=0.01)
+_TERMS = {
+    "joint_pos": observation(mdp.joint_pos_rel, 0.01),
+    "joint_vel": observation(mdp.joint_vel_rel, 1.5),
+    "ee_to_cube": observation(
+        mdp.ee_to_object_distance,
+        0.01,
+        object_name="cube",
+        asset_cfg=SceneEntityCfg("robot", site_names=_NO_NAMES),
     ),
-    "joint_vel": ObservationTermCfg(
-        func=mdp.joint_vel_rel, noise=UniformNoiseCfg(n_min=-1.5, n_max=1.5)
+    "cube_to_goal": observation(
+        mdp.object_to_goal_distance, 0.01, object_name="cube", command_name="lift_height"
     ),
-    "ee_to_cube": ObservationTermCfg(
-        func=mdp.ee_to_object_distance,
-        params={
-            "object_name": "cube",
-            "asset_cfg": SceneEntityCfg("robot", site_names=_NO_NAMES),
-        },
-        noise=UniformNoiseCfg(n_min=-0.01, n_max=0.01),
-    ),
-    "cube_to_goal": ObservationTermCfg(
-        func=mdp.object_to_goal_distance,
-        params={"object_name": "cube", "command_name": "lift_height"},
-        noise=UniformNoiseCfg(n_min=-0.01, n_max=0.01),
-    ),
-    "actions": ObservationTermCfg(func=mdp.last_action),
+    "actions": observation(mdp.last_action),
 }
 
 _COMMANDS: dict[str, CommandTermCfg] = {

@@ -20,9 +20,9 @@ from mjlab.managers import (
 )
 from mjlab.scene import SceneCfg
 from mjlab.sim import MujocoCfg, SimulationCfg
+from mjlab.tasks.terms import observation
 from mjlab.tasks.tracking import mdp
 from mjlab.terrains import TerrainEntityCfg
-from mjlab.utils.noise import UniformNoiseCfg
 from mjlab.viewer import ViewerConfig
 
 # Placeholder for robot-specific names.
@@ -92,34 +92,28 @@ def make_tracking_env_cfg() -> ManagerBasedRlEnvCfg:
 # Config sections. `make_tracking_env_cfg` copies them.
 
 
-def _term(func: object, noise: float | None = None, **params: object) -> ObservationTermCfg:
-    """Return an observation term with parameters and uniform noise of half-width `noise`."""
-    uniform = None if noise is None else UniformNoiseCfg(n_min=-noise, n_max=noise)
-    return ObservationTermCfg(func=func, params=params, noise=uniform)
-
-
 _ACTOR_TERMS: dict[str, ObservationTermCfg] = {
-    "command": _term(mdp.generated_commands, command_name="motion"),
-    "motion_anchor_pos_b": _term(mdp.motion_anchor_pos_b, 0.25, command_name="motion"),
-    "motion_anchor_ori_b": _term(mdp.motion_anchor_ori_b, 0.05, command_name="motion"),
-    "base_lin_vel": _term(mdp.builtin_sensor, 0.5, sensor_name="robot/imu_lin_vel"),
-    "base_ang_vel": _term(mdp.builtin_sensor, 0.2, sensor_name="robot/imu_ang_vel"),
-    "joint_pos": _term(mdp.joint_pos_rel, 0.01, biased=True),
-    "joint_vel": _term(mdp.joint_vel_rel, 0.5),
-    "actions": _term(mdp.last_action),
+    "command": observation(mdp.generated_commands, command_name="motion"),
+    "motion_anchor_pos_b": observation(mdp.motion_anchor_pos_b, 0.25, command_name="motion"),
+    "motion_anchor_ori_b": observation(mdp.motion_anchor_ori_b, 0.05, command_name="motion"),
+    "base_lin_vel": observation(mdp.builtin_sensor, 0.5, sensor_name="robot/imu_lin_vel"),
+    "base_ang_vel": observation(mdp.builtin_sensor, 0.2, sensor_name="robot/imu_ang_vel"),
+    "joint_pos": observation(mdp.joint_pos_rel, 0.01, biased=True),
+    "joint_vel": observation(mdp.joint_vel_rel, 0.5),
+    "actions": observation(mdp.last_action),
 }
 # Privileged terms, without noise and encoder bias.
 _CRITIC_TERMS: dict[str, ObservationTermCfg] = {
-    "command": _term(mdp.generated_commands, command_name="motion"),
-    "motion_anchor_pos_b": _term(mdp.motion_anchor_pos_b, command_name="motion"),
-    "motion_anchor_ori_b": _term(mdp.motion_anchor_ori_b, command_name="motion"),
-    "body_pos": _term(mdp.robot_body_pos_b, command_name="motion"),
-    "body_ori": _term(mdp.robot_body_ori_b, command_name="motion"),
-    "base_lin_vel": _term(mdp.builtin_sensor, sensor_name="robot/imu_lin_vel"),
-    "base_ang_vel": _term(mdp.builtin_sensor, sensor_name="robot/imu_ang_vel"),
-    "joint_pos": _term(mdp.joint_pos_rel),
-    "joint_vel": _term(mdp.joint_vel_rel),
-    "actions": _term(mdp.last_action),
+    "command": observation(mdp.generated_commands, command_name="motion"),
+    "motion_anchor_pos_b": observation(mdp.motion_anchor_pos_b, command_name="motion"),
+    "motion_anchor_ori_b": observation(mdp.motion_anchor_ori_b, command_name="motion"),
+    "body_pos": observation(mdp.robot_body_pos_b, command_name="motion"),
+    "body_ori": observation(mdp.robot_body_ori_b, command_name="motion"),
+    "base_lin_vel": observation(mdp.builtin_sensor, sensor_name="robot/imu_lin_vel"),
+    "base_ang_vel": observation(mdp.builtin_sensor, sensor_name="robot/imu_ang_vel"),
+    "joint_pos": observation(mdp.joint_pos_rel),
+    "joint_vel": observation(mdp.joint_vel_rel),
+    "actions": observation(mdp.last_action),
 }
 
 _COMMANDS: dict[str, CommandTermCfg] = {

@@ -19,7 +19,6 @@ from mjlab.managers import (
     EventTermCfg,
     MetricsTermCfg,
     ObservationGroupCfg,
-    ObservationTermCfg,
     RewardTermCfg,
     SceneEntityCfg,
     TerminationTermCfg,
@@ -36,11 +35,11 @@ from mjlab.sensor import (
     TerrainHeightSensorCfg,
 )
 from mjlab.sim import MujocoCfg, SimulationCfg
+from mjlab.tasks.terms import observation
 from mjlab.tasks.velocity import mdp
 from mjlab.terrains import TerrainEntityCfg
 from mjlab.terrains.config import ROUGH_TERRAINS_CFG
 from mjlab.utils.errors import UnknownNameError
-from mjlab.utils.noise import UniformNoiseCfg
 from mjlab.utils.string import suggest
 from mjlab.viewer import ViewerConfig
 
@@ -264,41 +263,33 @@ _FOOT_HEIGHT_SCAN = TerrainHeightSensorCfg(
 _SENSORS: tuple[SensorCfg, ...] = (_TERRAIN_SCAN, _FOOT_HEIGHT_SCAN)
 
 
-def _term(
-    func: object, noise: float | None = None, scale: float | None = None, **params: object
-) -> ObservationTermCfg:
-    """Return an observation term with parameters and uniform noise of half-width `noise`."""
-    uniform = None if noise is None else UniformNoiseCfg(n_min=-noise, n_max=noise)
-    return ObservationTermCfg(func=func, params=params, noise=uniform, scale=scale)
-
-
 # 1 / max_distance of the rays.
 _SCAN_SCALE = 1.0 / 5.0
 _ACTOR_TERMS = {
-    "base_lin_vel": _term(mdp.builtin_sensor, 0.5, sensor_name="robot/imu_lin_vel"),
-    "base_ang_vel": _term(mdp.builtin_sensor, 0.2, sensor_name="robot/imu_ang_vel"),
-    "projected_gravity": _term(mdp.projected_gravity, 0.05),
-    "joint_pos": _term(mdp.joint_pos_rel, 0.01, biased=True),
-    "joint_vel": _term(mdp.joint_vel_rel, 1.5),
-    "actions": _term(mdp.last_action),
-    "command": _term(mdp.generated_commands, command_name="twist"),
-    "height_scan": _term(mdp.height_scan, 0.1, _SCAN_SCALE, sensor_name="terrain_scan"),
+    "base_lin_vel": observation(mdp.builtin_sensor, 0.5, sensor_name="robot/imu_lin_vel"),
+    "base_ang_vel": observation(mdp.builtin_sensor, 0.2, sensor_name="robot/imu_ang_vel"),
+    "projected_gravity": observation(mdp.projected_gravity, 0.05),
+    "joint_pos": observation(mdp.joint_pos_rel, 0.01, biased=True),
+    "joint_vel": observation(mdp.joint_vel_rel, 1.5),
+    "actions": observation(mdp.last_action),
+    "command": observation(mdp.generated_commands, command_name="twist"),
+    "height_scan": observation(mdp.height_scan, 0.1, _SCAN_SCALE, sensor_name="terrain_scan"),
 }
 # The critic observes the actor's terms without noise (no corruption in its group) and without
 # encoder bias, and further foot terms.
 _CRITIC_TERMS = {
     **copy.deepcopy(_ACTOR_TERMS),
-    "joint_pos": _term(mdp.joint_pos_rel),
-    "height_scan": _term(mdp.height_scan, None, _SCAN_SCALE, sensor_name="terrain_scan"),
-    "foot_height": _term(
+    "joint_pos": observation(mdp.joint_pos_rel),
+    "height_scan": observation(mdp.height_scan, None, _SCAN_SCALE, sensor_name="terrain_scan"),
+    "foot_height": observation(
         mdp.foot_height,
         sensor_name="foot_height_scan",
         # Sites instead of the sensor, as in releases 1.1 and 1.2. Dropped if left empty.
         asset_cfg=SceneEntityCfg("robot", site_names=_NO_NAMES),
     ),
-    "foot_air_time": _term(mdp.foot_air_time, sensor_name="feet_ground_contact"),
-    "foot_contact": _term(mdp.foot_contact, sensor_name="feet_ground_contact"),
-    "foot_contact_forces": _term(mdp.foot_contact_forces, sensor_name="feet_ground_contact"),
+    "foot_air_time": observation(mdp.foot_air_time, sensor_name="feet_ground_contact"),
+    "foot_contact": observation(mdp.foot_contact, sensor_name="feet_ground_contact"),
+    "foot_contact_forces": observation(mdp.foot_contact_forces, sensor_name="feet_ground_contact"),
 }
 
 _COMMANDS: dict[str, CommandTermCfg] = {

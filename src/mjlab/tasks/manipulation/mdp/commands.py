@@ -34,7 +34,6 @@ __all__ = [
 FIXED_GOAL = (0.4, 0.0, 0.3)
 """Goal of difficulty `fixed`, relative to the environment's origin (m)."""
 _GOAL_RADIUS = 0.03
-_GOAL_COLOR: Color = (1.0, 0.5, 0.0, 0.3)
 _DIFFICULTIES = ("fixed", "dynamic")
 logger = logging.getLogger(__name__)
 _MAX_TRIES = 200
@@ -96,6 +95,7 @@ class GoalCommand(CommandTerm):
 
     # GoalCommandCfg or a subclass of it.
     cfg: Any
+    _goal_color: Color = (1.0, 0.5, 0.0, 0.3)
 
     def __init__(self, cfg: GoalCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
@@ -207,10 +207,10 @@ class GoalCommand(CommandTerm):
             torch.maximum(metrics[name], metrics["at_goal"], out=metrics[name])
 
     def _debug_vis_impl(self, visualizer: DebugVisualizer) -> None:
-        color = self.cfg.viz.target_color if hasattr(self.cfg, "viz") else _GOAL_COLOR
-        visualizer.add_legend(color, "goal")
+        visualizer.add_legend(self._goal_color, "goal")
         for index in visualizer.get_env_indices(self.num_envs):
-            visualizer.add_sphere(self.target_pos[index].cpu().numpy(), _GOAL_RADIUS, color)
+            goal = self.target_pos[index].cpu().numpy()
+            visualizer.add_sphere(goal, _GOAL_RADIUS, self._goal_color)
 
 
 @dataclass(kw_only=True)
@@ -260,6 +260,7 @@ class LiftingCommand(GoalCommand):
     def __init__(self, cfg: LiftingCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         self.object: Entity = env.scene[cfg.entity_name]
+        self._goal_color = cfg.viz.target_color
         self.metrics = {
             "object_height": torch.zeros(self.num_envs, dtype=torch.float32, device=self.device),
             **self.metrics,

@@ -61,15 +61,8 @@ def compute_ee_position_error(
 
     0 for an empty `ee_body_names`. Raises `ValueError` for a body that is not tracked.
     """
-    if not ee_body_names:
-        return torch.zeros(
-            len(command.robot_joint_vel), dtype=torch.float32, device=command.body_indexes.device
-        )
-    for name in ee_body_names:
-        check_exists("tracked body", name, command.body_names)
-    columns = body_columns(command, ee_body_names)
     distance = (command.body_pos_relative_w - command.robot_body_pos_w).norm(dim=-1)
-    return distance[:, columns].mean(dim=1)
+    return _mean_over(command, ee_body_names, distance)
 
 
 def compute_ee_orientation_error(
@@ -79,15 +72,19 @@ def compute_ee_orientation_error(
 
     0 for an empty `ee_body_names`. Raises `ValueError` for a body that is not tracked.
     """
-    if not ee_body_names:
-        return torch.zeros(
-            len(command.robot_joint_vel), dtype=torch.float32, device=command.body_indexes.device
-        )
-    for name in ee_body_names:
-        check_exists("tracked body", name, command.body_names)
-    columns = body_columns(command, ee_body_names)
     angle = quat_error_magnitude(command.body_quat_relative_w, command.robot_body_quat_w)
-    return angle[:, columns].mean(dim=1)
+    return _mean_over(command, ee_body_names, angle)
+
+
+def _mean_over(
+    command: MotionReader, body_names: tuple[str, ...], errors: torch.Tensor
+) -> torch.Tensor:
+    """Return the mean of `errors`, (N, K), over the named bodies, (N,); 0 without bodies."""
+    if not body_names:
+        return torch.zeros_like(errors[:, 0])
+    for name in body_names:
+        check_exists("tracked body", name, command.body_names)
+    return errors[:, body_columns(command, body_names)].mean(dim=1)
 
 
 # Evaluation metrics, and the config of evaluation environments.
