@@ -128,15 +128,6 @@ def test_an_episode_ends_when_the_hand_hits_the_ground_in_any_substep(force, end
     assert mdp.illegal_contact(env, "touch").tolist() == [True, True, True]
 
 
-@pytest.mark.parametrize("threshold", [-10.0, math.nan])
-def test_force_that_no_contact_can_have_warns(make_env, threshold):
-    def edit(cfg):
-        cfg.terminations["ee_ground_collision"].params["force_threshold"] = threshold
-
-    with pytest.warns(UserWarning, match="'ee_ground_collision': force_threshold.* (-10.0|nan)"):
-        make_env(edit=edit)
-
-
 def test_an_arm_that_pushes_its_hand_into_the_ground_ends_its_episode(make_env):
     env = make_env(num_envs=2)
     env.reset()
