@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from mjlab.envs import ManagerBasedRlEnv
+from mjlab.envs.curriculum_state import lasting_state
 from mjlab.managers import (
     CommandTerm,
     CommandTermCfg,
@@ -194,6 +195,16 @@ def test_an_exact_state_holds_attributes_and_settings(make):
     env, other = trained(make, 3), make(3)
     other.load_state_dict(env.state_dict())
     assert memory(other) == memory(env)
+
+
+def test_attributes_of_environments_are_no_memory():
+    cfg = load_env_cfg("Mjlab-Cartpole-Balance")
+    cfg.scene.num_envs = 2
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    env.step(torch.zeros(2, 1))
+    assert lasting_state(env)["attributes"] == {}
+    env.close()
 
 
 def test_settings_of_the_new_config_are_kept(make):

@@ -57,12 +57,12 @@ _SETTINGS = ("episode_length_s",)
 _OWN_ATTRIBUTES = frozenset(
     {
         *("_acts_between_substeps", "_built_settings", "_built_state", "_device"),
-        *("_holds_common_steps", "_may_not_start", "_nan_resets", "_pending_reset"),
-        *("_renderer", "_renderer_is_open", "_sim_step_counter", "_stepped_to", "_steps_as_one"),
-        *("_term_edits", "common_step_counter", "diverged", "episode_length_buf", "extras"),
-        *("manager_visualizers", "metadata", "obs_buf", "observes_ends", "observes_failures"),
-        *("physics_dt", "render_mode", "reset_buf", "reset_terminated", "reset_time_outs"),
-        *("reward_buf",),
+        *("_holds_common_steps", "_nan_resets", "_pending_reset", "_recorded_fields"),
+        *("_renderer", "_renderer_is_open", "_sim_step_counter", "_step_modes", "_stepped_to"),
+        *("_steps_as_one", "_term_edits", "common_step_counter", "diverged"),
+        *("episode_length_buf", "extras", "manager_visualizers", "metadata", "obs_buf"),
+        *("observes_ends", "observes_failures", "physics_dt", "render_mode", "reset_buf"),
+        *("reset_terminated", "reset_time_outs", "reward_buf"),
     }
 )
 _MISSING = object()

@@ -530,23 +530,34 @@ def check_terms(saved: Any, now: Mapping[str, Any], networks: Iterable[str], pat
     Raises:
         CheckpointError: names, order or shapes differ.
     """
-    lines = []
-    for name in (*networks, "actions"):
-        # Older files lack both, and environments without managers the second.
-        found: Any = now.get(name, {})
-        trained: Any = (saved or {}).get(name, found) if found else found
-        if list(trained.items()) != list(found.items()):
-            lines.append(f"  {name}: trained with {_listed(trained)}; got {_listed(found)}")
-    if lines:
-        raise CheckpointError(
-            f"Checkpoint {path!r} was trained with other terms, or in another order:\n"
-            + "\n".join(lines)
-            + "\nUse the task as it was trained, or train again."
-        )
+    # Older files lack both, and environments without managers the second.
+    found = {name: now[name] for name in (*networks, "actions") if now.get(name)}
+    if reason := other_terms(saved or {}, found):
+        raise CheckpointError(f"Checkpoint {path!r} {reason}")
+
+
+def other_terms(trained: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return how the terms `now` differ from those a policy was `trained` with; empty if they do not.
+
+    Both are names, in order, with shapes or texts by name of what reads or has the terms. Names that
+    `trained` lacks are unknown.
+    """
+    lines = [
+        f"  {name}: trained with {_listed(trained[name])}; got {_listed(terms)}"
+        for name, terms in now.items()
+        if name in trained and list(trained[name].items()) != list(terms.items())
+    ]
+    if not lines:
+        return ""
+    return (
+        "was trained with other terms, or in another order:\n"
+        + "\n".join(lines)
+        + "\nUse the task as it was trained, or train again."
+    )
 
 
 def _listed(terms: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {shape}" for name, shape in terms.items()) or "nothing"
+    return ", ".join(f"{name} {shape}".rstrip() for name, shape in terms.items()) or "nothing"
 
 
 # Exact resume.

@@ -378,6 +378,8 @@ class Run:
         Raises:
             UserError: names or order differ.
         """
+        from mjlab.rl.checkpoint import other_terms
+
         # Weights & Biases does not keep the order of what it stores.
         if self.folder.parent.name == WANDB_CACHE:
             return
@@ -385,26 +387,20 @@ class Run:
         lists = [groups.get(network) for network in networks] if isinstance(groups, dict) else ()
         read = [group for names in lists if isinstance(names, list) for group in names]
         recorded, actions = (self.params["env"].get(name) for name in ("observations", "actions"))
-        pairs = {"actions": (env.actions, actions)}
+        pairs = {"actions": (actions, env.actions)}
         for group, then in recorded.items() if isinstance(recorded, dict) else ():
             now = env.observations.get(group)
             if now is not None and isinstance(then, dict) and group in read:
-                pairs[f"observations.{group}"] = now.terms, then.get("terms")
-        lines = []
-        for name, (now, then) in pairs.items():
-            own = [term for term, cfg in now.items() if cfg is not None]
-            if isinstance(then, dict):
-                trained = [term for term, cfg in then.items() if cfg is not None]
-                if own != trained:
-                    lines.append(
-                        f"  {name}: trained with {', '.join(trained)}; got {', '.join(own)}"
-                    )
-        if lines:
-            raise UserError(
-                f"The policy of {self.folder} was trained with other terms, or in another order:\n"
-                + "\n".join(lines)
-                + "\nUse the task as it was trained, or train again."
-            )
+                pairs[f"observations.{group}"] = then.get("terms"), now.terms
+        known = {name: pair for name, pair in pairs.items() if isinstance(pair[0], dict)}
+        trained, used = ({name: _names(pair[i]) for name, pair in known.items()} for i in (0, 1))
+        if reason := other_terms(trained, used):
+            raise UserError(f"The policy of {self.folder} {reason}")
+
+
+def _names(terms: Any) -> dict[str, str]:
+    """Return the names of terms that are not switched off, in order, as `other_terms` takes them."""
+    return {name: "" for name, cfg in terms.items() if cfg is not None}
 
 
 def _short(value: Any) -> str:
