@@ -199,7 +199,7 @@ def task_source(task_name: str) -> str | None:
     That of an entry point, or for tasks registered otherwise the main script. None: an interactive
     session. Raises `UnknownTaskError`.
     """
-    module = sys.modules[_find(task_name).package or "__main__"]
+    module = sys.modules.get(_find(task_name).package or "__main__")
     return getattr(module, "__file__", None)
 
 
@@ -410,19 +410,17 @@ def _register_all(source: str, module: str, load: Callable[[], object]) -> None:
 
 
 def _missing_extra(error: BaseException) -> str:
-    """Return a hint at the extra if `error` was caused by one of its modules missing, else ""."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, ModuleNotFoundError) and cause.name is not None:
-            module = cause.name.partition(".")[0]
-            # An installed package may lack the submodule: moviepy 2 has no `moviepy.editor`.
-            if module in _COMPAT_MODULES and sys.modules.get(module) is None:
-                return (
-                    f"\n{module} comes with the extra mjlab[compat]: require mjlab[compat] instead of "
-                    "mjlab, or run `uv sync --extra compat` in the checkout."
-                )
-        cause = cause.__cause__ or cause.__context__
-    return ""
+    """Return a hint at the extra if one of its modules is missing, the error or its cause, else ""."""
+    missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
+    name = missing.name if isinstance(missing, ModuleNotFoundError) else None
+    module = (name or "").partition(".")[0]
+    # An installed package may lack the submodule: moviepy 2 has no `moviepy.editor`.
+    if module not in _COMPAT_MODULES or sys.modules.get(module) is not None:
+        return ""
+    return (
+        f"\n{module} comes with the extra mjlab[compat]: require mjlab[compat] instead of mjlab, or run "
+        "`uv sync --extra compat` in the checkout."
+    )
 
 
 __getattr__ = older_names(__name__)
