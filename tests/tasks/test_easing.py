@@ -271,7 +271,7 @@ def test_difficulty_resumes_exactly(make_growing):
 def test_evaluations_in_between_do_not_count(make_growing):
     env = make_growing(interval=10)
     before = difficulty(env)._tally.clone()
-    with env.common_steps_held():
+    with env.curricula_held():
         env.termination_manager.terminated.fill_(True)
         env.step(torch.zeros(2, env.action_manager.total_action_dim))
         env.reset()

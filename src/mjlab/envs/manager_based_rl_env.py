@@ -14,6 +14,7 @@ import torch
 from mjlab.compat import translate_older
 from mjlab.envs import curriculum_state, env_state
 from mjlab.envs.cfg_checks import check_env_cfg, report_odd_times, report_start
+from mjlab.envs.final_observations import final_observations
 from mjlab.envs.mdp.events import reset_scene_to_default
 from mjlab.envs.types import VecEnvObs, VecEnvStepReturn
 from mjlab.managers import (
@@ -395,7 +396,8 @@ class ManagerBasedRlEnv(Tabular):
         for mode in self._step_modes:
             self.event_manager.apply(mode=mode, dt=self.step_dt)
         moved = self.scene.take_moved_envs()
-        self._observe_ends(moved)
+        if self.observes_ends and self.cfg.auto_reset:
+            self.extras |= final_observations(self, moved)
         reset_ids = self._reset_ended()
         self._forward(reset_ids, moved)
         self._compute_commands(reset_ids)
@@ -412,22 +414,11 @@ class ManagerBasedRlEnv(Tabular):
         )
 
     @contextlib.contextmanager
-    def common_steps_held(self) -> Generator[None]:
-        """Freeze `common_step_counter` within this context, e.g. during evaluation.
-
-        Curricula that depend on the counter do not advance.
-        """
-        held, self._holds_common_steps = self._holds_common_steps, True
-        try:
-            yield
-        finally:
-            self._holds_common_steps = held
-
-    @contextlib.contextmanager
     def curricula_held(self) -> Generator[None]:
         """Hold step counter, curriculum terms and terrain levels within this context.
 
-        If the counter was set since the last step, curriculum terms are called once, to follow it.
+        For evaluations. If the counter was set since the last step, curriculum terms are called
+        once, to follow it.
         """
         with contextlib.ExitStack() as stack:
             if self.scene.terrain is not None:
@@ -435,7 +426,8 @@ class ManagerBasedRlEnv(Tabular):
             if self.common_step_counter != self._stepped_to:
                 self.curriculum_manager.compute(as_ids(None, self.num_envs, self.device))
             stack.enter_context(self.curriculum_manager.held())
-            stack.enter_context(self.common_steps_held())
+            stack.callback(setattr, self, "_holds_common_steps", self._holds_common_steps)
+            self._holds_common_steps = True
             yield
 
     def get_observations(self) -> VecEnvObs:
@@ -502,37 +494,6 @@ class ManagerBasedRlEnv(Tabular):
         # Covers rewards added by subclasses of the manager.
         self.reward_buf.masked_fill_(self.diverged, 0.0)
         self.extras["log"]["Simulation/nan_rewards"] = manager.nonfinite.count
-
-    def _observe_ends(self, moved: torch.Tensor | None) -> None:
-        """Store the final observations of episodes that end in `extras`, see `observes_ends`.
-
-        Data read by resets and curricula (derived quantities, rays, images, random numbers) is not
-        affected.
-
-        Args:
-            moved: Environments moved by an event, (N,) bool. None: no environment.
-        """
-        if not (self.observes_ends and self.cfg.auto_reset):
-            return
-        if self.observes_failures:
-            observed = self.reset_buf & ~self.diverged
-        else:
-            observed = self.reset_time_outs & ~self.reset_terminated
-        ids = observed.nonzero().flatten()
-        if len(ids) == 0:
-            return
-        with self.sim.looking_ahead(ids):
-            if moved is not None and len(placed := ids[moved[ids]]) > 0:
-                self.sim.forward(placed)
-            self.sim.sense(ids)
-            observations = self.observation_manager.preview()
-        self.extras["final_observations"] = {
-            name: value[ids]
-            if isinstance(value, torch.Tensor)
-            else {term: part[ids] for term, part in value.items()}
-            for name, value in observations.items()
-        }
-        self.extras["final_ids"] = ids
 
     def _reset_ended(self) -> torch.Tensor:
         """Reset the environments that are done, with `auto_reset`; return their ids."""
