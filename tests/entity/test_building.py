@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import zipfile
 
 import mujoco
@@ -84,27 +83,18 @@ MOTOR = BuiltinMotorActuatorCfg(target_names_expr=("k.*",), effort_limit=1.0)
 IN_XML = '<actuator><motor name="drive" joint="knee"/></actuator></mujoco>'
 
 
-@pytest.mark.parametrize(
-    ("actuators", "said"),
-    [
-        ((SERVO, MOTOR), r"MotorActuatorCfg.*'knee' has one by BuiltinPositionActuatorCfg"),
-        ((SERVO, SERVO), r"'hip' has one .*, 'knee' has one "),
-    ],
-)
-def test_an_actuator_on_a_joint_that_has_one_already_is_refused(kit, actuators, said):
-    for order in (actuators, actuators[::-1]):
-        for sort in (False, True):
-            cfg = kit.cfg(kit.ROBOT, sort_actuators=sort, articulation=actuated(*order))
-            with pytest.raises(ValueError, match="already have an actuator") as caught:
-                cfg.build()
-            if order is actuators:
-                assert re.search(said, str(caught.value))
+@pytest.mark.parametrize("sort", [False, True])
+@pytest.mark.parametrize("actuators", [(SERVO, MOTOR), (MOTOR, SERVO), (SERVO, SERVO)])
+def test_two_configs_for_a_joint_raise(kit, actuators, sort):
+    cfg = kit.cfg(kit.ROBOT, sort_actuators=sort, articulation=actuated(*actuators))
+    with pytest.raises(ValueError, match="repeated name '(hip|knee)' in actuator"):
+        cfg.build()
 
 
 def test_an_xml_actuator_may_be_taken_over_twice(kit):
     wrap = XmlActuatorCfg(target_names_expr=("knee",), command_field="effort")
     xml = kit.ROBOT.replace("</mujoco>", IN_XML)
-    with pytest.warns(UserWarning, match="'knee' has one by XmlActuatorCfg"):
+    with pytest.warns(UserWarning, match=r"XmlActuatorCfg.*\['knee'\]"):
         sim, scene = kit.make(1, robot=kit.cfg(xml, articulation=actuated(wrap, wrap)))
     scene["robot"].set_joint_effort_target(torch.tensor([[0.0, 3.0]]))
     scene.write_data_to_sim()
@@ -122,7 +112,7 @@ def test_an_actuator_beside_one_of_the_xml_is_accepted_with_a_warning_and_both_a
         sort_actuators=sort,
         articulation=actuated(*actuators),
     )
-    with pytest.warns(UserWarning, match="'knee' has the XML actuator 'drive'"):
+    with pytest.warns(UserWarning, match=r"\['knee'\].*forces add up"):
         sim, scene = kit.make(1, robot=cfg)
     robot = scene["robot"]
     robot.set_joint_position_target(torch.tensor([[0.0, 0.5]]))
@@ -134,31 +124,6 @@ def test_an_actuator_beside_one_of_the_xml_is_accepted_with_a_warning_and_both_a
     sim.forward()
     # The servo's share is its stiffness of 1 times the distance.
     assert sim.data.qfrc_actuator[0, -1].item() == pytest.approx(0.5 + 2.0)
-
-
-@pytest.mark.parametrize(
-    "names", [("knee",), ("drive", "knee"), ("knee", "drive"), ("", "knee", "drive")]
-)
-def test_an_actuator_with_the_name_of_one_of_the_xml_is_refused(kit, names):
-    motors = "".join(f'<motor name="{name}" joint="knee"/>' for name in names)
-    motors = motors.replace('name="" ', "")
-    xml = kit.ROBOT.replace("</mujoco>", f"<actuator>{motors}</actuator></mujoco>")
-    with pytest.raises(ValueError, match="'knee' has the XML actuator .*'knee'"):
-        kit.cfg(xml, articulation=actuated(SERVO)).build()
-
-
-def test_an_actuator_with_the_name_of_one_on_another_joint_is_refused(kit):
-    motor = BuiltinMotorActuatorCfg(target_names_expr=("hip",), effort_limit=1.0)
-    xml = kit.ROBOT.replace("</mujoco>", IN_XML.replace("drive", "hip"))
-    with pytest.raises(ValueError, match=r"joints \['hip'\].*on other targets"):
-        kit.cfg(xml, articulation=actuated(motor)).build()
-
-
-def test_every_actuator_of_the_xml_on_a_joint_is_named_in_the_warning(kit):
-    both = '<actuator><motor name="drive" joint="knee"/><motor name="assist" joint="knee"/>'
-    xml = kit.ROBOT.replace("</mujoco>", f"{both}</actuator></mujoco>")
-    with pytest.warns(UserWarning, match="XML actuator 'drive' and the XML actuator 'assist'"):
-        kit.cfg(xml, articulation=actuated(MOTOR)).build()
 
 
 def test_actuators_of_the_xml_and_others_may_share_a_pattern_but_no_joint(kit):

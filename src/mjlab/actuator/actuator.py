@@ -135,7 +135,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
 
     _transient = {
         "cfg", "entity", "_mjs_actuators", "_target_ids_list", "_target_names", "_target_ids",
-        "_ctrl_ids", "_global_ctrl_ids", "_global_element_ids", "_in_group", "_resets_delay",
+        "_ctrl_ids", "_global_ctrl_ids", "_global_element_ids", "_resets_delay",
     }  # fmt: skip
 
     param_names: ClassVar[tuple[str, ...]] = ()

@@ -295,7 +295,7 @@ def build_actuators(
     for cfg in cfgs:
         ids, found = _find_targets(cfg, names)
         built.append((build(cfg, ids, found), [full_names[cfg.transmission_type][i] for i in ids]))
-    _check_second_actuators(spec, built)
+    _warn_second_actuators(spec, built)
     # XmlActuators first: they look up the XML's actuators before new ones are added.
     ordered = [pair for pair in built if isinstance(pair[0].cfg, XmlActuatorCfg)]
     added = [pair for pair in built if not isinstance(pair[0].cfg, XmlActuatorCfg)]
@@ -350,65 +350,32 @@ def _find_targets(
     return ids, found
 
 
-def _check_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, list[str]]]) -> None:
-    """Warn if a config adds an actuator to a target with an XML actuator: their forces add up.
-
-    Raises:
-        ValueError: two configs add an actuator to the same target, or two actuators get the same
-            name.
-    """
-    in_xml: dict[tuple[TransmissionType, str], list[str]] = {}
-    for element in spec.actuators:
-        for transmission, kinds in XML_TRANSMISSIONS.items():
-            if element.trntype in kinds:
-                in_xml.setdefault((transmission, element.target), []).append(element.name)
-    names_in_xml = {element.name for element in spec.actuators}
-    claimed: dict[tuple[bool, TransmissionType, str], str] = {}
+def _warn_second_actuators(spec: mujoco.MjSpec, built: list[tuple[Actuator, list[str]]]) -> None:
+    """Warn of targets with an actuator of the XML and one of a config, or with two XmlActuators."""
+    in_xml = {
+        (transmission, element.target)
+        for element in spec.actuators
+        for transmission, kinds in XML_TRANSMISSIONS.items()
+        if element.trntype in kinds
+    }
+    wrapped: set[tuple[TransmissionType, str]] = set()
     for actuator, targets in built:
-        cfg, kind = actuator.cfg, actuator.transmission_type
-        wraps = isinstance(cfg, XmlActuatorCfg)
-        label = f"{type(cfg).__name__}({cfg.target_names_expr!r})"
-        # XmlActuator skips targets without an actuator.
-        names = [name for name in targets if (kind, name) in in_xml or not wraps]
-        taken, beside, twice = [], [], []
-        for name in names:
-            others = [] if wraps else in_xml.get((kind, name), [])
-            by_xml = " and ".join(f"the XML actuator {other or '(unnamed)'!r}" for other in others)
-            if name in others:
-                taken.append(f"{short_name(name)!r} has {by_xml}")
-            elif (wraps, kind, name) in claimed:
-                (twice if wraps else taken).append(
-                    f"{short_name(name)!r} has one by {claimed[wraps, kind, name]}"
-                )
-            elif others:
-                beside.append(f"{short_name(name)!r} has {by_xml}")
-        message = f"{label} acts on {kind.value}s that already have an actuator: "
-        if taken:
-            raise ValueError(
-                f"{message}{', '.join(taken)}. Narrow the patterns, remove the actuator from the XML, "
-                "or use only XmlActuatorCfg, which takes over the XML actuator."
+        cfg, own = actuator.cfg, {(actuator.transmission_type, name) for name in targets} & in_xml
+        if isinstance(cfg, XmlActuatorCfg):
+            both, outcome = own & wrapped, "the last config sets the control; narrow the patterns"
+            wrapped |= own
+        else:
+            both = own
+            outcome = (
+                "their forces add up; remove the actuator from the XML if that is not intended"
             )
-        # New actuators are named after their targets.
-        same = [short_name(name) for name in names if not wraps and name in names_in_xml]
-        if same:
-            raise ValueError(
-                f"{label} adds actuators named after the {kind.value}s {same}, but the XML has "
-                "actuators with these names on other targets; rename or remove the XML actuators."
-            )
-        if beside:
+        if both:
             warnings.warn(
-                f"{message}{', '.join(beside)}. Both are active and their forces add up; if this is "
-                "not intended, remove the actuator from the XML.",
+                f"{type(cfg).__name__}({cfg.target_names_expr!r}) acts on {cfg.transmission_type.value}s "
+                f"that already have an actuator, {sorted(short_name(name) for _, name in both)}: {outcome}.",
                 UserWarning,
                 stacklevel=2,
             )
-        if twice:
-            warnings.warn(
-                f"{message}{', '.join(twice)}. The last config sets the control; narrow the patterns.",
-                UserWarning,
-                stacklevel=2,
-            )
-        claimed |= dict.fromkeys(((wraps, kind, name) for name in names), label)
 
 
 # Initial state.
