@@ -543,11 +543,12 @@ class ActuatorGroup:
     """
 
     _actuators: list[Any] = field(default_factory=list)
-    _writers: list[Actuator | SharedDelay] = field(default_factory=list)
+    writers: list[Any] = field(default_factory=list)
+    """Objects that write controls by `apply_controls`, in order. Empty before `initialize`."""
 
     def initialize(self, num_envs: int, device: str) -> None:
         """Create the delay lines. The actuators must be initialized."""
-        self._writers = [actuator for actuator in self._actuators if not actuator.has_delay]
+        self.writers = [actuator for actuator in self._actuators if not actuator.has_delay]
         members: dict[Any, list[Actuator]] = {}
         for actuator in self._actuators:
             if actuator.has_delay:
@@ -556,14 +557,14 @@ class ActuatorGroup:
             line = sharing[0].make_delay_buffer(num_envs, device)
             for k, actuator in enumerate(sharing):
                 actuator.share_delay(line, resets=k == 0)
-            self._writers.append(SharedDelay(sharing, line) if len(sharing) > 1 else sharing[0])
+            self.writers.append(SharedDelay(sharing, line) if len(sharing) > 1 else sharing[0])
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
         """Write the controls of all actuators in the group.
 
         With `env_ids` (environments just reset), other environments are unchanged.
         """
-        for writer in self._writers:
+        for writer in self.writers:
             writer.apply_controls(data, env_ids)
 
     def _delay_settings(self, actuator: Actuator) -> tuple[Any, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mjlab.actuator.actuator import (
@@ -38,9 +38,6 @@ class BuiltinActuatorGroup(ActuatorGroup):
     `compute` are not in the group.
     """
 
-    # Field of targets, columns to read in it, and columns of the controls to write, without delay.
-    _copies: list[tuple[str, Columns, Columns]] = field(default_factory=list)
-
     @staticmethod
     def process(
         actuators: Sequence[Actuator],
@@ -60,9 +57,8 @@ class BuiltinActuatorGroup(ActuatorGroup):
     def initialize(self, num_envs: int, device: str) -> None:
         """Create the delay lines, and plan the copies. The actuators must be initialized."""
         super().initialize(num_envs, device)
-        self._writers = [writer for writer in self._writers if writer.has_delay]
-        self._copies = [
-            (
+        copies = [
+            _Copy(
                 str(target_field(actuator.transmission_type, command)),
                 as_columns(actuator.target_ids.tolist(), device),
                 as_columns(ctrl_ids.tolist(), device),
@@ -75,14 +71,21 @@ class BuiltinActuatorGroup(ActuatorGroup):
                 strict=True,
             )
         ]
-
-    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
-        """See `ActuatorGroup`."""
-        for name, source, columns in self._copies:
-            values = read_columns(getattr(data, name), source)
-            write_columns(data.data.ctrl, columns, values, env_ids)
-        super().apply_controls(data, env_ids)
+        self.writers = [*copies, *(writer for writer in self.writers if writer.has_delay)]
 
     def _delay_settings(self, actuator: Any) -> tuple[Any, ...]:
         own = None if actuator.shares_delay else id(actuator)
         return (*super()._delay_settings(actuator), own)
+
+
+@dataclass
+class _Copy:
+    """Copy of columns `source` of a target field to columns `ctrl` of the controls."""
+
+    field: str
+    source: Columns
+    ctrl: Columns
+
+    def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
+        values = read_columns(getattr(data, self.field), self.source)
+        write_columns(data.data.ctrl, self.ctrl, values, env_ids)

@@ -158,6 +158,10 @@ class Entity:
             lambda actuator, ids, names: actuator.build(self, ids, names),
             cfg.sort_actuators,
         )
+        self._updated_actuators = [
+            actuator for actuator in self._actuators if type(actuator).update is not Actuator.update
+        ]
+        self._writers: list[Any] = []
         self.initial_state = resolve_initial_state(
             self._spec, self._free_joint, self._joints, self.xml_key, cfg.init_state
         )
@@ -278,10 +282,11 @@ class Entity:
         self._data = _make_data(self, indexing, model, data, device)
         for actuator in self._actuators:
             actuator.initialize(mj_model, model, data, device)
-        self._builtin_group, others = BuiltinActuatorGroup.process(self._actuators)
-        self._fused_group, self._own_actuators = FusedActuatorGroup.process(others)
-        self._builtin_group.initialize(data.nworld, device)
-        self._fused_group.initialize(data.nworld, device)
+        builtin, others = BuiltinActuatorGroup.process(self._actuators)
+        fused, others = FusedActuatorGroup.process(others)
+        for group in (builtin, fused):
+            group.initialize(data.nworld, device)
+        self._writers = [*builtin.writers, *fused.writers, *others]
         ids = [actuator.id for actuator in self._spec.actuators]
         listed = {i for one in self._actuators for i in one.global_element_ids.tolist()}
         uses_key = self.xml_key is not None and self.cfg.init_state.joint_pos is None
@@ -306,7 +311,7 @@ class Entity:
 
     def update(self, dt: float) -> None:
         """Update the actuators after a physics substep of `dt` seconds."""
-        for actuator in self._actuators:
+        for actuator in self._updated_actuators:
             actuator.update(dt)
 
     def write_data_to_sim(self, env_ids: EnvIds = None) -> None:
@@ -315,13 +320,8 @@ class Entity:
         With `env_ids`, only the controls, delay lines and histories of these environments change:
         a partial reset does not affect other environments.
         """
-        if not self._actuators:
-            return
-        data = self.data
-        self._builtin_group.apply_controls(data, env_ids)
-        self._fused_group.apply_controls(data, env_ids)
-        for actuator in self._own_actuators:
-            actuator.apply_controls(data, env_ids)
+        for writer in self._writers:
+            writer.apply_controls(self.data, env_ids)
 
     # Element names.
 

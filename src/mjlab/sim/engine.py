@@ -103,6 +103,14 @@ def why_not_computed(model: mujoco.MjModel, field: str) -> str | None:
     return None
 
 
+def is_bad(values: torch.Tensor) -> torch.Tensor:
+    """Return rows with a value that is not finite or beyond `mjMAXVAL`, (N,) bool."""
+    if values.shape[1] == 0:
+        return torch.zeros(len(values), dtype=torch.bool, device=values.device)
+    # Comparisons with NaN are false.
+    return ~(values.abs().amax(dim=1) <= mujoco.mjMAXVAL)
+
+
 # Rays.
 
 
@@ -243,8 +251,6 @@ class Engine(ABC):
     capabilities: Capabilities
     model_fields: dict[str, torch.Tensor]
     """Live tensors of the expanded `MjModel` and `MjOption` fields, (N, ...)."""
-    checked_fields: tuple[str, ...] = ("qpos", "qvel")
-    """`MjData` fields checked by `bad_states`."""
     bytes_each: int = 0
     """Memory reserved per environment (bytes). Observations and images come on top: cartpole, Go1, G1
     and YAM take 1.2 to 1.6 times as much, and 5.5 times with images of 32 x 32 pixels."""
@@ -354,18 +360,12 @@ class Engine(ABC):
         Derived fields keep their values until `forward`; model fields are unchanged.
         """
 
-    def bad_states(self) -> torch.Tensor:
-        """Return environments in a bad state after the last step, (N,) bool.
+    @abstractmethod
+    def bad_substeps(self) -> torch.Tensor:
+        """Return environments with accelerations, or a state within the step, in a bad state, (N,) bool.
 
-        As in MuJoCo: positions, velocities or accelerations not finite or beyond `mjMAXVAL` (1e10).
+        See `Simulation.bad_states`.
         """
-        bad = torch.zeros(self.num_envs, dtype=torch.bool, device=self.data_field("qpos").device)
-        for name in self.checked_fields:
-            values = self.data_field(name)
-            if values.shape[1] > 0:
-                # Comparisons with NaN are false.
-                bad |= ~(values.abs().amax(dim=1) <= mujoco.mjMAXVAL)
-        return bad
 
     def bad_dof(self, env_idx: int) -> int | None:
         """Return the degree of freedom at which MuJoCo found a bad state; None if unknown."""

@@ -26,6 +26,7 @@ from mjlab.sim.engine import (
     RayQuery,
     Stage,
     create_engine,
+    is_bad,
     mirror_on_warp,
     resolve_engine_name,
     why_not_computed,
@@ -445,7 +446,7 @@ class Simulation:
 
         As in MuJoCo: positions, velocities or accelerations not finite or beyond `mjMAXVAL` (1e10).
         """
-        return self._engine.bad_states()
+        return self._engine.bad_substeps() | is_bad(self.data.qpos) | is_bad(self.data.qvel)
 
     def bad_dof(self, env_idx: int) -> int | None:
         """Return the degree of freedom at which MuJoCo found a bad state; None if unknown."""

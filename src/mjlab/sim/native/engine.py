@@ -287,8 +287,10 @@ class NativeEngine(Engine):
     # Physics.
 
     def step(self, nstep: int, record: tuple[str, ...] = ()) -> dict[str, torch.Tensor]:
-        fields = {name: self.data_field(name) for name in record}
-        recorded = {name: field.new_empty(nstep, *field.shape) for name, field in fields.items()}
+        recorded = {}
+        for name in record:
+            field = self.data_field(name)
+            recorded[name] = field.new_empty(nstep, *field.shape)
         if nstep == 0:
             return recorded
         self._copy_in(thorough=True)
@@ -374,11 +376,10 @@ class NativeEngine(Engine):
             columns = self._sensor_columns[stage] if name == "sensordata" else None
             self._outputs[name].copy_out(rows, columns)
 
-    def bad_states(self) -> torch.Tensor:
-        # Warnings since the reset. MuJoCo checks every substep, including accelerations. These
-        # are copied only if read.
+    def bad_substeps(self) -> torch.Tensor:
+        # Warnings since the reset: MuJoCo checks every substep.
         warned = self._batch.warning[:, _BAD_STATES, _COUNT].any(axis=1)
-        return super().bad_states() | torch.from_numpy(warned)
+        return torch.from_numpy(warned)
 
     def bad_dof(self, env_idx: int) -> int | None:
         warnings = self._batch.warning[env_idx]

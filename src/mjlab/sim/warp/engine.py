@@ -39,6 +39,7 @@ from mjlab.sim.engine import (
     Engine,
     EngineUnavailableError,
     Stage,
+    is_bad,
 )
 from mjlab.sim.warp.overflow import OverflowWatch
 from mjlab.sim.warp.rays import WarpRays
@@ -98,8 +99,6 @@ class WarpEngine(Engine):
 
     `wp_model`, `wp_data` and `wp_device` are MuJoCo Warp's objects.
     """
-
-    checked_fields = ("qpos", "qvel", "qacc")
 
     # Tensors created here are written later, in any torch mode.
     @torch.inference_mode(False)
@@ -382,6 +381,9 @@ class WarpEngine(Engine):
                 recorded[name][k] = field
         self._overflow.tick()
         return recorded
+
+    def bad_substeps(self) -> torch.Tensor:
+        return is_bad(self.data_field("qacc"))
 
     def bad_dof(self, env_idx: int) -> int | None:
         bad = ~(self.data_field("qacc")[env_idx].abs() <= mujoco.mjMAXVAL)
