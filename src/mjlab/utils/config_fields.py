@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import functools
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 
@@ -18,20 +18,18 @@ def _unknown(path: str, value: Any, seen: set[int]) -> Iterator[str]:
     if id(value) in seen:
         return
     seen.add(id(value))
-    inner: dict[str, Any] = {}
-    if isinstance(value, (Mapping, list, tuple)):
-        items = value.items() if isinstance(value, Mapping) else enumerate(value)
-        inner = {f"{path}[{key!r}]": item for key, item in items}
+    if isinstance(value, (dict, list, tuple)):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _unknown(f"{path}[{key!r}]", item, seen)
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = [field.name for field in dataclasses.fields(value)]
-        inner = {f"{path}.{name}": getattr(value, name, None) for name in fields}
         is_ours = any(base.__module__.startswith("mjlab.") for base in type(value).__mro__)
-        for name in getattr(value, "__dict__", {}) if is_ours else ():
-            if not (name in fields or name.startswith("_") or hasattr(type(value), name)):
+        for name, item in getattr(value, "__dict__", {}).items():
+            if name in fields:
+                yield from _unknown(f"{path}.{name}", item, seen)
+            elif is_ours and not name.startswith("_") and not hasattr(type(value), name):
                 close = difflib.get_close_matches(name, fields, n=1)
                 yield f"{path}.{name}" + "".join(f" (did you mean {c!r}?)" for c in close)
-    for name, item in inner.items():
-        yield from _unknown(name, item, seen)
 
 
 # Registry, environment and runner check the same config.
