@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from mjlab.managers import CurriculumManager, CurriculumTermCfg
@@ -56,18 +55,3 @@ def test_results_hold_until_the_next_compute(env):
     assert manager.reset(None) == manager.reset(None) == {"Curriculum/a": 1}
     manager.compute(None)
     assert manager.reset(None) == {"Curriculum/a": 2}
-
-
-@pytest.mark.parametrize(
-    ("result", "words"),
-    [
-        (torch.ones(3), r"term 'a': .*\(3,\)"),
-        (torch.ones(0), r"term 'a': .*\(0,\)"),
-        ({"k": torch.ones(2, 1)}, r"term 'a', key 'k': .*\(2, 1\)"),
-    ],
-)
-def test_a_tensor_of_several_elements_is_refused_by_name(env, result, words):
-    manager = CurriculumManager({"a": CurriculumTermCfg(func=lambda env, env_ids: result)}, env)
-    with pytest.raises(ValueError, match=words):
-        manager.compute(None)
-    assert manager.reset(None) == {}

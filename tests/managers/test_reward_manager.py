@@ -174,18 +174,11 @@ def test_terms_that_draw_can_be_switched_off(env):
         manager.set_debug_vis("plain", False)
 
 
-@pytest.mark.parametrize("weight", [None, "1", (1.0,)])
-def test_a_weight_that_is_no_number_is_named(env, weight):
-    with pytest.raises(TypeError, match="RewardManager term 'a' weight: .*number"):
-        RewardManager({"a": term("a", weight)}, env)
-
-
 @pytest.mark.parametrize("weight", [float("nan"), float("inf")])
-def test_a_weight_that_is_not_finite_counts_as_zero(env, weight):
+def test_a_weight_that_is_not_finite_counts_as_zero(env, caplog, weight):
     cfg = RewardTermCfg(func=lambda env: torch.ones(4), weight=weight)
-    with pytest.warns(UserWarning, match="RewardManager term 'a' weight"):
-        manager = RewardManager({"a": cfg}, env)
-    assert manager.compute(0.02).tolist() == [0.0] * 4
+    assert RewardManager({"a": cfg}, env).compute(0.02).tolist() == [0.0] * 4
+    assert "'a' was NaN or infinite" in caplog.text
 
 
 def test_a_weight_may_be_a_tensor(env):

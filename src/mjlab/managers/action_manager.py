@@ -199,18 +199,8 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
 
 
 def as_action(action: Any, device: str) -> torch.Tensor:
-    """Return an action as a tensor on `device`; arrays and lists of numbers become float32.
-
-    Raises:
-        ValueError: `action` is neither a tensor nor an array of numbers.
-    """
+    """Return an action as a tensor on `device`; arrays and lists of numbers become float32."""
     if isinstance(action, torch.Tensor):
         return action.detach().to(device)
-    try:
-        # Copied, because torch warns about read-only arrays.
-        return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"action: expected a float tensor, array or list of shape (environments, components), "
-            f"got {type(action).__name__} ({error})."
-        ) from error
+    # Copied, because torch warns about read-only arrays.
+    return torch.as_tensor(np.array(action), dtype=torch.float32, device=device)

@@ -53,23 +53,13 @@ class CurriculumManager(TermListManager):
     def compute(self, env_ids: torch.Tensor | slice | None = None) -> None:
         """Call all terms for the environments about to reset, and store their results.
 
-        Does nothing inside `held`. Raises `ValueError` if a term returns a tensor without exactly one
-        element.
+        Does nothing inside `held`.
         """
         if self._is_held:
             return
         index = as_index(env_ids)
         for name, cfg in zip(self._term_names, self._term_cfgs, strict=True):
-            state = cfg.func(self._env, index, **cfg.params)
-            for key, value in state.items() if isinstance(state, dict) else [(None, state)]:
-                if isinstance(value, torch.Tensor) and value.numel() != 1:
-                    suffix = "" if key is None else f", key {key!r}"
-                    raise ValueError(
-                        f"{self._label(name)}{suffix}: expected one number to log, got shape "
-                        f"{tuple(value.shape)}; reduce it (mean, max) in the term, or return a "
-                        "dict of numbers."
-                    )
-            self._state[name] = state
+            self._state[name] = cfg.func(self._env, index, **cfg.params)
             if self.after_term is not None:
                 self.after_term(name)
 

@@ -13,7 +13,7 @@ import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes
 from mjlab.managers.debug_vis import TermFunctionSwitches
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, label_errors
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.sim.engine import FIXED_CONSTANTS, INERTIAL_CONSTANTS
 from mjlab.sim.randomization import RecomputeLevel
 from mjlab.utils.errors import check_one_of
@@ -81,12 +81,13 @@ class EventManager(TermFunctionSwitches, TermListManager):
                 self._last_reset_step[name] = never
             if term.mode == "interval":
                 bounds = term.interval_range_s
-                with label_errors(f"{self._label(name)} interval_range_s"):
-                    if bounds is None:
-                        raise ValueError("expected (shortest, longest) in seconds, got None.")
-                    shortest, longest = bounds
-                    in_order = 0.0 <= shortest <= longest
-                if not in_order:
+                if bounds is None:
+                    raise ValueError(
+                        f"{self._label(name)} interval_range_s: expected (shortest, longest) in "
+                        "seconds, got None."
+                    )
+                shortest, longest = bounds
+                if not 0.0 <= shortest <= longest:
                     warnings.warn(
                         f"{self._label(name)} interval_range_s: expected (shortest, longest) in "
                         f"seconds with 0 <= shortest <= longest, got {bounds!r}; times below 0 fire at "

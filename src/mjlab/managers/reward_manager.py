@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -12,7 +10,7 @@ import torch
 
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.debug_vis import TermFunctionSwitches
-from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager, label_errors
+from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
 from mjlab.managers.nonfinite import NonFiniteWatch
 from mjlab.utils.indexing import as_index, is_empty
 from mjlab.utils.screen import shown
@@ -37,8 +35,6 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         cfg: Terms by name.
         env: The environment.
         scale_by_dt: Multiply rewards by the control timestep (s), so that weights are rates.
-
-    Raises `TypeError` if a weight is not a number.
     """
 
     _cfg_type = RewardTermCfg
@@ -56,16 +52,6 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     ) -> None:
         self._scale_by_dt = scale_by_dt
         super().__init__(cfg, env)
-        for name, term in zip(self._term_names, self._term_cfgs, strict=True):
-            with label_errors(f"{self._label(name)} weight"):
-                is_finite = math.isfinite(term.weight)
-            if not is_finite:
-                warnings.warn(
-                    f"{self._label(name)} weight: expected a finite number, got {term.weight!r}; NaN and "
-                    "infinite rewards count as 0. To disable the term, set it to None.",
-                    UserWarning,
-                    stacklevel=2,
-                )
         size = (len(self._term_names), self.num_envs)
         # Terms first: each term writes to contiguous memory.
         self._rates = torch.zeros(size, dtype=torch.float32, device=self.device)
