@@ -146,6 +146,7 @@ EDITS: dict[str, tuple[Any, Any]] = {
     "no states": (entry("optimizer_state_dict", "state"), None),
     "a text for iterations": (entry("iterations_finished"), str),
     "a list of infos": (entry("infos"), lambda x: [x]),
+    "a tensor for the checksum": (entry("checksum"), lambda x: torch.ones(2, 3)),
 }
 
 

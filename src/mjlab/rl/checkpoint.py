@@ -178,7 +178,8 @@ def read_checkpoint(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]
         if not isinstance(data, dict):
             raise ValueError(f"expected a dict, got a {type(data).__name__}")
         written = data.pop(_CHECKSUM, None)
-        return data, written is None or written == _checksum(data)
+        is_intact = written is None or (type(written) is int and written == _checksum(data))
+        return data, is_intact
     except pickle.UnpicklingError as error:
         called = re.search(r"(?:GLOBAL|class|function) ([\w.]+)", str(error))
         reason, hint = "not a file of torch, or corrupt", ""

@@ -227,7 +227,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 rescue.check_folder(self.save, f"model_{iteration}.pt")
                 # Before the evaluation, which may take longer than there is time for.
                 is_saving = self._owes_evaluation or stop.requested or done == total
-                if is_saving or self._is_save_due(iteration):
+                if self._run_folder is not None and (
+                    is_saving or iteration % self.cfg["save_interval"] == 0
+                ):
                     self._save_checkpoint()
                     rescue.learned = None
                 is_solved = self._owes_evaluation and self._evaluate_solved(done, stop)
@@ -696,10 +698,6 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     def _is_written(self) -> bool:
         """True if the checkpoint of this iteration is in the run folder."""
         return self._written is not None and self._written[0] == self._checkpoint_path
-
-    def _is_save_due(self, iteration: int) -> bool:
-        # Runners without a folder need no interval.
-        return self._run_folder is not None and iteration % self.cfg["save_interval"] == 0
 
     def _save_checkpoint(self) -> None:
         """Write a checkpoint and the policy as ONNX into the run folder."""
