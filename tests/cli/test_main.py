@@ -150,7 +150,7 @@ def test_an_error_of_any_kind_that_this_package_raises_on_purpose_is_a_message(c
 
     status, _, err = ended(unknown_entity, capsys)
     assert status == 1
-    assert "\nerror: Unknown entity or sensor 'robot'." in err
+    assert "\nerror: Unknown entity or sensor 'robot'; " in err
     assert "no_such_field" in ended(wrong_arguments, capsys)[2]
 
 

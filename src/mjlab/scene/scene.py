@@ -48,7 +48,7 @@ from mjlab.utils.spec import (
     pop_settings,
 )
 from mjlab.utils.state import stateful
-from mjlab.utils.string import counted
+from mjlab.utils.string import counted, suggest
 from mjlab.utils.tables import Table, Tabular, settings_of
 
 TERRAIN = "terrain"
@@ -234,10 +234,8 @@ class Scene(Tabular):
             return self._sensors[key]
         if key in self._entities:
             return self._entities[key]
-        raise UnknownNameError(
-            f"Unknown entity or sensor {key!r}. Entities: {list(self._entities)}. "
-            f"Sensors: {list(self._sensors)}."
-        )
+        names = [*self._entities, *self._sensors]
+        raise UnknownNameError(f"Unknown entity or sensor {key!r}; {suggest(key, names)}")
 
     @property
     def cfg(self) -> SceneCfg:

@@ -342,7 +342,7 @@ def test_unknown_entity(make_env):
     def edit(cfg):
         cfg.commands["twist"].entity_name = name
 
-    with pytest.raises(UnknownNameError, match=rf"'twist': .*'{name}'.*'terrain', 'robot'"):
+    with pytest.raises(UnknownNameError, match=f"'twist': .*'{name}'; did you mean 'robot'"):
         make_env(edit=edit)
 
 

@@ -47,6 +47,7 @@ _SENSOR_SIGNS = {
 }
 # Tolerance of ray positions (m) and axes (unit vectors).
 _TOLERANCE = 1e-4
+# Building the mirrors of a Go1 takes 11 ms, mirroring 3072 samples 1.3 ms.
 _cache: WeakKeyDictionary[Any, _Mirrors] = WeakKeyDictionary()
 
 

@@ -168,7 +168,7 @@ def single_body(env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg) -> int | None
             f"asset_cfg: expected exactly one body of entity {asset_cfg.name!r}, got {names}; omit "
             "body_names for the root."
         )
-    return ids[0] if ids else None
+    return ids[0] if len(ids) == 1 else None
 
 
 def body_quat(data: Any, body: int | None) -> torch.Tensor:
