@@ -21,8 +21,8 @@ from PIL import Image
 
 from mjlab.rl.checkpoint import latest_checkpoint
 from mjlab.runs.policy import make_env, make_policy
-from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.demo import DEMOS
+from mjlab.tasks.registry import load_env_cfg
 from mjlab.terrains import (
     BoxInvertedPyramidStairsTerrainCfg,
     SubTerrainCfg,
@@ -168,7 +168,7 @@ def save(frames: list[np.ndarray], path: Path) -> None:
 
 def record(clip: Clip, policy: Path, seed: int) -> list[np.ndarray]:
     """Return the frames of a clip, each (height, width, 3), uint8."""
-    cfg = registered_env_cfg(clip.task, clip.profile, "play")
+    cfg = load_env_cfg(clip.task, play=True, profile=clip.profile)
     cfg.scene.env_spacing = clip.spacing
     cfg.scene.spec_fn = light_studio
     # The robot starts at the center of its environment, and walks at one velocity.

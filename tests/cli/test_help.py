@@ -11,11 +11,10 @@ import pytest
 from mjlab.cli.flags import parse_flags, with_task_options
 from mjlab.cli.help import print_help, requested_topic, screen_rows
 from mjlab.cli.train_config import TrainConfig
-from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.play import PlayConfig
 from mjlab.scripts.profile_env import ProfileConfig
-from mjlab.tasks.registry import list_tasks
+from mjlab.tasks.registry import list_tasks, load_env_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
 TRACKING = "Mjlab-Tracking-Flat-Unitree-G1"
@@ -32,7 +31,7 @@ def flags_in(text: str) -> set[str]:
 
 def config(command: str, task: str):
     if command in POLICY_FLAGS:
-        env = registered_env_cfg(task, None, "play" if command == "play" else "train")
+        env = load_env_cfg(task, play=command == "play")
         return with_task_options(POLICY_FLAGS[command](env=env), task)
     return with_task_options(TrainConfig.from_task(task), task)
 

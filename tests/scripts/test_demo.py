@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from mjlab.runs.policy import load_policy, make_env
-from mjlab.runs.run import registered_env_cfg
 from mjlab.scripts import demo
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.viewer.page_server import open_browser
@@ -78,7 +77,7 @@ def test_a_robot_without_a_policy_is_told_with_those_that_have_one(run):
 @pytest.mark.parametrize("name", demo.DEMOS)
 def test_a_bundled_policy_walks_forward_as_told(name):
     bundled = demo.DEMOS[name]
-    cfg = registered_env_cfg(bundled.task, bundled.profile, "play")
+    cfg = load_env_cfg(bundled.task, play=True, profile=bundled.profile)
     twist = cfg.commands["twist"]
     twist.rel_standing_envs = twist.rel_heading_envs = 0.0
     twist.ranges.lin_vel_x, twist.ranges.lin_vel_y = (0.8, 0.8), (0.0, 0.0)

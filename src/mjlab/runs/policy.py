@@ -14,8 +14,8 @@ from mjlab.rl.checkpoint import CheckpointError
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import acting_cfg
 from mjlab.runs.checkpoint import Checkpoint
-from mjlab.runs.run import Run, registered_env_cfg
-from mjlab.tasks.registry import load_rl_cfg, load_runner_cls
+from mjlab.runs.run import Run
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 from mjlab.utils.torch import prepare_torch
 
 
@@ -86,7 +86,7 @@ def load_policy(
         from mjlab.rl.exporter_utils import load_onnx_policy
 
         # The profile may ease the physics of training.
-        trained = registered_env_cfg(task, profile, "train")
+        trained = load_env_cfg(task, profile=profile)
         return load_onnx_policy(checkpoint.path, env, device, trained)
     from mjlab.rl import MjlabOnPolicyRunner
 

@@ -35,11 +35,11 @@ DEMOS = {
 
 def demo_cfg(demo: Demo) -> PlayConfig:
     """Return the default flags of `demo`: one robot, on the CPU, in the browser."""
-    from mjlab.runs.run import registered_env_cfg
     from mjlab.scripts.play import PlayConfig
     from mjlab.sensor import RayCastSensorCfg
+    from mjlab.tasks.registry import load_env_cfg
 
-    env = registered_env_cfg(demo.task, demo.profile, "play")
+    env = load_env_cfg(demo.task, play=True, profile=demo.profile)
     for sensor in env.scene.sensors:
         # Rays would distract from the robot.
         if isinstance(sensor, RayCastSensorCfg):

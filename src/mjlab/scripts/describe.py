@@ -15,7 +15,6 @@ from mjlab.cli.flags import (
     with_task_options,
 )
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from mjlab.runs.run import registered_env_cfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.screen import shown
@@ -52,7 +51,7 @@ def command(argv: list[str], prog: str) -> None:
     task, *flags = argv
     # The defaults of the other flags depend on these two.
     choice = previewed(ConfigChoice(), flags)
-    env_cfg = _env_cfg(task, choice)
+    env_cfg = load_env_cfg(task, choice.play, choice.profile)
     default = with_task_options(DescribeConfig(choice.profile, choice.play, env=env_cfg), task)
     cfg = parse_flags(type(default), default, flags, f"{prog} {task}")
     if cfg.json and cfg.markdown:
@@ -79,7 +78,7 @@ def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:
         ValueError: invalid config, or a resource of the task was not found.
     """
     cfg = cfg or DescribeConfig()
-    env_cfg = copy.deepcopy(cfg.env) or _env_cfg(task, cfg)
+    env_cfg = copy.deepcopy(cfg.env) or load_env_cfg(task, cfg.play, cfg.profile)
     prepare_env_cfg(task, cfg, env_cfg, checkpoint=None)
     num_envs = env_cfg.scene.num_envs
     env_cfg.scene.num_envs = 1
@@ -90,12 +89,6 @@ def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:
         return TaskDescription(task, cfg, num_envs, env)
     finally:
         env.close()
-
-
-def _env_cfg(task: str, choice: ConfigChoice) -> ManagerBasedRlEnvCfg:
-    if choice.play:
-        return registered_env_cfg(task, choice.profile, "play")
-    return load_env_cfg(task, profile=choice.profile)
 
 
 class TaskDescription:

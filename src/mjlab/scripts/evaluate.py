@@ -24,7 +24,7 @@ from mjlab.cli.policy_flags import (
 from mjlab.rl.checkpoint import curricula_of, naming_checkpoint
 from mjlab.runs import Checkpoint
 from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_policy
-from mjlab.runs.run import registered_env_cfg
+from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.logging import print_notice
 from mjlab.utils.ranges import Count, Seed, check_ranges
 from mjlab.utils.screen import shown
@@ -73,7 +73,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
     report_policy(task, checkpoint, cfg, env_cfg, "evaluate")
-    default = registered_env_cfg(task, cfg.profile, "evaluate").scene.num_envs
+    default = load_env_cfg(task, profile=cfg.profile, evaluate=True).scene.num_envs
     is_chosen = keep_num_envs or env_cfg.scene.num_envs != default
     num_envs = cfg.num_envs or (None if is_chosen else cfg.num_episodes)
     agent = agent_cfg_of(task, checkpoint, cfg.profile)

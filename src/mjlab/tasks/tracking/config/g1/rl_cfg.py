@@ -62,8 +62,9 @@ def unitree_g1_tracking_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
 
 
 def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
-    first = _ACTION_RATE_AT_FIRST * env_cfg.rewards[_ACTION_RATE].weight
-    ease_weight(env_cfg, _ACTION_RATE, first, _ACTION_RATE_SAMPLES // _NUM_ENVS)
+    if (penalty := env_cfg.rewards[_ACTION_RATE]) is not None:
+        first = _ACTION_RATE_AT_FIRST * penalty.weight
+        ease_weight(env_cfg, _ACTION_RATE, first, _ACTION_RATE_SAMPLES // _NUM_ENVS)
     params = {"command_name": _COMMAND, "steps": _CALM_SAMPLES // _NUM_ENVS}
     env_cfg.curriculum["eased_starts"] = CurriculumTermCfg(func=GrowingStarts, params=params)
     rl_cfg.actor.class_name = "mjlab.tasks.tracking.rl.reference_actor:ReferenceActor"

@@ -197,7 +197,7 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
     fewer = copy.deepcopy(FULL_COLLISION)
     fewer.geom_names_expr = (_FOOT, *_LIMBS)
     env_cfg.scene.entities["robot"].collisions = (fewer,)
-    penalties = {name: term for name, term in env_cfg.rewards.items() if term.weight < 0.0}
+    penalties = {n: term for n, term in env_cfg.rewards.items() if term and term.weight < 0.0}
     env_cfg.rewards = {
         **copy.deepcopy(_GAIT_REWARDS),
         **penalties,
