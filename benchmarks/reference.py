@@ -260,7 +260,7 @@ seed until its evaluations solve the task, or until its time limit. `make refere
 - **Samples**: environment steps, over all environments. **Minutes**: rollouts and updates, without evaluations.
   These runs are evaluated from the start, more often than others, to record curves.
 - **Final**: result of `evaluate` for the last policies, on seeds not used in training: the mean over seeds and, in
-  brackets, the lowest and the highest end of their 95 % intervals. The table shows metrics of the success criterion;
+  brackets, the lowest and the highest end of their 95 % intervals. The table shows the metrics that solve the task;
   the sections show all.
 - Curves: mean evaluation returns over seeds, with one sample standard deviation shaded.
 """
@@ -320,7 +320,7 @@ def _summary(reference: Reference | None) -> tuple[str, str, str]:
 
 
 def _deciding(reference: Reference) -> list[str]:
-    """Return the metrics of the task's success criterion, by default the return."""
+    """Return the metrics that solve the task, by default the return."""
     from mjlab.tasks.registry import load_rl_cfg
 
     cfg = load_rl_cfg(reference.task, profile=reference.profile).evaluation

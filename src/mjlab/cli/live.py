@@ -170,7 +170,7 @@ class LiveView(TrainingObserver):
             },
             # Returns: they do not compare with a reward per step.
             "evaluations": self._evaluations if self._unit == "return" else {},
-            "goal": self._progress.goal if self._unit == "return" else None,
+            "goal": self._progress.solved_return if self._unit == "return" else None,
             "time": time.time(),
         }
 

@@ -323,7 +323,7 @@ class RslRlBaseRunnerCfg:
     upload_git_diff: bool = field(default=False, kw_only=True)
     """Upload the git diff to Weights & Biases."""
     evaluation: EvaluationCfg = field(default_factory=EvaluationCfg, kw_only=True)
-    """Success criteria and evaluations during training."""
+    """Conditions of a solved task, and evaluations during training."""
 
 
 @dataclass

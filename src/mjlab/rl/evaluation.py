@@ -1,7 +1,7 @@
 """Evaluation: scores of policies without exploration, and the check that a task is solved.
 
 `evaluate_policy` plays one episode per environment. `SolvedCheck` does so during a training run,
-which stops after two successful evaluations. The first has the same episodes each time, so that
+which stops after two evaluations of a solved task. The first has the same episodes each time, so that
 only the policy changes. A noisy policy passes it by luck if it is tried often enough, hence the
 second, on episodes that are new to the run.
 """

@@ -1,4 +1,4 @@
-"""Training progress: the value that decides, beside its goal.
+"""Training progress: the values that decide, beside their bounds.
 
 `TrainingProgress` collects what observers receive. It renders as a panel (rich, without borders),
 as a line for log files, and as the sentences that end a run. `NotebookProgress` shows the panel in one
@@ -149,7 +149,7 @@ class TrainingProgress(TrainingObserver):
         return usual, None if left is None else share * left
 
     @property
-    def goal(self) -> float | None:
+    def solved_return(self) -> float | None:
         """Return of evaluations that solves the task, None if other values decide."""
         return next((b.limit for b in self._bounds if b.name == "mean_return"), None)
 
@@ -170,7 +170,7 @@ class TrainingProgress(TrainingObserver):
         return "rising" if now > before else "falling" if now < before else "not met"
 
     def _next_evaluation(self) -> str | None:
-        """Return when the policy is evaluated next, None if the task has no goal."""
+        """Return when the policy is evaluated next, None if nothing solves the task."""
         if not self._bounds or self.stats is None:
             return None
         cfg = self._cfg.evaluation
@@ -279,7 +279,7 @@ class TrainingProgress(TrainingObserver):
         stats = self.stats
         if stats is None:
             return rows
-        solves = "" if self.goal is None else f"; {number(self.goal)} solves"
+        solves = "" if self.solved_return is None else f"; {number(self.solved_return)} solves"
         unit = _UNITS[stats.exploring_return is None]
         rows.append((unit, f"{number(self._exploring(stats))}, exploring{solves}"))
         rows.append(("episodes", self._episodes(stats)))

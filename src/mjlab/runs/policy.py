@@ -131,7 +131,7 @@ def agent_cfg_of(
 ) -> RslRlBaseRunnerCfg:
     """Return the learner config of the run that wrote `checkpoint`; that of `task` without one.
 
-    Flags of the run may have changed networks, clipping of actions and the success criterion.
+    Flags of the run may have changed networks, clipping of actions and the success of an episode.
 
     Args:
         task: Name of the task.
