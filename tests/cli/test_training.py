@@ -1,11 +1,14 @@
-"""Torch is configured before a command trains or plays."""
+"""Environments of training and of its evaluations."""
 
 from __future__ import annotations
 
 import pytest
 
+from mjlab.cli.training import evaluation_env_cfg
+from mjlab.managers import RewardTermCfg
 from mjlab.runs.policy import make_env
-from mjlab.scripts.train import TrainConfig, launch_training
+from mjlab.runs.settings import typed_settings
+from mjlab.scripts.train import TrainConfig, launch_training, parse_train_flags
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 
@@ -30,3 +33,34 @@ def test_training_and_playing_prepare_torch_first(monkeypatch, tmp_path, command
             )
         else:
             make_env(task, load_env_cfg(task), "cpu")
+
+
+G1 = "Mjlab-Velocity-Flat-Unitree-G1"
+
+
+def test_evaluations_have_the_flags_of_the_run():
+    # The weight is that of the profile, and another one is registered.
+    flags = [
+        "--profile", "cpu", "--env.rewards.action-rate-l2.weight", "-0.5",
+        "--env.rewards.linear.weight", "9", "--env.sim.num-threads", "1",
+        "--env.rewards.foot-slip", "None",
+    ]  # fmt: skip
+    cfg = parse_train_flags(G1, flags, "train")
+    evaluated = evaluation_env_cfg(G1, cfg, typed_settings(cfg.env, "env", flags))
+    registered = load_env_cfg(G1)
+    assert registered.rewards["action_rate_l2"].weight == -0.1
+    assert evaluated.rewards["action_rate_l2"].weight == -0.5
+    assert evaluated.rewards["foot_slip"] is None
+    assert evaluated.rewards.keys() == registered.rewards.keys()
+    assert evaluated.sim.num_threads == 1
+    assert evaluated.decimation == registered.decimation != cfg.env.decimation
+
+
+def test_evaluations_have_the_changes_of_a_program():
+    cfg = TrainConfig.from_task(G1, "cpu")
+    cfg.env.rewards["mine"] = RewardTermCfg(func=lambda env: env.reward_buf, weight=1.0)
+    cfg.env.scene.entities["robot"].init_state.pos = (0.0, 0.0, 2.0)
+    evaluated = evaluation_env_cfg(G1, cfg, {})
+    assert evaluated.rewards["mine"].weight == 1.0
+    assert evaluated.scene.entities["robot"].init_state.pos == (0.0, 0.0, 2.0)
+    assert "alive" not in evaluated.rewards
