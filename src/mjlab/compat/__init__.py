@@ -408,13 +408,11 @@ def warn_of_sites(name: str) -> None:
 def translate_older(cfg: Any) -> None:
     """Translate an environment config that a package of an older release filled in, in place."""
     groups = [group.terms for group in cfg.observations.values() if group is not None]
-    terms = [
-        term for terms in (cfg.rewards, *groups) for term in terms.values() if term is not None
-    ]
+    terms = [term for terms in (cfg.rewards, *groups) for term in terms.values()]
     feet = [
         term
         for term in terms
-        if hasattr(term.params.get("asset_cfg"), "site_names")
+        if hasattr(getattr(term, "params", {}).get("asset_cfg"), "site_names")
         and (reads_foot_scan(term) or getattr(term.func, "__name__", "") in _OLDER_PARAMS)
     ]
     if feet:

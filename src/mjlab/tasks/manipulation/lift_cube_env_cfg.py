@@ -41,8 +41,8 @@ def make_lift_cube_env_cfg() -> ManagerBasedRlEnvCfg:
       geoms of the events `fingertip_friction_*`; the primary of the sensor `ee_ground_collision`;
     - `viewer.body_name`.
 
-    Building the environment raises for empty sites and sensors. Events without geoms change nothing
-    and log a warning.
+    Building the environment raises for sensors and observations left empty, and warns of events
+    without geoms, which change nothing.
     """
     cfg = ManagerBasedRlEnvCfg(
         decimation=4,

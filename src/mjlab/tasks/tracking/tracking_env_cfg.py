@@ -51,7 +51,8 @@ def make_tracking_env_cfg() -> ManagerBasedRlEnvCfg:
       termination `ee_body_pos`;
     - `viewer.body_name`.
 
-    Building the environment raises for fields left empty.
+    Building the environment raises for fields of the command and of sensors left empty, and warns of
+    terms.
     """
     cfg = ManagerBasedRlEnvCfg(
         decimation=4,
