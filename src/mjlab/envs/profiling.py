@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 _SIMULATION = {
     "step": "physics",
     "forward": "forward",
-    "forward_after_reset": "forward",
     "sense": "sense",
     "reset": "reset",
 }
