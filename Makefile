@@ -55,8 +55,11 @@ reference:  ## Train stock tasks on several seeds; TASKS="A B" SEEDS=N MINUTES=N
 PYTHON ?= $(or $(wildcard .venv/bin/python),python3)
 DEVICE ?= cuda:0
 
-gpu:  ## Test and measure on an NVIDIA GPU, in ten minutes; PARTS="parity speed" for some parts.
-	$(PYTHON) benchmarks/gpu.py --device $(DEVICE) $(if $(PARTS),--part $(PARTS)) $(GPU_FLAGS)
+gpu:  ## Measure and test on an NVIDIA GPU, in twelve minutes; PARTS="parity speed" for some parts.
+	status=0; \
+	$(PYTHON) benchmarks/gpu.py --device $(DEVICE) $(if $(PARTS),--part $(PARTS)) $(GPU_FLAGS) || status=1; \
+	$(if $(PARTS),,MJLAB_TEST_CUDA_DEVICE=$(DEVICE) $(PYTHON) -m pytest -q -m cuda tests/sim || status=1;) \
+	exit $$status
 
 torture:  ## Kill, damage, limit, mistake and attack; PARTS="kills page" SEED=N MINUTES=N TRIAL=N.
 	$(DEV) pytest -s -m robustness tests/robustness $(if $(PARTS),--parts $(PARTS)) \
