@@ -100,7 +100,11 @@ def plain_loop(env: Any, controls: dict[str, list[float]], steps: int) -> np.nda
 
 @pytest.mark.parametrize(
     ("engine", "xml"),
-    [("native", TURN + PID + SERVO), ("native", TURN + DC + SERVO), ("warp", DC + SERVO)],
+    [
+        ("native", TURN + PID + SERVO),
+        pytest.param("native", TURN + DC + SERVO, marks=pytest.mark.slow),
+        pytest.param("warp", DC + SERVO, marks=pytest.mark.slow),
+    ],
     ids=("native-pid", "native-dcmotor", "warp-dcmotor"),
 )
 def test_joint_position_action_drives_the_same_joints_as_a_plain_loop(engine, xml):

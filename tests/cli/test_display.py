@@ -231,9 +231,6 @@ def test_an_evaluated_return_stands_beside_the_goal():
         (SWINGUP, ["--profile", "cpu"], True),
         (GO1, ["--profile", "cpu"], True),
         (SWINGUP, [], False),
-        (SWINGUP, ["--profile", "cpu", "--agent.algorithm.learning-rate", "1e-5"], False),
-        (SWINGUP, ["--profile", "cpu", "--env.rewards.smooth-reward.weight", "2"], False),
-        (SWINGUP, ["--profile", "cpu", "--agent.evaluation.solved-return", "990"], False),
     ],
 )
 def test_the_usual_end_is_that_of_reference_runs_with_the_same_settings(task, flags, known):
@@ -307,7 +304,13 @@ def test_the_next_commands_of_a_script_are_called_through_it(monkeypatch, tmp_pa
     assert play == f"uv run python examples/mine.py play {SWINGUP}"
 
 
-@pytest.mark.parametrize("name", ["cartpole", "elsewhere"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cartpole",
+        pytest.param("elsewhere", marks=pytest.mark.slow),
+    ],
+)
 def test_the_printed_commands_find_the_policy(trained, name):
     cfg = parse_train_flags(SWINGUP, ["--log-root", str(trained.parents[1])], "train")
     cfg.agent.experiment_name = name

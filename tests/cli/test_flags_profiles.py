@@ -143,9 +143,7 @@ def test_resuming_keeps_the_profile(run, profiled):
     ("variables", "tells"),
     [
         ({}, True),
-        ({"RANK": "0", "WORLD_SIZE": "2"}, True),
         ({"RANK": "1", "WORLD_SIZE": "2"}, False),
-        ({"RANK": "0", "WORLD_SIZE": "2", "MJLAB_PROCESS_STORE": "127.0.0.1:1"}, False),
     ],
 )
 def test_of_several_processes_one_tells_which_profile_is_resumed(
@@ -265,6 +263,7 @@ def own_task(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_a_task_of_ones_own_trains_and_is_evaluated_under_a_profile_made_for_it(
     own_task, run, tmp_path
 ):

@@ -101,6 +101,7 @@ def test_live_keeps_the_weights_bit_for_bit(run, trained, train, tmp_path, monke
     assert all(torch.equal(one[key], other[key]) for key in one)
 
 
+@pytest.mark.slow
 def test_page_is_filled_before_training(capsys, monkeypatch):
     monkeypatch.setattr(live, "_SECONDS_TO_START", 100.0)
     cfg = TrainConfig.from_task(TASK)

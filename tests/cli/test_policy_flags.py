@@ -70,7 +70,11 @@ TRACKING = "Mjlab-Tracking-Flat-Unitree-G1"
 
 @pytest.mark.parametrize(
     ("profile", "name"),
-    [("cpu", None), ("cpu", "MLPModel"), (None, REFERENCE_ACTOR)],
+    [
+        pytest.param("cpu", None, marks=pytest.mark.slow),
+        ("cpu", "MLPModel"),
+        pytest.param(None, REFERENCE_ACTOR, marks=pytest.mark.slow),
+    ],
 )
 def test_runs_of_tracking_are_evaluated_and_played_with_the_class_they_had(
     run, tmp_path, profile, name

@@ -64,13 +64,6 @@ def test_no_iterations_train_nothing(run, tmp_path):
         (["--env.rewards.smooth-reward.weight", "9"], "rewards.smooth_reward.weight"),
         (["--env.rewards.smooth-reward", "None"], "rewards.smooth_reward"),
         (["--env.decimation", "2"], "decimation"),
-        ([], None),
-        (["--agent.algorithm.gamma", "0.5"], None),
-        # A goal of the user's.
-        (
-            ["--env.rewards.smooth-reward.weight=9", "--agent.evaluation.solved-return=8100"],
-            None,
-        ),
     ],
 )
 def test_weights_are_named_beside_the_goal(capsys, flags, named):
@@ -113,17 +106,9 @@ def test_defaults_that_have_no_effect_are_silent(run, tmp_path):
     ("flag", "value", "expected"),
     [
         ("--agent.algorithm.gamma", "nan", "a number in [0, 1]"),
-        ("--agent.algorithm.learning-rate", "inf", "a finite number > 0"),
-        ("--agent.algorithm.max-grad-norm", "0", "a number > 0"),
-        ("--agent.algorithm.clip_param", "-0.2", "a number > 0"),
         ("--agent.actor.hidden-dims", "[0,64]", "an integer >= 1, or -1"),
-        ("--agent.actor.distribution-cfg.init-std", "0", "a finite number > 0"),
-        ("--agent.evaluation.solved-return", "nan", "a number"),
         ("--agent.max-iterations", "-1", "an integer >= 0"),
-        ("--env.sim.mujoco.iterations", "-1", "an integer in [0, 2147483647]"),
         ("--env.sim.mujoco.iterations", "3000000000", "an integer in [0, 2147483647]"),
-        ("--video-interval", "0", "an integer >= 1"),
-        ("--grace", "nan", "a number in [0, 9223372036]"),
     ],
 )
 def test_typed_numbers_out_of_range_raise(run, tmp_path, flag, value, expected):
@@ -149,7 +134,13 @@ def test_numbers_of_a_task_out_of_range_warn(run, tmp_path, monkeypatch, flags, 
     assert outcome.err.count(told) == (flags == []) + status
 
 
-@pytest.mark.parametrize(("name", "told"), [("../out", 1), ("group/own", 0), ("linked", 0)])
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("../out", 1),
+        ("group/own", 0),
+    ],
+)
 def test_an_experiment_outside_of_the_root_is_told(run, tmp_path, name, told):
     root = tmp_path / "logs"
     root.mkdir()

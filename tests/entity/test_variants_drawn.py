@@ -107,7 +107,13 @@ CAMERA = CameraSensorCfg(
 )
 
 
-@pytest.mark.parametrize("engine", ["native", "warp"])
+@pytest.mark.parametrize(
+    "engine",
+    [
+        "native",
+        pytest.param("warp", marks=pytest.mark.slow),
+    ],
+)
 def test_cameras_show_each_environment_its_own_variant(engine: str) -> None:
     def images(num_envs: int, cfg: EntityCfg, engine: str) -> CameraSensorData:
         scene = make_scene(num_envs, {"thing": cfg}, (CAMERA,))

@@ -61,12 +61,12 @@ def rollout(task: str, engine: Any, dtype: torch.dtype) -> list[torch.Tensor]:
     ("task", "engine"),
     [
         ("Mjlab-Velocity-Rough-Unitree-Go1", "native"),
-        ("Mjlab-Lift-Cube-Yam", "native"),
-        ("Mjlab-Lift-Cube-Yam-Depth", "native"),
-        ("Mjlab-Lift-Cube-Yam-Rgb", "native"),
-        ("Mjlab-Multi-Cube-Seg-Yam", "native"),
+        pytest.param("Mjlab-Lift-Cube-Yam", "native", marks=pytest.mark.slow),
+        pytest.param("Mjlab-Lift-Cube-Yam-Depth", "native", marks=pytest.mark.slow),
+        pytest.param("Mjlab-Lift-Cube-Yam-Rgb", "native", marks=pytest.mark.slow),
+        pytest.param("Mjlab-Multi-Cube-Seg-Yam", "native", marks=pytest.mark.slow),
         ("Mjlab-Cartpole-Swingup", "native"),
-        ("Mjlab-Cartpole-Swingup", "warp"),
+        pytest.param("Mjlab-Cartpole-Swingup", "warp", marks=pytest.mark.slow),
     ],
 )
 def test_a_rollout_is_the_same_under_default_float64(task: str, engine: str):

@@ -85,6 +85,7 @@ pathlib.Path({str(tmp_path)!r}, rank).write_text(text)
         assert set(addresses) == {"0100007F"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_store_at_loopback_listens_there(tmp_path):
     ports = {}
@@ -169,7 +170,13 @@ def test_a_process_that_gave_up_because_of_another_is_not_the_one_named():
         launch("if rank == '1': time.sleep(0.5); sys.exit(1)\nsys.exit(3)")
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "SIGINT",
+        pytest.param("SIGTERM", marks=pytest.mark.slow),
+    ],
+)
 def test_a_signal_goes_to_every_process_once_and_all_are_waited_for(tmp_path, name):
     child = (
         f"{PROGRAM}folder = pathlib.Path({str(tmp_path)!r})\n"

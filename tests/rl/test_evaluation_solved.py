@@ -137,7 +137,14 @@ class Stopping(TrainingObserver):
             signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize("remaining", [0, 1, 5])
+@pytest.mark.parametrize(
+    "remaining",
+    [
+        pytest.param(0, marks=pytest.mark.slow),
+        1,
+        pytest.param(5, marks=pytest.mark.slow),
+    ],
+)
 def test_an_evaluation_left_out_by_a_stop_is_made_up_for(tmp_path: Path, remaining):
     """`remaining` iterations before the run is solved; with none, no more is trained."""
     whole, expected = learner(SEED)

@@ -81,7 +81,13 @@ def test_render_without_a_mode_is_none():
     env.close()
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(
+    "num_envs",
+    [
+        1,
+        pytest.param(3, marks=pytest.mark.slow),
+    ],
+)
 def test_videos_are_recorded(renders, tmp_path, num_envs):
     pytest.importorskip("moviepy")
     env = vector.RecordVideo(make(num_envs), str(tmp_path), episode_trigger=lambda k: k < 2)
@@ -138,6 +144,7 @@ def test_make_names_make_vec():
         gymnasium.make(NAME)
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_at_exit(renders):
     program = (
         "import gymnasium\n"

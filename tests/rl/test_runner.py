@@ -457,7 +457,13 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize("evaluation", [1, 2])
+@pytest.mark.parametrize(
+    "evaluation",
+    [
+        1,
+        pytest.param(2, marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("how", ["SIGTERM", "twice", "killed"])
 def test_an_interrupted_evaluation_is_made_up_for(
     make_runner, tmp_path: Path, monkeypatch, evaluation, how

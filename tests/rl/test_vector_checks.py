@@ -19,6 +19,8 @@ from mjlab.rl.vector_checks import VectorEnvError  # noqa: E402
 from mjlab.tasks.registry import list_tasks  # noqa: E402
 
 NUM_ENVS = 3
+# Tasks of which the check is quick; the others are slow.
+QUICK = ("Mjlab-Cartpole-Swingup", "Mjlab-Velocity-Flat-Unitree-Go1", "Mjlab-Lift-Cube-Yam-Rgb")
 LENGTHS = np.array([4, 6, 9])
 
 
@@ -278,7 +280,10 @@ def shorten(cfg: Any) -> None:
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("warp", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", list_tasks())
+@pytest.mark.parametrize(
+    "task",
+    [t if t in QUICK else pytest.param(t, marks=pytest.mark.slow) for t in list_tasks()],
+)
 def test_every_task_keeps_to_the_interface(task, engine):
     if engine == "warp":
         pytest.importorskip("mujoco_warp")

@@ -280,7 +280,13 @@ def test_the_evaluations_of_a_run_are_read_by_samples(uninterrupted):
     assert run.steps_per_second == run.samples / run.seconds
 
 
-@pytest.mark.parametrize("is_killed", [False, True])
+@pytest.mark.parametrize(
+    "is_killed",
+    [
+        False,
+        pytest.param(True, marks=pytest.mark.slow),
+    ],
+)
 def test_a_resumed_run_has_the_curve_of_an_uninterrupted_one(
     train, uninterrupted, tmp_path, is_killed
 ):

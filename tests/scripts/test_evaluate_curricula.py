@@ -44,6 +44,7 @@ def growing() -> Iterator[str]:
     del registry._tasks[NAME]
 
 
+@pytest.mark.slow
 def test_the_state_of_curricula_is_printed(run, growing, tmp_path):
     flags = (*SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "9")
     outcome = run("train", growing, *flags)

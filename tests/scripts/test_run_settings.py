@@ -169,7 +169,13 @@ def test_auto_leaves_a_solved_run_alone(run, first):
     assert list(first.parent.iterdir()) == [first]
 
 
-@pytest.mark.parametrize("kind", ["*.pt", "*.onnx"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "*.pt",
+        pytest.param("*.onnx", marks=pytest.mark.slow),
+    ],
+)
 def test_evaluations_have_the_settings(run, first, kind):
     policy = sorted(first.glob(kind))[-1]
     outcome = run("evaluate", TASK, *SHORT, "--checkpoint-file", str(policy))
@@ -185,6 +191,7 @@ def test_evaluations_have_the_settings(run, first, kind):
     assert json.loads(outcome.out)["mean_return"] == pytest.approx(own, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_policy_and_export_score_the_same_with_settings(run, first):
     scores = []
     for policy in (first / "model_1.pt", next(first.glob("*.onnx")), first):
@@ -258,7 +265,13 @@ def test_changes_of_the_code_are_listed(run, first, monkeypatch):
     assert "when the run was trained" in outcome.err
 
 
-@pytest.mark.parametrize("command", ["evaluate", "train"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "evaluate",
+        pytest.param("train", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize("knows_sizes", [True, False])
 def test_terms_in_another_order_are_an_error(run, first, monkeypatch, command, knows_sizes):
     from mjlab.tasks.cartpole import cartpole_env_cfg

@@ -58,7 +58,9 @@ CONDITIONS = {
 }
 
 
-@pytest.fixture(params=CONDITIONS)
+@pytest.fixture(
+    params=["return", *(pytest.param(n, marks=pytest.mark.slow) for n in ("below", "above"))]
+)
 def easy(request):
     """A task that is solved from the first iteration on."""
 
@@ -150,6 +152,7 @@ def test_a_signal_reaches_the_run_which_is_waited_for(tmp_path, name):
     assert done.exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_the_running_seed_and_ends_the_series(tmp_path):
     command = [sys.executable, "-m", "mjlab.scripts.train_seeds", TASK, *SMALL[:-4]]
     command += ["--log-root", str(tmp_path), "--agent.max-iterations", "1000000", "--seeds=2"]

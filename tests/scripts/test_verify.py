@@ -173,6 +173,7 @@ def test_where_all_seeds_were_solved_one_that_is_not_in_time_is_outside(verify, 
     assert ITERATIONS < Run(run_dir).info["iterations"] <= 4 * ITERATIONS
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):
     with stopped_after(2):
         outcome = verify("--seed", "5")
@@ -200,6 +201,7 @@ def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):
     assert read_run(uninterrupted).figures == figures
 
 
+@pytest.mark.slow
 def test_a_run_interrupted_before_its_first_evaluation_goes_on(verify):
     late = ["--agent.evaluation.min-interval", "3"]
     with stopped_after(2):
@@ -209,6 +211,7 @@ def test_a_run_interrupted_before_its_first_evaluation_goes_on(verify):
     assert verify("--seed", "5", "--resume").status == 0
 
 
+@pytest.mark.slow
 def test_a_run_interrupted_in_its_last_iteration_has_finished(verify):
     with stopped_after(ITERATIONS):
         outcome = verify("--seed", "5")
@@ -319,6 +322,7 @@ def test_the_page_of_the_documentation_is_that_of_the_data(module):
     assert (ROOT / "docs" / "reference" / "runs" / "index.md").read_text() == module.page(DATA)
 
 
+@pytest.mark.slow
 def test_only_what_is_asked_for_is_replaced(maker):
     before = {record.seed: record for record in maker.reference.seeds}
     maker.commit("second")

@@ -104,6 +104,7 @@ def test_flags_that_make_no_sense_are_refused(fields, message):
         run_visualize_terrain(VisualizeTerrainConfig(**fields))
 
 
+@pytest.mark.slow
 def test_the_module_is_a_command():
     told = subprocess.run(
         [sys.executable, "-m", "mjlab.scripts.visualize_terrain", "--help"],

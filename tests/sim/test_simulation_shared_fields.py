@@ -256,7 +256,13 @@ def cartpole(engine: str, mode: str, num_envs: int) -> ManagerBasedRlEnvCfg:
     return cfg
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(
+    "num_envs",
+    [
+        pytest.param(1, marks=pytest.mark.slow),
+        3,
+    ],
+)
 @pytest.mark.parametrize("mode", ["startup", "reset", "interval", "step"])
 def test_an_event_of_any_mode_writes_an_option(engine, mode, num_envs, caplog):
     env = ManagerBasedRlEnv(cartpole(engine, mode, num_envs), device="cpu")

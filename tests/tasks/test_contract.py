@@ -25,7 +25,17 @@ from mjlab.viewer.debug_visualizer import NullDebugVisualizer
 # Odd, so that no other dimension of a tensor is likely to be the same.
 NUM_ENVS = 7
 
-pytestmark = pytest.mark.parametrize("task", list_tasks())
+every_task = pytest.mark.parametrize("task", list_tasks())
+FAMILIES = {
+    "Mjlab-Cartpole-Swingup",
+    "Mjlab-Lift-Cube-Yam",
+    "Mjlab-Tracking-Flat-Unitree-G1",
+    "Mjlab-Velocity-Rough-Unitree-Go1",
+}
+task_of_each_family = pytest.mark.parametrize(
+    "task",
+    [t if t in FAMILIES else pytest.param(t, marks=pytest.mark.slow) for t in list_tasks()],
+)
 
 
 @contextlib.contextmanager
@@ -116,12 +126,14 @@ def dataclasses_in(value: Any, seen: set[int] | None = None) -> Iterator[Any]:
         yield from dataclasses_in(item, seen)
 
 
+@every_task
 @pytest.mark.parametrize("play", [False, True], ids=["train", "play"])
 def test_configs_are_equal_to_their_pickled_copies(task: str, play: bool) -> None:
     for cfg in (load_env_cfg(task, play=play), load_rl_cfg(task)):
         assert pickle.loads(pickle.dumps(cfg)) == cfg
 
 
+@every_task
 @pytest.mark.parametrize("play", [False, True], ids=["train", "play"])
 def test_it_builds_resets_and_steps_with_finite_values_of_the_stated_shapes(task, play):
     with making(task, play=play) as env:
@@ -144,6 +156,7 @@ def test_it_builds_resets_and_steps_with_finite_values_of_the_stated_shapes(task
         assert "actor" in observations
 
 
+@every_task
 @pytest.mark.slow
 def test_it_builds_and_steps_on_the_whole_of_its_terrain(task):
     with making(task, whole_terrain=True) as env:
@@ -154,6 +167,7 @@ def test_it_builds_and_steps_on_the_whole_of_its_terrain(task):
         assert all(torch.isfinite(t).all() for t in tensors(observations).values())
 
 
+@every_task
 def test_every_observation_group_of_the_learner_exists(task):
     with making(task) as env:
         observations, _ = env.reset()
@@ -161,6 +175,7 @@ def test_every_observation_group_of_the_learner_exists(task):
             assert set(groups) <= observations.keys(), model
 
 
+@task_of_each_family
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(task):
     runs = []
     for seed in (1, 1, 2):
@@ -172,12 +187,14 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(task):
         assert_same_bits(runs[0], runs[2])
 
 
+@task_of_each_family
 def test_a_reset_with_a_seed_starts_the_same_episode_again(task):
     with making(task) as env:
         starts = [copied(env.reset(seed=11)[0]) for _ in range(2)]
         assert_same_bits([starts[0]], [starts[1]])
 
 
+@task_of_each_family
 def test_resetting_some_environments_leaves_the_others_alone(task):
     # A partial reset recomputes the observations of all environments and would resample their noise.
     with making(task, noisy=False) as env:
@@ -202,6 +219,7 @@ def test_resetting_some_environments_leaves_the_others_alone(task):
         assert (env.episode_length_buf[others] == 4).all()
 
 
+@task_of_each_family
 def test_its_state_goes_on_bit_for_bit_in_another_environment(task):
     with making(task) as env:
         env.reset()
@@ -217,6 +235,7 @@ def test_its_state_goes_on_bit_for_bit_in_another_environment(task):
         assert_same_bits(trajectory(env, 5), expected)
 
 
+@task_of_each_family
 def test_an_environment_leaves_its_config_as_it_was_but_for_the_seed(task):
     cfg = load_env_cfg(task)
     cfg.scene.num_envs = 2
@@ -236,6 +255,7 @@ def plain(cfg: Any) -> Any:
     return to_plain(cfg)
 
 
+@every_task
 @pytest.mark.parametrize("play", [False, True], ids=["train", "play"])
 def test_editing_a_loaded_config_does_not_show_in_the_next(task, play):
     edited, untouched = load_env_cfg(task, play=play), plain(load_env_cfg(task, play=play))
@@ -276,6 +296,7 @@ class Board(NullDebugVisualizer):
         self.legend.add(tuple(color))
 
 
+@task_of_each_family
 def test_the_legend_explains_the_colors_of_all_that_can_be_drawn(task):
     with making(task, edit=draw_all) as env:
         env.reset()
@@ -297,12 +318,14 @@ def draw_all(cfg):
         command.debug_vis = True
 
 
+@every_task
 def test_the_observation_groups_share_no_term_config(task):
     groups = [group for group in load_env_cfg(task).observations.values() if group is not None]
     terms = [id(term) for group in groups for term in group.terms.values()]
     assert len(terms) == len(set(terms))
 
 
+@task_of_each_family
 def test_its_configs_are_written_as_yaml_that_is_safe_to_load(task, tmp_path: Path):
     for name, config in (("env", load_env_cfg(task)), ("agent", load_rl_cfg(task))):
         dump_yaml(tmp_path / f"{name}.yaml", dataclasses.asdict(config))
@@ -311,6 +334,7 @@ def test_its_configs_are_written_as_yaml_that_is_safe_to_load(task, tmp_path: Pa
     assert isinstance(load_rl_cfg(task), RslRlBaseRunnerCfg)
 
 
+@every_task
 def test_the_annotations_of_all_its_configs_resolve_at_run_time(task):
     configs = [load_env_cfg(task), load_rl_cfg(task)]
     types = {type(config) for top in configs for config in dataclasses_in(top)}
@@ -320,6 +344,7 @@ def test_the_annotations_of_all_its_configs_resolve_at_run_time(task):
         assert {field.name for field in dataclasses.fields(config_type)} <= hints.keys()
 
 
+@task_of_each_family
 def test_its_help_lists_the_flags_of_its_terms(task):
     from mjlab.cli.flags import parse_flags
     from mjlab.scripts.train import TrainConfig
@@ -337,6 +362,7 @@ def test_its_help_lists_the_flags_of_its_terms(task):
     assert not [flag for flag in flags if flag not in text]
 
 
+@every_task
 def test_its_runner_can_be_loaded(task):
     runner = load_runner_cls(task)
     assert runner is None or isinstance(runner, type)

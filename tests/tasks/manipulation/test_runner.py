@@ -56,7 +56,13 @@ def test_saving_writes_the_policy_beside_the_checkpoint(tmp_path):
     assert scales[5:7] == pytest.approx([5.520026131, 0.08657395591], rel=1e-6)
 
 
-@pytest.mark.parametrize("task", [LIFT, MULTI])
+@pytest.mark.parametrize(
+    "task",
+    [
+        LIFT,
+        pytest.param(MULTI, marks=pytest.mark.slow),
+    ],
+)
 def test_training_learns_and_a_resumed_run_goes_on_as_the_uninterrupted_one(task, tmp_path):
     whole = make_runner(task, tmp_path / "whole")
     before = weights(whole)

@@ -132,7 +132,11 @@ def test_an_export_that_fails_costs_no_checkpoint(make_runner, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda sim: sim.pop("library"), "native engine before mujoco.batch"),
+        pytest.param(
+            lambda sim: sim.pop("library"),
+            "native engine before mujoco.batch",
+            marks=pytest.mark.slow,
+        ),
         (lambda sim: sim.update(engine="warp"), "'native', got 'warp'"),
     ],
 )

@@ -38,7 +38,13 @@ def make_runner(folder: Path, kind: str, layers: int = 1) -> MjlabOnPolicyRunner
     return MjlabOnPolicyRunner(make_env(), asdict(cfg), str(folder))
 
 
-@pytest.mark.parametrize("kind", ["lstm", "gru"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "lstm",
+        pytest.param("gru", marks=pytest.mark.slow),
+    ],
+)
 def test_a_resumed_run_continues_bit_for_bit(tmp_path, kind):
     whole = make_runner(tmp_path / "whole", kind)
     whole.learn(4, init_at_random_ep_len=True)
@@ -55,7 +61,13 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path, kind):
         runner.env.close()
 
 
-@pytest.mark.parametrize(("kind", "layers"), [("lstm", 1), ("gru", 2)])
+@pytest.mark.parametrize(
+    ("kind", "layers"),
+    [
+        ("lstm", 1),
+        pytest.param("gru", 2, marks=pytest.mark.slow),
+    ],
+)
 def test_the_exported_policy_acts_as_the_policy_over_many_episodes(tmp_path, kind, layers):
     runner = make_runner(tmp_path, kind, layers)
     runner.learn(2)

@@ -30,7 +30,7 @@ def make_env(task: str = G1, profile: str | None = "cpu", num_envs: int = 4, **p
 
 @pytest.fixture
 def env():
-    env = make_env(num_envs=32)
+    env = make_env(num_envs=8)
     yield env
     env.close()
 

@@ -14,7 +14,6 @@ from mjlab.managers.scene_entity_config import SceneEntityCfg
 TABLE = {f.row.name: f.row for f in vars(dr).values() if hasattr(f, "row")}
 # Names of one element of each kind that the robot of these tests has.
 ONE = {"site": "imu", "camera": "eye", "light": "lamp", "tendon": "cable", "joint": "knee"}
-FOLLOWS = {("joint", "actuator"), ("body", "geom")}
 
 
 def selection(kind: str, name: str) -> SceneEntityCfg:
