@@ -303,12 +303,12 @@ def test_a_spoilt_checkpoint_is_refused_and_not_run(run, resumable, tmp_path, sc
     assert resumable.read_bytes() == content
 
 
-def test_a_checkpoint_of_another_network_is_told_with_both_shapes(run, resumable, tmp_path):
+def test_another_network_is_told_with_both_shapes(run, resumable, tmp_path):
     flags = ("--agent.resume", "True", "--agent.actor.hidden-dims", "(64,32)")
     outcome = run("train", TASK, *SMALL, *flags, "--log-root", str(tmp_path / "logs"))
     assert outcome.status == 1
-    assert "(32, 64)" in outcome.message
-    assert "(64, 64)" in outcome.message
+    assert "[32, 64]" in outcome.message
+    assert "[64, 64]" in outcome.message
     assert load_checkpoint(resumable)["iterations_finished"] == 2
 
 

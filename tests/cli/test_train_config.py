@@ -106,7 +106,6 @@ def test_defaults_that_have_no_effect_are_silent(run, tmp_path):
     ("flag", "value", "expected"),
     [
         ("--agent.algorithm.gamma", "nan", "a number in [0, 1]"),
-        ("--agent.actor.hidden-dims", "[0,64]", "an integer >= 1, or -1"),
         ("--agent.max-iterations", "-1", "an integer >= 0"),
         ("--env.sim.mujoco.iterations", "3000000000", "an integer in [0, 2147483647]"),
     ],

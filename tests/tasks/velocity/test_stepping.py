@@ -66,14 +66,14 @@ def test_the_image_of_what_it_does_is_what_it_does_in_the_mirror(env):
     """Half a stride later, and with the state turned to the other side, the other leg does the same."""
     obs, _ = env.reset()
     for _ in range(20):
-        obs, *_ = env.step(0.3 * torch.randn(32, 29))
+        obs, *_ = env.step(0.3 * torch.randn(env.num_envs, 29))
     act = mdp.stepping_action(ObservationTermCfg(func=mdp.stepping_action, params={}), env)
     shown = act(env)
     robot, clock = env.scene["robot"], env.command_manager.get_term("gait")
     joints, velocities = robot.data.joint_pos.clone(), robot.data.root_link_vel_w.clone()
     pose = robot.data.root_link_pose_w.clone()
     _, mirrored = mirror_left_right(env, actions=shown)
-    wanted = mirrored[32:]
+    wanted = mirrored[env.num_envs :]
     mirror = mirror_of_joints(env.sim.mj_model, robot)
     flipped = pose.clone()
     flipped[:, 1] *= -1.0
