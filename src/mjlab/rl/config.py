@@ -218,6 +218,7 @@ class EvaluationCfg:
     environment step: with rewards in [0, 1], an episode of 1000 steps has at most 1000.
     """
 
+    # A solved task.
     solved_return: Number | None = None
     """Mean evaluation return required for a solved task. None without other conditions: evaluations
     with `trigger_return` only."""
@@ -228,17 +229,17 @@ class EvaluationCfg:
     failures in 200 count as 4.9 %, 0 in 4 as 24 %."""
     solved_above: Annotated[dict[str, float], Range()] = field(default_factory=dict)
     """Lower bounds of metrics by name, as `solved_below`."""
-    metrics: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
-    """Metrics besides the return: `func(env) -> (num_envs,)` by name, averaged over the steps of an
-    episode."""
-    units: dict[str, str] = field(default_factory=dict)
-    """Units of `metrics` by name, shown beside their values."""
     stop_when_solved: bool = field(default=True, metadata=shown("learning", "False"))
     """Stop training once the task is solved and a second evaluation, on unused episodes, confirms
     it."""
-    num_episodes: Count = 256
-    """Number of episodes of an evaluation and of its confirmation; one per environment, with the
-    deterministic policy."""
+
+    # Success of an episode.
+    success: Number | str | None = None
+    """Success of an episode: a minimum return; `survival`, no termination before the time limit; or
+    `module:function`, a function `func(env) -> (num_envs,) bool`, read one step before the end, because the
+    environment has reset when the last step returns. None: a return of `solved_return`."""
+
+    # When to evaluate.
     trigger_fraction: Weight = 0.8
     """Fraction of `solved_return` that the mean reward of the training data, times the episode
     length, must reach before an evaluation. Saves time; below 1, because training explores."""
@@ -248,10 +249,16 @@ class EvaluationCfg:
     """Minimum number of iterations between evaluations."""
     first_iteration: CountOrZero = 0
     """Minimum number of iterations before the first evaluation."""
-    success: Number | str | None = None
-    """Success of an episode: a minimum return; `survival`, no termination before the time limit; or
-    `module:function`, a function `func(env) -> (num_envs,) bool`, read one step before the end, because the
-    environment has reset when the last step returns. None: a return of `solved_return`."""
+
+    # Size and content of an evaluation.
+    num_episodes: Count = 256
+    """Number of episodes of an evaluation and of its confirmation; one per environment, with the
+    deterministic policy."""
+    metrics: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
+    """Metrics besides the return: `func(env) -> (num_envs,)` by name, averaged over the steps of an
+    episode."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units of `metrics` by name, shown beside their values."""
 
     @staticmethod
     def of(values: EvaluationCfg | Mapping[str, Any] | None) -> EvaluationCfg:
