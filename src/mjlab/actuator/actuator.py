@@ -5,7 +5,8 @@ An `Actuator` implements one `ActuatorCfg` of an entity for all joints, tendons 
 at every physics substep converts the entity's commands to their controls.
 
 An environment step runs `decimation` physics substeps. If no actuator or sensor acts between
-substeps, the engine runs all of them in one dispatch. This makes CPU runs several times faster.
+substeps, the engine runs all of them in one dispatch, which makes steps of the native engine 1.10
+(Go1, G1 tracking) to 1.15 times (Cartpole) as fast.
 `constant_within_step` marks methods that allow this.
 """
 

@@ -308,7 +308,7 @@ class ManagerBasedRlEnv(Tabular):
             entity.needs_substep for entity in self.scene.entities.values()
         )
         # If nothing acts between substeps, the engine runs all substeps in one call and records
-        # the fields that sensors need from each substep.
+        # the fields that sensors need from each substep; see `mjlab.actuator.actuator`.
         self._steps_as_one = not (
             self._acts_between_substeps
             or self.scene.needs_substep

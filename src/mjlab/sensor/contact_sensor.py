@@ -445,7 +445,7 @@ class _ContactTimers:
     substep of the next.
     """
 
-    _transient = {"_running", "_last", "_idle", "_ended", "_contact_is_idle", "_zero"}
+    _transient = {"_running", "_last", "_idle", "_ended", "_contact_is_idle"}
 
     def __init__(self, num_envs: int, num_primaries: int, device: str) -> None:
         shape = (num_envs, num_primaries)
@@ -457,7 +457,6 @@ class _ContactTimers:
         self._ended = torch.zeros(2, *shape, dtype=torch.bool, device=device)
         # Air is idle in contact (True), contact is idle in the air (False).
         self._contact_is_idle = torch.tensor([False, True], device=device).view(2, 1, 1)
-        self._zero = torch.zeros((), dtype=torch.float64, device=device)
 
     def update(self, in_contact: torch.Tensor, dt: float) -> None:
         """Advance by a substep of `dt` seconds that ended with `in_contact`, (N, P) bool."""
@@ -466,8 +465,7 @@ class _ContactTimers:
         self._ended.logical_and_(self._idle)
         self._running.add_(dt)
         torch.where(self._ended, self._running, self._last, out=self._last)
-        # Faster than `masked_fill_`.
-        torch.where(self._idle, self._zero, self._running, out=self._running)
+        self._running.masked_fill_(self._idle, 0.0)
 
     def reset(self, rows: torch.Tensor | slice) -> None:
         """Set all durations of some environments to zero."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -24,15 +23,6 @@ _REDUCE: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
 
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _HFIELD = int(mujoco.mjtGeom.mjGEOM_HFIELD)
-
-# Maximum number of cells of the surface lookup grid, along each of x and y.
-_MAX_CELLS = 512
-
-# Edge tolerance (m): float32 may place a point on an edge beyond the edge.
-_EDGE_TOLERANCE = 1e-3
-
-# Maximum number of planes to test sequentially.
-_MAX_LEVEL_PLANES = 4
 
 
 @dataclass
@@ -107,19 +97,11 @@ class TerrainHeightSensor(RayCastSensor):
 
     def _zero_below_ground(self, heights: torch.Tensor, missed: torch.Tensor) -> torch.Tensor:
         """Return heights with 0 for rays that missed because they start below the ground."""
-        if self._ground.is_level:
-            below = self._ground.is_above_level(self._origins.flatten(0, 1)).view_as(missed)
-            return torch.where(missed & below, 0.0, heights)
-        if heights.device.type == "cpu":
-            # Few rays miss. Testing for misses is cheap on a CPU, but would synchronize a GPU.
-            rows, columns = missed.nonzero(as_tuple=True)
-            if len(rows):
-                below = self._ground.is_above(self._origins[rows, columns], rows)
-                heights[rows[below], columns[below]] = 0.0
-            return heights
-        envs = torch.arange(len(heights), device=heights.device).repeat_interleave(self.num_rays)
-        below = self._ground.is_above(self._origins.flatten(0, 1), envs).view_as(missed)
-        return torch.where(missed & below, 0.0, heights)
+        rows, columns = missed.nonzero(as_tuple=True)
+        if len(rows):
+            below = self._ground.is_above(self._origins[rows, columns], rows)
+            heights[rows[below], columns[below]] = 0.0
+        return heights
 
 
 class OneSidedGround:
@@ -169,45 +151,6 @@ class OneSidedGround:
         # Planes among height fields read elevations too; their factor `_elevation` is 0.
         self._has_fields = bool(is_field.any())
         self._heights = _tensor(m.hfield_data, device)
-        is_still = not (self._has_fields or self._is_placed_by_env or self._is_rotated)
-        self.is_level = is_still and len(geoms) <= _MAX_LEVEL_PLANES
-        """True for a few static planes without rotation; see `is_above_level`."""
-        self._level_planes = list(zip(self._pos.tolist(), self._extent.tolist(), strict=True))
-        self._make_grid(host.geom_xpos[geoms], host.geom_xmat[geoms], extent, carried, device)
-
-    def _make_grid(
-        self, pos: np.ndarray, mat: np.ndarray, extent: np.ndarray, carried: np.ndarray, device: str
-    ) -> None:
-        """List the surfaces above and below each cell of a grid over x and y.
-
-        Moving, infinite and tilted surfaces are listed in every cell.
-        """
-        mat = mat.reshape(-1, 3, 3)
-        is_local = ~carried & np.isfinite(extent).all(axis=1) & (mat[:, 2, 2] > 1.0 - 1e-9)
-        local = np.flatnonzero(is_local)
-        half = (np.abs(mat[local, :2, :2]) * extent[local, None, :]).sum(axis=-1) + _EDGE_TOLERANCE
-        low, high = pos[local, :2] - half, pos[local, :2] + half
-        start, end = (
-            (low.min(axis=0), high.max(axis=0)) if len(local) else (np.zeros(2), np.ones(2))
-        )
-        # With cells half as wide as the smallest surface, few surfaces share a cell.
-        narrowest = half.min(axis=0) if len(local) else np.ones(2)
-        count = np.ceil((end - start) / narrowest).clip(1, _MAX_CELLS).astype(int)
-        size = (end - start) / count
-        first = np.floor((low - start) / size).astype(int).clip(0, count - 1)
-        last = np.floor((high - start) / size).astype(int).clip(0, count - 1)
-        # The last cell covers all points outside the grid.
-        cells: list[list[int]] = [[] for _ in range(count.prod() + 1)]
-        for geom, (x0, y0), (x1, y1) in zip(local.tolist(), first, last, strict=True):
-            for x in range(x0, x1 + 1):
-                for y in range(y0, y1 + 1):
-                    cells[x * count[1] + y].append(geom)
-        everywhere = np.flatnonzero(~is_local).tolist()
-        width = max(len(cell) for cell in cells)
-        table = [cell + [-1] * (width - len(cell)) + everywhere for cell in cells]
-        self._grid = torch.tensor(table, dtype=torch.long, device=device)
-        self._grid_start, self._grid_size = _tensor(start, device), _tensor(size, device)
-        self._grid_count = torch.from_numpy(count).to(device)
 
     def __len__(self) -> int:
         return len(self._geoms)
@@ -217,57 +160,39 @@ class OneSidedGround:
 
         `envs`: environment of each point, (M,).
         """
-        cell = ((points[:, :2] - self._grid_start) / self._grid_size).nan_to_num(-1.0).floor()
-        is_outside = ((cell < 0) | (cell >= self._grid_count)).any(dim=-1)
-        x, y = cell.clamp(min=0.0, max=float(_MAX_CELLS)).long().unbind(-1)
-        rows = torch.where(is_outside, len(self._grid) - 1, x * self._grid_count[1] + y)
-        # Candidate surfaces above or below the points, (M, K). Padding: -1.
-        found = self._grid[rows]
-        geoms = found.clamp(min=0)
-        pos = self._pos[geoms]
+        pos, mat = self._pos, self._mat
         if self._is_placed_by_env:
-            pos = self._data.geom_xpos[envs[:, None], self._geoms[geoms]]
-        # (M, K, 3): the points in the frames of the geoms.
+            pos, mat = (
+                field[envs][:, self._geoms]
+                for field in (self._data.geom_xpos, self._data.geom_xmat)
+            )
+        # (M, G, 3): the points in the frames of the geoms.
         local = points[:, None] - pos
         if self._is_placed_by_env or self._is_rotated:
-            mat = self._mat[geoms]
-            if self._is_placed_by_env:
-                mat = self._data.geom_xmat[envs[:, None], self._geoms[geoms]]
             local = (mat * local[..., :, None]).sum(dim=-2)
-        inside = (local[..., :2].abs() <= self._extent[geoms]).all(dim=-1) & (found >= 0)
-        return (inside & (local[..., 2] < self._surface(local, geoms))).any(dim=-1)
+        inside = (local[..., :2].abs() <= self._extent).all(dim=-1)
+        return (inside & (local[..., 2] < self._surface(local))).any(dim=-1)
 
-    def is_above_level(self, points: torch.Tensor) -> torch.Tensor:
-        """Same as `is_above`, for `is_level` ground: testing plane by plane is faster."""
-        result = torch.zeros_like(points[:, 0], dtype=torch.bool)
-        for position, extent in self._level_planes:
-            below = points[:, 2] < position[2]
-            for axis in range(2):
-                if extent[axis] < math.inf:
-                    below &= (points[:, axis] - position[axis]).abs() <= extent[axis]
-            result |= below
-        return result
-
-    def _surface(self, local: torch.Tensor, geoms: torch.Tensor) -> torch.Tensor:
-        """Return heights of surfaces `geoms` (...,) at positions (..., 3), in the geom frames.
+    def _surface(self, local: torch.Tensor) -> torch.Tensor:
+        """Return heights of all surfaces at positions (M, G, 3) in their frames, (M, G).
 
         Each height field cell consists of two triangles, split from its first to its last corner.
         """
         if not self._has_fields:
             return torch.zeros_like(local[..., 2])
-        cells = self._shape[geoms].flip(-1) - 1
-        scaled = (local[..., :2] / self._extent[geoms] + 1.0) * 0.5 * cells
+        cells = self._shape.flip(-1) - 1
+        scaled = (local[..., :2] / self._extent + 1.0) * 0.5 * cells
         # Positions beyond the edge are discarded later, but must index valid elevations.
         scaled = torch.minimum(scaled.nan_to_num().clamp(min=0.0), cells.to(scaled.dtype))
         corner = torch.minimum(scaled.long(), cells - 1)
         x, y = (scaled - corner).unbind(-1)
-        columns = self._shape[geoms, 1]
-        first = self._start[geoms] + corner[..., 1] * columns + corner[..., 0]
+        columns = self._shape[:, 1]
+        first = self._start + corner[..., 1] * columns + corner[..., 0]
         h00, h01 = self._heights[first], self._heights[first + 1]
         h10, h11 = self._heights[first + columns], self._heights[first + columns + 1]
         lower = h00 + x * (h01 - h00) + y * (h11 - h01)
         upper = h00 + y * (h10 - h00) + x * (h11 - h10)
-        return self._elevation[geoms] * torch.where(x >= y, lower, upper)
+        return self._elevation * torch.where(x >= y, lower, upper)
 
 
 def _tensor(array: Any, device: str) -> torch.Tensor:
