@@ -21,8 +21,7 @@ ORIGIN_STEP = 3.0
 class Object:
     """Object at the pose last written, by the command or by a test."""
 
-    def __init__(self, num_envs: int, geom_ids: list[int], is_fixed_base: bool = False) -> None:
-        self.is_fixed_base = is_fixed_base
+    def __init__(self, num_envs: int, geom_ids: list[int]) -> None:
         self.indexing = SimpleNamespace(geom_ids=torch.tensor(geom_ids))
         self.data = SimpleNamespace(root_link_pos_w=torch.zeros(num_envs, 3))
         self.pose = torch.zeros(num_envs, 7)

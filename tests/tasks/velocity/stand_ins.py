@@ -32,9 +32,7 @@ class StandInEnv:
             root_link_lin_vel_b=torch.zeros(num_envs, 3),
             root_link_ang_vel_b=torch.zeros(num_envs, 3),
         )
-        self.robot = SimpleNamespace(
-            data=self.data, is_fixed_base=False, num_bodies=1, body_names=("trunk",)
-        )
+        self.robot = SimpleNamespace(data=self.data, num_bodies=1, body_names=("trunk",))
         self.scene: Any = _Scene(robot=self.robot, **sensors)
         self.commands: dict[str, torch.Tensor] = {}
         self.command_manager = SimpleNamespace(

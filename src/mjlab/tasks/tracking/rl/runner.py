@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from rsl_rl.env import VecEnv
@@ -132,7 +131,8 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
         self, path: str, filename: str = "policy.onnx", verbose: bool = False
     ) -> None:
         """Write the policy and the reference to `path`/`filename`; see `PolicyWithReference`."""
-        motion: Any = getattr(self.motion_command, "motion", None)
+        # Custom commands may have no motion.
+        motion = cast("MotionLibrary", getattr(self.motion_command, "motion", None))
         missing = [name for name in (*REFERENCE, "time_step_total") if not hasattr(motion, name)]
         if missing:
             logger.info("Policy exported without the motion: attributes %s are missing.", missing)
@@ -169,9 +169,11 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             path = Path(getattr(command.cfg, "motion_file", ""))
             files = (path,) if path.is_file() else ()
         new = record_motions(files, folder, self._registry_name) if files else []
-        # An active Weights & Biases run implies that wandb is imported.
-        wandb: Any = sys.modules.get("wandb")
-        if self.cfg.get("logger") != "wandb" or getattr(wandb, "run", None) is None:
+        if self.cfg.get("logger") != "wandb":
+            return
+        import wandb
+
+        if wandb.run is None:
             return
         if self.cfg.get("upload_model", True):
             for path in new:
