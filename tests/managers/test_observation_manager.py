@@ -193,7 +193,7 @@ def test_a_wrong_number_of_rows_warns(env):
 
 
 def test_a_result_that_is_no_tensor_names_group_and_term(env):
-    with pytest.raises(TypeError, match="'g/t'.*list"):
+    with pytest.raises(ValueError, match=r"'g/t'.*\[1.0\]"):
         make(env, ObservationTermCfg(func=lambda env: [1.0]))
 
 

@@ -14,7 +14,7 @@ import torch
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.manager_base import ManagerBase, ManagerTermBaseCfg, label_errors
 from mjlab.utils.buffers import CircularBuffer, DelayBuffer
-from mjlab.utils.errors import WrongTypeError, check_exists
+from mjlab.utils.errors import check_exists
 from mjlab.utils.indexing import as_ids, is_empty
 from mjlab.utils.memory import check_memory
 from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
@@ -473,7 +473,7 @@ class ObservationTerm:
         """
         cfg = self.cfg
         value = cfg.func(self._env, **cfg.params)
-        if getattr(value, "shape", None) != self._raw_shape:
+        if value.shape != self._raw_shape:
             self._check_shape(value)
         if value.dtype == torch.float64:
             # Policies are float32, whatever torch's default dtype.
@@ -541,9 +541,8 @@ class ObservationTerm:
         """Return the objects that a call may change, except for delay and history."""
         return [part for part in (self.cfg.func, self._noise_model) if is_stateful(part)]
 
-    def _check_shape(self, value: Any) -> None:
-        if not isinstance(value, torch.Tensor):
-            self._check_first(value)
+    def _check_shape(self, value: torch.Tensor) -> None:
+        """Warn of a shape that is not that of the first call."""
         logger.warning(
             "%s: expected shape %s, as before, got %s.",
             *(self._name, tuple(self._raw_shape), tuple(value.shape)),
@@ -552,18 +551,15 @@ class ObservationTerm:
 
     def _check_first(self, value: Any) -> None:
         expected = f"({self._env.num_envs}, ...), with one or more dimensions after the first"
-        if not isinstance(value, torch.Tensor):
-            raise WrongTypeError(
-                f"{self._name}: expected a tensor of shape {expected}, got "
-                f"{type(value).__name__}: {value!r}."
-            )
-        if value.ndim < 2:
-            hint = "; use `.unsqueeze(-1)` for one number" if value.ndim == 1 else ""
+        shape = getattr(value, "shape", ())
+        if len(shape) < 2:
+            hint = "; use `.unsqueeze(-1)` for one number" if len(shape) == 1 else ""
             raise ValueError(
-                f"{self._name}: expected shape {expected}, got {tuple(value.shape)}{hint}."
+                f"{self._name}: expected a tensor of shape {expected}, got "
+                f"{tuple(shape) or repr(value)}{hint}."
             )
-        if value.shape[0] != self._env.num_envs:
-            _warn(f"{self._name}: expected shape {expected}, got {tuple(value.shape)}.")
+        if shape[0] != self._env.num_envs:
+            _warn(f"{self._name}: expected shape {expected}, got {tuple(shape)}.")
 
     def _build_noise_model(self) -> Any:
         noise = self.cfg.noise
