@@ -218,8 +218,7 @@ def test_a_time_range_turned_round_raises(env, low, high):
 
 
 def test_negative_times_resample_at_the_next_step(env):
-    with pytest.warns(UserWarning, match="resampling_time_range"):
-        manager, term = make(env, -2.0, -1.0)
+    manager, term = make(env, -2.0, -1.0)
     manager.reset(None)
     manager.compute(0.1)
     assert term.draws.flatten().tolist() == [2.0] * 4

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -69,13 +68,6 @@ class CommandTerm(ManagerTermBase):
             raise ValueError(
                 f"{self.name} resampling_time_range: expected shortest <= longest (s), got "
                 f"{(low, high)}."
-            )
-        if low < 0.0:
-            warnings.warn(
-                f"{self.name} resampling_time_range: expected times >= 0 (s), got {(low, high)}; "
-                "a time below 0 resamples at the next step.",
-                UserWarning,
-                stacklevel=2,
             )
         self.metrics: dict[str, torch.Tensor] = {}
         self.time_left = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
