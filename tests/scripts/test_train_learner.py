@@ -113,8 +113,8 @@ def test_the_physics_leaves_a_core_to_sac(monkeypatch, tmp_path, flags, world_si
     env = environments.training_env(cfg, "cpu", tmp_path, ProcessRank(0, world_size, 0, world_size))
     try:
         assert env.unwrapped.sim.capabilities.num_threads == threads
-        # Evaluations copy the config, and nothing is learned while they run.
-        assert env.unwrapped.cfg.sim.num_threads == before
+        # Nothing is learned while evaluations run.
+        assert environments.evaluation_env_cfg(TASK, cfg, {}).sim.num_threads == before
     finally:
         env.close()
 
