@@ -209,20 +209,6 @@ def test_unlike_actuators_and_native_pd_have_lags_of_their_own(make_world, cfgs)
     assert (found[:, 0] != found[:, -1]).any()
 
 
-def test_a_shared_line_draws_once_at_a_reset_and_lags_set_on_one_hold_for_all(make_world):
-    world = make_world(position("hip", **DELAY), position("knee", **DELAY))
-    first, second = world.entity.actuators
-    lags(world)
-    second.set_lags(torch.tensor([1, 2, 3]))
-    assert lags(world).tolist() == [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]
-    second.reset()
-    assert lags(world).tolist() == [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]
-    torch.manual_seed(3)
-    first.reset()
-    expected = first._delay_buffer.current_lags.tolist()
-    assert lags(world)[:, 1].tolist() == expected
-
-
 # Control laws.
 
 

@@ -136,32 +136,6 @@ def test_crash_of_the_page_is_one_warning(monkeypatch, caplog):
     assert caplog.text.count("process ended; training continues. no such screen") == 1
 
 
-def test_weights_are_written_once_a_second(view):
-    weights = view._exchange.weights
-    view.on_iteration(STATS)
-    written = weights.stat().st_mtime_ns
-    view.on_iteration(STATS)
-    assert weights.stat().st_mtime_ns == written
-    # Whatever one time costs, it is for at most 1 % of the time.
-    assert view._next_weights - time.perf_counter() > 0.9
-    slow = view._exchange.write_weights
-    view._next_weights = 0.0
-    view._exchange.write_weights = lambda *args: (time.sleep(0.05), slow(*args))
-    view.on_iteration(STATS)
-    assert view._next_weights - time.perf_counter() > 4.0
-
-
-def test_view_takes_the_newest_weights_once(view):
-    network, env = torch.nn.Linear(2, 1), SimpleNamespace(common_step_counter=0)
-    newest = NewestWeights(view._exchange, network, env)
-    assert newest.take() is None
-    view.on_start(0, 9)
-    assert newest.take() is not None
-    assert torch.equal(network.weight, view._runner.network.weight)
-    assert env.common_step_counter == 40
-    assert newest.take() is None
-
-
 def test_curve_has_the_numbers_of_the_terminal(view):
     terminal = progress(solved_return=900.0, trigger_fraction=0.8)
     view.follow(FakeRunner(), terminal)
@@ -178,18 +152,6 @@ def test_curve_has_the_numbers_of_the_terminal(view):
     assert (shown["iteration"], shown["total_iterations"]) == (3, 9)
     assert shown["rows"] == terminal.rows()
     assert "310 of 900" in dict(shown["rows"])["last eval"]
-
-
-def test_curve_of_a_long_run_is_thinned(view):
-    newest = NewestWeights(view._exchange, view._runner.network, view._runner.env.unwrapped)
-    for iteration in range(1, 5001):
-        view.on_iteration(replace(STATS, iteration=iteration, mean_step_reward=float(iteration)))
-    view.on_evaluation(4999, evaluated(5.0), False)
-    shown = newest.take()
-    assert shown["unit"] == "reward per step"
-    assert 300 < len(shown["curve"]) <= 402
-    assert shown["curve"][4999] == 4999.0
-    assert shown["evaluations"] == {}
 
 
 HOLD = """

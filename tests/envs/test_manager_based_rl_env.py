@@ -1,18 +1,25 @@
-"""One environment step: order, resets, seeds, and errors."""
+"""Environment: steps, episodes, checks of its config, and dtypes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mjlab.actuator import BuiltinMotorActuatorCfg
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
 from mjlab.managers import (
+    CommandTerm,
+    CommandTermCfg,
     EventTermCfg,
     MetricsTermCfg,
     ObservationGroupCfg,
@@ -20,6 +27,9 @@ from mjlab.managers import (
     RewardTermCfg,
     TerminationTermCfg,
 )
+from mjlab.managers.action_manager import as_action
+from mjlab.scene import Scene, SceneCfg
+from mjlab.sim import Simulation, SimulationCfg
 from mjlab.tasks.registry import load_env_cfg
 
 NUM_ENVS = 6
@@ -197,40 +207,6 @@ def test_one_dispatch_for_all_substeps_gives_the_bits_of_one_for_each(make):
     one_by_one = make()
     one_by_one._steps_as_one = False
     assert torch.equal(run(together, 8), run(one_by_one, 8))
-
-
-def test_a_metric_that_looks_between_substeps_changes_nothing_else(make):
-    seen: list[float] = []
-
-    def look(env):
-        seen.append(float(env.sim.data.qvel[0, 0]))
-        return torch.zeros(env.num_envs)
-
-    plain = run(make(), 3)
-    env = make(lambda cfg: cfg.metrics.update(m=MetricsTermCfg(func=look, per_substep=True)))
-    assert not env._steps_as_one
-    seen.clear()
-    assert torch.equal(run(env, 3), plain)
-    assert len(seen) == 3 * env.cfg.decimation
-    assert len(set(seen)) == len(seen), "every call must see a different substep"
-
-
-def test_targets_that_are_the_same_in_all_substeps_are_written_once(make, monkeypatch):
-    per_substep = {"m": MetricsTermCfg(func=lambda env: env.sim.data.qvel[:, 0], per_substep=True)}
-    env = make(lambda cfg: cfg.metrics.update(per_substep))
-    calls = []
-    for owner, name in ((env.action_manager, "apply_action"), (env.scene, "write_data_to_sim")):
-        original = getattr(owner, name)
-        monkeypatch.setattr(
-            owner, name, lambda *args, f=original, n=name: (calls.append(n), f(*args))[1]
-        )
-    run(env, 1)
-    assert calls == ["apply_action", "write_data_to_sim"]
-    # An actuator or action that changes between substeps is called before each substep.
-    env._acts_between_substeps = True
-    calls.clear()
-    run(env, 1)
-    assert calls == ["apply_action", "write_data_to_sim"] * env.cfg.decimation
 
 
 def delay_the_actuator(cfg: ManagerBasedRlEnvCfg) -> None:
@@ -419,3 +395,365 @@ def test_the_state_of_another_number_of_environments_is_refused(make):
     other = make(lambda cfg: setattr(cfg.scene, "num_envs", 2))
     with pytest.raises(ValueError, match=f"expected 2 .*got {NUM_ENVS}.*--num-envs {NUM_ENVS}"):
         other.load_state_dict(state)
+
+
+# Checks of the config.
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = ManagerBasedRlEnv(cartpole(), device="cpu")
+    env.reset()
+    yield env
+    env.close()
+
+
+# The config.
+
+
+@pytest.mark.parametrize("value", [0, 2.5, "4"])
+def test_decimation_is_a_count(value):
+    cfg = cartpole()
+    cfg.decimation = value
+    with pytest.raises(ValueError, match="decimation.*expected an integer >= 1"):
+        ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def test_an_episode_may_last_for_decades():
+    cfg = cartpole()
+    cfg.episode_length_s, cfg.decimation = 1e9, 1
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    assert not env.step(torch.zeros(NUM_ENVS, 1))[3].any()
+    env.close()
+
+
+def test_counts_of_numpy():
+    cfg = cartpole()
+    cfg.decimation, cfg.scene.num_envs = np.int32(2), np.int32(3)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    assert env.reset()[0]["actor"].shape[0] == 3
+    env.close()
+
+
+# The device.
+
+
+def test_without_a_device_there_is_a_default(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    env = ManagerBasedRlEnv(cartpole(), device=None)  # ty: ignore
+    assert env.device == env.reset()[0]["actor"].device.type == "cpu"
+    env.close()
+
+
+@pytest.mark.parametrize("length", [0.0, -1.0])
+@pytest.mark.parametrize("limited", [False, True])
+def test_a_time_limit_needs_an_episode_length(length, limited):
+    limit = {"t": TerminationTermCfg(func=mdp.time_out, time_out=True)} if limited else {}
+    cfg = cartpole()
+    cfg.episode_length_s, cfg.terminations = length, limit
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+    assert sum("episode_length_s" in str(w.message) for w in seen) == limited
+    env.reset()
+    truncated = env.step(torch.zeros(NUM_ENVS, 1))[3]
+    assert truncated.tolist() == [limited] * NUM_ENVS
+    env.close()
+
+
+# Actions.
+
+
+def test_arrays_and_lists_act_as_tensors_do(env):
+    action = torch.linspace(-1.0, 1.0, NUM_ENVS)[:, None]
+    array = action.double().numpy()
+    array.flags.writeable = False
+    for form in (action, array, action.numpy(), action.tolist()):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            env.step(form)
+        torch.testing.assert_close(env.action_manager.action, action)
+    assert as_action([[1]], "cpu").dtype == torch.float32
+
+
+def test_an_array_is_copied():
+    array = np.zeros((2, 1), dtype=np.float32)
+    action = as_action(array, "cpu")
+    array[:] = 1.0
+    assert (action == 0.0).all()
+
+
+@pytest.mark.parametrize("action", [None, "left", {"a": 1}, [[1.0], [1.0, 2.0]], object()])
+def test_an_action_of_no_numbers_is_refused(env, action):
+    with pytest.raises((TypeError, ValueError)):
+        env.step(action)
+
+
+def test_an_array_of_another_shape_is_refused(env):
+    with pytest.raises(ValueError, match=r"expected shape \(6, 1\).*got \(6, 2\)"):
+        env.step(np.zeros((NUM_ENVS, 2)))
+
+
+# Environments to reset.
+
+
+@pytest.mark.parametrize(
+    ("env_ids", "expected"),
+    [
+        (None, [0, 1, 2, 3, 4, 5]),
+        (slice(4, None), [4, 5]),
+        (3, [3]),
+        ([], []),
+        ([5, 0], [5, 0]),
+        (torch.tensor([-1, 2], dtype=torch.int32), [5, 2]),
+        (np.array([1, 2]), [1, 2]),
+        (torch.tensor([True, False, False, True, False, False]), [0, 3]),
+    ],
+)
+def test_reset_ids(env, env_ids, expected):
+    env.step(torch.zeros(NUM_ENVS, 1))
+    env.reset(env_ids=env_ids)
+    assert (env.episode_length_buf == 0).nonzero().flatten().tolist() == sorted(expected)
+
+
+@pytest.mark.parametrize(
+    "env_ids", [[0, 6], torch.tensor([-7]), torch.ones(5, dtype=torch.bool), torch.tensor([1.5])]
+)
+def test_a_wrong_reset_changes_nothing(env, env_ids):
+    env.step(torch.zeros(NUM_ENVS, 1))
+    before, state = env.episode_length_buf.clone(), torch.get_rng_state()
+    with pytest.raises(IndexError):
+        env.reset(env_ids=env_ids, seed=3)
+    assert torch.equal(env.episode_length_buf, before)
+    assert torch.equal(torch.get_rng_state(), state), "no generator may be reseeded"
+
+
+# Odd terms.
+
+
+def odd(match, *, reset=True, **fields):
+    """Return the warnings that match while a Go1 environment is built and reset."""
+    cfg = load_env_cfg("Mjlab-Velocity-Flat-Unitree-Go1")
+    cfg.scene.num_envs = 1
+    for name, value in fields.items():
+        setattr(cfg, name, value)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        if reset:
+            env.reset()
+            env.reset()
+        env.close()
+    return [str(w.message) for w in seen if match in str(w.message)]
+
+
+@pytest.mark.parametrize(
+    ("time_out", "finite", "count"), [(False, False, 1), (True, False, 0), (False, True, 0)]
+)
+def test_a_time_limit_that_counts_as_failure_warns(time_out, finite, count):
+    terms = {"limit": TerminationTermCfg(func=mdp.time_out, time_out=time_out)}
+    seen = odd("'limit'", reset=False, terminations=terms, is_finite_horizon=finite)
+    assert len(seen) == count
+
+
+@pytest.mark.parametrize(
+    ("shortest", "global_time", "limited", "count"),
+    [(1.5, False, True, 1), (1.0, False, True, 0), (1.5, True, True, 0), (1.5, False, False, 0)],
+)
+def test_an_interval_that_episodes_do_not_reach_warns(shortest, global_time, limited, count):
+    fired = []
+    event = EventTermCfg(
+        func=lambda env, env_ids: fired.append(env_ids),
+        mode="interval",
+        interval_range_s=(shortest, 2.0),
+        is_global_time=global_time,
+    )
+    limit = {"limit": TerminationTermCfg(func=mdp.time_out, time_out=True)}
+    seen = odd(
+        "['late'] interval_range_s",
+        events={"late": event},
+        episode_length_s=1.0,
+        terminations=limit if limited else {},
+    )
+    assert len(seen) == count
+
+
+def test_episodes_without_reset_events_warn_once():
+    parts = {"commands": {}, "rewards": {}, "observations": {}, "curriculum": {}, "metrics": {}}
+    assert len(odd("mode 'reset'", events={}, reset=False, **parts)) == 1
+    push = EventTermCfg(func=lambda env, env_ids: None, mode="step")
+    assert len(odd("mode 'reset'", events={"push": push}, reset=False, **parts)) == 1
+    start = EventTermCfg(func=mdp.reset_scene_to_default, mode="reset")
+    assert odd("mode 'reset'", events={"start": start}) == []
+
+
+class PlaceCfg(CommandTermCfg):
+    def build(self, env):
+        return Place(self, env)
+
+
+class Place(CommandTerm):
+    """Command that starts the robot at a frame of a motion."""
+
+    command = None
+
+    def _resample_command(self, env_ids):
+        robot = self._env.scene["robot"]
+        robot.write_joint_state_to_sim(
+            robot.data.default_joint_pos[env_ids],
+            robot.data.default_joint_vel[env_ids],
+            env_ids=env_ids,
+        )
+
+
+def test_a_command_may_start_episodes():
+    commands = {"motion": PlaceCfg(resampling_time_range=(9.0, 9.0))}
+    parts = {"rewards": {}, "observations": {}, "curriculum": {}, "metrics": {}}
+    assert odd("mode 'reset'", events={}, commands=commands, **parts) == []
+
+
+# Float types.
+
+
+NUM_TYPED = 3
+
+
+@pytest.fixture
+def double() -> Iterator[None]:
+    """Make float64 torch's default type."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def rollout(task: str, engine: Any, dtype: torch.dtype) -> list[torch.Tensor]:
+    """Return what five steps under a default type give, one reset by a time-out among them."""
+    torch.set_default_dtype(dtype)
+    try:
+        cfg = load_env_cfg(task)
+        cfg.scene.num_envs, cfg.seed, cfg.sim.engine = NUM_TYPED, 3, engine
+        ones = torch.ones  # Called at every step, in the default type.
+        cfg.observations["actor"].terms["own"] = ObservationTermCfg(
+            func=lambda env: ones(env.num_envs, 2)
+        )
+        cfg.rewards["own"] = RewardTermCfg(func=lambda env: ones(env.num_envs), weight=1.0)
+        env = ManagerBasedRlEnv(cfg, device="cpu")
+        observations, _ = env.reset()
+        results = list(observations.values())
+        actions = np.random.default_rng(0).uniform(
+            -1, 1, (5, NUM_TYPED, *env.action_space.shape[1:])
+        )
+        for step, action in enumerate(actions):
+            if step == 2:
+                env.episode_length_buf[1] = env.max_episode_length
+            observations, reward, *_ = env.step(torch.tensor(action, dtype=dtype))
+            results += [*observations.values(), reward, env.sim.data.qpos.clone()]
+        env.close()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    return results
+
+
+@pytest.mark.parametrize(
+    ("task", "engine"),
+    [
+        ("Mjlab-Velocity-Rough-Unitree-Go1", "native"),
+        pytest.param("Mjlab-Lift-Cube-Yam", "native", marks=pytest.mark.slow),
+        pytest.param("Mjlab-Lift-Cube-Yam-Depth", "native", marks=pytest.mark.slow),
+        pytest.param("Mjlab-Lift-Cube-Yam-Rgb", "native", marks=pytest.mark.slow),
+        pytest.param("Mjlab-Multi-Cube-Seg-Yam", "native", marks=pytest.mark.slow),
+        ("Mjlab-Cartpole-Swingup", "native"),
+        pytest.param("Mjlab-Cartpole-Swingup", "warp", marks=pytest.mark.slow),
+    ],
+)
+def test_a_rollout_is_the_same_under_default_float64(task: str, engine: str):
+    single, double = (rollout(task, engine, dtype) for dtype in (torch.float32, torch.float64))
+    for expected, found in zip(single, double, strict=True):
+        assert found.dtype == expected.dtype == torch.float32
+        assert torch.equal(found, expected)
+
+
+XML = """
+<mujoco>
+  <worldbody>
+    <body name="base" {mocap}>
+      {root}
+      <geom size=".1"/>
+      <body pos="0 0 1"><joint name="j"/><geom size=".1"/>
+        <body pos="0 0 1"><joint name="k"/><geom size=".1"/><site name="s"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>
+</mujoco>
+"""
+
+
+def make_entity(floating: bool) -> Any:
+    xml = XML.format(mocap="", root="<freejoint/>" if floating else "")
+    motors = tuple(
+        BuiltinMotorActuatorCfg(target_names_expr=names, transmission_type=kind, effort_limit=9.0)
+        for names, kind in ((("j", "k"), "joint"), (("t",), "tendon"), (("s",), "site"))
+    )
+    cfg = EntityCfg(
+        spec_fn=lambda: mujoco.MjSpec.from_string(xml),
+        articulation=EntityArticulationInfoCfg(actuators=motors),
+    )
+    scene = Scene(SceneCfg(num_envs=NUM_TYPED, entities={"robot": cfg}), device="cpu")
+    sim = Simulation(NUM_TYPED, SimulationCfg(), spec=scene.spec, device="cpu")
+    scene.initialize(sim.mj_model, sim.model, sim.data)
+    return scene["robot"]
+
+
+# By name: the width of its values, and the data or target that it writes.
+WRITERS = {
+    "write_root_state_to_sim": (13, "qpos"),
+    "write_root_link_pose_to_sim": (7, "qpos"),
+    "write_root_link_velocity_to_sim": (6, "qvel"),
+    "write_root_link_velocity_b_to_sim": (6, "qvel"),
+    "write_root_com_velocity_to_sim": (6, "qvel"),
+    "write_joint_position_to_sim": (2, "qpos"),
+    "write_joint_velocity_to_sim": (2, "qvel"),
+    "write_ctrl_to_sim": (4, "ctrl"),
+    "write_mocap_pose_to_sim": (7, "mocap_pos"),
+    "set_joint_position_target": (2, "joint_pos_target"),
+    "set_joint_velocity_target": (2, "joint_vel_target"),
+    "set_joint_effort_target": (2, "joint_effort_target"),
+    "set_tendon_len_target": (1, "tendon_len_target"),
+    "set_tendon_vel_target": (1, "tendon_vel_target"),
+    "set_tendon_effort_target": (1, "tendon_effort_target"),
+    "set_site_effort_target": (1, "site_effort_target"),
+}
+
+
+@pytest.mark.parametrize("env_ids", [None, torch.tensor([2, 0])], ids=("all", "some"))
+@pytest.mark.parametrize("convert", [torch.from_numpy, np.asarray, np.ndarray.tolist])
+@pytest.mark.parametrize("name", WRITERS)
+def test_writers_take_values_of_any_float_type(name: str, convert: Any, env_ids: Any):
+    entity = make_entity(floating="mocap" not in name)
+    width, written = WRITERS[name]
+    rows = NUM_TYPED if env_ids is None else len(env_ids)
+    values = np.random.default_rng(1).normal(size=(rows, width))
+
+    def field() -> torch.Tensor:
+        source = entity.data if "target" in written else entity.data.data
+        return getattr(source, written)
+
+    before = field().clone()
+    getattr(entity, name)(convert(values), env_ids=env_ids)
+    found = field().clone()
+    field().copy_(before)
+    getattr(entity, name)(torch.from_numpy(values).float(), env_ids=env_ids)
+    assert found.dtype == torch.float32
+    assert not torch.equal(found, before)
+    torch.testing.assert_close(found, field(), rtol=1e-6, atol=1e-6)
+
+
+def test_wrenches_take_float64(double):
+    entity = make_entity(floating=True)
+    force = np.arange(NUM_TYPED * 9.0).reshape(NUM_TYPED, 3, 3)
+    entity.write_external_wrench_to_sim(force, torch.zeros(NUM_TYPED, 3, 3))
+    found = entity.data.body_external_force
+    assert found.dtype == torch.float32
+    np.testing.assert_array_equal(found.numpy(), force)

@@ -144,18 +144,6 @@ def test_a_program_and_a_batch_compute_the_policy(exported):
             )
 
 
-def test_a_batch_is_one_call(exported, monkeypatch):
-    _, path = exported
-    policy, calls = OnnxPolicy(path), []
-    run = policy._session.run
-    monkeypatch.setattr(
-        policy, "_session", SimpleNamespace(run=lambda *args: calls.append(1) or run(*args))
-    )
-    shown = observations()
-    policy({"actor": shown["state"], "camera": shown["camera"], "depth": shown["depth"]})
-    assert len(calls) == 1
-
-
 def test_the_identity_of_the_weights_holds(exported, caplog):
     _, path = exported
     OnnxPolicy(path)

@@ -54,17 +54,6 @@ def test_metrics_have_their_units():
     assert "share        0.25   no interval" in lines
 
 
-def test_a_terminal_shows_a_bar_and_clears_it():
-    out = io.StringIO()
-    console = Console(file=out, force_terminal=True, width=90)
-    with EvaluationProgress(1000, console) as progress:
-        progress._last = float("-inf")
-        progress.update(250, 0.3)
-    assert "250 of 1,000 episodes" in out.getvalue()
-    # The line of the bar is erased.
-    assert out.getvalue().endswith("\x1b[2K")
-
-
 def test_elsewhere_lines_are_rare_and_go_to_stderr(capsys):
     with EvaluationProgress(8, Console(file=io.StringIO())) as progress:
         progress.update(1, 0.2)

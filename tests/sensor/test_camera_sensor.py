@@ -236,22 +236,6 @@ def test_images_are_empty_before_and_change_with_sense_only(engine):
     assert scene["eye"].data.depth[0, 3, 3] == pytest.approx(0.43, abs=1e-5)
 
 
-def test_only_what_is_asked_for_is_rendered_and_once_for_each_sense(monkeypatch):
-    sim, scene = scene_with(camera(data_types=("depth",)), camera("other", "room/map"))
-    calls = []
-    original = sim._engine.render
-    monkeypatch.setattr(sim._engine, "render", lambda views: calls.append(views) or original(views))
-    sim.step()
-    sim.forward()
-    assert not calls
-    sim.sense()
-    for _ in range(3):
-        data = scene["cam"].data
-    assert [[view.data_types for view in views] for views in calls] == [[("depth",), ALL]]
-    assert data.rgb is None
-    assert data.segmentation is None
-
-
 def test_data_is_overwritten_unless_it_is_cloned():
     sensors = (camera("live"), camera("kept", clone_data=True))
     sim, scene = scene_with(*sensors, ball=BALL)
@@ -277,17 +261,6 @@ def test_images_can_be_rendered_under_inference_mode_and_then_without():
     sense(sim)
     assert not scene["cam"].data.depth.equal(first)
     scene["cam"].data.depth.zero_()
-
-
-def test_rendering_leaves_the_number_of_threads_of_torch_as_it_is():
-    sim, _ = scene_with(camera())
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        sense(sim)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
 
 
 # The sensor context.

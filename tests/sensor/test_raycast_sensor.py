@@ -351,24 +351,6 @@ def test_orientations_are_those_of_the_time_of_sensing_whenever_they_are_read():
         _ = data.quat
 
 
-def test_sensors_that_see_the_same_groups_are_cast_together(monkeypatch):
-    cfgs = (
-        scan("a", include_geom_groups=(0, 2)),
-        scan("b", include_geom_groups=(2, 0, 0), max_distance=3.0, exclude_parent_body=False),
-        scan("c", include_geom_groups=(0,)),
-    )
-    sim, _ = scene_with(*cfgs)
-    queries = []
-    cast = sim._engine.raycast
-    monkeypatch.setattr(
-        sim._engine,
-        "raycast",
-        lambda query: queries.append(query.origins.shape[1]) or cast(query),
-    )
-    sense(sim)
-    assert queries == [242, 121]
-
-
 def test_a_sensor_cast_alone_measures_the_same():
     cfgs = [scan(name, include_geom_groups=None, exclude_parent_body=False) for name in "ab"]
     sim, scene = scene_with(*cfgs)

@@ -330,27 +330,6 @@ def test_rays_are_cast_under_inference_mode_as_a_rollout_does(hilly):
                 torch.testing.assert_close(near, every, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("model", "direction"),
-    [({"kind": "CYLINDER"}, DOWN), ({"turn": 0.2}, DOWN), ({}, (0.6, 0.0, -0.8))],
-    ids=["another kind", "turned", "slanted"],
-)
-def test_what_is_not_looked_up_is_asked_of_mujoco(model, direction, monkeypatch):
-    model = terrain_model(**model)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    sim = Simulation(2, SimulationCfg(engine="native"), model=model, device="cpu")
-    calls = queries(sim, monkeypatch)
-    origins = 4.0 * torch.rand(2, 30, 3, generator=torch.Generator().manual_seed(2)) - 2.0
-    directions = torch.tensor(direction).repeat(2, 30, 1)
-    distances = sim.raycast(origins, directions, (0,))[0]
-    assert calls == [True]
-    for r in range(30):
-        ray = origins[1, r].numpy(), directions[1, r].numpy()
-        expected = mj_ray_hit(model, data, *ray, (0,))[0]
-        assert distances[1, r].item() == pytest.approx(expected, rel=1e-6, abs=1e-6)
-
-
 def test_a_query_that_fails_in_one_environment_is_a_miss_there_alone(shapes):
     if shapes.capabilities.name != "native":
         pytest.skip("MuJoCo Warp does not raise")
@@ -442,23 +421,6 @@ def test_rays_down_on_one_endless_plane_end_at_its_height_and_miss_from_below():
     assert distances.tolist() == [[1.75, 0.0, -1.0, -1.0]] * 2
     assert normals.tolist() == [[[0.0, 0.0, 1.0]] * 2 + [[0.0, 0.0, 0.0]] * 2] * 2
     assert geoms.tolist() == [[1, 1, -1, -1]] * 2
-
-
-@pytest.mark.parametrize(
-    ("groups", "excluded", "is_alone"),
-    [
-        ((0,), -1, True), ((0,), 1, True), ((0,), 0, False), ((0, 1), -1, False),
-        ((2,), -1, False), ((4,), -1, False),
-    ],
-)  # fmt: skip
-def test_only_rays_that_meet_fixed_upright_planes_alone_are_computed_without_a_query(
-    planes, groups, excluded, is_alone, monkeypatch
-):
-    sim, _ = planes
-    calls = queries(sim, monkeypatch)
-    origins, directions = rays(((0.0, 0.0, 2.5), DOWN))
-    sim.raycast(origins, directions, groups, torch.tensor([excluded], dtype=torch.int32))
-    assert calls == ([] if is_alone else [True])
 
 
 def test_planes_that_a_randomization_has_moved_are_met_where_they_are():

@@ -13,11 +13,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mujoco.batch import DATA_FIELDS, Batch, SimulationError
+from mujoco.batch import DATA_FIELDS
 
 from mjlab.sim import MujocoCfg, Simulation, SimulationCfg
 from mjlab.sim.engine import ACCELERATION_FIELDS, INPUTS, VELOCITY_FIELDS
-from mjlab.sim.native.engine import NativeEngine
 
 from .parity_models import MODELS
 
@@ -153,41 +152,6 @@ def test_recorded_substeps_are_those_of_single_steps(engine: str, guarded: bool,
             assert torch.equal(getattr(together.data, name), getattr(one_by_one.data, name))
 
 
-def test_an_environment_that_warns_goes_on_while_its_substeps_are_recorded() -> None:
-    """`Batch.rollout` would stop it at the warning."""
-    together, one_by_one = build(), build()
-    for sim in (together, one_by_one):
-        sim.data.ctrl[1] = float("nan")
-    recorded = together.step(4, ("qpos",))["qpos"]
-    one_by_one.step(4)
-    assert together._engine._batch.warning[1, int(mujoco.mjtWarning.mjWARN_BADCTRL)].any()
-    assert (recorded[1:, 1, 2] < recorded[:-1, 1, 2]).all(), "the trunk must keep falling"
-    assert torch.equal(together.data.qpos, one_by_one.data.qpos)
-
-
-def test_an_environment_in_which_mujoco_raises_does_not_touch_those_recorded_beside_it(
-    monkeypatch,
-) -> None:
-    """An error is simulated for the rollout only; single steps then raise by themselves."""
-    together, one_by_one = build(), build()
-    batch, failed = together._engine._batch, []
-
-    def rollout(nstep: int, record: tuple[str, ...]) -> None:
-        batch.state[:] += 0.1  # Leftover state must be discarded.
-        failed.append(nstep)
-        raise SimulationError(np.array([1]), "mj_stackAlloc: out of memory")
-
-    monkeypatch.setattr(batch, "rollout", rollout)
-    for sim in (together, one_by_one):
-        sim.data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
-    recorded = together.step(4, ("qpos", "sensordata"))
-    assert failed == [4]
-    for k in range(4):
-        one_by_one.step()
-        for name, values in recorded.items():
-            assert torch.equal(values[k], getattr(one_by_one.data, name)), name
-
-
 @pytest.mark.parametrize("per_call", [1, 3, 8])
 @pytest.mark.parametrize("record", [(), ("qpos", "sensordata")])
 def test_substeps_in_several_calls_are_those_of_one(monkeypatch, per_call, record) -> None:
@@ -318,35 +282,6 @@ BOX = """
   </worldbody>
 </mujoco>
 """
-
-
-def test_a_batch_that_keeps_the_data_of_its_simulations_gives_the_same_bits(monkeypatch) -> None:
-    """Models with sleep have a persistent batch that continues from computed stages."""
-    plain = build()
-    with monkeypatch.context() as patched:
-        patched.setattr(
-            NativeEngine,
-            "_make_batch",
-            lambda self, model, count, threads=None: Batch(model, count, 1, persistent=True),
-        )
-        kept = build()
-    assert kept._engine._batch.persistent
-    assert not plain._engine._batch.persistent
-    ids = torch.tensor([1])
-    for sim in (plain, kept):
-        _ = sim.data.sensordata, sim.data.xpos, sim.data.cvel, sim.data.qacc
-        sim.data.qvel[:, 0] = torch.tensor([0.0, 0.5, 1.0])
-    for k in range(6):
-        for sim in (plain, kept):
-            sim.data.ctrl[:] = 0.1 * k
-            if k == 3:
-                sim.reset(ids)
-                sim.data.qpos[1, 2] = 0.1
-            sim.step(4, ("sensordata",) if k % 2 else ())
-            sim.forward(stage="vel")
-            sim.forward(ids)
-        for name in ("qpos", "qvel", "sensordata", "xpos", "cvel", "qacc"):
-            assert torch.equal(getattr(plain.data, name), getattr(kept.data, name)), (k, name)
 
 
 def test_a_model_with_sleep_steps_as_plain_mujoco_does() -> None:

@@ -66,22 +66,6 @@ def test_a_reset_clears_every_activation_of_the_chosen_environment_only(sim, ids
         sim.forward()
 
 
-def test_a_reset_of_all_environments_clears_every_activation(sim):
-    drive(sim)
-    sim.reset()
-    assert (sim.data.act == 0).all()
-    assert (sim.copy_to_host(2).act == 0).all()
-
-
-def test_activations_that_nobody_has_read_are_cleared_too(sim):
-    drive(sim)
-    sim.reset(torch.tensor([1]))
-    sim.step()
-    # Without control, activations that start at zero stay there.
-    assert (sim.copy_to_host(1).act == 0).all()
-    assert (sim.copy_to_host(0).act != 0).all()
-
-
 def test_rates_of_activations_are_cleared_with_them(sim):
     rates = sim.data.act_dot
     drive(sim)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import gc
-import logging
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
 from typing import Any
 
 import mujoco
-import mujoco_warp
 import pytest
 import torch
 import warp as wp
-from torch.overrides import TorchFunctionMode
 
 from mjlab.entity import EntityCfg
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg, mdp
@@ -274,37 +270,9 @@ def test_options_reach_mujoco_warp() -> None:
     assert (data.naconmax, data.njmax) == (40, 40)
 
 
-def test_capacities_are_estimated_if_not_given() -> None:
-    # The first of 16, 24, 32, 48, 64, ... not below 45 contacts and 53 constraint rows.
-    engine = make_engine(LANDING_BOX)
-    assert (engine.wp_data.naconmax, engine.wp_data.njmax) == (2 * 48, 64)
-
-
 def test_an_unknown_broadphase_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match="'nxn', 'sap_tile', 'sap_segmented'"):
         make_engine(TWO_JOINTS, broadphase="octree")
-
-
-def test_an_overflow_is_logged_once(
-    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
-) -> None:
-    engine = on_the_floor(make_engine(LANDING_BOX, njmax=4))
-    with caplog.at_level(logging.WARNING):
-        for _ in range(70):
-            engine.step(1)
-    assert "njmax=4" in caplog.text, "it was not noticed while stepping"
-    engine.close()
-    messages = [record.getMessage() for record in caplog.records]
-    assert len([text for text in messages if "njmax=4" in text]) == 1, messages
-    assert "overflow" not in capfd.readouterr().out
-
-
-def test_a_run_within_its_capacity_logs_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    engine = on_the_floor(make_engine(LANDING_BOX))
-    with caplog.at_level(logging.WARNING):
-        engine.step(2)
-        engine.close()
-    assert not caplog.records
 
 
 # State.
@@ -607,61 +575,6 @@ def test_warp_is_quiet_unless_asked_otherwise(
 # results of work that torch queues within the block too early.
 
 
-class _WorkOfTorch(TorchFunctionMode):
-    """Recorder of torch functions that run while an engine is within `ordered`."""
-
-    LOOKING = frozenset(
-        {
-            "__get__",
-            "__set__",
-            "as_tensor",
-            "data_ptr",
-            "stride",
-            "is_contiguous",
-            "dim",
-            "size",
-            "element_size",
-            "numel",
-        }
-        | {"requires_grad_", "view", "expand", "is_conj", "untyped_storage", "storage_offset"}
-    )
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.is_ordered = False
-        self.found: list[str] = []
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        if self.is_ordered and func.__name__ not in self.LOOKING:
-            self.found.append(func.__name__)
-        return func(*args, **(kwargs or {}))
-
-
-def test_torch_computes_nothing_that_warp_reads_within_the_same_wait() -> None:
-    engine = make_engine(LANDING_BOX)
-    work, ordered = _WorkOfTorch(), engine.ordered
-
-    @contextmanager
-    def noted():
-        with ordered():
-            work.is_ordered = True
-            yield
-            work.is_ordered = False
-
-    engine.ordered = noted
-    # Not contiguous and of different dtypes, so the engine must copy.
-    rays = torch.zeros(3, 4, 2).permute(2, 1, 0)
-    with work:
-        engine.raycast(RayQuery(rays, rays - 1.0, None, torch.ones(8, dtype=torch.int64)[::2]))
-        engine.step(1)
-        engine.forward(torch.tensor([1]))
-        engine.reset(torch.tensor([0]))
-        engine.expand(("body_mass",))
-        engine.recompute_constants(3, torch.tensor([0]))
-    # Copies of `expand` are queued on Warp's stream.
-    assert set(work.found) <= {"copy_"}
-
-
 # CUDA code paths, tested by an engine on the CPU that is patched to act as on CUDA.
 
 
@@ -690,29 +603,6 @@ def test_graphs_are_captured_at_construction_without_a_trace(
     engine.step(2)
     engine.close()
     assert not caplog.records
-
-
-def test_capturing_again_in_a_run_keeps_state_results_and_overflow_flags(
-    as_on_cuda: None, caplog: pytest.LogCaptureFixture
-) -> None:
-    engine = on_the_floor(make_engine(LANDING_BOX))
-    fields = ("time", "qpos", "qvel", "qacc_warmstart", "qacc", "qfrc_constraint", "sensordata")
-    engine.data_field("qvel")[0, 0] = 1.0
-    engine.step(3)
-    engine.wp_data.overflow.fill_(int(mujoco_warp.OverflowType.HFIELD))
-    before = {name: engine.data_field(name).clone() for name in (*fields, "xpos", "cvel")}
-    contacts = {name: value.clone() for name, value in vars(engine.data_field("contact")).items()}
-    engine.create_graph()
-    for name, value in before.items():
-        assert torch.equal(engine.data_field(name), value), name
-    for name, value in contacts.items():
-        assert torch.equal(getattr(engine.data_field("contact"), name), value), name
-    caplog.clear()
-    engine.close()
-    assert "height-field cells" in caplog.text
-    # A forward pass would compute different values.
-    engine.forward(None)
-    assert not torch.equal(engine.data_field("qacc"), before["qacc"])
 
 
 @pytest.mark.parametrize("mode", ["startup", "reset"])
@@ -744,25 +634,6 @@ def test_graphs_of_an_environment_that_randomizes_are_captured_before_its_first_
     env.close()
 
 
-def test_kernels_are_loaded_before_a_capture_which_no_collection_disturbs(
-    as_on_cuda: None,
-) -> None:
-    engine = make_engine(LANDING_BOX)
-    collects: list[bool] = []
-
-    def work() -> None:
-        collects.append(gc.isenabled())
-
-    engine.launch("probe", work)
-    engine.launch("probe", work, times=2)
-    assert collects == [True, False]
-    assert gc.isenabled()
-    # Expanded fields may need other kernels.
-    engine.expand(("body_mass",))
-    engine.launch("probe", work, times=3)
-    assert collects == [True, False] * 2
-
-
 def test_rays_replay_one_graph_for_all_sensors(as_on_cuda: None) -> None:
     engine = make_engine(LANDING_BOX)
     captured = engine._graphs.keys() - {"step", "pos", "vel", "acc"}
@@ -773,23 +644,6 @@ def test_rays_replay_one_graph_for_all_sensors(as_on_cuda: None) -> None:
     captured = engine._graphs.keys() - {"step", "pos", "vel", "acc"}
     assert len(captured) == 1
     torch.testing.assert_close(first[0], torch.full((2, 3), 1.55))
-
-
-def test_where_capturing_is_refused_kernels_are_launched_one_by_one(
-    as_on_cuda: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Refused:
-        def __init__(self, **_: object) -> None:
-            raise RuntimeError("no capture")
-
-    replayed = make_engine(LANDING_BOX)
-    monkeypatch.setattr(wp, "ScopedCapture", Refused)
-    plain = make_engine(LANDING_BOX)
-    assert [record.getMessage() for record in caplog.records if "no capture" in record.message]
-    assert len(caplog.records) == 1
-    for engine in (replayed, plain):
-        on_the_floor(engine).step(5)
-    assert torch.equal(replayed.data_field("qpos"), plain.data_field("qpos"))
 
 
 # Captured graphs on a GPU. Skipped without a GPU.

@@ -8,7 +8,6 @@ import torch
 from mjlab.utils.indexing import (
     as_columns,
     as_ids,
-    as_index,
     num_selected,
     read_columns,
     write_columns,
@@ -36,12 +35,6 @@ def test_environment_ids_become_int64_whatever_their_form(env_ids, expected):
 def test_a_mask_of_another_length_is_an_error():
     with pytest.raises(IndexError):
         as_ids(MASK, 5, "cpu")
-
-
-def test_int64_ids_are_not_copied():
-    ids = torch.tensor([2, 0])
-    assert as_ids(ids, 4, "cpu") is ids
-    assert as_index(ids) is ids
 
 
 @pytest.mark.parametrize(

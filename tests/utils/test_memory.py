@@ -114,12 +114,6 @@ def test_unknown_memory_is_unlimited(machine):
     assert items(10**30)
 
 
-def test_sizes_beyond_every_float(machine):
-    machine(total=8 * GB)
-    with pytest.raises(ValueError, match="expected at most 8 "):
-        items(10**400)
-
-
 def test_address_space_limits(machine, monkeypatch):
     machine(total=64 * GB)
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (8 * GB, 8 * GB))
@@ -231,15 +225,6 @@ def test_replay_and_rollout_estimates(machine, env):
 
 
 # Other sizes.
-
-
-def test_a_billion_environments_end_at_once():
-    cfg = load_env_cfg(CARTPOLE)
-    cfg.scene.num_envs = 10**10
-    begin = time.monotonic()
-    with pytest.raises(ValueError, match="num_envs: expected at most .* got 10,000,000,000"):
-        ManagerBasedRlEnv(cfg, device="cpu")
-    assert time.monotonic() - begin < 20.0
 
 
 @pytest.mark.parametrize("engine", ["native", "warp"])

@@ -7,12 +7,11 @@ import os
 import signal
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from viewer_fakes import FakeEnv, push
 
-from mjlab.viewer.base import BaseViewer, TermHistory, VerbosityLevel, ViewerAction, reset_policy
+from mjlab.viewer.base import BaseViewer, ViewerAction, reset_policy
 
 
 class ListViewer(BaseViewer):
@@ -202,14 +201,6 @@ def test_the_first_interrupt_ends_the_loop_and_the_old_handler_comes_back(viewer
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_rates_are_logged_for_those_who_ask_for_detail(caplog) -> None:
-    with caplog.at_level(logging.INFO):
-        ListViewer(FakeEnv(1), push(), verbosity=VerbosityLevel.INFO).log_performance()
-        assert "steps/s" not in caplog.text
-        ListViewer(FakeEnv(1), push(), verbosity=VerbosityLevel.DEBUG).log_performance()
-    assert "steps/s" in caplog.text
-
-
 def test_a_frame_rate_that_is_not_positive_is_rejected() -> None:
     with pytest.raises(ValueError, match="frame_rate.*0"):
         ListViewer(FakeEnv(1), push(), frame_rate=0)
@@ -240,15 +231,3 @@ def test_a_subclass_offers_other_speeds() -> None:
     viewer.reset_speed()
     assert viewer.target_realtime == 0.9
     assert [2.0**n for n in range(-5, 4)] == BaseViewer.SPEED_MULTIPLIERS
-
-
-def test_only_the_latest_points_are_kept_and_averaged_over_finite_ones() -> None:
-    history = TermHistory(length=4)
-    for value in (1.0, 2.0, float("inf"), 4.0, 6.0):
-        history.add([("a", [value])])
-    np.testing.assert_array_equal(history.values("a"), [2.0, np.nan, 4.0, 6.0])
-    assert history.mean("a") == 4.0
-    history.clear()
-    assert history.names == ["a"]
-    assert history.mean("a") == 0.0
-    assert len(history.values("unknown")) == 0

@@ -19,7 +19,6 @@ from mjlab.viewer.native.viewer import (
     MousePush,
     PlotCfg,
     compute_viewports,
-    make_empty_figure,
     plot_scale,
     reward_figures,
 )
@@ -214,12 +213,6 @@ class TestRewardPlots:
         assert low == pytest.approx(1.02 - 0.25 * 0.97, abs=0.02)
         assert high == pytest.approx(1.99 + 0.25 * 0.97, abs=0.02)
 
-    @pytest.mark.parametrize(
-        ("magnitude", "exponent"), [(0.01, 0), (999.0, 0), (1000.0, 3), (0.004, -3), (0.0, 0)]
-    )
-    def test_magnitudes_that_read_badly_are_scaled(self, magnitude, exponent) -> None:
-        assert plot_scale(np.array([0.0, magnitude]), PlotCfg())[0] == exponent
-
     def test_at_most_twelve_terms_in_two_columns_inside_the_window(self) -> None:
         history = TermHistory(300)
         history.add([(f"term{i}", [float(i)]) for i in range(20)])
@@ -267,11 +260,3 @@ class TestRewardPlots:
         assert figure.linepnt[0] == 5
         assert list(figure.gridsize) == [2, 6]
         assert figure.figurergba[3] == pytest.approx(0.2)
-
-    def test_an_empty_figure_has_points_at_past_steps(self) -> None:
-        figure = make_empty_figure("title", (3, 4), (-1.0, 2.0), 50, 0.3)
-        np.testing.assert_array_equal(figure.linedata[0, :100:2], -np.arange(50))
-        assert not figure.linedata[0, 1:100:2].any()
-        assert list(figure.range[1]) == [-1.0, 2.0]
-        assert figure.title == "title"
-        assert make_empty_figure("long", (3, 4), (0.0, 1.0), 5000, 0.3).linedata[0, 2000] == -1000

@@ -85,14 +85,6 @@ def test_page_shows_the_newest_progress(page) -> None:
         np.testing.assert_array_equal(viewer._plot.data[1], [100.0, 300.0, 741.0])
 
 
-def test_titles_and_values_are_text() -> None:
-    rows = [("return", "<i>")]
-    content = progress_html("<b>", PROGRESS | {"rows": rows}, age=7.2)
-    assert "&lt;b&gt;" in content
-    assert "<strong>Return:</strong> &lt;i&gt;" in content
-    assert "7 s old" in content
-
-
 def test_legend_names_what_is_drawn() -> None:
     content = progress_html("", PROGRESS, age=0.0)
     assert all(part in content for part in ("return, exploring", "evaluated", "goal"))

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
-import numpy as np
 import pytest
 from viewer_fakes import FakeEnv
 
 from mjlab.viewer.viser import MjlabViserScene
 from mjlab.viewer.viser.overlays import (
-    ViserCameraOverlays,
     ViserContactOverlays,
     ViserDebugOverlays,
     ViserTermOverlays,
@@ -47,17 +43,6 @@ def test_terms_are_recorded_while_it_runs_and_start_over_with_another_environmen
     assert not len(values("upright"))
 
 
-def test_without_metrics_there_is_no_tab_for_them(viser_server, env, scene) -> None:
-    env.metrics_manager = SimpleNamespace(active_terms=[])
-    overlays = ViserTermOverlays(viser_server, env, scene, frame_time=0.02)
-    tabs = viser_server.gui.add_tab_group()
-    overlays.setup_tabs(tabs)
-    assert tabs._tab_labels == ("Rewards",)
-    overlays.update(False)
-    overlays.cleanup()
-    assert overlays.reward_plotter is None
-
-
 def test_the_environment_draws_anew_unless_it_is_switched_off(env, scene) -> None:
     overlays = ViserDebugOverlays(env, scene)
     for _ in range(2):
@@ -85,13 +70,3 @@ def test_contacts_are_drawn_again_for_another_environment(scene, flag) -> None:
     overlays.on_env_switch()
     assert overlays.is_enabled()
     assert redraws
-
-
-def test_an_environment_without_cameras_gets_no_folder(viser_server, env) -> None:
-    overlays = ViserCameraOverlays(viser_server, env, env.sim.mj_model)
-    assert not overlays.has_cameras
-    overlays.setup_controls()
-    overlays.update(env.sim.data, 0, np.zeros(3))
-    assert overlays.camera_viewers == []
-    assert not overlays.has_cameras
-    assert not viser_server.gui._container_handle_from_uuid["root"]._children

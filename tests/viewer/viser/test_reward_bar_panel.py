@@ -50,9 +50,3 @@ def test_hidden_terms_have_no_bar_and_the_sum_comes_first(viser_server) -> None:
     weights["b"] = 1.0
     panel.update([term("a", 2.0), term("b", -0.5)])
     assert ">b<" in panel._html.content
-
-
-def test_it_leaves_nothing_behind(viser_server) -> None:
-    panel = RewardBarPanel(viser_server, ["a"], 0.1)
-    panel.cleanup()
-    assert not viser_server.gui._container_handle_from_uuid["root"]._children

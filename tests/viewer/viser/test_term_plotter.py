@@ -29,9 +29,3 @@ def test_another_environment_starts_over(viser_server) -> None:
     plotter.update([term("a", 5.0)])
     assert plotter._plots["a"].data[1].tolist() == [5.0]
     assert "environment 2" in plotter._label.content
-
-
-def test_it_leaves_nothing_behind(viser_server) -> None:
-    plotter = ViserTermPlotter(viser_server, ["a", "b"])
-    plotter.cleanup()
-    assert not viser_server.gui._container_handle_from_uuid["root"]._children

@@ -19,8 +19,6 @@ from mjlab.viewer.viser.scene import MjlabViserScene
 from mjlab.viewer.viser.viewer import (
     CheckpointManager,
     UpdateReason,
-    checkpoint_number,
-    format_time_ago,
     local_checkpoints,
     status_html,
 )
@@ -136,19 +134,6 @@ def test_what_is_drawn_is_a_copy_taken_between_steps(viser_server) -> None:
     np.testing.assert_array_equal(viewer.scene._last_body_xpos, before)
 
 
-def test_controls_only_ask_for_a_redraw_and_never_draw_themselves(viser_server) -> None:
-    viewer = make(viser_server)
-    show(viewer)
-    assert not viewer._update_reasons
-    drawn = []
-    viewer.scene._update_visualization_locked = lambda *_: drawn.append(1)
-    viewer.scene.request_update()  # Called by mjviser's controls.
-    assert viewer._update_reasons == {UpdateReason.SCENE_REQUEST}
-    assert not drawn
-    show(viewer)
-    assert drawn
-
-
 def test_each_sensor_that_draws_has_a_switch(viser_server) -> None:
     viewer = make(viser_server)
     show(viewer)
@@ -166,12 +151,6 @@ def test_each_sensor_that_draws_has_a_switch(viser_server) -> None:
 def checkboxes(server) -> list:
     handles = server.gui._gui_input_handle_from_uuid.values()
     return [handle for handle in handles if type(handle).__name__ == "GuiCheckboxHandle"]
-
-
-def test_contact_points_are_wider_than_mjviser_draws_them(viser_server) -> None:
-    viewer = make(viser_server)
-    authored = viewer.env.sim.mj_model.vis.scale.contactwidth
-    assert viewer.scene.mj_model.vis.scale.contactwidth > 1.5 * authored
 
 
 def test_commands_hear_of_pauses_and_gui_resets(viser_server) -> None:
@@ -224,12 +203,6 @@ class TestCheckpoints:
         listed = source.fetch_available()
         assert [name for name, _ in listed] == ["model_0.pt", "model_50.pt", "model_1000.pt"]
         assert listed[1][1] == "5m ago"
-
-    def test_numbers_and_ages(self) -> None:
-        assert [checkpoint_number(n) for n in ("model_12.pt", "best.pt", "a_b_3.pt")] == [12, 0, 0]
-        times = (0, 59, 60, 3599, 3600, 86399, 86400, 260000)
-        ages = ["0s", "59s", "1m", "59m", "1h", "23h", "1d", "3d"]
-        assert [format_time_ago(s) for s in times] == [f"{age} ago" for age in ages]
 
     def test_choosing_loads_the_policy_resets_and_clears_the_plots(
         self, viser_server, folder
@@ -297,14 +270,6 @@ class TestCheckpoints:
         content = make(viser_server, manager=manager)._checkpoint_panel._about.content
         assert content == "**Run:** run"
 
-    def test_names_that_differ_in_odd_bytes_are_all_listed(self, viser_server) -> None:
-        names = ["model_\udcfe.pt", "model_\udcff.pt"]
-        listed = [(name, "1m ago") for name in names]
-        manager = CheckpointManager(names[0], lambda: listed, lambda name: push())
-        panel = make(viser_server, manager=manager)._checkpoint_panel
-        assert len(set(panel._choice.options)) == 2
-        assert set(panel._labels.values()) == set(names)
-
     def test_use_latest_looks_for_new_files(self, viser_server, folder) -> None:
         loaded = []
         source = local_checkpoints(folder, lambda path: loaded.append(path.name) or push())
@@ -313,12 +278,6 @@ class TestCheckpoints:
         viewer._checkpoint_panel.load_latest()
         viewer._process_actions()
         assert loaded == ["model_2000.pt"]
-
-    def test_listing_again_loads_nothing(self, viser_server, folder) -> None:
-        viewer = make(viser_server, manager=local_checkpoints(folder, lambda path: 1 / 0))
-        (folder / "model_2000.pt").touch()
-        viewer._checkpoint_panel.refresh()
-        assert viewer._actions.empty()
 
     def test_errors_while_loading_or_listing_are_shown_and_the_old_policy_plays_on(
         self, viser_server, folder
@@ -359,21 +318,6 @@ def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
     scene._variants._next_check = 0.0
     scene.update(env.sim)
     assert [shape.envs for shape in scene._variants._shapes.values()] == [[0, 1, 2]]
-
-
-def test_a_shape_that_differs_is_found_behind_others_that_do_not(viser_server) -> None:
-    env = FakeEnv(2)
-    model = env.sim.mj_model
-    pole = next(i for i in range(model.ngeom) if model.geom(i).name.startswith("cartpole/pole"))
-    rgba = torch.as_tensor(model.geom_rgba).float().expand(2, -1, -1).clone()
-    rgba[1, pole, :3] = 0.9
-    env.sim.expand("geom_rgba", rgba)
-    scene = MjlabViserScene(viser_server, model, 2, env.sim.model, env.sim.expanded_fields)
-    # Sort the batch of the pole last.
-    scene._mesh_groups.sort(key=lambda batch: model.geom_bodyid[pole] in batch.body_ids)
-    assert len(scene._mesh_groups) > 1
-    scene.update(env.sim)
-    assert [shape.envs for shape in scene._variants._shapes.values()] == [[0], [1]]
 
 
 def test_switching_the_environment_removes_the_drawings_of_the_old_one(viser_server) -> None:
