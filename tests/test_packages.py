@@ -86,7 +86,7 @@ for env_cfg in (crashes, fails, works):
 """
 
 
-def test_packages_that_fail_to_import_are_reported_and_do_not_hurt_others(tmp_path, package):
+def test_failing_imports_do_not_hurt_others(tmp_path, package):
     raises = package("raises", "x = 1\n\nraise RuntimeError('their mistake')\n")
     lacks = package("lacks", "import no_such_module_anywhere\n")
     dropped = package("dropped", "from mjlab.entity import NoSuchThing\n")

@@ -226,7 +226,7 @@ def test_the_initial_keyframe_holds_joints_by_the_position_input():
     np.testing.assert_allclose(entity.compile().key_ctrl[0], [0, 0, 0, 0.1, 0, 0.3, 0])
 
 
-def test_gains_and_limits_are_randomized_in_the_rows_of_their_own_actuators():
+def test_gains_are_randomized_in_their_rows():
     ideal = IdealPdActuatorCfg(
         target_names_expr=("knee",), stiffness=40.0, damping=3.0, effort_limit=20.0
     )
@@ -271,12 +271,12 @@ def test_an_orientation_cannot_follow_targets_and_says_what_to_use(make_world):
 
 
 @pytest.mark.parametrize(("element", "kind"), [(PID, "(?i)pid"), (TURN, "orientation|SO3")])
-def test_warp_names_the_actuators_it_does_not_have_when_the_environment_is_built(element, kind):
+def test_warp_names_unsupported_actuators(element, kind):
     with pytest.raises(EngineUnavailableError, match=kind):
         make_env(ARM.format(actuators=element + SERVO), (XML[1],), engine="warp")
 
 
-def test_an_actuator_of_a_config_does_not_take_the_inputs_of_the_xmls_default(make_world):
+def test_config_actuators_ignore_xml_defaults(make_world):
     extra = '<default><pid input="pos vel"/></default>'
     world = make_world(KNEE, extra=extra)
     assert world.sim.mj_model.nu == 1

@@ -68,7 +68,7 @@ def test_network_sees_errors_and_velocities_newest_first(make_world, tmp_path, o
     torch.testing.assert_close(ctrl, torch.full((3, 3), expected))
 
 
-def test_first_values_after_a_reset_fill_the_history_of_that_environment_only(make_world, tmp_path):
+def test_resets_fill_histories_of_their_envs(make_world, tmp_path):
     world = make_world(make_cfg(save(Weighted(), tmp_path)))
     first = drive(world, 1.0, pos=0.0, vel=0.0)
     torch.testing.assert_close(first, torch.full((3, 3), 1.0 + 10.0))

@@ -37,7 +37,7 @@ def test_kind_is_detected_and_its_command_becomes_the_control(make_world, elemen
     )
 
 
-def test_first_actuator_of_each_target_is_taken_and_bare_targets_are_left_out(make_world):
+def test_first_actuators_of_targets_are_taken(make_world):
     world = make_world(XmlActuatorCfg(target_names_expr=JOINTS), extra=MOTORS)
     actuator = world.entity.actuators[0]
     assert actuator.target_names == ["hip", "knee"]

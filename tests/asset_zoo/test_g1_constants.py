@@ -98,7 +98,7 @@ def test_motors_and_gains_are_those_of_the_task_tables():
     assert get_g1_robot_cfg().articulation.soft_joint_pos_limit_factor == 0.9
 
 
-def test_gains_give_each_motor_alone_the_natural_frequency_and_damping_ratio():
+def test_gains_give_frequency_and_damping_ratio():
     for motor in ("5020", "7520_14", "7520_22", "4010"):
         inertia, stiffness, damping = (
             getattr(g1, f"{figure}_{motor}") for figure in ("ARMATURE", "STIFFNESS", "DAMPING")

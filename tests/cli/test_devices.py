@@ -33,9 +33,7 @@ def test_a_device_that_cannot_be_used_is_refused_with_what_to_do(monkeypatch):
 @pytest.mark.parametrize(
     ("flags", "times"), [({}, 1), ({"device": "cpu"}, 0), ({"gpu_ids": None}, 0)]
 )
-def test_training_says_once_that_there_is_no_gpu_unless_the_cpu_was_asked_for(
-    flags, times, monkeypatch, capsys, caplog
-):
+def test_a_missing_gpu_is_told_once(flags, times, monkeypatch, capsys, caplog):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     cfg = TrainConfig.from_task("Mjlab-Cartpole-Swingup")
     for name, value in flags.items():

@@ -80,7 +80,7 @@ def test_a_switch_needs_no_value_and_takes_one(flag):
     ("flags", "named"),
     [(["--cuont", "3"], "--cuont"), (["--count", "many"], "many"), (["stray"], "stray")],
 )
-def test_a_flag_that_is_not_there_or_not_of_its_kind_ends_with_status_2(flags, named, capsys):
+def test_wrong_flags_end_with_status_2(flags, named, capsys):
     with pytest.raises(SystemExit) as caught:
         parsed(*flags)
     assert caught.value.code == 2
@@ -281,7 +281,7 @@ class AnnotatedForCheckersCfg(EventTermCfg):
     source: KnownToCheckers | None = None
 
 
-def test_a_config_annotated_for_type_checkers_alone_is_left_to_the_parser(config):
+def test_configs_for_type_checkers_are_parsed(config):
     config.env.events["odd"] = AnnotatedForCheckersCfg(func=print, mode="reset")
     flags = ["--env.events.odd.source", "None"]
     assert switch_terms_off(config, flags)[1] == flags

@@ -146,9 +146,7 @@ def test_resuming_keeps_the_profile(run, profiled):
         ({"RANK": "1", "WORLD_SIZE": "2"}, False),
     ],
 )
-def test_of_several_processes_one_tells_which_profile_is_resumed(
-    profiled, monkeypatch, capsys, variables, tells
-):
+def test_one_process_tells_the_resumed_profile(profiled, monkeypatch, capsys, variables, tells):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     flags = ["--agent.resume", "True", "--log-root", str(profiled.parents[1])]
@@ -264,9 +262,7 @@ def own_task(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_task_of_ones_own_trains_and_is_evaluated_under_a_profile_made_for_it(
-    own_task, run, tmp_path
-):
+def test_a_custom_task_has_custom_profiles(own_task, run, tmp_path):
     short = ("--env.episode-length-s", "0.1", "--device", "cpu")
     trained = run(
         "train", OWN, "--profile", "cpu", "--log-root", str(tmp_path), "--num-envs", "4",

@@ -137,7 +137,7 @@ def test_the_traceback_of_a_defect_is_kept_in_a_file(capsys, monkeypatch, tmp_pa
     assert "Traceback" not in err
 
 
-def test_an_error_of_any_kind_that_this_package_raises_on_purpose_is_a_message(capsys, failing):
+def test_errors_of_this_package_are_messages(capsys, failing):
     failing(UserError("."))  # Applies the fixture's patches.
     from mjlab.actuator import XmlActuatorCfg
     from mjlab.scene import Scene, SceneCfg

@@ -76,9 +76,7 @@ TRACKING = "Mjlab-Tracking-Flat-Unitree-G1"
         pytest.param(None, REFERENCE_ACTOR, marks=pytest.mark.slow),
     ],
 )
-def test_runs_of_tracking_are_evaluated_and_played_with_the_class_they_had(
-    run, tmp_path, profile, name
-):
+def test_runs_of_tracking_keep_their_class(run, tmp_path, profile, name):
     common = ("--log-root", str(tmp_path), "--device", "cpu")
     flags = ["--num-envs", "4", "--agent.max-iterations", "2", "--agent.num-steps-per-env", "4"]
     for network in ("actor", "critic"):

@@ -103,9 +103,7 @@ def test_an_xml_actuator_may_be_taken_over_twice(kit):
 
 @pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize("sort", [False, True])
-def test_an_actuator_beside_one_of_the_xml_is_accepted_with_a_warning_and_both_act(
-    kit, wrapped, sort
-):
+def test_actuators_beside_the_xml_warn_and_act(kit, wrapped, sort):
     actuators = [SERVO, *([XmlActuatorCfg(target_names_expr=("knee",))] if wrapped else [])]
     cfg = kit.cfg(
         kit.ROBOT.replace("</mujoco>", IN_XML),
@@ -267,7 +265,7 @@ def test_default_root_state_is_that_of_the_config(kit):
     assert scene["arm"].data.default_root_state.tolist() == [pose] * 2
 
 
-def test_the_default_initial_state_of_an_entity_without_joints_is_not_reported(caplog):
+def test_entities_without_joints_are_silent(caplog):
     with caplog.at_level(logging.WARNING):
         EntityCfg().build()
     assert not caplog.records

@@ -37,9 +37,7 @@ weights = st.lists(st.integers(0, 20), min_size=1, max_size=6).filter(any)
 
 
 @given(weights=weights, num_envs=st.integers(1, 200))
-def test_each_variant_gets_its_quota_by_the_largest_remainders_in_one_block(
-    weights: list[int], num_envs: int
-) -> None:
+def test_quotas_of_variants(weights: list[int], num_envs: int) -> None:
     worlds = allocate_worlds(tuple(map(float, weights)), num_envs)
     assert worlds == sorted(worlds)
     assert len(worlds) == num_envs
@@ -141,7 +139,7 @@ BAD_SIBLINGS = {
 
 
 @pytest.mark.parametrize("what", BAD_SIBLINGS)
-def test_a_variant_with_another_structure_than_its_siblings_is_refused_by_name(what: str) -> None:
+def test_variants_need_one_structure(what: str) -> None:
     changes, message = BAD_SIBLINGS[what]
     odd = thing("odd", '<geom size=".1"/>', **changes)
     with pytest.raises(ValueError, match=f"(?s).*{message}") as caught:
@@ -261,7 +259,7 @@ def test_slots_are_found_by_their_whole_names() -> None:
     assert names == ["mjlab/pad/thing/collision/0", "mjlab/pad/thing/collision/1"]
 
 
-def test_variants_of_the_scene_have_the_mass_of_the_first_and_pads_have_none() -> None:
+def test_pads_of_variants_have_no_mass() -> None:
     scene = make_scene(2, {"thing": VariantEntityCfg(variants=THINGS)})
     alone = BOX().compile()
     merged = scene.spec.compile()

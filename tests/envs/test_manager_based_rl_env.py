@@ -154,7 +154,7 @@ def test_the_parts_of_a_step_come_in_their_order(make):
     ]  # fmt: skip
 
 
-def test_rewards_read_derived_quantities_one_substep_old_and_observations_current_ones(make):
+def test_rewards_lag_one_substep_and_observations_none(make):
     def edit(cfg):
         cfg.rewards = {
             "joint": RewardTermCfg(func=joint_pos, weight=1.0),
@@ -180,9 +180,7 @@ def test_rewards_read_derived_quantities_one_substep_old_and_observations_curren
 
 
 @pytest.mark.parametrize("looks_between", [False, True])
-def test_rewards_of_the_very_first_step_read_quantities_as_old_as_those_of_any_other(
-    make, looks_between
-):
+def test_first_rewards_lag_as_later_ones(make, looks_between):
     # A field that nothing else reads, so that the reward of the first step is the first to do so.
     def center_of_mass(env):
         return env.sim.data.subtree_com[:, -1, 0].clone()
@@ -252,7 +250,7 @@ def test_an_environment_that_is_done_starts_anew_in_the_same_step(make):
     assert any(name.startswith("Episode_") for name in extras["log"])
 
 
-def test_without_auto_reset_an_environment_that_is_done_has_to_be_reset_by_hand(make):
+def test_without_auto_reset_users_reset(make):
     env = make(lambda cfg: setattr(cfg, "auto_reset", False))
     env.episode_length_buf[3] = env.max_episode_length - 1
     before = env.sim.data.qpos[3].clone()
@@ -295,7 +293,7 @@ def test_an_episode_has_as_many_steps_as_its_length_says(steps, decimation, time
 # Rewards.
 
 
-def test_rewards_are_scaled_by_the_duration_of_a_step_unless_told_otherwise(make):
+def test_rewards_are_scaled_by_the_step(make):
     scaled = run(make(), 4)[:, :, 5]
     plain = run(make(lambda cfg: setattr(cfg, "scale_rewards_by_dt", False)), 4)[:, :, 5]
     torch.testing.assert_close(scaled, plain * 0.05)
@@ -382,7 +380,7 @@ def test_spaces_have_the_shapes_of_what_is_returned(make):
     assert env.unwrapped is env
 
 
-def test_without_a_render_mode_there_is_no_image_and_an_unknown_one_is_refused(make):
+def test_render_modes(make):
     assert make().render() is None
     env = ManagerBasedRlEnv(cartpole(), device="cpu", render_mode="hologram")
     with pytest.raises(NotImplementedError, match=r"'hologram'.*'rgb_array'"):

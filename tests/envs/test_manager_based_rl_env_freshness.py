@@ -233,7 +233,7 @@ def ends(due: list[int]) -> dict[str, mm.TerminationTermCfg | None]:
 # Steps.
 
 
-def test_observations_have_the_forces_of_the_last_substep_and_the_motion_of_now(make):
+def test_observations_have_last_forces_and_new_motion(make):
     env, reference = make()
     for _ in range(5):
         observed = act(env)
@@ -281,7 +281,7 @@ def test_all_reset_at_once_see_a_full_forward(make):
     check(env, act(env), reference.of_forward, (*FORCES, *MOTION))
 
 
-def test_what_an_environment_observes_does_not_depend_on_the_resets_of_others(make):
+def test_observations_ignore_resets_of_others(make):
     runs = []
     for ended in ([], [1]):
         due: list[int] = []
@@ -293,7 +293,7 @@ def test_what_an_environment_observes_does_not_depend_on_the_resets_of_others(ma
             torch.testing.assert_close(with_reset[name][[0, 2]], without[name][[0, 2]])
 
 
-def test_without_auto_reset_the_last_observation_has_the_forces_of_the_last_substep(make):
+def test_last_observations_have_the_last_forces(make):
     due: list[int] = []
     env, reference = make(terminations=ends(due), auto_reset=False)
     due[:] = [2]
@@ -357,7 +357,7 @@ def test_a_push_changes_velocities_and_leaves_the_forces_that_acted(make):
     assert observed["turning"][2, 2] > 0.5
 
 
-def test_what_an_action_places_between_substeps_is_computed_by_the_next_one(make, monkeypatch):
+def test_places_set_between_substeps_act_next(make, monkeypatch):
     env, reference = make()
     apply = env.action_manager.apply_action
     monkeypatch.setattr(env.action_manager, "apply_action", lambda: (apply(), place(env, None)))

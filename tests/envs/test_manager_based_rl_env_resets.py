@@ -119,7 +119,7 @@ class Place(Sensor[torch.Tensor]):
         return self._sim_data.xpos[:, 1:, 0].clone()
 
 
-def test_a_sensor_that_a_reward_has_read_is_fresh_in_the_observation_of_the_same_step(make):
+def test_sensors_read_by_rewards_are_observed_fresh(make):
     read: list[torch.Tensor] = []
 
     def reward(env):
@@ -143,7 +143,7 @@ def test_a_sensor_that_a_reward_has_read_is_fresh_in_the_observation_of_the_same
 
 @ACTUATORS
 @BY
-def test_after_a_reset_position_actuators_hold_the_joints_where_they_were_put(make, actuator, by):
+def test_position_actuators_hold_reset_joints(make, actuator, by):
     due: list[int] = []
     offset = {"position_range": (-0.2, 0.2), "velocity_range": (0.0, 0.0)}
     events: dict[str, mm.EventTermCfg | None] = {}
@@ -168,7 +168,7 @@ def test_after_a_reset_position_actuators_hold_the_joints_where_they_were_put(ma
     assert (env.sim.data.actuator_force.abs() < 1e-4).all()
 
 
-def test_episodes_cut_short_by_hand_are_recorded_and_those_not_begun_are_not(make):
+def test_episodes_reset_by_hand_are_recorded(make):
     recorded: list[tuple[list[int], torch.Tensor]] = []
 
     class Ends(mm.RecorderTerm):
@@ -248,7 +248,7 @@ class Nothing(mm.CommandTerm):
 
 
 @BY
-def test_the_timer_of_a_command_starts_with_the_episode_and_not_a_step_before(make, by):
+def test_command_timers_start_with_the_episode(make, by):
     due: list[int] = []
     command = NothingCfg(resampling_time_range=(2.0, 2.0))
     env = make(config(terminations=ends(due), commands={"nothing": command}))
@@ -547,9 +547,7 @@ def read_everything(env: Any, env_ids: Any, seen: list[torch.Tensor]) -> torch.T
         ("warp", (remember, disturb)),
     ],
 )
-def test_trajectories_random_numbers_and_what_resets_read_do_not_depend_on_the_switch(
-    make_ending, engine, edits
-):
+def test_observing_ends_changes_no_trajectory(make_ending, engine, edits):
     results = []
     for observes_ends in (False, True):
         seen: list[torch.Tensor] = []

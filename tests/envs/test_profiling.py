@@ -102,7 +102,7 @@ def measured():
     env.close()
 
 
-def test_terms_add_up_to_no_more_than_their_manager_and_phases_than_the_steps(measured):
+def test_profiled_times_add_up(measured):
     _, profile = measured
     assert profile.num_steps == STEPS
     assert 0.0 < sum(profile.phases.values()) <= profile.step_time

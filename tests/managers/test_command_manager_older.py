@@ -194,7 +194,7 @@ def test_an_older_update_takes_every_way_to_name_environments(env_ids):
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_a_partial_reset_keeps_counters_of_the_class_and_lets_generators_go_on():
+def test_partial_resets_keep_class_counters():
     env, play = make(Update)
     play._update_command([1])
     assert play.updates_of_all == 0
@@ -239,7 +239,7 @@ def test_methods_with_todays_arguments_are_called_as_they_are():
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning")
-def test_a_subclass_of_the_velocity_command_may_call_its_update_without_env_ids():
+def test_subclasses_may_update_without_env_ids():
     class Doubled(UniformVelocityCommand):
         def _update_command(self):
             super()._update_command()

@@ -38,7 +38,7 @@ def test_the_reward_is_the_weighted_sum_of_terms(make_env, values, weights, dt, 
     assert manager._step_reward.shape == (4, len(values))
 
 
-def test_sums_of_episodes_are_logged_and_cleared_for_reset_environments_only(env):
+def test_episode_sums_are_logged_at_resets(env):
     env.values = {"a": torch.arange(4.0), "b": torch.ones(4)}
     manager = RewardManager({"a": term("a"), "b": term("b", -2.0)}, env)
     for _ in range(5):

@@ -100,7 +100,7 @@ def test_the_state_is_restored_after_an_evaluation_that_fails():
     assert state == {"episode": 3}
 
 
-def test_more_episodes_than_environments_take_rounds_and_fewer_take_part_of_one():
+def test_episodes_take_as_many_rounds_as_needed():
     assert evaluate_policy(counting(), still, 6).returns == (1.0, 3.0, 6.0, 10.0, 1.0, 3.0)
     assert evaluate_policy(counting(), still, 2).returns == (1.0, 3.0)
 
@@ -191,7 +191,7 @@ def test_bounds_judge_rates_by_the_middle_of_their_interval():
 
 
 @pytest.mark.parametrize("rate", [0.01, 0.05, 0.2, 0.3])
-def test_so_many_episodes_without_a_failure_show_a_rate_and_one_less_does_not(rate):
+def test_episodes_needed_for_a_failure_rate(rate):
     needed = episodes_to_show(rate)
     assert rates(0, needed).judged("failure_rate") <= rate
     assert rates(0, needed - 1).judged("failure_rate") > rate
@@ -209,7 +209,7 @@ def test_success_is_by_return_or_by_function():
     assert by_function.success_rate == 0.25
 
 
-def test_metrics_are_averaged_over_the_steps_of_an_episode_and_then_over_episodes():
+def test_metrics_average_steps_then_episodes():
     # Before its steps environment i has seen 0, ..., i steps, which is i/2 on average.
     result = evaluate_policy(
         counting(), still, metrics={"steps": lambda env: env.episode_length_buf.float()}
@@ -298,7 +298,7 @@ def test_what_outlives_a_reset_does_not_reach_the_next_evaluation():
     assert env.unwrapped.common_step_counter == counter
 
 
-def test_an_environment_whose_state_does_not_fit_is_evaluated_with_a_warning(caplog):
+def test_unfit_states_are_evaluated_with_a_warning(caplog):
     class Refusing(FakeEnv):
         def load_state_dict(self, state):
             raise ValueError("It changed its size.")

@@ -168,7 +168,7 @@ def test_an_evaluation_left_out_by_a_stop_is_made_up_for(tmp_path: Path, remaini
     assert before.told == expected.told
 
 
-def test_a_run_that_does_not_stop_is_evaluated_to_the_end_without_confirmations():
+def test_endless_runs_are_evaluated_unconfirmed():
     runner, told = learner(SEED, stop_when_solved=False)
     runner.learn(15)
     assert runner.stop_reason == "finished"

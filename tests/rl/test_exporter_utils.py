@@ -157,7 +157,7 @@ def test_a_cartpole_run_leaves_a_policy_with_its_metadata(tmp_path: Path):
     env.close()
 
 
-def test_metadata_of_position_actions_have_full_precision_and_the_actuators_gains():
+def test_metadata_of_position_actions_are_exact():
     env = leg_env()
     metadata = get_base_metadata(env, "some_run")
     assert list(metadata)[:12] == [

@@ -106,7 +106,7 @@ def test_it_computes_what_torch_does(tmp_path: Path, activation: str) -> None:
 @pytest.mark.parametrize("batch", [None, 1, "batch"])
 @pytest.mark.parametrize("layers", [1, 2])
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
-def test_memory_is_kept_for_each_environment_and_forgotten_at_the_end_of_its_episode(
+def test_memory_is_per_environment_and_episode(
     tmp_path: Path, kind: str, layers: int, batch: int | str | None
 ) -> None:
     torch.manual_seed(1)
@@ -233,7 +233,7 @@ def test_only_what_the_actions_follow_from_is_computed(tmp_path: Path) -> None:
         OnnxPolicy(path)
 
 
-def test_numbers_of_three_decimals_are_like_the_full_ones_and_other_words_are_not() -> None:
+def test_rounded_numbers_are_alike() -> None:
     assert _alike("0.373,0.249", "0.37275302,0.24850203")
     assert _alike("0.25", "0.25,0.25,0.25")
     assert not _alike("0.25,0.5,0.25", "0.25,0.25,0.25")

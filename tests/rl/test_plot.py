@@ -160,7 +160,7 @@ def test_what_a_curve_shows_stays_in_sight(curve):
     assert visible_range(curve) is None
 
 
-def test_a_run_that_was_resumed_before_its_end_has_one_value_for_each_iteration(tmp_path: Path):
+def test_resumed_curves_have_one_value_an_iteration(tmp_path: Path):
     write_run(tmp_path, {0: 1.0, 1: 2.0, 2: 3.0, 3: 4.0})
     (first,) = tmp_path.iterdir()
     first.rename(tmp_path / "events.out.tfevents.0")

@@ -93,13 +93,13 @@ def finish(logger: Any, it: int) -> IterationStats:
 @pytest.mark.parametrize(
     ("failures", "limit"), [(0.0, 40.0), (0.1, 40.0), (0.01, 10.0), (1.0, 7.0)]
 )
-def test_the_expected_length_is_the_mean_of_a_truncated_geometric_distribution(failures, limit):
+def test_expected_lengths_are_truncated_geometric(failures, limit):
     survived = [(1.0 - failures) ** step for step in range(int(limit))]
     assert mean_length(failures, limit) == pytest.approx(sum(survived))
 
 
 @pytest.mark.parametrize("with_time_outs", [False, True])
-def test_the_exploring_return_does_not_wait_for_episodes_and_is_free_of_the_time_step(
+def test_the_exploring_return_needs_no_episode(
     with_time_outs,
 ):
     logger = make_logger(RunLogger, rnd=False)
@@ -278,7 +278,7 @@ def test_a_runner_with_a_loop_of_its_own_leaves_checkpoints_and_scalars(
     ("settings", "kept", "uploaded"),
     [({}, True, False), ({"upload_git_diff": True}, True, True), ({"save_git_diff": False}, 0, 0)],
 )
-def test_only_the_given_repository_is_kept_and_nothing_of_it_uploaded_unless_asked_to(
+def test_uploads_of_repositories_are_opt_in(
     make_runner, tmp_path: Path, monkeypatch, settings, kept, uploaded
 ):
     task = tmp_path / "my_tasks"

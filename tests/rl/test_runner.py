@@ -378,9 +378,7 @@ def test_weights_of_nan_end_training_with_those_before(make_runner, tmp_path: Pa
     make_runner().load(str(tmp_path / "run" / "model_1.pt"))
 
 
-def test_an_error_right_after_a_resume_leaves_the_exact_checkpoint_the_newest(
-    make_runner, tmp_path: Path, monkeypatch
-):
+def test_errors_after_a_resume_keep_the_checkpoint(make_runner, tmp_path: Path, monkeypatch):
     make_runner(tmp_path / "first").learn(2)
     resumed = make_runner(tmp_path / "second")
     resumed.load(str(tmp_path / "first" / "model_1.pt"))
@@ -567,7 +565,7 @@ def test_an_evaluation_owed_by_the_last_iteration_is_made(make_runner, tmp_path:
     assert not load_checkpoint(tmp_path / "second" / "model_2.pt")["owes_evaluation"]
 
 
-def test_no_evaluation_is_made_before_the_first_iteration_that_may_have_one(make_runner):
+def test_first_iteration_of_evaluations(make_runner):
     recorder = Recorder()
     runner = make_runner(evaluation=solved_at(0.01, first_iteration=4))
     runner.observers.append(recorder)
@@ -800,7 +798,7 @@ def test_a_subclass_decides_where_policies_are_exported(make_runner, tmp_path: P
     assert not list((tmp_path / "run").glob("*.onnx"))
 
 
-def test_policies_are_exported_beside_the_checkpoint_under_the_name_of_the_run(tmp_path: Path):
+def test_exports_have_the_name_of_the_run(tmp_path: Path):
     from mjlab.rl import MjlabOnPolicyRunner
 
     folder, name, path = MjlabOnPolicyRunner._get_export_paths(str(tmp_path / "run" / "model_7.pt"))

@@ -88,7 +88,7 @@ def expected(log: Log, value_of: Any) -> torch.Tensor:
     return rewards
 
 
-def test_ppo_stores_the_reward_plus_the_discounted_value_of_the_final_observation():
+def test_ppo_bootstraps_from_final_observations():
     runner = make_runner()
     log = Log(runner)
     runner.learn(1)

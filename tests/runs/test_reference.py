@@ -140,7 +140,7 @@ def learning(rng, speed: float = 1.0, spread: float = 0.4) -> RunRecord:
 
 
 @pytest.mark.parametrize("count", [3, 5])
-def test_few_healthy_seeds_that_end_when_they_are_solved_are_called_outside(count):
+def test_few_solved_seeds_are_called_outside(count):
     """Each is slower than all of the reference with a probability of one in count + 1."""
     rng = np.random.default_rng(0)
     outside = 0

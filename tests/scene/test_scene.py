@@ -253,7 +253,7 @@ def test_caches_are_dropped_by_forward_update_and_reset(kit):
         torch.testing.assert_close(sensor.data[0, 2], before[0, 2] + 1.0)
 
 
-def test_only_sensors_of_forces_keep_their_data_when_velocities_are_computed(kit):
+def test_force_sensors_keep_their_data(kit):
     touch = ContactSensorCfg(name="touch", primary=ContactMatch("body", "box", entity="box"))
 
     class Copy(Sensor[torch.Tensor]):
@@ -275,7 +275,7 @@ def test_only_sensors_of_forces_keep_their_data_when_velocities_are_computed(kit
         assert (scene["touch"].data is before[1]) == kept
 
 
-def test_environments_in_which_something_was_placed_are_known_until_the_next_substep(kit):
+def test_placed_environments_are_known_for_a_substep(kit):
     sim, scene = kit.make(num_envs=4, entities={"box": kit.cfg(kit.BOX)})
     box = scene["box"]
     assert scene.take_moved_envs() is None

@@ -35,7 +35,7 @@ def options_of(model: mujoco.MjModel) -> dict:
     return {name: str(getattr(model.opt, name)) for name in names}
 
 
-def test_the_config_decides_and_each_difference_is_reported_with_the_assignment(kit, xml, caplog):
+def test_the_config_decides_and_reports_differences(kit, xml, caplog):
     scene = build(robot=kit.cfg(xml, 'timestep=".01" cone="elliptic" impratio="7"/>'))
     assert reports(scene, MujocoCfg(cone="elliptic"), caplog) == [
         "Option timestep is 0.002, from MujocoCfg; to follow the XML of 'robot', "
@@ -89,7 +89,7 @@ def test_an_option_written_out_counts_even_at_mujocos_default(kit, caplog):
     assert "sim.mujoco.integrator = 'euler'" in reports(spoken, MujocoCfg(), caplog)[0]
 
 
-def test_a_simulation_of_the_spec_and_the_environment_have_the_same_options(kit, caplog):
+def test_spec_and_environment_have_one_set_of_options(kit, caplog):
     options = (
         'timestep=".01" integrator="Euler" density="7" noslip_iterations="3"'
         '><flag contact="disable"/></option>'
@@ -196,7 +196,7 @@ def test_flags_of_an_xml_are_reported_as_applying_with_the_assignment(kit, xml, 
     assert reports(scene, sim.mujoco, caplog) == []
 
 
-def test_entities_that_disagree_beyond_the_config_are_reported_and_neither_wins(kit):
+def test_entities_that_disagree_are_reported(kit):
     with pytest.warns(UserWarning, match="not applied") as caught:
         scene = build(
             one=kit.cfg(kit.BOX, 'timestep=".01" density="7" viscosity="1"/>'),

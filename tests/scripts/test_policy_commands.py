@@ -67,9 +67,7 @@ def test_weights_and_biases_without_a_login_is_one_error(run, tmp_path, monkeypa
     assert "run `wandb login` or set WANDB_API_KEY" in outcome.message
 
 
-def test_training_that_is_uploaded_needs_a_login_before_anything_is_built(
-    run, tmp_path, monkeypatch
-):
+def test_uploads_need_a_login_first(run, tmp_path, monkeypatch):
     log_out(monkeypatch, tmp_path)
     outcome = run("train", TASK, "--log-root", str(tmp_path / "logs"), "--agent.logger", "wandb")
     assert outcome.status == 1

@@ -757,7 +757,7 @@ def test_runs_have_a_gpu_each_or_share_the_cores(monkeypatch, flags, jobs, visib
     assert {slot["MJLAB_CORES"] for slot in slots} == {shares}
 
 
-def test_a_run_is_resumed_from_the_last_checkpoint_with_iterations_left(monkeypatch, tmp_path):
+def test_runs_resume_with_iterations_left(monkeypatch, tmp_path):
     """After its last iteration, nothing would be trained, and the last evaluation stay missing."""
     agent = SimpleNamespace(max_iterations=3)
     monkeypatch.setattr(

@@ -180,7 +180,7 @@ def test_a_run_of_weights_and_biases_is_resumed(run, trained, tmp_path, monkeypa
     assert "iteration 2" in outcome.out
 
 
-def test_a_state_that_turns_nan_is_counted_and_the_run_goes_on(run, tmp_path, monkeypatch):
+def test_nan_states_are_counted_and_reset(run, tmp_path, monkeypatch):
     from mjlab.envs import ManagerBasedRlEnv
 
     step = ManagerBasedRlEnv.step
@@ -210,7 +210,7 @@ def test_a_state_that_turns_nan_is_counted_and_the_run_goes_on(run, tmp_path, mo
     assert "'cartpole/" in outcome.err, "the joint is named"
 
 
-def test_physics_that_diverges_nearly_everywhere_ends_training(run, tmp_path, monkeypatch):
+def test_diverging_physics_ends_training(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # Other libraries in this process set one: dm_control at import.
     handler = mujoco.get_mju_user_warning()
@@ -238,7 +238,7 @@ def test_training_stops_by_itself_once_solved(train, tmp_path):
     assert Run(run_dir).info["iterations"] < 6
 
 
-def test_the_names_of_the_parts_are_those_of_the_interface():
+def test_names_of_the_interface():
     assert run_train is launch_training
     with pytest.raises(AttributeError, match="no_such_name"):
         from mjlab.scripts import train
@@ -297,7 +297,7 @@ def test_a_folder_with_a_checkpoint_is_never_removed(tmp_path):
     assert list(tmp_path.iterdir()) == [folder.path]
 
 
-def test_what_a_killed_run_was_writing_is_removed_at_the_next_start(tmp_path):
+def test_files_of_killed_runs_are_removed(tmp_path):
     older = tmp_path / "2026-01-01_00-00-00"
     clips = older / "videos" / "train"
     clips.mkdir(parents=True)

@@ -73,7 +73,7 @@ def test_the_help_lists_the_flags_of_the_learner(run):
 
 
 @pytest.mark.parametrize("script", ["train", "train_seeds"])
-def test_a_learner_that_does_not_exist_is_told_with_those_that_do(run, script):
+def test_unknown_learners_list_the_known(run, script):
     outcome = run(script, TASK, "--learner", "td3")
     assert outcome.status == 1
     assert all(name in outcome.message for name in ("td3", "ppo", "sac", "distillation"))
@@ -141,7 +141,7 @@ def test_resuming_keeps_the_learner_and_takes_its_flags(run, first):
     assert Run(new).info["learner"] == "sac"
 
 
-def test_a_run_of_ppo_is_resumed_without_a_word_about_learners(run, trained, tmp_path):
+def test_runs_of_ppo_resume_without_notice(run, trained, tmp_path):
     first = shutil.copytree(trained, tmp_path / "cartpole" / "2026-01-01_00-00-00")
     outcome = resume(run, first)
     assert outcome.status == 0, outcome.err
@@ -149,9 +149,7 @@ def test_a_run_of_ppo_is_resumed_without_a_word_about_learners(run, trained, tmp
     assert resume(run, first, *OF_SAC).status == 2
 
 
-def test_a_profile_that_chooses_sac_leaves_runs_of_ppo_as_they_are(
-    monkeypatch, trained, tmp_path, capsys
-):
+def test_a_profile_with_sac_keeps_runs_of_ppo(monkeypatch, trained, tmp_path, capsys):
     registry.list_tasks()
     monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
     own = registry._tasks[TASK]
@@ -216,7 +214,7 @@ def test_the_newest_policy_of_a_learner_is_played(run, first, trained):
     assert "`train Mjlab-Cartpole-Swingup --learner sac`" in outcome.message
 
 
-def test_its_policy_is_that_of_its_export_and_takes_neither_thread_nor_replay(of_sac):
+def test_sac_policies_act_as_their_export(of_sac):
     checkpoint = of_sac / "model_1.pt"
     cfg = acting_cfg(agent_cfg_of(TASK, Checkpoint(checkpoint)))
     assert cfg["actor"]["hidden_dims"] == (8,)
@@ -253,7 +251,7 @@ def test_its_policy_is_that_of_its_export_and_takes_neither_thread_nor_replay(of
         pytest.param("Mjlab-Velocity-Flat-Unitree-Go1", marks=pytest.mark.slow),
     ],
 )
-def test_tasks_with_runners_of_their_own_learn_by_it(run, tmp_path, task):
+def test_tasks_with_custom_runners_learn_by_sac(run, tmp_path, task):
     common = ("--log-root", str(tmp_path), "--device", "cpu")
     small = ("--num-envs", "4", "--agent.max-iterations", "1", "--agent.num-steps-per-env", "3")
     profile = ("--profile", "cpu") if "Go1" in task else ()
@@ -296,7 +294,7 @@ def test_the_teacher_has_the_network_of_its_run(student):
     assert agent["student"]["hidden_dims"] == [64, 64]
 
 
-def test_a_student_is_resumed_evaluated_and_played_from_both_files(run, train, student):
+def test_students_resume_and_evaluate(run, train, student):
     logs = student[1].parents[1]
     argv = ["--log-root", str(logs), "--device", "cpu"]
     resumed = train(logs, 3, "--agent.resume", "True", "--agent.load-run", student[1].name)
@@ -355,7 +353,7 @@ def test_a_student_without_a_teacher_is_told_so(run, tmp_path):
     assert not list(tmp_path.glob("*/*"))
 
 
-def test_the_blind_student_of_rough_ground_sees_all_but_the_ground():
+def test_the_blind_student_sees_no_ground():
     task = "Mjlab-Velocity-Rough-Unitree-Go1"
     groups = load_env_cfg(task, profile="blind").observations
     assert set(groups["actor"].terms) - set(groups["student"].terms) == {"height_scan"}

@@ -72,7 +72,7 @@ def assert_resumes_exactly(
 
 
 @pytest.mark.slow
-def test_a_run_that_is_killed_resumes_from_its_last_checkpoint_bit_for_bit(train, tmp_path):
+def test_a_killed_run_resumes_bit_for_bit(train, tmp_path):
     log_root = tmp_path / "logs"
     process = start_endless_run(log_root)
     wait_for_checkpoint(log_root, process, "model_1.pt")
@@ -83,7 +83,7 @@ def test_a_run_that_is_killed_resumes_from_its_last_checkpoint_bit_for_bit(train
     assert_resumes_exactly(train, log_root, run_dir, tmp_path)
 
 
-def test_sigterm_saves_exports_and_ends_with_its_status(tmp_path):
+def test_sigterm_saves_and_exports(tmp_path):
     log_root = tmp_path / "logs"
     process = start_endless_run(log_root)
     wait_for_checkpoint(log_root, process, "model_0.pt")
@@ -102,7 +102,7 @@ def test_sigterm_saves_exports_and_ends_with_its_status(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_evaluation_ends_at_a_signal_and_is_made_up_for(train, tmp_path):
+def test_a_signalled_evaluation_is_repeated(train, tmp_path):
     log_root = tmp_path / "logs"
     flags = ("--agent.evaluation.trigger-return=-1e9", "--agent.evaluation.min-interval", "1")
     flags += ("--agent.evaluation.num-episodes", "256")
@@ -205,7 +205,7 @@ def test_a_signal_while_building_leaves_no_folder(tmp_path, number):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no signals to groups of processes")
-def test_a_signal_that_ends_the_reader_of_a_pipe_first_leaves_a_checkpoint(tmp_path):
+def test_a_broken_pipe_leaves_a_checkpoint(tmp_path):
     log_root = tmp_path / "logs"
     process = subprocess.Popen(
         endless_run(log_root), stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -255,7 +255,7 @@ def test_both_end_with_the_same_networks_bit_for_bit(pair):
     assert [name for name in saved if not torch.equal(saved[name], held[name])] == []
 
 
-def test_observation_normalizers_have_seen_the_data_of_both(pair):
+def test_normalizers_see_data_of_all_processes(pair):
     run, _ = pair
     # Two iterations of four steps in four environments, in each of two processes.
     assert run.probe(0)["weights"]["obs_normalizer.count"] == 2 * 4 * 4 * 2
@@ -304,7 +304,7 @@ def test_the_cores_are_shared_out(pair):
     assert run.probe(0)["threads"] == run.probe(1)["threads"] == share
 
 
-def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_new_folder(pair):
+def test_processes_resume_from_one_checkpoint(pair):
     run, _ = pair
     (before,) = run.runs()
     # A folder without a checkpoint, as a run leaves that was killed early.
@@ -334,7 +334,7 @@ def test_both_resume_from_the_checkpoint_that_the_first_finds_before_there_is_a_
     assert [event.step for event in events.Scalars("Train/mean_step_reward")] == [2]
 
 
-def test_a_process_that_fails_while_training_takes_the_other_along_and_says_why(tmp_path):
+def test_a_failing_process_ends_the_others(tmp_path):
     flags = ("--agent.max-iterations", "1000")
     run = ProcessRun(tmp_path, *flags, patches=("fail_while_training",))
     first, second = run.end()
@@ -348,7 +348,7 @@ def test_a_process_that_fails_while_training_takes_the_other_along_and_says_why(
     assert [c.path for c in Run(run_dir).checkpoints][-1].name == "model_0.pt"
 
 
-def test_a_process_that_fails_before_training_is_named_and_leaves_no_folder(tmp_path):
+def test_a_process_failing_early_leaves_no_folder(tmp_path):
     first, second = ProcessRun(tmp_path, patches=("fail_while_building",)).end()
     assert (first.status, second.status) == (3, 1)
     assert "error in process 1: no room in process 1" in second.err
@@ -357,7 +357,7 @@ def test_a_process_that_fails_before_training_is_named_and_leaves_no_folder(tmp_
 
 
 @pytest.mark.slow
-def test_what_is_wrong_in_all_processes_is_told_once(tmp_path):
+def test_errors_of_all_processes_are_told_once(tmp_path):
     first, second = ProcessRun(tmp_path, "--agent.save-interval", "0").end()
     assert (first.status, second.status) == (1, 3)
     assert "--agent.save-interval: expected an integer >= 1, got 0" in first.err
@@ -365,7 +365,7 @@ def test_what_is_wrong_in_all_processes_is_told_once(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_signal_to_one_stops_all_after_the_same_iteration_and_saves_once(tmp_path):
+def test_a_signal_to_one_process_stops_all(tmp_path):
     run = ProcessRun(tmp_path, "--agent.max-iterations", "1000000")
     end = time.monotonic() + 60
     while not list(tmp_path.glob("logs/cartpole/*/model_0.pt")) and time.monotonic() < end:

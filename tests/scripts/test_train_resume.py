@@ -55,7 +55,7 @@ def without_training_state(run_dir: Path) -> None:
         torch.save(data, path)
 
 
-def test_it_has_the_environments_of_the_run_that_it_resumes(first, resume):
+def test_a_resumed_run_keeps_its_environments(first, resume):
     outcome = resume()
     assert outcome.status == 0, outcome.err
     assert "Resuming with --num-envs 16" in outcome.out
@@ -64,7 +64,7 @@ def test_it_has_the_environments_of_the_run_that_it_resumes(first, resume):
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_a_seed_to_be_drawn_is_the_one_of_the_run_that_is_resumed(first, resume, is_known):
+def test_a_resumed_run_keeps_its_drawn_seed(first, resume, is_known):
     if not is_known:
         (first / "params" / "agent.yaml").unlink()
     outcome = resume("--agent.seed", "-1")
@@ -79,13 +79,13 @@ def test_a_typed_number_of_environments_wins(first, resume):
     assert num_envs(new_run(first)) == 5
 
 
-def test_an_older_checkpoint_is_resumed_with_what_the_parameters_say(first, resume):
+def test_older_checkpoints_resume_by_parameters(first, resume):
     without_training_state(first)
     assert resume().status == 0
     assert num_envs(new_run(first)) == 16
 
 
-def test_where_nothing_says_how_many_environments_there_were_this_is_told(first, resume):
+def test_an_unknown_number_of_environments_is_told(first, resume):
     without_training_state(first)
     shutil.rmtree(first / "params")
     outcome = resume()

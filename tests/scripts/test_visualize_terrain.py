@@ -80,7 +80,7 @@ def test_all_presets_are_shown_side_by_side(viser_server):
     assert page.scene.origins.shape == (1, len(ALL_TERRAIN_PRESETS), 3)
 
 
-def test_a_terrain_that_cannot_be_built_is_told_on_the_page_and_the_last_one_stays(viser_server):
+def test_the_page_keeps_the_last_valid_terrain(viser_server):
     page = TerrainPage(viser_server, "wave_terrain", num_levels=1, size=4.0, robot="none")
     page.rebuild()
     last = page.scene

@@ -114,7 +114,7 @@ def test_what_is_fully_transparent_is_not_seen(views):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_transparency_is_that_of_the_material_and_differs_between_environments(engine):
+def test_transparency_is_that_of_the_material(engine):
     xml = """<mujoco><asset><material name="clear" rgba="1 1 1 0"/></asset><worldbody>
       <geom name="near" size=".5" pos="0 0 2" material="clear"/><geom name="far" size=".5"/>
       <camera name="down" pos="0 0 4"/></worldbody></mujoco>"""
@@ -379,7 +379,7 @@ CLOTH = """
 """
 
 
-def test_what_the_native_engine_cannot_show_is_refused_when_the_task_is_built():
+def test_unsupported_images_fail_at_build():
     with pytest.raises(
         EngineUnavailableError, match="cameras of the native engine do not see flexes"
     ):
@@ -403,7 +403,7 @@ def test_a_sky_is_seen_where_there_is_nothing():
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_an_environment_that_has_diverged_leaves_the_images_of_others_alone(engine):
+def test_diverged_envs_leave_images_of_others(engine):
     eyes = (
         camera("eye", "room/down", width=7, height=7),
         camera("rider", None, parent_body="ball/ball", width=7, height=7),

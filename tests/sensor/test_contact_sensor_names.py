@@ -30,7 +30,7 @@ def robot(primary: ContactMatch, secondary: ContactMatch | None = None, **fields
 # Primaries.
 
 
-def test_primaries_come_in_the_order_of_the_spec_whatever_the_order_of_the_patterns():
+def test_primaries_have_the_order_of_the_spec():
     scene = robot(geom(("right_.*", "left_shin"), "robot"))
     assert scene["touch"].primary_names == ["left_shin", "right_foot", "right_shin"]
     assert elements(scene)[0] == ("robot/left_shin", "")
@@ -43,7 +43,7 @@ def test_bodies_and_subtrees_are_matched_among_bodies():
         assert {sensor.objtype for sensor in scene.spec.sensors} == {kind}
 
 
-def test_entries_of_exclude_are_searched_if_they_look_like_patterns_and_exact_otherwise():
+def test_exclude_takes_names_and_patterns():
     names = robot(geom(".*", "robot", exclude=("^right_", "left_shin")))["touch"].primary_names
     assert names == ["trunk_collision", "left_foot"]
     # Without special characters, "shin" is a whole name, which none is.
@@ -66,7 +66,7 @@ def test_the_terrain_is_an_entity_too():
         assert compose(sense(match), robot=LEGS)["touch"].primary_names == ["terrain"]
 
 
-def test_names_inside_attached_parts_are_found_by_their_short_and_their_full_name():
+def test_attached_names_may_be_short_or_full():
     arm = mujoco.MjSpec.from_string(
         "<mujoco><worldbody><body name='elbow'><joint name='j'/><geom name='tip' size='.1'/></body>"
         "</worldbody></mujoco>"

@@ -37,7 +37,7 @@ def test_the_height_scan_of_the_reference_has_17_by_11_rays_with_x_fastest():
     rows=st.integers(0, 12),
     step=st.sampled_from([0.05, 0.1, 0.13, 0.7]),
 )
-def test_a_grid_of_whole_steps_is_centered_and_reaches_both_ends_of_both_sides(columns, rows, step):
+def test_grids_of_whole_steps_are_centered(columns, rows, step):
     cfg = GridPatternCfg(size=(columns * step, rows * step), resolution=step)
     offsets, _ = cfg.generate_rays(None, CPU)
     assert len(offsets) == (columns + 1) * (rows + 1)
@@ -57,7 +57,7 @@ def test_a_grid_of_whole_steps_is_centered_and_reaches_both_ends_of_both_sides(c
         (0.0, [0.0]),
     ],
 )
-def test_a_grid_of_broken_steps_starts_at_its_lower_end_and_is_not_centered(size, expected):
+def test_grids_of_broken_steps_start_low(size, expected):
     offsets, _ = GridPatternCfg(size=(size, 0.0), resolution=0.1).generate_rays(None, CPU)
     torch.testing.assert_close(offsets[:, 0], torch.tensor(expected), atol=1e-6, rtol=0)
 

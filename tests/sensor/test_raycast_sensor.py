@@ -167,7 +167,7 @@ def test_a_frame_on_the_world_leaves_out_what_is_attached_to_the_world():
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_frames_of_several_kinds_and_entities_keep_the_order_in_which_they_are_given(engine):
+def test_frames_keep_their_order(engine):
     frames = (
         ObjRef("site", "right", "robot"),
         ObjRef("geom", "foot", "robot"),
@@ -235,9 +235,7 @@ def rays_of(sensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 @settings(max_examples=30, deadline=None)
 @given(roll=ANGLE, pitch=ANGLE, yaw=ANGLE)
-def test_base_aligned_rays_turn_with_the_frame_and_world_aligned_ones_do_not(
-    aligned, roll, pitch, yaw
-):
+def test_alignment_of_rays(aligned, roll, pitch, yaw):
     sim, scene, offsets, directions = aligned
     rotation = pose(sim, roll, pitch, yaw)
     sense(sim)
@@ -277,7 +275,7 @@ def test_a_frame_that_points_up_or_down_takes_its_heading_from_its_y_axis(aligne
     torch.testing.assert_close(rays_of(scene["yaw"])[0], expected, atol=2e-5, rtol=0)
 
 
-def test_the_orientation_reported_is_that_of_the_frame_whatever_the_alignment(aligned):
+def test_orientations_are_those_of_frames(aligned):
     sim, scene, *_ = aligned
     rotation = pose(sim, 0.3, 0.4, 0.5)
     sense(sim)
@@ -336,7 +334,7 @@ def test_what_was_measured_is_computed_once_until_rays_are_cast_again():
         assert scene[name].data is not before
 
 
-def test_orientations_are_those_of_the_time_of_sensing_whenever_they_are_read():
+def test_orientations_are_those_when_sensed():
     sim, scene = scene_with(scan())
     tilted = quat_from_euler_xyz(*(torch.tensor([a]) for a in (0.3, -0.2, 0.1)))
     sim.data.qpos[:, 3:7] = tilted
@@ -407,7 +405,7 @@ def test_an_environment_that_has_diverged_does_not_disturb_the_others():
         ({"pattern": PinholeCameraPatternCfg.from_mujoco_camera("eye")}, "robot/eye"),
     ],
 )
-def test_a_sensor_that_cannot_work_is_refused_by_name_when_the_scene_is_built(kwargs, message):
+def test_impossible_ray_sensors_fail_at_build(kwargs, message):
     with pytest.raises(ValueError, match=message) as error:
         scene_with(scan("my_scan", **kwargs))
     assert "Ray sensor 'my_scan'" in str(error.value)
@@ -546,7 +544,7 @@ def make_env(num_envs=2) -> ManagerBasedRlEnv:
     return ManagerBasedRlEnv(cfg, device="cpu")
 
 
-def test_observations_see_the_current_scene_and_rewards_that_of_the_step_before():
+def test_rays_of_rewards_are_a_step_old():
     env = make_env()
     obs, _ = env.reset()
     torch.testing.assert_close(obs["actor"], torch.full((2, 6), 0.5))

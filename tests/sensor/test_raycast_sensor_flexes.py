@@ -20,7 +20,7 @@ ENTITIES = {"robot": ROBOT, "cloth": CLOTH}
 DOWN = RayCastSensorCfg(name="down", frame=BASE, pattern=GridPatternCfg(size=(0.0, 0.0)))
 
 
-def test_a_ray_sensor_and_a_flex_are_refused_on_warp_when_the_task_is_built():
+def test_warp_rejects_rays_with_flexes():
     with pytest.raises(EngineUnavailableError, match="rays in a model with flexes.*native"):
         scene_with(DOWN, entities=ENTITIES, engine="warp")
 

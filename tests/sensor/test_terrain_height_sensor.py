@@ -96,7 +96,7 @@ def test_below_a_plane_and_below_a_height_field_the_height_is_zero(engine):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_ray_just_below_an_uphill_surface_counts_as_zero_and_not_as_a_drop(engine):
+def test_rays_below_uphill_surfaces_are_zero(engine):
     # A foot 5 mm above a 1 : 2 slope: the uphill ray starts 45 mm below the surface.
     cfg = height(reduction="none", pattern=RingPatternCfg.single_ring(0.1, 2))
     steep = field_of([[0.0, 1.0], [0.0, 1.0]], size=(1.0, 1.0, 1.0, 0.5))
@@ -148,7 +148,7 @@ def test_ground_of_another_group_is_no_ground():
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_ground_that_every_environment_places_for_itself_is_found_where_it_is(engine):
+def test_ground_may_differ_by_environment(engine):
     slab = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 .1"
       elevation="0 0 1 1"/></asset><worldbody><body name="slab"><geom type="hfield" hfield="h"/>
       </body></worldbody></mujoco>"""

@@ -186,7 +186,7 @@ def test_flat_boxes_meet_at_the_same_points_of_which_warp_keeps_four(depth):
 
 
 @pytest.mark.parametrize("depth", [1e-4, 1e-3])
-def test_boxes_in_any_pose_are_pressed_apart_by_the_same_depth_and_nearly_the_same_way(depth):
+def test_boxes_have_the_same_depth_and_normal(depth):
     angles, differs = [], 0
     for mine, theirs in compared(pressed_states(depth), FINGER):
         one, two = deepest(mine), deepest(theirs)

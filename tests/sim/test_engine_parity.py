@@ -247,9 +247,7 @@ def test_a_partial_forward_updates_only_its_environments(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("rows", [None, [1]])
-def test_a_forward_to_velocities_keeps_what_the_last_substep_left_of_later_stages(
-    pair: Pair, rows: list[int] | None
-) -> None:
+def test_a_forward_keeps_later_stages(pair: Pair, rows: list[int] | None) -> None:
     set_same_state(pair, seed=3)
     for sim in pair.both():
         sim.step(2)

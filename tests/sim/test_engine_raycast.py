@@ -406,7 +406,7 @@ def test_rays_against_nothing_but_planes_are_those_of_mj_ray(planes, seed, slant
         assert geoms[env, r] == geom
 
 
-def test_rays_down_on_one_endless_plane_end_at_its_height_and_miss_from_below():
+def test_rays_on_an_endless_plane():
     xml = """
     <mujoco><worldbody>
       <geom type="sphere" size="1" group="1"/>

@@ -93,7 +93,7 @@ def test_an_environment_that_was_reset_moves_as_a_new_one(sim):
 
 
 @pytest.mark.parametrize("field", ["body_mass", "actuator_gainprm", "gravity"])
-def test_defaults_are_those_of_construction_whatever_is_written_into_the_host_model(sim, field):
+def test_defaults_are_those_of_construction(sim, field):
     # Viewers write per-environment values there, before the first read of the default.
     owner = sim.mj_model.opt if field == "gravity" else sim.mj_model
     expected = np.array(getattr(owner, field), dtype=np.float32)

@@ -79,7 +79,7 @@ def test_a_derived_field_is_current_when_first_read():
 
 
 @pytest.mark.parametrize("substeps", [(4,), (1,), (1, 1, 1)])
-def test_a_field_first_read_in_the_first_step_is_as_old_as_one_that_was_read_before(substeps):
+def test_first_reads_lag_as_later_ones(substeps):
     early, late = make_sim(), make_sim()
     bound = {name: getattr(early.data, name) for name in ("xpos", "cvel", "qfrc_actuator")}
     for sim in (early, late):

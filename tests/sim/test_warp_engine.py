@@ -101,7 +101,7 @@ def test_too_small_a_capacity_is_refused_at_construction() -> None:
         make_engine(xml, njmax=1)
 
 
-def test_contacts_of_a_reference_pose_that_no_episode_starts_in_are_no_reason_to_refuse(
+def test_contacts_of_an_unused_pose_are_allowed(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """At the world origin a robot may be deep inside generated terrain."""
@@ -143,7 +143,7 @@ def test_a_data_field_that_is_not_offered_says_why(field: str, said: str) -> Non
 
 
 @pytest.mark.parametrize("xml", MODELS.values(), ids=MODELS)
-def test_every_data_field_that_is_offered_has_the_shape_that_mujoco_gives_it(xml: str) -> None:
+def test_data_fields_have_shapes_of_mujoco(xml: str) -> None:
     engine, host = make_engine(xml, num_envs=3), mujoco.MjData(mujoco.MjModel.from_xml_string(xml))
     mujoco.mj_forward(engine.mj_model, host)
     for field in offered_data_fields(engine.wp_data):
@@ -606,7 +606,7 @@ def test_graphs_are_captured_at_construction_without_a_trace(
 
 
 @pytest.mark.parametrize("mode", ["startup", "reset"])
-def test_graphs_of_an_environment_that_randomizes_are_captured_before_its_first_reset(
+def test_graphs_are_captured_before_the_first_reset(
     as_on_cuda: None, monkeypatch: pytest.MonkeyPatch, mode: Any
 ) -> None:
     captures: list[int] = []

@@ -135,7 +135,7 @@ def test_configs_are_equal_to_their_pickled_copies(task: str, play: bool) -> Non
 
 @every_task
 @pytest.mark.parametrize("play", [False, True], ids=["train", "play"])
-def test_it_builds_resets_and_steps_with_finite_values_of_the_stated_shapes(task, play):
+def test_tasks_build_reset_and_step(task, play):
     with making(task, play=play) as env:
         space = env.single_observation_space
         observations, _ = env.reset()

@@ -237,7 +237,7 @@ def test_an_unknown_task_is_a_key_error_with_the_nearest_names(load):
         ("mjlab.tasks.registry:no_such_function", "no_such_function"),
     ],
 )
-def test_a_lazy_config_that_cannot_be_imported_names_the_task_and_the_cause(name, cause):
+def test_failing_lazy_configs_name_task_and_cause(name, cause):
     register_mjlab_task("Lazy-Task", name, None, name, name)
     for load in (load_env_cfg, load_rl_cfg, load_runner_cls):
         with pytest.raises(TaskImportError, match=f"'Lazy-Task' .*'{name}'.*{cause}") as caught:

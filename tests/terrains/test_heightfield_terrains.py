@@ -84,7 +84,7 @@ def test_rough_ground_draws_one_height_a_pixel_by_row_and_column():
     np.testing.assert_allclose(built.surface[2:-2, 2:-2], drawn * 0.005, atol=1e-6)
 
 
-def test_coarser_rough_ground_passes_through_what_is_drawn_and_is_smooth_between():
+def test_coarse_rough_ground_is_smooth_between_draws():
     built = build(rough(size=(8.0, 6.0), border_width=0.0, downsampled_scale=2.0))
     drawn = np.random.default_rng(0).choice(np.arange(4, 24, 4), size=(3, 4)) * 0.005
     corners = built.surface[np.ix_([0, -1], [0, -1])]
@@ -118,7 +118,7 @@ def test_an_offset_lifts_the_spawn_point_over_obstacles():
     assert build(obstacles(origin_z_offset=0.3)).output.origin[2] == pytest.approx(0.3)
 
 
-def test_perlin_noise_is_smooth_spans_its_height_and_leaves_the_border_flat():
+def test_perlin_noise_is_smooth_with_a_flat_border():
     built = build(perlin(), 0.5)
     inner = built.surface[10:-10, 10:-10]
     assert (inner.min(), inner.max()) == (pytest.approx(0.0, abs=1e-6), pytest.approx(0.5))
@@ -177,7 +177,7 @@ def test_the_elevations_of_the_rough_tasks_slope():
 
 @pytest.mark.parametrize("difficulty", DIFFICULTIES)
 @pytest.mark.parametrize("kind", ALL)
-def test_no_ground_near_the_spawn_point_is_above_it_and_some_is_right_at_it(kind, difficulty):
+def test_spawn_points_are_on_the_ground(kind, difficulty):
     """The reference starts robots inside waves and rough ground, and 0.86 m above Perlin noise."""
     built = build(ALL[kind](), difficulty, seed=3)
     reach = {"slope": 1.0, "obstacles": 0.45}.get(kind, 1.0)

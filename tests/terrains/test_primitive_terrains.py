@@ -150,7 +150,7 @@ def test_a_random_grid_has_no_gap_around_the_platform():
     assert heights[np.ix_(abs(places - 4) < 1, abs(places - 4) < 1)] == pytest.approx(0.3)
 
 
-def test_a_tilted_grid_has_no_gap_around_the_platform_and_nothing_comes_out_of_it():
+def test_a_tilted_grid_surrounds_its_platform():
     for width, platform in ((1.0, 2.0), (1.9, 1.0), (0.7, 1.3)):
         built = preset("tilted_grid", grid_width=width, platform_width=platform)
         # Not along the seams of columns, where a ray may pass.
@@ -195,7 +195,7 @@ def test_the_columns_of_a_cross_are_kept_in_a_grid_with_holes():
     assert built.height(0.2, 0.2) == 0.0, "the frame stays"
 
 
-def test_merging_similar_heights_takes_fewer_boxes_for_about_the_same_ground():
+def test_merging_heights_takes_fewer_boxes():
     plain = preset("box_random_grid")
     merged = preset("box_random_grid", merge_similar_heights=True, height_merge_threshold=0.1)
     assert merged.model.ngeom < 0.8 * plain.model.ngeom

@@ -263,7 +263,7 @@ def test_environments_start_on_the_cells_of_their_level_and_column():
     torch.testing.assert_close(heights, torch.tensor([0.0, 0.4, 0.8, 1.2]))
 
 
-def test_a_generated_terrain_is_one_static_body_without_the_material_of_the_plane(recwarn, caplog):
+def test_a_generated_terrain_is_one_static_body(recwarn, caplog):
     entity = generated()
     assert not recwarn.list, "no word about a plane that is not there"
     assert not caplog.messages

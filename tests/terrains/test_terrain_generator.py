@@ -99,7 +99,7 @@ def test_a_curriculum_of_one_row_is_of_the_lowest_difficulty():
     assert [difficulty for difficulty, _, _ in kind.calls] == [0.3]
 
 
-def test_a_random_grid_draws_kind_then_difficulty_then_the_terrain_row_by_row():
+def test_random_grids_have_an_order_of_draws():
     kinds = {"a": Recorder(proportion=3.0, draws=2), "b": Recorder(proportion=1.0, draws=1)}
     build(num_rows=3, num_cols=4, sub_terrains=kinds, seed=5, difficulty_range=(0.1, 0.7))
     rng, expected = np.random.default_rng(5), {"a": [], "b": []}
@@ -253,7 +253,7 @@ def sampling(number: Any, radius: float) -> dict[str, FlatPatchSamplingCfg]:
     return {"spawn": FlatPatchSamplingCfg(num_patches=number, patch_radius=radius)}
 
 
-def test_flat_patches_are_moved_to_their_cells_and_gaps_hold_the_spawn_point():
+def test_flat_patches_lie_in_their_cells():
     kinds = {
         "few": Recorder(flat_patch_sampling=sampling(2, 0.7), patches=2),
         "none": Recorder(),

@@ -53,7 +53,7 @@ def test_other_columns_become_int64_ids(ids):
     assert columns.tolist() == ids
 
 
-def test_columns_first_used_in_inference_mode_can_be_differentiated_through():
+def test_columns_of_inference_mode_have_gradients():
     with torch.inference_mode():
         as_columns([7, 5], "cpu")
     source = torch.ones(1, 8, requires_grad=True)

@@ -374,7 +374,7 @@ with replacing(Path(sys.argv[1])) as file:
 """
 
 
-def test_a_temporary_file_is_removed_once_its_process_was_killed_and_not_before(tmp_path):
+def test_temporary_files_of_killed_processes_go(tmp_path):
     other = tmp_path / ".model_1.pt.abcdefgh.tmp"
     other.touch()
     command = [sys.executable, "-c", WRITE, str(tmp_path / "model_2.pt")]

@@ -55,7 +55,7 @@ ITERATIONS = st.integers(1, 100_000)
 @given(one=st.tuples(SEEDS, RANKS), other=st.tuples(SEEDS, RANKS))
 @example(one=(1, 1), other=(2, 0))
 @example(one=(2**20 - 1, 1000), other=(0, 999))
-def test_no_process_draws_the_numbers_of_another_of_its_run_or_of_one_with_another_seed(one, other):
+def test_processes_and_seeds_share_no_draws(one, other):
     assert (process_seed(*one) == process_seed(*other)) == (one == other)
     seed_rng(process_seed(*one))
     drawn = _draw()
@@ -70,9 +70,7 @@ def test_a_run_of_one_process_has_the_seed_that_it_was_given(seed):
 
 @given(run=SEEDS, process=st.tuples(SEEDS, RANKS), one=ITERATIONS, other=ITERATIONS)
 @example(run=0, process=(2**20 - 1, 1000), one=1, other=2)
-def test_evaluations_draw_what_no_process_and_no_other_evaluation_of_the_run_does(
-    run, process, one, other
-):
+def test_evaluations_share_no_draws(run, process, one, other):
     evaluations = {evaluation_seed(run), evaluation_seed(run, one), evaluation_seed(run, other)}
     assert len(evaluations) == (2 if one == other else 3)
     first, resumed = process_seed(*process), session_seed(process_seed(*process), one)
@@ -86,7 +84,7 @@ def test_sessions_of_a_run_draw_what_none_of_its_processes_drew_before(seed, ses
     assert one != other
 
 
-def test_runs_with_neighboring_seeds_are_evaluated_in_episodes_of_their_own():
+def test_neighboring_seeds_have_other_episodes():
     # Seeds 0 to 199 lie further apart than any run has iterations.
     bases = sorted(evaluation_seed(seed) for seed in range(200))
     gaps = [after - before for before, after in zip(bases, bases[1:], strict=False)]

@@ -15,7 +15,7 @@ from mjlab.utils.string import counted, escaped, filter_exp, resolve_expr, resol
 NAMES = ("hip_a", "hip_b", "knee")
 
 
-def test_patterns_match_the_start_of_a_name_and_the_first_in_dict_order_counts():
+def test_the_first_matching_pattern_counts():
     assert resolve_expr({"hip": 1, "hip_b": 2}, NAMES, 0) == (1, 1, 0)
     assert resolve_expr({"hip_b": 2, "hip": 1}, NAMES, 0) == (1, 2, 0)
 
@@ -34,7 +34,7 @@ def test_a_pattern_that_matches_nothing_is_reported(caplog, match):
 
 
 @pytest.mark.parametrize("match", [resolve_expr, filter_exp])
-def test_of_many_names_the_report_gives_those_that_are_near_and_the_number_of_others(caplog, match):
+def test_long_reports_list_near_names_and_a_count(caplog, match):
     names = (*(f"box_{i}" for i in range(2171)), "pillar")
     match({"piller": 1}, names)
     assert caplog.messages == [

@@ -115,7 +115,7 @@ def test_the_offset_is_where_mujoco_puts_its_own_camera(azimuth, elevation, dist
     assert (view.offset()[2] > 0) == (elevation < 0) or abs(elevation) < 1e-6
 
 
-def test_neighbors_are_the_nearest_by_origin_without_the_environment_itself() -> None:
+def test_neighbors_are_nearest_by_origin() -> None:
     origins = np.array([[0, 0, 0], [5, 0, 0], [1, 0, 0], [-2, 0, 0]], dtype=float)
     assert nearest_envs(origins, 0, 2) == [2, 3]
     assert nearest_envs(origins, 0, 99) == [2, 3, 1]

@@ -129,7 +129,7 @@ def test_browser_items_have_their_own_opacity_arrows_included(viser_server) -> N
         np.testing.assert_allclose(page._debug_handles[key].batched_opacities, [0.25, 0.75])
 
 
-def test_browser_items_vanish_when_they_are_not_drawn_again_and_move_with_the_scene(
+def test_browser_items_last_one_drawing(
     viser_server,
 ) -> None:
     page = ViserDebugVisualizer(viser_server, MODEL)

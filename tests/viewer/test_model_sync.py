@@ -30,7 +30,7 @@ def test_rotation_fields_are_reshaped_to_mujocos_rows() -> None:
     np.testing.assert_allclose(model.cam_mat0, np.eye(3).reshape(1, 9))
 
 
-def test_a_moved_geom_is_drawn_moved_although_the_compiler_gave_it_its_bodys_frame() -> None:
+def test_moved_geoms_are_drawn_moved() -> None:
     env = FakeEnv(1)
     geom = env.sim.mj_model.geom("cartpole/cart").id
     assert env.sim.mj_model.geom_sameframe[geom] != 0

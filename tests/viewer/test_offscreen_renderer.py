@@ -67,9 +67,7 @@ def test_bad_configurations_raise_before_any_drawing(fields, message) -> None:
         mujoco.FatalError("an OpenGL platform library has not been loaded"),
     ],
 )
-def test_a_machine_that_cannot_render_gives_one_error_that_says_what_to_install(
-    monkeypatch, failure
-) -> None:
+def test_missing_renderers_name_what_to_install(monkeypatch, failure) -> None:
     def fail(*_, **__):
         raise failure
 

@@ -83,7 +83,7 @@ def test_what_is_seen_through_stays_before_the_sky() -> None:
     assert 0 < red < pixels[18, 2, 0]
 
 
-def test_several_directional_lights_are_as_bright_as_one_and_cast_one_shadow() -> None:
+def test_several_suns_are_as_bright_as_one() -> None:
     scene = model()
     prepare_sun(scene, distance=4.0)
     np.testing.assert_allclose(scene.light_diffuse[:, 0], [0.4, 0.3, 0.7], rtol=1e-6)
@@ -91,7 +91,7 @@ def test_several_directional_lights_are_as_bright_as_one_and_cast_one_shadow() -
     assert scene.vis.map.shadowclip * scene.stat.extent == pytest.approx(4.0)
 
 
-def test_the_sun_stands_over_what_the_camera_looks_at_and_other_lights_stay() -> None:
+def test_the_sun_follows_the_camera() -> None:
     scene = model()
     data = mujoco.MjData(scene)
     mujoco.mj_forward(scene, data)

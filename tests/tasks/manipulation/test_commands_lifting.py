@@ -58,7 +58,7 @@ def test_numbers_are_drawn_in_the_documented_order(difficulty):
     assert torch.equal(cube.velocity, torch.zeros(4, 6))
 
 
-def test_goals_and_objects_are_within_their_ranges_from_the_origin_of_their_environment():
+def test_goals_and_objects_keep_their_ranges():
     env, term = lifting_command(
         StandInEnv(num_envs=500),
         difficulty="dynamic",
@@ -102,7 +102,7 @@ def test_without_a_range_of_poses_the_object_stays_where_it_is():
 # A new goal within an episode.
 
 
-def test_a_new_goal_moves_the_object_and_derives_where_it_is_in_these_environments_only():
+def test_a_new_goal_moves_objects_of_its_envs():
     env, term = started(difficulty="dynamic")
     before = term.command.clone(), env.objects["cube"].data.root_link_pos_w.clone()
     term.time_left[:] = torch.tensor([5.0, 0.01, 5.0, 0.02])
@@ -149,7 +149,7 @@ def test_an_object_exactly_as_far_as_the_threshold_is_not_at_its_goal():
     assert not term.metrics["at_goal"].any()
 
 
-def test_success_of_an_episode_outlives_the_goal_and_success_of_the_goal_does_not():
+def test_success_of_an_episode_outlives_its_goals():
     env, term = started()
     put(env, term, 0.0, 0.0, 1.0, 1.0)
     term.compute(0.02)

@@ -40,7 +40,7 @@ def placed(env: StandInEnv) -> torch.Tensor:
     return poses - env.scene.env_origins.unsqueeze(1)
 
 
-def test_numbers_are_drawn_in_the_documented_order_where_no_cube_is_in_another():
+def test_draws_have_the_documented_order():
     # In the first two environments the drawn places are far enough apart, in the others they are
     # not: then more numbers are drawn, after all of these.
     env, term = multi_cube_command(cubes(count=2, num_envs=30), difficulty="dynamic")
@@ -105,7 +105,7 @@ def test_placements_are_apart_and_untouched_where_they_were(seed, radii, envs):
     assert torch.equal(after[good], before[good])
 
 
-def test_cubes_for_which_there_is_no_room_end_the_search_and_were_warned_about(caplog):
+def test_cubes_without_room_warn(caplog):
     tight = PoseRange(x=(0.30, 0.31), y=(0.0, 0.01))
     env, term = multi_cube_command(cubes(count=3), object_pose_range=tight)
     assert "object_pose_range is small for the objects" in caplog.text
@@ -188,7 +188,7 @@ def test_the_wanted_cube_is_where_it_is_now_not_where_it_was():
     assert term.target_object_pos()[:, 0].tolist() == [0.0, 9.0, 2.0, 9.0]
 
 
-def test_all_cubes_are_moved_with_a_new_goal_and_derived_in_these_environments_only():
+def test_a_new_goal_moves_all_cubes_of_its_envs():
     env, term = started()
     before = placed(env)
     term.time_left[:] = torch.tensor([5.0, 5.0, 0.0, 5.0])

@@ -98,7 +98,7 @@ def test_sliders_move_goal_and_handle(play):
     assert play.handle.position == pytest.approx([ORIGIN_STEP + 0.55, 0.1, 0.25])
 
 
-def test_a_handle_that_is_dragged_too_far_comes_back_to_the_end_of_the_sliders(play):
+def test_handles_end_with_the_sliders(play):
     play.handle.by_person(position=(ORIGIN_STEP + 5.0, 0.0, 0.3))
     play.step()
     # 0.1 m beyond the range of goals.

@@ -63,7 +63,7 @@ def test_saving_writes_the_policy_beside_the_checkpoint(tmp_path):
         pytest.param(MULTI, marks=pytest.mark.slow),
     ],
 )
-def test_training_learns_and_a_resumed_run_goes_on_as_the_uninterrupted_one(task, tmp_path):
+def test_training_learns_and_resumes_exactly(task, tmp_path):
     whole = make_runner(task, tmp_path / "whole")
     before = weights(whole)
     whole.learn(2, init_at_random_ep_len=True)

@@ -50,7 +50,7 @@ def test_observations_have_the_sizes_of_the_interface(make_env, task, size):
     assert env.observation_manager.group_obs_dim == {"actor": (size,), "critic": (286,)}
 
 
-def test_after_a_reset_the_robot_is_at_a_frame_and_the_reference_at_the_next(make_env):
+def test_resets_put_robots_at_a_frame(make_env):
     env = make_env(edit=unperturbed, sampling_mode="uniform", num_envs=6)
     env.reset()
     command = command_of(env)
@@ -296,7 +296,7 @@ def displaced(env, shift, yaw) -> None:
     env.sim.forward()
 
 
-def test_the_relative_reference_goes_with_the_place_and_heading_of_the_robot(make_env):
+def test_relative_references_follow_the_robot(make_env):
     env = make_env(motion="slow_walk", num_envs=2)
     env.reset()
     command = command_of(env)

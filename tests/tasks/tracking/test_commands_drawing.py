@@ -70,7 +70,7 @@ def test_the_ghost_is_the_robot_alone_in_one_color(env):
     assert not (env.sim.mj_model.geom_rgba[:, 3] == 0.5).any()
 
 
-def test_ghosts_are_drawn_for_the_environments_in_view_and_may_stand_beside(env):
+def test_ghosts_of_the_environments_in_view(env):
     command, board = command_of(env), Board(0, 2)
     command.drawing.draw(board)
     at_reference = [qpos for qpos, *_ in board.ghosts]
@@ -145,7 +145,7 @@ def test_the_slider_follows_the_reference_while_playing(env, panel):
     assert command_of(env).time_steps.tolist() == [4, 4, 4]
 
 
-def test_the_slider_moves_the_reference_of_the_environment_in_view_while_paused(env, panel):
+def test_the_slider_moves_the_reference_in_view(env, panel):
     command = command_of(env)
     env.command_manager.on_viewer_pause(True)
     assert not panel.page["Frame"].disabled

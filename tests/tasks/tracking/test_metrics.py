@@ -111,9 +111,7 @@ class Motions:
             self.rounds.append([])
 
 
-def test_motions_are_shared_out_evenly_over_episodes_whatever_falls_and_the_same_again(
-    short, tmp_path
-):
+def test_motions_are_shared_out_evenly(short, tmp_path):
     motions = [short, *(part_of("wave", slice(0, n), tmp_path / f"{n}.npz") for n in (15, 20))]
     cfg = task_cfg(",".join(map(str, motions)), num_envs=4)
     play_motions_once(cfg)

@@ -86,7 +86,7 @@ def test_an_environment_that_has_not_made_a_step_stays_where_it_is():
     assert moves[1:] == ([1, 0, 0, 0], [0, 0, 0, 1])
 
 
-def test_levels_of_a_real_terrain_stay_at_the_first_reset_and_after_a_resume(make_env):
+def test_levels_stay_after_a_resume(make_env):
     env = make_env(GO1_ROUGH, num_envs=16)
     before = env.scene.terrain.terrain_levels.clone()
     env.reset()

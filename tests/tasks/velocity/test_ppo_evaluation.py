@@ -34,7 +34,7 @@ def test_evaluating_twice_with_one_seed_gives_the_same_figures(make_env, task):
     assert len(set(first.returns)) == 4
 
 
-def test_rounds_and_evaluations_leave_robots_on_the_terrain_where_they_began(make_env):
+def test_evaluations_keep_terrain_levels(make_env):
     env = make_evaluation_env(RslRlVecEnvWrapper(make_env(GO1_ROUGH, edit=on_all_levels)), 6, 2)
     terrain = env.unwrapped.scene.terrain
     kept = (

@@ -161,7 +161,7 @@ def test_empty_sites_stay_if_a_custom_term_takes_them(takes_sites):
     assert ("asset_cfg" in swing.params) == takes_sites
 
 
-def test_sites_in_another_order_than_the_contacts_are_accepted_with_a_warning(make_env):
+def test_sites_in_another_order_warn(make_env):
     def edit(cfg):
         to_sites(cfg)
         names = cfg.rewards["foot_clearance"].params["asset_cfg"].site_names

@@ -53,7 +53,7 @@ def test_the_task_is_trained_by_its_runner():
         assert load_runner_cls(f"Mjlab-Velocity-Flat-Unitree-{robot}") is VelocityOnPolicyRunner
 
 
-def test_a_resumed_run_goes_on_as_the_uninterrupted_one_with_its_curriculum(make_runner, tmp_path):
+def test_a_run_resumes_with_its_curriculum(make_runner, tmp_path):
     whole = make_runner(tmp_path / "whole", counter=119_990)
     whole.learn(4, init_at_random_ep_len=True)
     first = make_runner(tmp_path / "first", counter=119_990)

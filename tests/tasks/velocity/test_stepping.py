@@ -49,7 +49,7 @@ def lives(env: ManagerBasedRlEnv, steps: int, follow: bool) -> torch.Tensor:
     return life
 
 
-def test_a_robot_that_it_drives_steps_and_stands_where_one_in_its_default_pose_falls(env):
+def test_driven_robots_step_and_stand(env):
     assert (lives(env, 150, follow=False) < 150).all()
     assert (lives(env, 150, follow=True) == 150).float().mean() > 0.8
     highest = torch.zeros(2)

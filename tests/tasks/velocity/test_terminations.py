@@ -59,7 +59,7 @@ def test_the_bounds_are_those_of_the_grid_that_was_built():
     assert mdp.out_of_terrain_bounds(env, margin=1.0).tolist() == [False, False, False, True]
 
 
-def test_a_wall_around_the_terrain_adds_no_ground_and_a_wide_margin_leaves_a_point():
+def test_walls_add_no_ground():
     env = on_terrain((3.6, 0.0), (3.8, 0.0), rows=1, cols=1, border_width=-5.0)
     assert mdp.out_of_terrain_bounds(env).tolist() == [False, True]
     assert mdp.out_of_terrain_bounds(env, margin=99.0).tolist() == [True, True]

@@ -32,7 +32,7 @@ def started(**fields: Any) -> tuple[StandInEnv, Any]:
 
 
 @pytest.mark.parametrize("count", [1, 7, 33])
-def test_numbers_are_drawn_in_the_documented_order_one_for_each_environment(count):
+def test_draws_have_the_documented_order(count):
     shares = {
         "rel_heading_envs": 0.5,
         "rel_standing_envs": 0.3,
@@ -209,7 +209,7 @@ def test_updating_some_environments_leaves_the_others_alone():
 # Metrics.
 
 
-def test_errors_are_means_over_the_steps_of_the_episode_however_long_it_was():
+def test_command_errors_are_means_over_steps():
     env, term = started(resampling_time_range=(100.0, 100.0))
     steps = 700
     for step in range(steps):

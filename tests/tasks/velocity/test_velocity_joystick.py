@@ -23,7 +23,7 @@ def make(page: Page, env_idx: int = 1) -> tuple[VelocityJoystick, list[int]]:
     return joystick, changes
 
 
-def test_it_commands_the_environment_in_view_and_no_other_once_it_is_enabled(page):
+def test_the_joystick_commands_the_env_in_view(page):
     joystick, _ = make(page)
     command = torch.full((3, 3), 0.25)
     joystick.write_to(command)

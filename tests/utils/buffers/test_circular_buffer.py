@@ -162,7 +162,7 @@ def test_its_state_can_be_saved_and_restored():
     assert torch.equal(ring.current_length, other.current_length)
 
 
-def test_a_first_frame_under_inference_mode_does_not_forbid_later_ones_without_it() -> None:
+def test_frames_follow_those_of_inference_mode() -> None:
     buffer = CircularBuffer(2, 3, "cpu")
     with torch.inference_mode():
         buffer.append(torch.ones(3, 2))

@@ -88,7 +88,7 @@ def test_one_bias_for_all_components_starts_at_the_first_reset():
     assert (biased[[0, 1, 3, 4]] == 0).all()
 
 
-def test_a_bias_can_be_given_for_each_component_and_reset_before_the_first_call():
+def test_a_bias_may_differ_by_component():
     model = _bias_model(bias=ConstantNoiseCfg(bias=(1.0, 2.0, 3.0)))
     model.reset()
     assert model(DATA)[4].tolist() == [1.0, 2.0, 3.0]
@@ -117,7 +117,7 @@ def test_missing_configs_are_refused():
         cfg.class_type(cfg, 5, "cpu")
 
 
-def test_data_that_comes_first_under_inference_mode_does_not_forbid_resets_without_it() -> None:
+def test_resets_follow_data_of_inference_mode() -> None:
     noise = UniformNoiseCfg(n_min=1.0, n_max=2.0)
     model = NoiseModelWithAdditiveBiasCfg(noise_cfg=noise, bias_noise_cfg=noise)
     built = NoiseModelWithAdditiveBias(model, num_envs=2, device="cpu")

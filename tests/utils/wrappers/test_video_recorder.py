@@ -79,7 +79,7 @@ def test_a_clip_starts_at_its_step_and_holds_the_frames_after_each_step(tmp_path
     assert fps(env.written[0]) == pytest.approx(50.0)
 
 
-def test_an_episodes_clip_ends_with_it_and_each_episode_is_asked_about_once(tmp_path) -> None:
+def test_clips_end_with_their_episode(tmp_path) -> None:
     asked = []
     env = VideoRecorder(
         FilmedEnv(episode=5),

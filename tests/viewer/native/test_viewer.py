@@ -170,7 +170,7 @@ class TestMousePush:
         self.perturb.refselpos[:] = self.data.xpos[self.perturb.select] + [1.0, 0.0, 0.0]
         self.perturb.refpos[:] = self.perturb.refselpos
 
-    def test_a_push_along_the_rail_is_a_force_on_the_slider_of_that_environment(self) -> None:
+    def test_pushes_are_forces_on_the_slider(self) -> None:
         self.data.xfrc_applied[3] = 7.0
         self.push.apply(self.sim, 0, self.data, self.perturb)
         assert self.forces[0, 0] > 0.1

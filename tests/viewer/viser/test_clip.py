@@ -132,7 +132,7 @@ def test_a_machine_that_cannot_render_says_so_on_the_page(page, monkeypatch) -> 
     assert not client.downloads
 
 
-def test_a_page_that_is_closed_while_it_records_leaves_no_thread_and_no_file(page) -> None:
+def test_closed_pages_leave_no_recording(page) -> None:
     viewer, panel, client = page
     press(panel, client)
     show(viewer)

@@ -23,9 +23,7 @@ def scene(viser_server, env) -> MjlabViserScene:
     return MjlabViserScene(viser_server, env.sim.mj_model, 2)
 
 
-def test_terms_are_recorded_while_it_runs_and_start_over_with_another_environment(
-    viser_server, env, scene
-) -> None:
+def test_plots_restart_with_another_environment(viser_server, env, scene) -> None:
     overlays = ViserTermOverlays(viser_server, env, scene, frame_time=0.02)
     tabs = viser_server.gui.add_tab_group()
     overlays.setup_tabs(tabs)

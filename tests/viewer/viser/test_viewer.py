@@ -92,7 +92,7 @@ def test_environment_number_and_groups_come_from_the_config(viser_server) -> Non
     assert viewer.scene.geom_groups_visible == [True, False, False, True, False, False]
 
 
-def test_histories_get_one_point_a_step_however_often_the_display_is_refreshed(
+def test_plots_get_one_point_a_step(
     viser_server,
 ) -> None:
     viewer = make(viser_server)
@@ -225,9 +225,7 @@ class TestCheckpoints:
         assert len(rewards_of(viewer)) == 0
         assert "Loaded model_50.pt" in panel._message.content
 
-    def test_a_manager_of_the_caller_names_its_run_and_the_last_entry_is_the_latest(
-        self, viser_server
-    ) -> None:
+    def test_a_custom_manager_names_run_and_latest(self, viser_server) -> None:
         loaded = []
         manager = CheckpointManager(
             current_name="model_50.pt",
@@ -279,9 +277,7 @@ class TestCheckpoints:
         viewer._process_actions()
         assert loaded == ["model_2000.pt"]
 
-    def test_errors_while_loading_or_listing_are_shown_and_the_old_policy_plays_on(
-        self, viser_server, folder
-    ) -> None:
+    def test_errors_of_checkpoints_keep_the_policy(self, viser_server, folder) -> None:
         source = local_checkpoints(folder, lambda path: (_ for _ in ()).throw(OSError("truncated")))
         viewer = make(viser_server, manager=source)
         before = viewer.policy
@@ -296,7 +292,7 @@ class TestCheckpoints:
         assert "Cannot list checkpoints" in panel._message.content
 
 
-def test_shapes_that_differ_between_environments_are_drawn_as_each_has_them(
+def test_shapes_differ_between_environments(
     viser_server,
 ) -> None:
     env = FakeEnv(3)

@@ -388,7 +388,7 @@ def test_a_step_of_the_yam_is_that_of_mink_and_its_fingers_stay_coupled(
     )
 
 
-def test_a_joint_at_its_limit_stops_and_the_others_make_up_for_it_as_in_mink(arm: Any) -> None:
+def test_joints_at_limits_are_as_in_mink(arm: Any) -> None:
     limits = arm.robot.data.soft_joint_pos_limits
     # The upper arm may hardly move, which a reach downward asks of it.
     ik = term(arm, orientation_weight=0.0, max_dq=9.0)
