@@ -73,10 +73,13 @@ def make_due(env: ManagerBasedRlEnv, ids: slice) -> None:
 
 
 def counted(cuda: PretendCuda) -> Counter[str]:
-    """Return the waits by place, without those that draw until objects are apart, and zero all."""
+    """Return the waits by place, and zero all.
+
+    Left out are those that draw until objects are apart, and those for rays that hit no ground.
+    """
     waits = Counter[str]()
     for place, count in cuda.waits.items():
-        if " keep_apart: " not in place:
+        if " keep_apart: " not in place and " _zero_below_ground: " not in place:
             waits[re.sub(r":\d+ ", " ", place)] += count
     cuda.waits.clear()
     return waits
@@ -137,11 +140,11 @@ def test_waits_are_counted(cuda):
 
 
 def lookups(env: ManagerBasedRlEnv) -> int:
-    """Return the number of masks of a step: ends, divergence, and what is due."""
+    """Return the number of masks of a step: ends, and what is due."""
     commands = [env.command_manager.get_term(name) for name in env.command_manager.active_terms]
     motions = sum(isinstance(command, MotionCommand) for command in commands)
     timers = sum(isinstance(timer, torch.Tensor) for timer in env.event_manager._timers.values())
-    return 2 + env.observes_ends + len(commands) + motions + timers
+    return 1 + env.observes_ends + len(commands) + motions + timers
 
 
 # Tasks.
