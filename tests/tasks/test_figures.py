@@ -39,11 +39,11 @@ for task, positions in {
     }
 
 _PLACEMENT = {
+    "success": "mjlab.tasks.manipulation.config.yam.rl_cfg:placed_at_goal",
     "metrics": {
         n: f"tasks.manipulation.config.yam.rl_cfg:{n}" for n in ("position_error", "at_goal")
     },
     "units": {"position_error": "m"},
-    "success": "mjlab.tasks.manipulation.config.yam.rl_cfg:placed_at_goal",
 }
 for task in (
     "Mjlab-Lift-Cube-Yam",
@@ -81,9 +81,9 @@ _MOTION_ENDED = {
 }
 _MOTION_EVALUATION = {
     "_": "EvaluationCfg",
+    "success": "survival",
     "metrics": _MOTION_ERRORS,
     "units": dict(zip(_MOTION_ERRORS, ("m", "m", "rad/s", "m", "rad"), strict=True)),
-    "success": "survival",
 }
 for variant in ("", "-No-State-Estimation"):
     DEVIATIONS[f"Mjlab-Tracking-Flat-Unitree-G1{variant}"] = {

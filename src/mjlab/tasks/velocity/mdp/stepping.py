@@ -18,6 +18,7 @@ import torch
 
 from mjlab.envs.mdp.actions import JointPositionAction
 from mjlab.tasks.velocity.mdp.gait import require_gait_clock
+from mjlab.utils.errors import check_exists
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -123,6 +124,8 @@ class stepping_action:
         mujoco.mj_kinematics(env.sim.mj_model, reference)
         for joint, axis in _AXES.items():
             names = [pattern.format(side=side, joint=joint) for side in _SIDES]
+            for target in names:
+                check_exists(f"joint of action {name!r}", target, term.target_names)
             ids = [asset.joint_names.index(target) for target in names]
             axes = reference.xaxis[asset.indexing.joint_ids[ids].cpu()]
             if (axes @ axis < _MIN_ALIGNMENT).any():
