@@ -233,7 +233,7 @@ def test_programs_of_users_keep_keyboard_interrupt(tmp_path):
 def test_commands_keep_the_handler_of_ctrl_c(failing, handler):
     previous = signal.signal(signal.SIGINT, handler)
     try:
-        command = Command("one", "", "", "module_that_is_missing:command")
+        command = Command("one", "", "", module="module_that_is_missing")
         with pytest.raises(ModuleNotFoundError):
             run_subcommand(command, [], "one")
         assert signal.getsignal(signal.SIGINT) == handler
@@ -312,10 +312,8 @@ def test_every_command_has_help_a_line_in_the_overview_and_a_function(mjlab, com
     outcome = mjlab(command.name, "--help")
     assert outcome.status == 0, outcome.err
     assert outcome.out.startswith(f"usage: mjlab {command.name}")
-    module, _, function = command.function.partition(":")
-    assert list(inspect.signature(getattr(importlib.import_module(module), function)).parameters) == [
-        "argv", "prog",
-    ]  # fmt: skip
+    module = importlib.import_module(f"mjlab.scripts.{command.name.replace('-', '_')}")
+    assert list(inspect.signature(module.command).parameters) == ["argv", "prog"]
 
 
 def test_commands_are_installed_under_their_names():

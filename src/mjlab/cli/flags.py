@@ -32,7 +32,6 @@ from mjlab.tasks.registry import (
     load_options_cls,
     load_rl_cfg,
 )
-from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.ranges import check_ranges
 
@@ -74,21 +73,26 @@ def _parsed(config_type: type[C], default: C, flags: list[str], prog: str) -> C:
         print_help(default, topic, prog)
         sys.exit(0)
     edited, remaining = switch_terms_off(default, flags)
-    own: Any = config_type
-    switches = {field.name for field in dataclasses.fields(own) if field.type in ("bool", bool)}
-    words: list[str] = []
-    for word, following in pairwise([*remaining, "--"]):
-        words.append(word)
-        if _name_of(word) in switches and "=" not in word and following.startswith("--"):
-            words.append("True")
     return tyro.cli(
         config_type,
         default=edited,
-        args=words,
+        args=_with_values(config_type, remaining),
         prog=prog,
         config=mjlab.TYRO_FLAGS,
         registry=flag_rules(),
     )
+
+
+def _with_values(config_type: Any, flags: list[str]) -> list[str]:
+    """Return `flags` with the value True after bare switches."""
+    fields = dataclasses.fields(config_type)
+    switches = {field.name for field in fields if field.type in ("bool", bool)}
+    words: list[str] = []
+    for word, following in pairwise([*flags, "--"]):
+        words.append(word)
+        if _name_of(word) in switches and "=" not in word and following.startswith("--"):
+            words.append("True")
+    return words
 
 
 def _name_of(word: str) -> str:
@@ -132,16 +136,25 @@ def previewed(default: C, flags: list[str]) -> C:
     return own
 
 
-def read_count(flag: str, text: str) -> int:
-    """Return the value of a flag that counts something.
+def parse_own_flags(default: C, flags: list[str], prog: str) -> tuple[C, list[str]]:
+    """Return `default` updated by its flags, and the words of all others; prints help with `--help`.
 
     Raises:
-        UserError: the text is not an integer from 1 to 10,000.
+        ValueError: a typed number is out of its range.
     """
-    # `int` raises for thousands of digits.
-    if not (text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= 10_000):
-        raise UserError(f"{flag}: expected an integer in [1, 10000], got {text!r}.")
-    return int(text)
+    if requested_topic(flags) is not None:
+        print_help(default, "", prog)
+    config, others = tyro.cli(
+        type(default),
+        default=default,
+        args=_with_values(type(default), flags),
+        prog=prog,
+        config=(tyro.conf.FlagConversionOff,),
+        add_help=False,
+        return_unknown_args=True,
+    )
+    check_ranges(config, typed_values(flags))
+    return config, others
 
 
 # Profile and learner.

@@ -50,8 +50,6 @@ class Command:
     """Purpose, the heading in `mjlab --help`. Commands of a group follow each other."""
     summary: str
     """A few words in `mjlab --help`."""
-    function: str
-    """Implementation as "module:function", called as `function(argv, prog)`."""
     argument: str | None = None
     """Required first argument: TASK (a registered task) or another placeholder. None: optional."""
     details: str = ""
@@ -60,6 +58,8 @@ class Command:
     """Command lines, without `uv run`."""
     unknown_task_status: int = 1
     """Exit status for an unregistered task."""
+    module: str = ""
+    """Module with `command(argv, prog)`. Empty: that of `mjlab.scripts` with the same name."""
 
     def usage(self, prog: str) -> str:
         """Return the help printed by `prog --help`."""
@@ -67,8 +67,10 @@ class Command:
         lines = [f"usage: {' '.join(filter(None, words))}", "", self.details or self.summary, ""]
         if self.examples:
             lines += ["examples:", *(f"    uv run {example}" for example in self.examples), ""]
+        if self.argument:
+            lines.append(f"`{prog} {self.argument} --help` shows its flags.")
         if self.argument == "TASK":
-            lines += [f"`{prog} TASK --help` shows its flags; `mjlab list-envs` lists the tasks."]
+            lines.append("`mjlab list-envs` lists the tasks.")
         return "\n".join(lines).rstrip()
 
 
@@ -77,11 +79,11 @@ COMMANDS = (
         "train",
         "learn",
         "train a policy (checkpoint, ONNX, curve)",
-        "mjlab.scripts.train:command",
-        "TASK",
-        "Train a policy, by PPO or, with --learner sac, by SAC. Checkpoints, curves and the exported "
-        "policy go to\nlogs/rsl_rl/<experiment>/<time>/.",
-        (
+        argument="TASK",
+        details="""\
+Train a policy, by PPO or, with --learner sac, by SAC. Checkpoints, curves and the exported
+policy go to logs/rsl_rl/<experiment>/<time>/.""",
+        examples=(
             "train Mjlab-Cartpole-Swingup --num-envs 4096",
             "train Mjlab-Cartpole-Swingup --agent.algorithm.learning-rate 3e-4 --agent.seed 1",
             "train Mjlab-Cartpole-Swingup --agent.resume True",
@@ -93,11 +95,11 @@ COMMANDS = (
         "train-seeds",
         "learn",
         "the same task over several seeds",
-        "mjlab.scripts.train_seeds:command",
-        "TASK",
-        "Train a task once for each seed 1, 2, ..., N (--seeds N, default 5), each run to its last\n"
-        "iteration. All other flags are those of `train`.",
-        (
+        argument="TASK",
+        details="""\
+Train a task once for each seed 1, 2, ..., N (--seeds N, default 5), each run to its last
+iteration. All other flags are those of `train`.""",
+        examples=(
             "train-seeds Mjlab-Cartpole-Swingup --num-envs 512 --agent.max-iterations 100",
             "plot-seeds logs/rsl_rl/cartpole/*_seed_? --output swingup.png",
         ),
@@ -106,45 +108,30 @@ COMMANDS = (
         "sweep",
         "learn",
         "compare settings, side by side",
-        "mjlab.scripts.sweep:command",
-        "TASK",
-        "Train a task with several settings and seeds side by side, and compare them in a table and a plot.\n"
-        "The same command continues an interrupted sweep. All other flags are those of `train`.\n\n"
-        "flags:\n"
-        "    --over FLAG=A,B,...     values of a flag of `train`; several --over: all combinations\n"
-        "    --over FLAG=LOW..HIGH   range to sample from; LOW..HIGH:log on a logarithmic scale\n"
-        "    --trials N              number of settings to sample; required for ranges\n"
-        "    --seeds N               train each setting with the seeds 1, ..., N (default: 1)\n"
-        "    --jobs N                runs side by side (default: one per GPU, else one per CPU core)\n"
-        "    --folder DIR            folder of the sweep (default: logs/sweeps/<task and flags>)\n"
-        "    --storage URL           database shared by machines (default: SQLite file in the folder)\n"
-        "    --objective TAG         TensorBoard tag to compare (default: last evaluation, else return;\n"
-        "                            if settings change rewards: success rate or metrics)\n"
-        "    --minimize              prefer low values of the objective\n"
-        "    --device D              cpu, cuda:0, ... (default: GPUs if available)\n"
-        "    --gpu-ids IDS           GPUs to use, one run each, such as [0,2] (default: all)",
-        (
-            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-4,3e-4,1e-3 "
-            "--seeds 3",
-            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-5..1e-2:log "
-            "--trials 20",
+        argument="TASK",
+        details="""\
+Train a task with several settings and seeds side by side, and compare them in a table and a
+plot. The same command continues an interrupted sweep. All other flags are those of `train`.""",
+        examples=(
+            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-4,3e-4,1e-3 --seeds 3",
+            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-5..1e-2:log --trials 20",
         ),
     ),
     Command(
         "plot-seeds",
         "learn",
         "one curve with its spread",
-        "mjlab.scripts.plot_seeds:command",
     ),
     Command(
         "verify",
         "learn",
         "compare one seed with reference runs",
-        "mjlab.scripts.verify:command",
-        "TASK",
-        "Train a task with one seed and check that its learning curve lies within the band of the "
-        "reference runs\nbundled with the package. Exit status: 0 within, 1 outside, 2 invalid command line.",
-        (
+        argument="TASK",
+        details="""\
+Train a task with one seed and check that its learning curve lies within the band of the
+reference runs bundled with the package. Exit status: 0 within, 1 outside, 2 invalid command
+line.""",
+        examples=(
             "verify Mjlab-Cartpole-Swingup",
             "verify Mjlab-Velocity-Flat-Unitree-Go1 --device cpu --seed 1",
         ),
@@ -154,10 +141,9 @@ COMMANDS = (
         "demo",
         "watch",
         "drive a robot that can walk, now",
-        "mjlab.scripts.demo:command",
         details="""\
-Play a robot that tracks velocity commands, in the browser and offline: a Unitree Go1 (quadruped,
-`go1`, the default) or G1 (humanoid, `g1`). Flags are those of `play`.""",
+Play a robot that tracks velocity commands, in the browser and offline: a Unitree Go1
+(quadruped, `go1`, the default) or G1 (humanoid, `g1`). Flags are those of `play`.""",
         examples=(
             "demo",
             "demo g1",
@@ -169,10 +155,10 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         "play",
         "watch",
         "your newest policy, in the browser",
-        "mjlab.scripts.play:command",
-        "TASK",
-        "Show a trained policy (default: the newest) in the browser, in MuJoCo's window, or as a video.",
-        (
+        argument="TASK",
+        details="""\
+Show a trained policy (default: the newest) in the browser, in MuJoCo's window, or as a video.""",
+        examples=(
             "play Mjlab-Cartpole-Swingup",
             "play Mjlab-Cartpole-Swingup --checkpoint-file logs/rsl_rl/cartpole/model_500.pt",
             "play Mjlab-Cartpole-Swingup --agent random --viewer native",
@@ -183,11 +169,11 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         "evaluate",
         "watch",
         "return, errors and falls, with intervals",
-        "mjlab.scripts.evaluate:command",
-        "TASK",
-        "Play episodes with a trained policy, one per environment, and print the mean return with a "
-        "95 % interval,\nand the success rate if the task defines success.",
-        (
+        argument="TASK",
+        details="""\
+Play episodes with a trained policy, one per environment, and print the mean return with a 95 %
+interval, and the success rate if the task defines success.""",
+        examples=(
             "evaluate Mjlab-Cartpole-Swingup",
             "evaluate Mjlab-Cartpole-Swingup --num-episodes 1024 --json True",
         ),
@@ -196,34 +182,29 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         "runs",
         "watch",
         "your runs of a task, their settings and scores",
-        "mjlab.scripts.runs:command",
-        "TASK",
-        "List the runs of a task, the last started first: state, finished iterations, mean return of the last\n"
-        "evaluation, size on disk, and settings that differ from the task.",
-        ("mjlab runs Mjlab-Cartpole-Swingup", "mjlab runs Mjlab-Cartpole-Swingup --json"),
+        argument="TASK",
+        details="""\
+List the runs of a task, the last started first: state, finished iterations, mean return of the
+last evaluation, size on disk, and settings that differ from the task.""",
+        examples=(
+            "mjlab runs Mjlab-Cartpole-Swingup",
+            "mjlab runs Mjlab-Cartpole-Swingup --json",
+        ),
     ),
     Command(
         "list-envs",
         "build",
         "tasks and their profiles",
-        "mjlab.scripts.list_envs:command",
     ),
     Command(
         "describe",
         "build",
         "what a task observes, rewards and ends",
-        "mjlab.scripts.describe:command",
-        "TASK",
-        """\
-Print tables of a task: observations, actions, commands, rewards, terminations, events, curriculum, metrics,
-entities and sensors. Builds one environment on the CPU.
-
-flags:
-    --profile NAME      settings of a profile, such as cpu
-    --play              the environment of `play` instead of that of `train`
-    --json              JSON, with all columns and lists in full
-    --markdown          Markdown""",
-        (
+        argument="TASK",
+        details="""\
+Print tables of a task: observations, actions, commands, rewards, terminations, events,
+curriculum, metrics, entities and sensors. Builds one environment on the CPU.""",
+        examples=(
             "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1",
             "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu --json",
             "mjlab describe Mjlab-Cartpole-Swingup --env.rewards.smooth-reward.weight 2",
@@ -233,18 +214,12 @@ flags:
         "view",
         "build",
         "any MJCF or URDF, with sliders",
-        "mjlab.scripts.view:command",
-        "MODEL",
-        """\
-Show a model in the browser: joint and actuator sliders, geom groups, sites, contacts, inertia and frames.
-MODEL is a file (MJCF, URDF, MJB or a MuJoCo archive), a robot (g1, go1, yam, or module:function that
-returns an EntityCfg) or a task.
-
-flags:
-    --host ADDRESS            address to serve on; 0.0.0.0: all interfaces (default: 127.0.0.1)
-    --port N                  port to serve on; the next free port if taken (default: 8080)
-    --open-browser BOOL       open the page (default: True)""",
-        (
+        argument="MODEL",
+        details="""\
+Show a model in the browser: joint and actuator sliders, geom groups, sites, contacts, inertia
+and frames. MODEL is a file (MJCF, URDF, MJB or a MuJoCo archive), a robot (g1, go1, yam, or
+module:function that returns an EntityCfg) or a task.""",
+        examples=(
             "mjlab view robot.xml",
             "mjlab view robot.urdf",
             "mjlab view go1",
@@ -255,22 +230,19 @@ flags:
         "visualize-terrain",
         "build",
         "terrains, in the browser",
-        "mjlab.scripts.visualize_terrain:command",
     ),
     Command(
         "csv-to-npz",
         "build",
         "recorded joint angles to a motion",
-        "mjlab.scripts.csv_to_npz:command",
-        "--input-file FILE",
-        """\
-Convert a CSV of the retargeted LAFAN1 sets (one pose per line: root position, root quaternion x y z w,
-all joint angles) to the .npz that motion tracking reads, or resample an .npz to another rate.
-`--help` with another flag lists all flags.""",
-        (
+        argument="--input-file FILE",
+        details="""\
+Convert a CSV of the retargeted LAFAN1 sets (one pose per line: root position, root quaternion x
+y z w, all joint angles) to the .npz that motion tracking reads, or resample an .npz to another
+rate.""",
+        examples=(
             "mjlab csv-to-npz --input-file dance1_subject2.csv",
-            'mjlab csv-to-npz --input-file dance.csv --line-range "(120,720)" '
-            "--output-file dance.npz --render True",
+            'mjlab csv-to-npz --input-file dance.csv --line-range "(120,720)" --output-file dance.npz --render True',
             "mjlab csv-to-npz --input-file dance.csv --view True",
         ),
     ),
@@ -278,19 +250,13 @@ all joint angles) to the .npz that motion tracking reads, or resample an .npz to
         "export-scene",
         "build",
         "a task or robot as MuJoCo XML",
-        "mjlab.scripts.export_scene:command",
-        "TARGET",
-        """\
+        argument="TARGET",
+        details="""\
 Write scene.xml and its assets, for MuJoCo's viewer and other programs.
 
-TARGET is the name of a task (`mjlab list-envs`), a robot (g1, go1, yam), or module:function, a function
-without arguments that returns an EntityCfg.
-
-flags:
-    --output-dir DIR    output folder, must be new or empty (default: export)
-    --zip               write the archive DIR.zip instead of a folder
-    --overwrite         replace an earlier export; other files are kept""",
-        (
+TARGET is the name of a task (`mjlab list-envs`), a robot (g1, go1, yam), or module:function, a
+function without arguments that returns an EntityCfg.""",
+        examples=(
             "export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat",
             "export-scene g1 --zip",
         ),
@@ -299,11 +265,11 @@ flags:
         "profile-env",
         "find out",
         "where the time of a step goes",
-        "mjlab.scripts.profile_env:command",
-        "TASK",
-        "Step a task with random actions, and print the step time by phase (physics, forward, each "
-        "manager)\nand by term.",
-        (
+        argument="TASK",
+        details="""\
+Step a task with random actions, and print the step time by phase (physics, forward, each
+manager) and by term.""",
+        examples=(
             "profile-env Mjlab-Cartpole-Swingup",
             "profile-env Mjlab-Cartpole-Swingup --num-envs 4096 --steps 200 --json",
         ),
@@ -312,22 +278,16 @@ flags:
         "viz-nan",
         "find out",
         "the states before a NaN",
-        "mjlab.scripts.viz_nan:command",
-        "DUMP",
-        """\
-Show the states that led to a NaN. DUMP is a file written by `train --enable-nan-guard True`, such as
-nan_dump_latest.npz; the model is read from the same folder.
-
-flags:
-    --host ADDRESS      address to serve on; 0.0.0.0: all interfaces (default: 127.0.0.1)
-    --port N            port to serve on; the next free port if taken (default: 8080)""",
-        ("viz-nan /tmp/mjlab/nan_dumps/nan_dump_latest.npz",),
+        argument="DUMP",
+        details="""\
+Show the states that led to a NaN. DUMP is a file written by `train --enable-nan-guard True`,
+such as nan_dump_latest.npz; the model is read from the same folder.""",
+        examples=("viz-nan /tmp/mjlab/nan_dumps/nan_dump_latest.npz",),
     ),
     Command(
         "completion",
         "shell",
         "complete commands, tasks and flags (bash, zsh, fish)",
-        "mjlab.scripts.completion:command",
     ),
 )
 
@@ -401,14 +361,14 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
         except UnknownTaskError as error:
             error.exit_status = command.unknown_task_status
             raise
-    module, _, function = command.function.partition(":")
+    module = command.module or f"mjlab.scripts.{command.name.replace('-', '_')}"
     was_changed = end_by_interrupt(True)
     try:
-        run = getattr(importlib.import_module(module), function)
+        implementation = importlib.import_module(module)
     finally:
         if was_changed:
             end_by_interrupt(False)
-    run(argv, prog)
+    implementation.command(argv, prog)
 
 
 def run_alias(name: str) -> None:

@@ -14,16 +14,19 @@ The same command continues a sweep: finished runs are kept, others resume from t
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
 import re
 import shlex
 import subprocess
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from mjlab.cli.flags import is_given, read_count, typed_values
-from mjlab.cli.help import lookup
+import tyro
+
+from mjlab.cli.flags import is_given, parse_own_flags, typed_values
+from mjlab.cli.help import lookup, requested_topic
 from mjlab.cli.train_config import (
     TrainConfig,
     check_flags,
@@ -41,6 +44,7 @@ from mjlab.sweep.settings import (
     train_flags,
 )
 from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.ranges import Range
 from mjlab.utils.signals import Interrupted
 from mjlab.utils.string import counted
 
@@ -60,6 +64,39 @@ _RESERVED = {
 }
 # Flags of this machine, the same for all settings.
 _MACHINE = ("--device", "--gpu-ids")
+
+
+_Number = Annotated[int, Range(1, 10_000)]
+
+
+@dataclass
+class SweepFlags:
+    """Flags of `sweep`. All others are those of `train`."""
+
+    over: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FLAG=VALUES")
+    ] = ()
+    """Values of a flag of `train`: FLAG=A,B,...; a range to sample from: FLAG=LOW..HIGH, or FLAG=LOW..HIGH:log on
+    a logarithmic scale. Several --over: all combinations."""
+    trials: _Number | None = None
+    """Number of settings to sample. Required for ranges."""
+    seeds: _Number = 1
+    """Number of seeds 1, 2, ... of each setting."""
+    jobs: _Number | None = None
+    """Runs side by side. None: one per GPU, else one per CPU core."""
+    folder: str | None = None
+    """Folder of the sweep. None: logs/sweeps/<task and flags>."""
+    storage: str | None = None
+    """URL of a database shared by machines. None: SQLite file in the folder."""
+    objective: str | None = None
+    """TensorBoard tag to compare. None: last evaluation, else return; if settings change rewards, the
+    success rate or metrics."""
+    minimize: bool = False
+    """Prefer low values of the objective."""
+    device: str | None = None
+    """Torch device: cpu, cuda:0, ... None: GPUs if available."""
+    gpu_ids: str | None = None
+    """GPUs to use, one run each, such as [0,2]. None: all."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -96,49 +133,31 @@ def parse_sweep(argv: list[str], prog: str) -> Sweep:
         BadCallError, UserError, ValueError: a flag is invalid; the message names it.
     """
     task, *words = argv
-    parser = argparse.ArgumentParser(prog=f"{prog} {task}", add_help=False, allow_abbrev=False)
-    parser.add_argument("--over", action="append", default=[])
-    parser.add_argument("--minimize", action="store_true")
-    for flag in (
-        "--seeds",
-        "--trials",
-        "--jobs",
-        "--folder",
-        "--storage",
-        "--objective",
-        *_MACHINE,
-    ):
-        parser.add_argument(flag)
-    args, flags = parser.parse_known_args(words)
-    if "-h" in flags or "--help" in flags:
-        print(f"`{prog} --help` shows the flags of the sweep. All others are those of `train`:\n")
+    own, flags = parse_own_flags(SweepFlags(), words, f"{prog} {task}")
+    if requested_topic(flags) is not None:
         parse_train(task, tuple(flags), prog)
-    axes = tuple(map(Axis.parse, args.over))
-    counts = {
-        name: None if text is None else read_count(f"--{name}", text)
-        for name, text in (("seeds", args.seeds), ("trials", args.trials), ("jobs", args.jobs))
-    }
-    _check_axes(axes, flags, counts["trials"])
-    machine = [(flag, getattr(args, flag[2:].replace("-", "_"))) for flag in _MACHINE]
+    axes = tuple(map(Axis.parse, own.over))
+    _check_axes(axes, flags, own.trials)
+    machine = (("--device", own.device), ("--gpu-ids", own.gpu_ids))
     sweep = Sweep(
         task=task,
         axes=axes,
         flags=tuple(flags),
         machine_flags=tuple(word for flag, value in machine if value for word in (flag, value)),
-        seeds=counts["seeds"] or 1,
-        trials=counts["trials"],
-        jobs=counts["jobs"],
+        seeds=own.seeds,
+        trials=own.trials,
+        jobs=own.jobs,
         folder=ROOT,
-        storage=args.storage,
+        storage=own.storage,
     )
     cfgs = check_settings(sweep)
-    objective = choose_objective(task, cfgs, args.objective, args.minimize)
+    objective = choose_objective(task, cfgs, own.objective, own.minimize)
     if objective.past_goal is None:
         report_moved_goal(task, cfgs[0])
     return dataclasses.replace(
         sweep,
         axes=tuple(_with_type(axis, cfgs[0]) for axis in axes),
-        folder=Path(args.folder or ROOT / _name(sweep)),
+        folder=Path(own.folder or ROOT / _name(sweep)),
         objective=objective,
     )
 

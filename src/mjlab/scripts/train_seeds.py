@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Annotated
 
 from mjlab.cli.devices import NO_GPU
-from mjlab.cli.flags import is_given, read_count
+from mjlab.cli.flags import is_given, parse_own_flags
 from mjlab.cli.main import run_alias
 from mjlab.cli.train_process import run_forwarding_signals, train_command
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.logging import print_notice
+from mjlab.utils.ranges import Range
 from mjlab.utils.signals import (
     Interrupted,
     interrupting_signal,
 )
 
-_SEEDS_HELP = "--seeds N    Train with the seeds 1, 2, ..., N, sequentially (default: 5)."
+
+@dataclass
+class SeedsFlags:
+    """Flags of `train-seeds`. All others are those of `train`."""
+
+    seeds: Annotated[int, Range(1, 10_000)] = 5
+    """Number of seeds 1, 2, ..., trained one after another."""
 
 
 def command(argv: list[str], prog: str) -> None:
     """Run `train-seeds`."""
-    count, flags, experiment = _parse(argv, prog)
+    count, flags = _parse(argv, prog)
     for seed in range(1, count + 1):
         print(f"\nSeed {seed} of {count}", flush=True)
         # Averaged curves must have equal length, so runs must not stop when solved. User flags come
@@ -39,20 +46,15 @@ def command(argv: list[str], prog: str) -> None:
             raise UserError(f"Training with seed {seed} ended with status {status}.")
 
 
-def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
-    """Return the number of seeds, the flags of `train`, and the folder of the runs.
+def _parse(argv: list[str], prog: str) -> tuple[int, list[str]]:
+    """Return the number of seeds, and the flags of `train`.
 
     Exits on invalid flags and on `--help`.
     """
     from mjlab.cli.train_config import check_typed_flags, parse_train_flags
 
     task, *words = argv
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--seeds", nargs="?", default="5", const="")
-    args, flags = parser.parse_known_args(words)
-    count = read_count("--seeds", args.seeds)
-    if "-h" in flags or "--help" in flags:
-        print(f"{_SEEDS_HELP}\nAll other flags are those of `train`:\n", flush=True)
+    own, flags = parse_own_flags(SeedsFlags(), words, f"{prog} {task}")
     cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
     check_typed_flags(cfg, flags)
     for flag in ("--agent.seed", "--agent.run-name"):
@@ -65,7 +67,7 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str], Path]:
         # Once, not once per seed.
         print_notice(NO_GPU)
         flags = [*flags, "--device", "cpu"]
-    return count, flags, cfg.experiment_folder
+    return own.seeds, flags
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import re
 import signal
 import subprocess
 import time
@@ -38,8 +37,6 @@ _EVALUATIONS = 10
 """Number of evaluations of a run."""
 _FIRST_REPORT_S = 60.0
 """Time until what is left is printed, while no run ends (s); the times in between double."""
-# Number of finished iterations in the output of a run: `[12/100]`.
-_ITERATION = re.compile(rb"^\[(\d+)/\d+\]", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -54,23 +51,10 @@ class _Run:
     slot: dict[str, str]
     begin: float
     """Start (s), as `time.monotonic`."""
-    offset: int
-    """Size of the output of earlier sessions (bytes)."""
     first: int
     """Number of iterations of earlier sessions."""
     total: int
     """Number of iterations."""
-
-    @property
-    def iteration(self) -> int:
-        """Number of finished iterations, as in the output of the run."""
-        lines: list[bytes] = []
-        # Users may delete it meanwhile.
-        with contextlib.suppress(OSError), open(self.log.name, "rb") as log:
-            size = log.seek(0, os.SEEK_END)
-            log.seek(max(self.offset, size - 4096))
-            lines = _ITERATION.findall(log.read())
-        return max(self.first, int(lines[-1])) if lines else self.first
 
 
 class Runs:
@@ -190,10 +174,9 @@ class Runs:
         process = start_in_background(command, environment, log)
         first = 0 if saved is None or saved.number is None else saved.number + 1
         total = max(1, train_config(sweep, setting).agent.max_iterations)
-        run = _Run(
-            trial, seed, name, process, log, slot, time.monotonic(), log.tell(), first, total
+        self._running.append(
+            _Run(trial, seed, name, process, log, slot, time.monotonic(), first, total)
         )
-        self._running.append(run)
 
     def _settle(self, run: _Run) -> None:
         """Print how a run ended; store the value of its trial after the last seed."""
@@ -233,6 +216,15 @@ class Runs:
         self._training += trained.training_seconds
         self._evaluating += trained.evaluation_seconds
 
+    def _iteration(self, run: _Run) -> int:
+        """Return the number of iterations that a run has recorded in its evaluations and checkpoints."""
+        sessions = self._sweep.sessions(setting_of(run.trial), run.seed)
+        done = [run.first]
+        for session in sessions[:1]:
+            done += [one["iteration"] for one in session.evaluations]
+            done += [saved.number + 1 for saved in session.checkpoints if saved.number is not None]
+        return max(done)
+
     def what_is_left(self) -> str:
         """Return the number of runs left here, the time they take, and the share of evaluations."""
         elsewhere = sum(
@@ -241,7 +233,9 @@ class Runs:
         )
         left = (self._sweep.num_settings - elsewhere) * self._sweep.seeds - self._num_ended
         # After the last iteration, the last evaluation is left.
-        done = [(min(run.iteration, run.total - 1) / run.total, run) for run in self._running]
+        done = [
+            (min(self._iteration(run), run.total - 1) / run.total, run) for run in self._running
+        ]
         spent = self._spent + sum(time.monotonic() - run.begin for run in self._running)
         trained = self._trained + sum(part - run.first / run.total for part, run in done)
         text = f"{counted(left, 'run')} left"
@@ -256,14 +250,13 @@ class Runs:
 
 def machine_slots(sweep: Sweep) -> list[dict[str, str]]:
     """Return the environment variables of runs side by side: one GPU each, or a share of the cores."""
-    flags = dict(zip(sweep.machine_flags[::2], sweep.machine_flags[1::2], strict=True))
+    cfg = train_config(sweep, sweep.combinations[0])
     gpus: list[int | str] = []
-    if "--device" not in flags:
-        ids = flags.get("--gpu-ids", "all")
-        named = [int(number) for number in re.findall(r"\d+", ids)]
-        gpus = select_gpus("all" if ids == "all" else named or None)[0] or []
+    if cfg.device is None:
+        ids = cfg.gpu_ids if "--gpu-ids" in sweep.machine_flags else "all"
+        gpus = select_gpus(ids or None)[0] or []
     # A device by name, such as cuda:1, is one.
-    is_gpu = flags.get("--device", "cpu") != "cpu"
+    is_gpu = cfg.device not in (None, "cpu")
     suited = len(gpus) or (1 if is_gpu else available_cores())
     jobs = min(sweep.jobs or suited, sweep.num_settings * sweep.seeds)
     share = str(max(1, available_cores() // jobs))

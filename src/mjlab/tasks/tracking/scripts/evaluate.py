@@ -19,16 +19,17 @@ from mjlab.tasks.tracking.mdp.metrics import TRACKING_ERRORS
 _NAME = "python -m mjlab.tasks.tracking.scripts.evaluate"
 _COMMAND = Command(
     _NAME,
-    "Policies",
-    "Evaluate a motion tracking policy.",
-    "mjlab.tasks.tracking.scripts.evaluate:command",
-    "TASK",
-    "Play one motion per environment, and print the fraction of episodes without termination,\n"
-    "and the mean errors.",
-    (
+    "watch",
+    "evaluate a motion tracking policy",
+    argument="TASK",
+    details="""\
+Play one motion per environment, and print the fraction of episodes without termination, and the
+mean errors.""",
+    examples=(
         f"{_NAME} Mjlab-Tracking-Flat-Unitree-G1 --wandb-run-path org/project/run",
         f"{_NAME} Mjlab-Tracking-Flat-Unitree-G1 --num-envs 200 --output-file metrics.json",
     ),
+    module="mjlab.tasks.tracking.scripts.evaluate",
 )
 
 
