@@ -77,7 +77,7 @@ def _hostile(rng: random.Random) -> str:
 
 
 def _model(server: Any, names: list[str]) -> list[str]:
-    from mjlab.scripts.view import ModelPage
+    from mjlab.viewer.viser.model_page import ModelPage
 
     model = _model_of(names)
     ModelPage(server, names[0], model, lambda: model)
@@ -85,8 +85,8 @@ def _model(server: Any, names: list[str]) -> list[str]:
 
 
 def _damaged_model(server: Any, names: list[str]) -> list[str]:
-    from mjlab.scripts.view import ModelPage
     from mjlab.utils.errors import UserError
+    from mjlab.viewer.viser.model_page import ModelPage
 
     def fail() -> Any:
         raise UserError(names[1])
@@ -96,8 +96,8 @@ def _damaged_model(server: Any, names: list[str]) -> list[str]:
 
 
 def _dump(server: Any, names: list[str]) -> list[str]:
-    from mjlab.scripts.viz_nan import NanPage
     from mjlab.utils.nan_guard import NanDump
+    from mjlab.viewer.viser.nan_page import NanPage
 
     model = _model_of(names)
     width = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjlab.scripts.view import ModelPage, ViewConfig, describe_model, load_model, run_view
+from mjlab.scripts.view import ViewConfig, load_model, run_view
 from mjlab.utils.errors import UserError
+from mjlab.viewer.viser.model_page import ModelPage, describe_model
 
 MJCF = """
 <mujoco>

@@ -8,15 +8,14 @@ import sys
 import numpy as np
 import pytest
 
-from mjlab.scripts.visualize_terrain import (
+from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig, run_visualize_terrain
+from mjlab.terrains.config import ALL_TERRAIN_PRESETS, flat, hf_pyramid_slope, wave_terrain
+from mjlab.viewer.viser.terrain_page import (
     TerrainPage,
-    VisualizeTerrainConfig,
     add_controls,
     build_terrain_scene,
-    run_visualize_terrain,
     with_values,
 )
-from mjlab.terrains.config import ALL_TERRAIN_PRESETS, flat, hf_pyramid_slope, wave_terrain
 
 
 @pytest.mark.parametrize("name", ALL_TERRAIN_PRESETS)

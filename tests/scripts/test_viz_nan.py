@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 import torch
 
-from mjlab.scripts.viz_nan import NanPage, VizNanConfig, load_dump, run_viz_nan
+from mjlab.scripts.viz_nan import VizNanConfig, load_dump, run_viz_nan
 from mjlab.utils.errors import UserError
 from mjlab.utils.nan_guard import CHECKED_FIELDS, NanDump, NanGuard, NanGuardCfg
+from mjlab.viewer.viser.nan_page import NanPage
 
 XML = """
 <mujoco>
