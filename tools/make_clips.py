@@ -189,7 +189,8 @@ def record(clip: Clip, policy: Path, seed: int) -> list[np.ndarray]:
     if clip.motion is not None:
         motion: Any = cfg.commands["motion"]
         motion.motion_file = clip.motion
-    env = make_env(clip.task, cfg, "cpu", clip.num_envs, seed=seed)
+    cfg.scene.num_envs, cfg.seed = clip.num_envs, seed
+    env = make_env(clip.task, cfg, "cpu")
     try:
         act = make_policy(clip.task, env, "trained", policy, "cpu", clip.profile)
         return film(clip, env, act)

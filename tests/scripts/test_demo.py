@@ -21,7 +21,7 @@ HEADLESS = ("--viewer", "none", "--num-steps", "3", "--device", "cpu")
 @pytest.fixture(scope="module")
 def go1_policy(tmp_path_factory) -> Path:
     """An exported policy of the demo's task that has not learned anything."""
-    env = make_env(GO1.task, load_env_cfg(GO1.task, play=True), "cpu", 1)
+    env = make_env(GO1.task, load_env_cfg(GO1.task, play=True), "cpu")
     cfg = load_rl_cfg(GO1.task)
     cfg.actor.hidden_dims = cfg.critic.hidden_dims = (8,)
     path = tmp_path_factory.mktemp("demo") / "go1.onnx"
@@ -82,7 +82,8 @@ def test_a_bundled_policy_walks_forward_as_told(name):
     twist.rel_standing_envs = twist.rel_heading_envs = 0.0
     twist.ranges.lin_vel_x, twist.ranges.lin_vel_y = (0.8, 0.8), (0.0, 0.0)
     twist.ranges.ang_vel_z = (0.0, 0.0)
-    env = make_env(bundled.task, cfg, "cpu", 4, seed=0)
+    cfg.scene.num_envs, cfg.seed = 4, 0
+    env = make_env(bundled.task, cfg, "cpu")
     try:
         policy = load_policy(bundled.task, env, bundled.policy, "cpu")
         robot = env.unwrapped.scene["robot"].data

@@ -219,8 +219,10 @@ def test_sac_policies_act_as_their_export(of_sac):
     cfg = acting_cfg(agent_cfg_of(TASK, Checkpoint(checkpoint)))
     assert cfg["actor"]["hidden_dims"] == (8,)
     assert cfg["algorithm"]["replay_steps"] == 1
-    env_cfg = env_cfg_of(TASK, EvaluateConfig(), Checkpoint(checkpoint), purpose="evaluate")
-    env = make_env(TASK, env_cfg, "cpu", 5)
+    env_cfg = env_cfg_of(
+        TASK, EvaluateConfig(num_envs=5), Checkpoint(checkpoint), purpose="evaluate"
+    )
+    env = make_env(TASK, env_cfg, "cpu")
     before = set(threading.enumerate())
     try:
         policy = load_policy(TASK, env, checkpoint, "cpu")

@@ -24,13 +24,13 @@ from mjlab.tasks.registry import load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_list, print_notice
 from mjlab.utils.os import get_wandb_checkpoint_path
-from mjlab.utils.ranges import check_ranges
+from mjlab.utils.ranges import Count, Seed, check_ranges
 from mjlab.utils.screen import shown
 
 
 @dataclass
 class PolicyFlags:
-    """Flags that select the policy, the device and the engine."""
+    """Flags that select the policy and its environments."""
 
     agent: Literal["zero", "random", "trained"] = field(
         default="trained", metadata=shown("policy", "trained|zero|random")
@@ -43,12 +43,16 @@ class PolicyFlags:
     """Weights & Biases run of the policy, as entity/project/run."""
     wandb_checkpoint_name: str | None = None
     """Checkpoint of the Weights & Biases run. None: newest."""
+    num_envs: Count | None = field(default=None, metadata=shown("run", "N", "env.scene.num_envs"))
+    """Number of environments; short for --env.scene.num-envs. None: number of the task."""
+    seed: Seed | None = field(default=None, metadata=shown("run", "N"))
+    """Seed of the environments. None: that of the task."""
     device: str | None = field(default=None, metadata=shown("run", "cpu|cuda:0"))
     """Torch device. None: a GPU if available."""
     engine: Literal["auto", "native", "warp"] | None = field(
         default=None, metadata=shown("run", "auto|native|warp", "env.sim.engine")
     )
-    """Physics engine."""
+    """Physics engine; short for --env.sim.engine. None: that of the task."""
     log_root: str = field(default="logs/rsl_rl", metadata=shown("policy", "DIR"))
     """Root folder of all runs."""
     profile: str | None = field(default=None, metadata=shown("policy", "NAME"))
@@ -189,6 +193,12 @@ def env_cfg_of(
         cfg = with_changes(apply_settings(registered, run.settings, "env")[0], cfg, registered)
     path = None if checkpoint is None else checkpoint.path
     prepare_env_cfg(task, flags, cfg, path, flags.wandb_run_path if is_fetched else None)
+    if flags.num_envs is not None:
+        cfg.scene.num_envs = flags.num_envs
+    if flags.engine is not None:
+        cfg.sim.engine = flags.engine
+    if flags.seed is not None:
+        cfg.seed = flags.seed
     return cfg
 
 

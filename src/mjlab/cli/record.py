@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
@@ -30,10 +30,6 @@ class VideoCfg:
     """File format."""
     camera: int | str | None = None
     """Model camera, name or index. None: viewer camera of the task."""
-    num_envs: int | None = None
-    """Number of environments. None: number of the task."""
-    engine: Any = None
-    """Physics engine. None: engine of the task."""
     agent: str = "trained"
     """Policy without a checkpoint: `zero` or `random`."""
     profile: str | None = None
@@ -61,8 +57,6 @@ def record_policy(
         task,
         env_cfg,
         device,
-        video.num_envs,
-        video.engine,
         render_mode="rgb_array",
         agent=agent_cfg_of(task, checkpoint, video.profile),
     )

@@ -190,10 +190,10 @@ def restore_num_envs(cfg: TrainConfig, checkpoint: Checkpoint) -> None:
 def choose_seed(run: Run | None) -> int:
     """Return and print the seed of the resumed run, or a random seed."""
     if run is not None and run.seed is not None:
-        print(f"Seed:    {run.seed}, as before; --agent.seed overrides")
+        print(f"Seed:    {run.seed}, as before; --seed overrides")
         return run.seed
     seed = draw_seed()
-    print(f"Seed:    {seed}, drawn; --agent.seed {seed} repeats the run")
+    print(f"Seed:    {seed}, drawn; --seed {seed} repeats the run")
     return seed
 
 

@@ -58,6 +58,10 @@ class TrainConfig:
     of the profile or task."""
     num_envs: Count | None = field(default=None, metadata=shown("run", "N", "env.scene.num_envs"))
     """Number of environments per process; short for --env.scene.num-envs."""
+    seed: Annotated[int, Range(-1, 2**32 - 1)] | None = field(
+        default=None, kw_only=True, metadata=shown("run", "N", "agent.seed")
+    )
+    """Seed of the run and its environments; short for --agent.seed."""
     device: str | None = field(default=None, metadata=shown("run", "cpu|cuda:0"))
     """Torch device: cpu, cuda:0, ... None: a GPU if available; one GPU per process in multi-GPU runs."""
     engine: Literal["auto", "native", "warp"] | None = field(

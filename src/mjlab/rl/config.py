@@ -288,7 +288,7 @@ class EvaluationCfg:
 class RslRlBaseRunnerCfg:
     """Training run config."""
 
-    seed: Annotated[int, Range(-1, 2**32 - 1)] = field(default=42, metadata=shown("run", "N"))
+    seed: Annotated[int, Range(-1, 2**32 - 1)] = 42
     """Seed of the run and its environments; -1 draws a seed, printed and recorded. Other processes
     of the run derive their seeds from it."""
     num_steps_per_env: Count = field(default=24, metadata=shown("learning", "N"))

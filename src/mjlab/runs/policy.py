@@ -23,25 +23,16 @@ def make_env(
     task: str,
     cfg: ManagerBasedRlEnvCfg,
     device: str,
-    num_envs: int | None = None,
-    engine: Any = None,
     *,
-    seed: int | None = None,
     render_mode: str | None = None,
     agent: RslRlBaseRunnerCfg | None = None,
 ) -> Any:
-    """Return the wrapped environment of `cfg`; arguments that are None keep the value in `cfg`.
+    """Return the wrapped environment of `cfg`.
 
     Actions are clipped to `clip_actions` of the learner config `agent`. None: that of the task.
     """
     prepare_torch(device)
-    cfg = copy.deepcopy(cfg)
-    cfg.seed = cfg.seed if seed is None else seed
-    if num_envs is not None:
-        cfg.scene.num_envs = num_envs
-    if engine is not None:
-        cfg.sim.engine = engine
-    env = ManagerBasedRlEnv(cfg, device=device, render_mode=render_mode)
+    env = ManagerBasedRlEnv(copy.deepcopy(cfg), device=device, render_mode=render_mode)
     clip_actions = (agent or load_rl_cfg(task)).clip_actions
     return rl.RslRlVecEnvWrapper(env, clip_actions=clip_actions)
 

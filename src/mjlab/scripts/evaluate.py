@@ -47,7 +47,7 @@ class EvaluateConfig(PolicyFlags):
     max_steps: Count | None = field(default=None, metadata=shown("run", "N"))
     """Maximum episode length in steps; longer episodes are truncated and not a success. None: episode
     length of evaluations."""
-    seed: Seed = field(default=0, metadata=shown("run", "N"))
+    seed: Seed | None = field(default=0, metadata=shown("run", "N"))
     """Seed of the evaluation."""
     json: bool = field(default=False, metadata=shown("run"))
     """Print only JSON."""
@@ -74,12 +74,12 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
     report_policy(task, checkpoint, cfg, env_cfg, "evaluate")
     default = load_env_cfg(task, profile=cfg.profile, evaluate=True).scene.num_envs
-    is_chosen = keep_num_envs or env_cfg.scene.num_envs != default
-    num_envs = cfg.num_envs or (None if is_chosen else cfg.num_episodes)
+    if cfg.num_envs is None and not keep_num_envs and env_cfg.scene.num_envs == default:
+        env_cfg.scene.num_envs = cfg.num_episodes
     agent = agent_cfg_of(task, checkpoint, cfg.profile)
     solved = agent.evaluation
     check_ranges(solved, (), "agent.evaluation")
-    env = make_env(task, env_cfg, device, num_envs, cfg.engine, seed=cfg.seed, agent=agent)
+    env = make_env(task, env_cfg, device, agent=agent)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         if checkpoint is not None:

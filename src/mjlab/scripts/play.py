@@ -34,8 +34,6 @@ __getattr__ = older_names(__name__)
 class PlayConfig(PolicyFlags):
     """Flags of `play`."""
 
-    num_envs: Count | None = field(default=None, metadata=shown("watch", "N", "env.scene.num_envs"))
-    """Number of environments. None: number of the task."""
     video: bool = field(default=False, metadata=shown("record"))
     """Record a clip instead of opening a viewer."""
     video_length: CountOrZero = field(default=200, metadata=shown("record", "N"))
@@ -106,15 +104,13 @@ def run_play(task: str, cfg: PlayConfig) -> None:
             height=cfg.video_height,
             width=cfg.video_width,
             camera=cfg.camera,
-            num_envs=cfg.num_envs,
-            engine=cfg.engine,
             agent=cfg.agent,
             profile=cfg.profile,
         )
         record_policy(task, env_cfg, checkpoint, folder, device, video)
         return
     agent = agent_cfg_of(task, checkpoint, cfg.profile)
-    env = make_env(task, env_cfg, device, cfg.num_envs, cfg.engine, agent=agent)
+    env = make_env(task, env_cfg, device, agent=agent)
     print(f"Physics:    {env.unwrapped.sim.capabilities.description}")
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)

@@ -39,13 +39,13 @@ class ProfileConfig(PolicyFlags):
         default="random", metadata=shown("policy", "trained|zero|random")
     )
     """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
-    num_envs: Count = field(default=1024, metadata=shown("run", "N"))
+    num_envs: Count | None = field(default=1024, metadata=shown("run", "N"))
     """Number of environments."""
     steps: Count = field(default=100, metadata=shown("run", "N"))
     """Environment steps to time."""
     warm_up: CountOrZero = field(default=20, metadata=shown("run", "N"))
     """Environment steps before timing."""
-    seed: Seed = field(default=0, metadata=shown("run", "N"))
+    seed: Seed | None = field(default=0, metadata=shown("run", "N"))
     """Seed of states and actions."""
     json: bool = field(default=False, metadata=shown("run"))
     """Print only JSON."""
@@ -68,20 +68,13 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="train")
     report_policy(task, checkpoint, cfg, env_cfg, "train")
-    env = make_env(
-        task,
-        env_cfg,
-        device,
-        cfg.num_envs,
-        cfg.engine,
-        seed=cfg.seed,
-        agent=agent_cfg_of(task, checkpoint, cfg.profile),
-    )
+    agent = agent_cfg_of(task, checkpoint, cfg.profile)
+    env = make_env(task, env_cfg, device, agent=agent)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         lengths = env.episode_length_buf
         env.episode_length_buf = torch.randint_like(lengths, high=env.max_episode_length)
-        with torch.inference_mode(), threads_for_policy(policy, cfg.num_envs, device):
+        with torch.inference_mode(), threads_for_policy(policy, env.num_envs, device):
             _step(env, policy, cfg.warm_up)
             seconds = _step(env, policy, cfg.steps)
             with profiled_steps(env.unwrapped) as profile:
@@ -91,7 +84,7 @@ def run_profile_env(task: str, cfg: ProfileConfig) -> dict[str, Any]:
         env.close()
     times = {
         "task": task,
-        "num_envs": cfg.num_envs,
+        "num_envs": env.num_envs,
         "physics": physics,
         "steps": cfg.steps,
         "step_ms": 1e3 * seconds / cfg.steps,

@@ -53,6 +53,7 @@ ROOT = Path("logs/sweeps")
 
 # Flags that the sweep sets, and alternatives.
 _RESERVED = {
+    "--seed": "--seeds N",
     "--agent.seed": "--seeds N",
     "--agent.run-name": "--folder DIR",
     "--agent.experiment-name": "--folder DIR",

@@ -156,6 +156,8 @@ def _train(
         check_ranges(cfg, ())
     if run is not None and run.seed is not None and "agent.seed" not in typed:
         cfg.agent.seed = run.seed
+    if cfg.seed is not None:
+        cfg.agent.seed = cfg.seed
     if cfg.agent.seed == -1:
         cfg.agent.seed = broadcast_from_first(lambda: choose_seed(run))
     cfg.apply_short_forms(rank)
@@ -259,7 +261,8 @@ def _typed(task: str, cfg: TrainConfig, flags: list[str] | None) -> Settings:
             for path, (now, _) in given.items()
             if is_given(f"--{path.replace('_', '-')}", flags)
         }
-    return found | ({} if cfg.num_envs is None else {"env.scene.num_envs": cfg.num_envs})
+    short = {"env.scene.num_envs": cfg.num_envs, "agent.seed": cfg.seed}
+    return found | {path: value for path, value in short.items() if value is not None}
 
 
 def settings_to_record(task: str, cfg: TrainConfig, typed: Settings, run: Run | None) -> Settings:

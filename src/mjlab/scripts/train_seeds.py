@@ -57,7 +57,7 @@ def _parse(argv: list[str], prog: str) -> tuple[int, list[str]]:
     own, flags = parse_own_flags(SeedsFlags(), words, f"{prog} {task}")
     cfg = parse_train_flags(task, flags, prog=f"{prog} {task}")
     check_typed_flags(cfg, flags)
-    for flag in ("--agent.seed", "--agent.run-name"):
+    for flag in ("--seed", "--agent.seed", "--agent.run-name"):
         if is_given(flag, flags):
             raise BadCallError(
                 f"{flag}: expected no value, because runs use the seeds 1, 2, ... and are named after them; "
