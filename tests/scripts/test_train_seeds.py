@@ -181,7 +181,7 @@ def test_an_interrupted_seed_ends_the_series(run, monkeypatch, child, received, 
 def test_the_help_of_a_task_tells_of_seeds_and_the_flags_of_train(run, commands):
     outcome = run("train_seeds", TASK, "--help")
     assert outcome.status == 0
-    assert "--seeds N" in outcome.out
+    assert "--seeds INT" in outcome.out
     assert "--num-envs" in outcome.out
     assert not commands
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import itertools
 import os
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
+from mjlab.cli.flags import typed_values
 from mjlab.cli.resume import resume_flags
 from mjlab.cli.train_process import train_command
 from mjlab.rl.evaluation import Bound
@@ -250,13 +252,13 @@ class Runs:
 
 def machine_slots(sweep: Sweep) -> list[dict[str, str]]:
     """Return the environment variables of runs side by side: one GPU each, or a share of the cores."""
-    cfg = train_config(sweep, sweep.combinations[0])
+    flags = typed_values([*sweep.machine_flags])
     gpus: list[int | str] = []
-    if cfg.device is None:
-        ids = cfg.gpu_ids if "--gpu-ids" in sweep.machine_flags else "all"
-        gpus = select_gpus(ids or None)[0] or []
+    if "device" not in flags:
+        ids = flags.get("gpu_ids", "all")
+        gpus = select_gpus("all" if ids == "all" else ast.literal_eval(ids))[0] or []
     # A device by name, such as cuda:1, is one.
-    is_gpu = cfg.device not in (None, "cpu")
+    is_gpu = flags.get("device", "cpu") != "cpu"
     suited = len(gpus) or (1 if is_gpu else available_cores())
     jobs = min(sweep.jobs or suited, sweep.num_settings * sweep.seeds)
     share = str(max(1, available_cores() // jobs))
