@@ -102,13 +102,13 @@ def test_the_short_forms_win_over_the_task(train, tmp_path):
 
 def test_a_drawn_seed_is_said(run, tmp_path):
     argv = [TASK, *SMALL, "--log-root", str(tmp_path), "--agent.max-iterations", "1"]
-    outcome = run("train", *argv, "--agent.seed", "-1")
+    outcome = run("train", *argv, "--seed", "-1")
     (drawn,) = (tmp_path / "cartpole").iterdir()
     agent, env = (
         yaml.safe_load((drawn / "params" / f"{name}.yaml").read_text()) for name in ("agent", "env")
     )
     assert agent["seed"] == env["seed"] >= 0
-    assert f"--agent.seed {agent['seed']} repeats the run" in outcome.out
+    assert f"--seed {agent['seed']} repeats the run" in outcome.out
 
 
 def test_a_run_leaves_all_its_files(trained):
