@@ -481,21 +481,6 @@ def test_a_failed_run_is_named_and_retried_by_the_same_command(sweep, machine, f
     assert len(rows_of(folder)) == 2
 
 
-def test_a_log_may_be_deleted(sweep, machine, folder, monkeypatch):
-    start = machine.start
-
-    def start_without_log(command, environment, output):
-        Path(output.name).unlink()
-        return start(command, environment, output)
-
-    monkeypatch.setattr("mjlab.sweep.runs.start_in_background", start_without_log)
-    monkeypatch.setattr("mjlab.sweep.runs._FIRST_REPORT_S", 0.0)
-    machine.fails = ("1e-3",)
-    outcome = sweep(*LEARNING, "--folder", str(folder))
-    assert "Failed   learning-rate=1e-3, seed 1: no output" in outcome.out
-    assert "Finished learning-rate=1e-4" in outcome.out
-
-
 def test_a_run_whose_resumption_fails_is_not_called_saved(sweep, machine, folder):
     argv = ("--over", f"{RATE}=1e-4,1e-3", "--folder", str(folder), "--jobs", "1")
     machine.interrupts_after = 1
@@ -506,15 +491,6 @@ def test_a_run_whose_resumption_fails_is_not_called_saved(sweep, machine, folder
     assert outcome.status == 1
     assert "Failed   learning-rate=1e-4" in outcome.out
     assert "Saved" not in outcome.out
-
-
-def test_integers_of_a_range_are_trained_once_each(sweep, machine, folder):
-    flag = "agent.algorithm.num-learning-epochs"
-    argv = ("--over", f"{flag}=2..4", "--trials", "8", f"--{RATE}", "1e-3")
-    assert sweep(*argv, "--folder", str(folder)).status == 0
-    epochs = [flags_of(command)[f"--{flag}"] for command in machine.commands]
-    assert len(epochs) == len(set(epochs))
-    assert set(epochs) <= {"2", "3", "4"}
 
 
 def test_values_of_ranges_are_sampled(sweep, machine, folder):
@@ -605,21 +581,6 @@ def test_damaged_studies_are_rebuilt_from_the_folders(sweep, machine, folder, ov
     assert len(machine.commands) == trained
 
 
-@pytest.mark.parametrize("over", [LEARNING, SAMPLED])
-def test_a_trial_that_has_just_begun_is_not_damage(sweep, machine, folder, over):
-    """Optuna stores the parameters of an enqueued trial after its state."""
-    argv = (*over, "--folder", str(folder))
-    assert sweep(*argv).status == 0
-    rows, trained = rows_of(folder), len(machine.commands)
-    with contextlib.closing(sqlite3.connect(folder / "study.db")) as base, base:
-        base.execute("UPDATE trials SET state = 'RUNNING' WHERE number = 1")
-        base.execute("DELETE FROM trial_params WHERE trial_id = 2")
-        base.execute("DELETE FROM trial_values WHERE trial_id = 2")
-    assert sweep(*argv).status == 0
-    assert rows_of(folder) == rows
-    assert len(machine.commands) == trained
-
-
 def test_a_lost_definition_keeps_the_trials(sweep, machine, folder):
     argv = (*LEARNING, "--folder", str(folder))
     assert sweep(*argv).status == 0
@@ -645,21 +606,6 @@ def test_a_damaged_definition_is_named_with_its_cure(sweep, machine, folder, con
     assert "delete it" in message
     path.unlink()
     assert sweep(*argv).status == 0
-
-
-@pytest.mark.parametrize("kind", ["folder", "pipe", "garbage"])
-@pytest.mark.parametrize("name", ["lock.db", "study.db", "sweep.json"])
-def test_what_stands_in_the_place_of_a_file_is_named(sweep, machine, folder, name, kind):
-    path = folder / name
-    path.unlink(missing_ok=True)
-    if kind == "garbage":
-        path.write_bytes(b"garbage" * 99)
-    else:
-        path.mkdir() if kind == "folder" else os.mkfifo(path)
-    message = sweep(*LEARNING, "--folder", str(folder)).message
-    assert str(path) in message
-    assert "delete it" in message
-    assert not machine.commands
 
 
 def test_a_locked_study_is_not_called_damaged(sweep, machine, folder):

@@ -128,11 +128,6 @@ def test_ground_that_no_ray_can_meet_warns_once(kind, groups, ground, engine):
     assert (scene["scan"].data.distances == -1.0).all()
 
 
-def test_world_without_ground_is_silent():
-    sensor = scan(include_geom_groups=(0,))
-    assert warnings_of(*scene_with(sensor, ground=lambda spec: None)) == []
-
-
 @pytest.mark.parametrize("alignment", ["base", "yaw"])
 def test_height_observations_warn_once_per_sensor(alignment):
     sim, scene = scene_with(scan(ray_alignment=alignment))

@@ -181,11 +181,6 @@ def test_names_of_geoms_and_assets():
     assert len(set(names)) == 98
 
 
-def test_the_ground_weighs_nothing():
-    _, built = build(sub_terrains={"tilt": ALL_TERRAIN_PRESETS["tilted_grid"]()}, size=(8.0, 8.0))
-    assert built.model.body_mass.tolist() == [0.0, 0.0]
-
-
 # Colors, border and light.
 
 
@@ -230,10 +225,6 @@ def test_a_negative_border_height_makes_a_wall():
     _, built = build(border_width=0.5, border_height=-1.5)
     assert built.height(2.25, 0.0) == built.height(0.0, -3.25) == pytest.approx(1.5)
     assert built.all_corners()[:, 2].min() == pytest.approx(-0.5), "the wall stands on z = 0"
-
-
-def test_no_border_without_a_width():
-    assert build(border_width=0.0)[1].model.ngeom == 1
 
 
 def test_a_light_shines_down_on_the_whole_grid():
@@ -350,18 +341,6 @@ def test_difficulties_are_those_of_the_range(ends):
         )  # fmt: skip
     # Four steps and the platform, of 0.2 m each at difficulty 1.
     assert generator.terrain_origins[:, 0, 2] == pytest.approx(np.array(ends))
-
-
-@pytest.mark.parametrize("num_cols", [0, -1])
-def test_curriculum_ignores_the_number_of_columns(num_cols):
-    generator, _ = build(curriculum=True, num_rows=2, num_cols=num_cols)
-    assert generator.num_cols == len(generator.cfg.sub_terrains)
-
-
-def test_proportion_of_a_single_type_is_one():
-    kinds = {"a": BoxFlatTerrainCfg(proportion=-1.0)}
-    generator, _ = build(sub_terrains=kinds)
-    assert generator.proportions.tolist() == [1.0]
 
 
 def test_an_error_of_a_sub_terrain_says_which_one_it_is():

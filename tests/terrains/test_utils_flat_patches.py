@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjlab.terrains.terrain_generator import FlatPatchSamplingCfg
-from mjlab.terrains.utils import find_flat_patches_from_heightfield
 from mjlab.terrains.utils import find_flat_patches_from_heightfield as find
 
 from .heightfields import Built, build, obstacles, perlin, rough, slope
@@ -127,30 +126,11 @@ def test_without_a_flat_spot_all_patches_are_the_center():
     np.testing.assert_allclose(found, np.tile([4.0, 4.0, height], (4, 1)), atol=1e-6)
 
 
-def test_a_finer_grid_has_more_places():
-    cfg = patch(num_patches=400, patch_radius=0.2, grid_resolution=0.025)
-    found = find(np.zeros((20, 30)), 0.1, 0.0, cfg, np.random.default_rng(0))
-    assert len(np.unique(found, axis=0)) == 400
-    spacing = np.diff(np.unique(found[:, 0])).min()
-    assert spacing == pytest.approx(3.0 / 119, rel=1e-6)
-
-
 def test_a_seed_gives_the_same_patches():
     cfg = obstacles(flat_patch_sampling={"a": patch(patch_radius=0.3)})
     first, again, other = (build(cfg, seed=s).output.flat_patches["a"] for s in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
-
-
-def test_asking_for_patches_does_not_change_the_ground():
-    plain = build(perlin())
-    asked = build(perlin(flat_patch_sampling={"a": patch()}))
-    np.testing.assert_array_equal(plain.surface, asked.surface)
-    assert plain.output.flat_patches is None
-
-
-def test_the_public_name_is_the_search():
-    assert find_flat_patches_from_heightfield is find
 
 
 @pytest.mark.parametrize(
@@ -182,8 +162,3 @@ def test_patches_without_room_are_at_the_center(fields):
     built = build(rough(flat_patch_sampling={"goal": patch(**fields)}))
     found = built.output.flat_patches["goal"]
     assert (found[:, :2] == np.array([4.0, 4.0])).all()
-
-
-def test_number_of_patches_may_be_zero():
-    built = build(rough(flat_patch_sampling={"goal": patch(num_patches=0)}))
-    assert built.output.flat_patches["goal"].shape == (0, 3)

@@ -30,8 +30,3 @@ def test_a_message_is_colored_on_a_terminal_only(capsys, monkeypatch):
 )
 def test_an_error_is_reduced_to_one_line(error, line):
     assert first_line(error) == line
-
-
-def test_an_unknown_color_is_refused():
-    with pytest.raises(ValueError, match=r"\['red'.*'pink'"):
-        print_info("hello", color="pink")

@@ -63,11 +63,6 @@ def test_processes_and_seeds_share_no_draws(one, other):
     assert (_draw() == drawn) == (one == other)
 
 
-@given(SEEDS)
-def test_a_run_of_one_process_has_the_seed_that_it_was_given(seed):
-    assert process_seed(seed, 0) == seed
-
-
 @given(run=SEEDS, process=st.tuples(SEEDS, RANKS), one=ITERATIONS, other=ITERATIONS)
 @example(run=0, process=(2**20 - 1, 1000), one=1, other=2)
 def test_evaluations_share_no_draws(run, process, one, other):

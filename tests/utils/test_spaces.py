@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
-
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
 
 
@@ -31,8 +29,3 @@ def test_batches_add_a_leading_axis_everywhere():
     assert camera.shape == (7,)
     assert camera.spaces["rgb"] == Box(shape=(7, 4, 5, 3), dtype="uint8")
     assert single.spaces["actor"].shape == (3,)
-
-
-def test_a_batch_must_not_be_empty():
-    with pytest.raises(ValueError, match="batch_size.*0"):
-        batch_space(Box(), 0)

@@ -15,7 +15,6 @@ import torch
 from mjlab.utils.noise import (
     ConstantNoiseCfg,
     GaussianNoiseCfg,
-    NoiseModelWithAdditiveBiasCfg,
     UniformNoiseCfg,
 )
 from mjlab.utils.tables import Table, format_value, json_value, settings_of
@@ -58,13 +57,6 @@ class Cfg:
 )
 def test_cells(value, text):
     assert format_value(value) == text
-
-
-def test_a_noise_model_names_its_noises():
-    noise, bias = UniformNoiseCfg(n_min=0.0), GaussianNoiseCfg(std=0.2)
-    text = format_value(NoiseModelWithAdditiveBiasCfg(noise_cfg=noise, bias_noise_cfg=bias))
-    assert str(noise) in text
-    assert str(bias) in text
 
 
 def test_long_lists_are_cut_and_counted():

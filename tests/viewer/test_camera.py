@@ -14,7 +14,7 @@ from viewer_fakes import FakeEnv
 from mjlab.entity import EntityCfg
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sim import Simulation, SimulationCfg
-from mjlab.viewer.camera import CameraView, first_moving_body, nearest_envs, resolve_camera
+from mjlab.viewer.camera import CameraView, nearest_envs, resolve_camera
 from mjlab.viewer.viewer_config import OriginType, ViewerConfig
 
 ENV = FakeEnv(1)
@@ -35,11 +35,6 @@ def test_auto_looks_at_the_fixed_point_where_nothing_moves() -> None:
     view = resolve_camera(ViewerConfig(lookat=(1.0, 2.0, 3.0)), model, {})
     assert view.body_id is None
     np.testing.assert_allclose(view.target(np.zeros((2, 3))), [1, 2, 3])
-
-
-def test_a_mocap_root_counts_as_moving() -> None:
-    xml = "<mujoco><worldbody><body/><body mocap='true'><body/></body></worldbody></mujoco>"
-    assert first_moving_body(mujoco.MjModel.from_xml_string(xml)) == 2
 
 
 def test_world_looks_at_the_fixed_point_although_something_moves() -> None:

@@ -22,14 +22,6 @@ def test_only_fields_that_are_drawn_are_copied_and_only_of_one_environment() -> 
     assert not np.allclose(env.sim.mj_model.geom_rgba, rgba[1])
 
 
-def test_rotation_fields_are_reshaped_to_mujocos_rows() -> None:
-    env = FakeEnv(1)
-    model = host_model(env.sim.mj_model)
-    env.sim.expand("cam_mat0", torch.eye(3).expand(1, model.ncam, 3, 3))
-    sync_model_fields(model, env.sim.model, env.sim.expanded_fields, 0)
-    np.testing.assert_allclose(model.cam_mat0, np.eye(3).reshape(1, 9))
-
-
 def test_moved_geoms_are_drawn_moved() -> None:
     env = FakeEnv(1)
     geom = env.sim.mj_model.geom("cartpole/cart").id

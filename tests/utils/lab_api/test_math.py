@@ -362,13 +362,6 @@ def test_a_camera_looks_the_same_way_in_every_convention(origin, target):
         assert_close(m.quat_apply(converted, directions[1]), m.quat_apply(quat, directions[0]))
 
 
-def test_unknown_camera_conventions_are_opengl():
-    convert = m.convert_camera_frame_orientation_convention
-    with pytest.warns(UserWarning, match="'usd'"):
-        converted = convert(_quat(0), "usd")  # ty: ignore[invalid-argument-type]
-    assert_close(converted, convert(_quat(0), "opengl"))
-
-
 @pytest.mark.parametrize("up_axis", ["Y", "Z"])
 def test_a_camera_looks_at_its_target_upright(up_axis):
     eyes, targets = _tensor(0, 5, 3), _tensor(1, 5, 3)
@@ -413,11 +406,6 @@ def test_reordering_takes_arrays_and_checks_its_arguments():
         m.convert_quat(torch.ones(4), to="wxy")  # ty: ignore[invalid-argument-type]
     with pytest.raises(ValueError, match=r"got \(3,\)"):
         m.convert_quat(torch.ones(3))
-
-
-def test_older_names_of_rotations():
-    assert m.quat_rotate is m.quat_apply
-    assert m.quat_rotate_inverse is m.quat_apply_inverse
 
 
 # Task packages compile functions when they are imported. Not those that take sizes, names or arrays.

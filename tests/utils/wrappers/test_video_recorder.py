@@ -159,15 +159,6 @@ def test_a_machine_that_cannot_render_is_said_once_and_stepping_goes_on(tmp_path
     assert names(tmp_path) == []
 
 
-def test_no_frames_no_file(tmp_path) -> None:
-    inner = FilmedEnv()
-    inner.render = lambda: None
-    env = VideoRecorder(inner, tmp_path, step_trigger=lambda n: n == 0, video_length=2)
-    env.step(ACTION)
-    env.close()
-    assert names(tmp_path) == []
-
-
 def test_a_folder_that_cannot_be_written_costs_the_video_and_not_the_run(tmp_path, caplog) -> None:
     (tmp_path / "file").touch()
     env = VideoRecorder(
@@ -230,17 +221,6 @@ def test_files_are_logged_unless_told_otherwise(tmp_path, caplog) -> None:
 def test_a_recorder_without_triggers_raises(tmp_path) -> None:
     with pytest.raises(ValueError, match="episode_trigger or a step_trigger"):
         VideoRecorder(FilmedEnv(), tmp_path)
-
-
-@pytest.mark.parametrize("length", [0, -5])
-def test_clips_below_one_frame_have_one(tmp_path, length) -> None:
-    with pytest.warns(UserWarning, match=rf"video_length.*got {length}"):
-        env = VideoRecorder(
-            FilmedEnv(), tmp_path, step_trigger=lambda n: n % 3 == 0, video_length=length
-        )
-    for _ in range(7):
-        env.step(ACTION)
-    assert [len(frames(path)) for path in env.written] == [1, 1, 1]
 
 
 def test_odd_sizes_and_float_frames_are_written(tmp_path) -> None:

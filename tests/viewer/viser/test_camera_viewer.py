@@ -13,8 +13,6 @@ from mjlab.sensor import CameraSensorCfg
 from mjlab.viewer.viser.camera_viewer import (
     ViserCameraViewer,
     depth_colors,
-    enlarged,
-    segmentation_colors,
     vertical_angle,
 )
 from mjlab.viewer.viser.overlays import ViserCameraOverlays
@@ -98,31 +96,9 @@ def test_the_field_of_view_of_a_sensor_is_that_of_the_part_that_is_used() -> Non
     assert vertical_angle(45.0, sensor, focal, 4.0) == pytest.approx(2 * math.atan(0.5))
 
 
-@pytest.mark.parametrize(
-    ("shape", "factor"), [((32, 32), 4), ((10, 100), 3), ((120, 160), 2), ((480, 640), 1)]
-)
-def test_images_are_enlarged_by_whole_factors_where_it_fits(shape, factor) -> None:
-    image = np.arange(np.prod(shape) * 3, dtype=np.uint8).reshape(*shape, 3)
-    large = enlarged(image)
-    assert large.shape == (shape[0] * factor, shape[1] * factor, 3)
-    np.testing.assert_array_equal(large[::factor, ::factor], image)
-
-
 def test_depth_grows_lighter_and_nothing_is_white() -> None:
     depth = np.array([[[0.0], [0.5], [1.0], [3.0]]])
     assert depth_colors(depth, 2.0)[0, :, 0].tolist() == [255, 63, 127, 255]
-
-
-def test_objects_have_colors_of_their_own_and_the_background_is_black() -> None:
-    ids = np.arange(-1, 100)
-    objects = np.stack((ids, np.where(ids < 0, -1, 5)), axis=-1)[None]
-    colors = segmentation_colors(objects)[0]
-    assert colors[0].tolist() == [0, 0, 0]
-    assert colors[1:].min() >= 64
-    assert len(np.unique(colors[1:], axis=0)) == 100
-    # Colors of neighboring IDs differ visibly.
-    step = np.abs(colors[2:].astype(int) - colors[1:-1].astype(int)).max(axis=1)
-    assert np.median(step) > 40
 
 
 def test_a_viewer_of_one_camera_is_made_and_removed_by_itself(viser_server) -> None:
