@@ -285,6 +285,19 @@ class EntityData:
         """(N, nb, 6) velocities of the bodies' centers of mass."""
         return torch.cat((self.body_com_lin_vel_w, self.body_com_ang_vel_w), dim=-1)
 
+    def link_lin_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
+        """Return linear velocities of the origins of links `bodies`, (N, n, 3)."""
+        ids, trees = self._bodies.tensor[bodies], self._body_trees.tensor[bodies]
+        return _linear_velocity(
+            self.data.xpos.index_select(1, ids),
+            self.data.subtree_com.index_select(1, trees),
+            self.data.cvel.index_select(1, ids),
+        )
+
+    def link_ang_vel_of(self, bodies: slice | torch.Tensor) -> torch.Tensor:
+        """Return angular velocities of links `bodies`, (N, n, 3)."""
+        return self.data.cvel.index_select(1, self._bodies.tensor[bodies])[..., :3]
+
     def _linear_at(self, pos: torch.Tensor, trees: Addresses, bodies: Addresses) -> torch.Tensor:
         """Return the linear velocities of points `pos`, (N, n, 3), of `bodies` in `trees`."""
         return _linear_velocity(

@@ -207,12 +207,12 @@ class MotionReader:
     @property
     def robot_body_lin_vel_w(self) -> torch.Tensor:
         """(N, K, 3) velocities of the tracked bodies' origins."""
-        return self.robot.data.body_link_lin_vel_w.index_select(1, self.body_indexes)
+        return self.robot.data.link_lin_vel_of(self.body_indexes)
 
     @property
     def robot_body_ang_vel_w(self) -> torch.Tensor:
         """(N, K, 3) angular velocities of the tracked bodies."""
-        return self.robot.data.body_link_ang_vel_w.index_select(1, self.body_indexes)
+        return self.robot.data.link_ang_vel_of(self.body_indexes)
 
     @property
     def robot_anchor_pos_w(self) -> torch.Tensor:
