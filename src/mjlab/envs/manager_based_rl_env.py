@@ -385,7 +385,8 @@ class ManagerBasedRlEnv(Tabular):
             terminated (N,) and truncated (N,) bool; extras, with `extras["log"]`. The next step
             overwrites only the extras.
         """
-        self._check_no_reset_is_due()
+        if not self.cfg.auto_reset:
+            self._check_no_reset_is_due()
         self._clear_extras()
         self.action_manager.process_action(action)
         self._run_physics()
@@ -437,8 +438,8 @@ class ManagerBasedRlEnv(Tabular):
     # Phases of a step.
 
     def _check_no_reset_is_due(self) -> None:
-        """Raise `RuntimeError` if, without `auto_reset`, an environment is done and was not reset."""
-        if not self.cfg.auto_reset and self._pending_reset.any():
+        """Raise `RuntimeError` if an environment is done and was not reset."""
+        if self._pending_reset.any():
             ids = self._pending_reset.nonzero().flatten().tolist()
             raise WrongStateError(
                 f"step: environments {ids[:10]}{' ...' if len(ids) > 10 else ''} are done and were "
