@@ -96,31 +96,6 @@ def test_references_with_the_world_first_are_named():
 
 
 @pytest.mark.parametrize(
-    ("rest", "named"),
-    [
-        (
-            '<contact><exclude body1="world" body2="ball"/></contact>',
-            "excludes [\"of 'world' and 'ball'\"]",
-        ),
-        ('<contact><exclude name="no" body1="ball" body2="world"/></contact>', "excludes ['no']"),
-        (
-            '<sensor><contact name="touch" body1="ball" body2="world" data="found"/></sensor>',
-            "contact sensors ['touch']",
-        ),
-        (
-            '<sensor><contact name="touch" body1="world" body2="ball" data="found"/></sensor>',
-            "contact sensors ['touch']",
-        ),
-    ],
-)
-def test_contact_filters_that_miss_the_terrain_warn_once(rest, named):
-    (said,) = build(thing(BALL, rest, init_state=HIGH))[2]
-    assert named in said
-    assert not build(thing(BALL, rest, init_state=HIGH), terrain=None)[2]
-    assert not build(thing(LINK.replace("link", "ball"), rest))[2]
-
-
-@pytest.mark.parametrize(
     ("world", "named"),
     [
         ('<geom name="step" size=".5"/>', "geoms ['step']"),

@@ -82,21 +82,6 @@ def test_all_sensors_on_all_allowed_objects_agree_with_mujoco():
         np.testing.assert_allclose(actual[1].numpy(), expected, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("sensor", OBJECTS)
-def test_wrong_objects_are_refused(sensor):
-    for kind in KINDS:
-        if OBJECTS[sensor] and kind not in OBJECTS[sensor]:
-            with pytest.raises(ValueError, match=f"'x' obj.type .*'{sensor}': .*got '{kind}'"):
-                BuiltinSensorCfg(name="x", sensor_type=sensor, obj=ref(kind))
-    if OBJECTS[sensor]:
-        with pytest.raises(ValueError, match="got None"):
-            BuiltinSensorCfg(name="x", sensor_type=sensor)
-    if sensor not in FRAME:
-        obj = ref(OBJECTS[sensor][0]) if OBJECTS[sensor] else None
-        with pytest.raises(ValueError, match=f"'x' ref.type .*'{sensor}': .*got 'site'"):
-            BuiltinSensorCfg(name="x", sensor_type=sensor, obj=obj, ref=ref("site"))
-
-
 def test_clock_may_have_an_element():
     sim, scene = scene_with(BuiltinSensorCfg(name="t", sensor_type="clock", obj=ref("site")))
     sim.step(nstep=3)
@@ -104,11 +89,9 @@ def test_clock_may_have_an_element():
     torch.testing.assert_close(scene["r/t"].data[:, 0], sim.data.time)
 
 
-def test_unknown_kinds_and_reference_objects_are_refused():
+def test_unknown_kinds_list_the_known_ones():
     with pytest.raises(ValueError, match="sensor_type.*'accelerometer'.*'gyroo'"):
-        BuiltinSensorCfg(name="x", sensor_type="gyroo", obj=ref("site"))
-    with pytest.raises(ValueError, match="'x' ref.type .*'framepos'.*'body', .*'joint'"):
-        BuiltinSensorCfg(name="x", sensor_type="framepos", obj=ref("site"), ref=ref("joint"))
+        scene_with(BuiltinSensorCfg(name="x", sensor_type="gyroo", obj=ref("site")))
 
 
 def test_a_frame_sensor_reports_in_its_reference_frame():

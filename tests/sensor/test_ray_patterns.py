@@ -127,42 +127,16 @@ def test_an_intrinsic_matrix_gives_the_vertical_field_of_view():
     assert cfg.fovy == pytest.approx(90.0)
 
 
-@pytest.mark.parametrize(
-    ("pattern", "message"),
-    [
-        (GridPatternCfg(resolution=0.0), "resolution.* 0.0"),
-        (GridPatternCfg(resolution=-0.1), "resolution.* -0.1"),
-        (GridPatternCfg(resolution=math.nan), "resolution.* nan"),
-        (GridPatternCfg(size=(1.0, -1.0)), r"size.*\(1.0, -1.0\)"),
-        (
-            PinholeCameraPatternCfg.from_mujoco_camera("eyes"),
-            "camera 'eyes'.*'eye'",
-        ),
-    ],
-)
-def test_patterns_that_make_no_sense_are_refused(pattern, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("resolution", [0.0, -0.1, math.nan])
+def test_resolution_is_positive(resolution):
+    with pytest.raises(ValueError, match="resolution: expected"):
+        GridPatternCfg(resolution=resolution).generate_rays(None, CPU)
+
+
+def test_an_unknown_camera_lists_the_known():
+    pattern = PinholeCameraPatternCfg.from_mujoco_camera("eyes")
+    with pytest.raises(ValueError, match="camera 'eyes'.*'eye'"):
         pattern.generate_rays(mujoco.MjModel.from_xml_string(CAMERAS), CPU)
-
-
-def test_rays_of_a_camera_need_the_model():
-    with pytest.raises(ValueError, match="camera 'eye'.*expected the compiled model, got None"):
-        PinholeCameraPatternCfg.from_mujoco_camera("eye").generate_rays(None, CPU)
-
-
-@pytest.mark.parametrize(
-    ("pattern", "message"),
-    [
-        (GridPatternCfg(direction=(0.0, 0.0, 0.0)), r"not all 0, got \(0.0, 0.0, 0.0\)"),
-        (RingPatternCfg.single_ring(direction=(0.0, 0.0, math.nan)), "nan.*every ray misses"),
-        (PinholeCameraPatternCfg(fovy=0.0), r"\(0, 180\), got 0.0"),
-        (PinholeCameraPatternCfg(fovy=200.0), r"\(0, 180\), got 200.0"),
-    ],
-)
-def test_odd_directions_warn_once(pattern, message):
-    with pytest.warns(UserWarning, match=message) as caught:
-        pattern.generate_rays(None, CPU)
-    assert len(caught) == 1
 
 
 def test_rings_without_samples_have_no_rays():

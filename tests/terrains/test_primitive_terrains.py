@@ -11,13 +11,11 @@ from hypothesis import strategies as st
 from mjlab.terrains import (
     BoxNarrowBeamsTerrainCfg,
     BoxNestedRingsTerrainCfg,
-    BoxOpenStairsTerrainCfg,
     BoxPyramidStairsTerrainCfg,
     BoxRandomGridTerrainCfg,
     BoxRandomSpreadTerrainCfg,
     BoxRandomStairsTerrainCfg,
     BoxSteppingStonesTerrainCfg,
-    BoxTiltedGridTerrainCfg,
 )
 from mjlab.terrains.boxes import merge_equal_cells
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
@@ -302,30 +300,7 @@ def test_a_ring_that_fills_the_middle_has_no_empty_sides():
     assert built.height(1.5, 1.5) == pytest.approx(0.25)
 
 
-# Invalid configs.
-
-
-@pytest.mark.parametrize(
-    ("cfg", "error", "message"),
-    [
-        (BoxPyramidStairsTerrainCfg(step_height_range=(0, 0.1), step_width=0.0),
-         ValueError, r"BoxPyramidStairsTerrainCfg.step_width: expected .*got 0.0"),
-        (BoxOpenStairsTerrainCfg(step_thickness=-0.1), ValueError, r"step_thickness: expected .*got -0.1"),
-        (BoxOpenStairsTerrainCfg(step_width_range=(0.0, 0.0)), ValueError, "step_width_range: "),
-        (BoxRandomGridTerrainCfg(size=(8, 6), grid_width=0.4, grid_height_range=(0, 0.3)),
-         ValueError, r"size: .*square.*got \(8, 6\)"),
-        (BoxRandomGridTerrainCfg(size=SIZE, grid_width=0.5, grid_height_range=(0, 1), border_width=0.0),
-         RuntimeError, "border.*16 columns of grid_width 0.5 m .*8.0 m"),
-        (BoxRandomGridTerrainCfg(size=SIZE, grid_width=9.0, grid_height_range=(0, 1)),
-         ValueError, r"grid_width: expected .*got 9.0"),
-        (BoxTiltedGridTerrainCfg(grid_width=0.0), ValueError, r"grid_width: expected .*got 0.0"),
-        (BoxRandomSpreadTerrainCfg(box_width_range=(1.0, 0.3)), ValueError, "high - low"),
-        (BoxSteppingStonesTerrainCfg(floor_depth=-1.0), ValueError, r"floor_depth: expected .*got -1.0"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_built_is_refused(cfg, error, message):
-    with pytest.raises(error, match=message):
-        ground(cfg)
+# Odd configs.
 
 
 @pytest.mark.parametrize(
@@ -341,6 +316,10 @@ def test_what_cannot_be_built_is_refused(cfg, error, message):
         ),
         BoxRandomSpreadTerrainCfg(num_boxes=-1),
         BoxRandomSpreadTerrainCfg(box_width_range=(0.0, 0.3)),
+        BoxRandomGridTerrainCfg(size=(8, 6), grid_width=0.4, grid_height_range=(0, 0.3)),
+        BoxRandomGridTerrainCfg(
+            size=SIZE, grid_width=0.5, grid_height_range=(0, 1), border_width=0.0
+        ),
         BoxSteppingStonesTerrainCfg(floor_depth=0.0),
         BoxSteppingStonesTerrainCfg(stone_size_range=(0.8, 0.4)),
         BoxNarrowBeamsTerrainCfg(beam_width_range=(0.4, 0.2), num_beams=9.0),  # ty: ignore

@@ -77,14 +77,10 @@ def test_debug_sites_show_the_origins():
 
 
 def test_configs_that_make_no_sense_are_refused():
-    with pytest.raises(ValueError, match="terrain_type: .*'plane', 'generator'.*got 'hills'"):
-        terrain(terrain_type="hills")
     with pytest.raises(ValueError, match="env_spacing: .*got None"):
         terrain(env_spacing=None)
     with pytest.raises(ValueError, match="terrain_generator: .*'generator', got None"):
         terrain(terrain_type="generator")
-    with pytest.raises(ValueError, match="max_init_terrain_level: .*>= 0.* -1"):
-        terrain(max_init_terrain_level=-1)
     with pytest.raises(TypeError, match=r"TerrainEntity\(cfg, device\)"):
         TerrainEntityCfg().build()
 
@@ -217,12 +213,6 @@ def test_randomized_origins_cover_all_cells_and_spare_other_environments():
     entity.randomize_env_origins(torch.arange(300))
     assert torch.equal(entity.env_origins[300:], before[300:])
     assert len(torch.unique(entity.env_origins[:300], dim=0)) == 6
-
-
-@pytest.mark.parametrize("shape", [(4, 3), (2, 2, 2), (0, 2, 3)])
-def test_origins_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match="origins: .*\\(levels, columns, 3\\)"):
-        terrain().configure_env_origins(torch.zeros(shape))
 
 
 # A generated terrain, as an entity.

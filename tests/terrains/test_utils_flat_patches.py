@@ -134,20 +134,6 @@ def test_a_seed_gives_the_same_patches():
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"num_patches": -1}, r"num_patches: expected .*got -1"),
-        ({"patch_radius": -0.1}, r"patch_radius: expected .*got -0.1"),
-        ({"grid_resolution": 0.0}, r"grid_resolution: expected .*got 0.0"),
-    ],
-)
-def test_a_patch_that_cannot_exist_is_refused(fields, message):
-    cfg = rough(flat_patch_sampling={"goal": patch(**fields)})
-    with pytest.raises(ValueError, match=r"flat_patch_sampling\['goal'\] " + message):
-        build(cfg)
-
-
-@pytest.mark.parametrize(
     "fields",
     [
         {"patch_radius": 5.0},

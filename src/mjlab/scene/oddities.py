@@ -76,8 +76,6 @@ def warn_oddities(scene: Scene, model: mujoco.MjModel) -> None:
             _warn_world_elements(name, entity, model)
         if not entity.is_fixed_base:
             _warn_buried(name, entity, model, data)
-            if scene.terrain is not None:
-                _warn_filters(name, entity.spec)
         grounds += [
             f"geom {short or '(unnamed)'!r} of entity {name!r}"
             for short, geom in zip(entity.geom_names, entity.indexing.geom_ids, strict=True)
@@ -176,30 +174,6 @@ def _warn_world_elements(name: str, entity: Entity, model: mujoco.MjModel) -> No
             f"Entity {name!r}: {', '.join(listed)} are fixed to the world, so all environments share "
             "them at the world's origin; move them to a separate entity, because each environment "
             "places its own fixed bases, or to the terrain."
-        )
-
-
-def _warn_filters(name: str, spec: mujoco.MjSpec) -> None:
-    """Warn of excludes and contact sensors of the world: the terrain is a separate body."""
-    filters = {
-        "excludes": [
-            e.name or f"of {short_name(e.bodyname1)!r} and {short_name(e.bodyname2)!r}"
-            for e in spec.excludes
-            if "world" in (e.bodyname1, e.bodyname2)
-        ],
-        "contact sensors": [
-            sensor.name
-            for sensor in spec.sensors
-            if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT
-            and "world" in (sensor.objname, sensor.refname)
-        ],
-    }
-    listed = [f"{kind} {_names(own)}" for kind, own in filters.items() if own]
-    if listed:
-        _warn(
-            f"Entity {name!r}: {', '.join(listed)} name the world, and the terrain is the separate "
-            "body 'terrain'; in SceneCfg.spec_fn use spec.add_exclude(bodyname1='terrain', "
-            "bodyname2=...), and for sensors ContactSensorCfg."
         )
 
 

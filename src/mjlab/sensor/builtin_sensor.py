@@ -33,23 +33,8 @@ SensorType = Literal[
 # The scene attaches its terrain without a prefix.
 _TERRAIN = "terrain"
 
-_FRAME = ("body", "xbody", "geom", "site", "camera")
-
 # MJCF names of sensor types whose `mjtSensor` constant has another name; both are accepted.
 _ENUM_NAMES = {"jointactuatorfrc": "jointactfrc", "tendonactuatorfrc": "tendonactfrc"}
-
-# Allowed object types by prefix of the sensor type; the first matching prefix applies.
-_OBJECTS: dict[str, tuple[str, ...]] = {
-    "frame": _FRAME,
-    "subtree": ("body",),
-    "joint": ("joint",),
-    "tendon": ("tendon",),
-    "actuator": ("actuator",),
-    "clock": (),
-    "e_potential": (),
-    "e_kinetic": (),
-    "": ("site",),
-}
 
 
 @dataclass
@@ -87,17 +72,6 @@ class BuiltinSensorCfg(SensorCfg):
     """Reference frame of a frame sensor. None: world."""
     cutoff: float = 0.0
     """Bound on the absolute value of the data. 0: no bound."""
-
-    def __post_init__(self) -> None:
-        check_one_of(f"Sensor {self.name!r} sensor_type", self.sensor_type, get_args(SensorType))
-        allowed = next(v for start, v in _OBJECTS.items() if self.sensor_type.startswith(start))
-        # Only frame sensors have a reference frame, and it is optional.
-        frames = (*_FRAME, None) if self.sensor_type.startswith("frame") else (None,)
-        # The element of a clock or an energy only gives its prefix to the name.
-        checked = (("obj", self.obj, allowed), ("ref", self.ref, frames))
-        for field, ref, types in checked if allowed else checked[1:]:
-            owner = f"Sensor {self.name!r} {field}.type for sensor_type {self.sensor_type!r}"
-            check_one_of(owner, None if ref is None else ref.type, types)
 
     @property
     def prefixed_name(self) -> str:
@@ -139,8 +113,8 @@ class BuiltinSensor(Sensor[torch.Tensor]):
         """Add the sensor to the scene's spec, unless it wraps an existing one.
 
         Raises:
-            ValueError: duplicate sensor name, or unknown entity or element (with the available
-                names).
+            ValueError: duplicate sensor name, or unknown type, entity or element (with the
+                available names).
         """
         cfg = self.cfg
         if cfg is None:
@@ -152,6 +126,7 @@ class BuiltinSensor(Sensor[torch.Tensor]):
                 f"Sensor {name!r} already exists in {where}: defined by its XML or by two configs. "
                 "Rename one, or remove the config: sensors of the XML are available without one."
             )
+        check_one_of(f"Sensor {name!r} sensor_type", cfg.sensor_type, get_args(SensorType))
         kind = _ENUM_NAMES.get(cfg.sensor_type, cfg.sensor_type)
         sensor = scene_spec.add_sensor(
             name=name, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind.upper()}")

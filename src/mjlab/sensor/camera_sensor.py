@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
-import warnings
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +12,12 @@ import torch
 from mjlab.sensor.sensor import Sensor, SensorCfg
 from mjlab.sim.engine import (
     CAMERA_DATA_TYPES,
-    NUM_GEOM_GROUPS,
     CameraDataType,
     CameraView,
     Images,
     rendered_geoms,
 )
-from mjlab.utils.errors import WrongStateError, check_count
+from mjlab.utils.errors import WrongStateError, check_count, check_one_of
 from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
@@ -30,9 +26,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Vertical fields of view of perspective cameras (deg).
+# Vertical field of view of an added camera (deg).
 _DEFAULT_FOVY = 45.0
-_MAX_FOVY = 180.0
 
 
 @dataclass
@@ -106,40 +101,15 @@ class CameraSensor(Sensor[CameraSensorData]):
         """Check the config.
 
         Raises:
-            ValueError: invalid image size or data types, no geom groups, or field of view >= 180.
+            ValueError: negative image size, or unknown data type.
         """
         super().__init__()
         self.cfg = cfg
         owner = f"Camera sensor {cfg.name!r}"
         check_count(f"{owner} width", cfg.width, minimum=0)
         check_count(f"{owner} height", cfg.height, minimum=0)
-        odd = []
-        if cfg.width * cfg.height == 0:
-            odd.append(f"expected at least 1 x 1 pixels, got {cfg.width} x {cfg.height}")
-        for field, allowed in (
-            ("data_types", CAMERA_DATA_TYPES), ("enabled_geom_groups", range(NUM_GEOM_GROUPS)),
-        ):  # fmt: skip
-            values = getattr(cfg, field)
-            is_set = isinstance(values, Collection) and len(values) > 0
-            message = f"{field}: expected at least one of {list(allowed)}, got {values!r}"
-            if not is_set or (field == "data_types" and any(v not in allowed for v in values)):
-                raise ValueError(f"{owner} {message}.")
-            if any(value not in allowed for value in values):
-                odd.append(message)
-        is_perspective = not cfg.orthographic and cfg.camera_name is None
-        limit = _MAX_FOVY if is_perspective else math.inf
-        if cfg.fovy is not None and not 0.0 < cfg.fovy < limit:
-            message = f"fovy: expected a number in (0, {limit:g}), got {cfg.fovy}"
-            if cfg.fovy >= limit:
-                raise ValueError(f"{owner} {message}.")
-            odd.append(message)
-        if cfg.camera_name is not None and cfg.parent_body is not None:
-            odd.append(
-                f"parent_body: expected None for the existing camera {cfg.camera_name!r}, got "
-                f"{cfg.parent_body!r}; it is not used"
-            )
-        if odd:
-            warnings.warn(f"{owner} {'; '.join(odd)}.", UserWarning, stacklevel=2)
+        for data_type in cfg.data_types:
+            check_one_of(f"{owner} data_types", data_type, CAMERA_DATA_TYPES)
         self._camera_idx = -1
         self._view: CameraView | None = None
         self._rgb: torch.Tensor | None = None

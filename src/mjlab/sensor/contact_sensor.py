@@ -19,7 +19,7 @@ import torch
 
 from mjlab.compat import offers_older_attributes
 from mjlab.sensor.sensor import Sensor, SensorCfg
-from mjlab.utils.errors import WrongStateError, check_count, check_one_of
+from mjlab.utils.errors import WrongStateError, check_one_of
 from mjlab.utils.memory import check_memory
 from mjlab.utils.mujoco import OBJECT_TYPES
 from mjlab.utils.state import stateful
@@ -85,29 +85,11 @@ class ContactSensorCfg(SensorCfg):
     track_air_time: bool = False
     """Track air and contact times, independent of `fields`."""
     global_frame: bool = False
-    """Rotate force and torque into the world frame. Requires `normal` and `tangent`. The force of
-    `netforce` is in the world frame already."""
+    """Rotate force and torque into the world frame. The force of `netforce` is there already."""
     history_length: int = 0
     """Number of substeps of force, torque and dist to keep, newest first. 0: no history."""
     debug: bool = False
     """Draw contact points and forces in viewers."""
-
-    def __post_init__(self) -> None:
-        owner = f"Contact sensor {self.name!r}"
-        check_one_of(f"{owner} reduce", self.reduce, get_args(Reduction))
-        if self.secondary is not None:
-            policies = get_args(SecondaryPolicy)
-            check_one_of(f"{owner} secondary_policy", self.secondary_policy, policies)
-        if not self.fields or len(set(self.fields)) != len(self.fields):
-            raise ValueError(f"{owner} fields: expected distinct names, got {self.fields!r}.")
-        for name in self.fields:
-            check_one_of(f"{owner} fields", name, FIELD_SIZES)
-        check_count(f"{owner} num_slots", self.num_slots)
-        missing = [name for name in ("normal", "tangent") if name not in self.fields]
-        if self.global_frame and missing:
-            raise ValueError(
-                f"{owner}: global_frame=True requires fields {missing}, got {self.fields!r}."
-            )
 
     def build(self) -> ContactSensor:
         """Build the sensor."""
@@ -130,9 +112,6 @@ class ContactMatch:
     exclude: tuple[str, ...] = ()
     """Names or regular expressions to remove from the matches. An entry with any of
     `.*+?[]{}()\\|^$` is a regular expression that is searched in the name, others are exact."""
-
-    def __post_init__(self) -> None:
-        check_one_of("ContactMatch.mode", self.mode, get_args(MatchMode))
 
     @property
     def patterns(self) -> tuple[str, ...]:
@@ -198,6 +177,8 @@ class ContactSensor(Sensor[ContactData]):
         measured = {*cfg.fields, *(_DEBUG_FIELDS if cfg.debug else ())}
         if cfg.track_air_time:
             measured.add("found")
+        if cfg.global_frame:
+            measured |= {"normal", "tangent"}
         self._fields = [name for name in FIELD_SIZES if name in measured]
         sizes = [FIELD_SIZES[name] for name in self._fields]
         self._offsets = [sum(sizes[:i]) for i in range(len(sizes))]
@@ -232,11 +213,14 @@ class ContactSensor(Sensor[ContactData]):
         """Add one MuJoCo contact sensor per primary.
 
         Raises:
-            ValueError: pattern without match, ambiguous secondary under policy `error`, or a
-                sensor name that is already taken.
+            ValueError: unknown reduction or field, pattern without match, ambiguous secondary
+                under policy `error`, or a sensor name that is already taken.
         """
         cfg = self.cfg
         owner = f"Contact sensor {cfg.name!r}"
+        check_one_of(f"{owner} reduce", cfg.reduce, get_args(Reduction))
+        for name in cfg.fields:
+            check_one_of(f"{owner} fields", name, FIELD_SIZES)
         primaries = _resolve_match(f"{owner}: primary", cfg.primary, scene_spec, entities)
         secondary = self._resolve_secondary(owner, scene_spec, entities)
         self._primary_names = [primary.name for primary in primaries]

@@ -6,7 +6,6 @@ Data has N environments, F frames and n rays per frame; ray `f n + r` is ray r o
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -25,7 +24,6 @@ from mjlab.sensor.ray_patterns import (
     RingPatternCfg,
 )
 from mjlab.sensor.sensor import Sensor, SensorCfg
-from mjlab.sim.engine import NUM_GEOM_GROUPS
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.lab_api.math import quat_from_matrix
 from mjlab.utils.memory import check_memory
@@ -169,21 +167,12 @@ class RayCastSensor(Sensor[RayCastData]):
         """Check the config.
 
         Raises:
-            ValueError: unknown alignment, or geom group outside 0..5.
+            ValueError: unknown alignment.
         """
         super().__init__()
         self.cfg = cfg
-        owner = f"Ray sensor {cfg.name!r}"
-        check_one_of(f"{owner} ray_alignment", cfg.ray_alignment, get_args(RayAlignment))
-        if not cfg.max_distance > 0.0:
-            warnings.warn(
-                f"{owner} max_distance: expected a length > 0 (m), got {cfg.max_distance}; every ray "
-                "misses.",
-                UserWarning,
-                stacklevel=2,
-            )
-        for group in cfg.include_geom_groups or ():
-            check_one_of(f"{owner} include_geom_groups", group, range(NUM_GEOM_GROUPS))
+        owner = f"Ray sensor {cfg.name!r} ray_alignment"
+        check_one_of(owner, cfg.ray_alignment, get_args(RayAlignment))
         frame = cfg.frame
         self._frame_refs = (frame,) if isinstance(frame, ObjRef) else tuple(frame)
         self._num_rays_per_frame = 0
@@ -196,12 +185,8 @@ class RayCastSensor(Sensor[RayCastData]):
         """Check the frames. The spec is unchanged.
 
         Raises:
-            ValueError: `frame` is empty, is not a body, site or geom, or has an unknown entity.
+            ValueError: a frame is not a body, site or geom, or has an unknown entity.
         """
-        if not self._frame_refs:
-            raise ValueError(
-                f"Ray sensor {self.cfg.name!r} frame: expected at least one ObjRef, got ()."
-            )
         for frame in self._frame_refs:
             owner = f"Ray sensor {self.cfg.name!r} frame {frame.name!r}"
             check_one_of(f"{owner} type", frame.type, _FRAMES)
@@ -218,12 +203,6 @@ class RayCastSensor(Sensor[RayCastData]):
             self._frames = _Frames(self._frame_refs, mj_model, data, device)
         except ValueError as error:
             raise ValueError(f"Ray sensor {self.cfg.name!r}: {error}") from error
-        if len(offsets) == 0:
-            warnings.warn(
-                f"Ray sensor {self.cfg.name!r} pattern: expected at least one ray, got 0.",
-                UserWarning,
-                stacklevel=2,
-            )
         self._offsets, self._local_directions = offsets, directions
         self._num_rays_per_frame = len(offsets)
         # Vertical rays keep their directions under a rotation about the vertical.

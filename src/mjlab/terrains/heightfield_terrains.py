@@ -15,24 +15,25 @@ import numpy as np
 
 from mjlab.compat import older_names
 from mjlab.terrains.terrain_generator import (
-    BYTES_PER_PIXEL,
     SubTerrainCfg,
     TerrainGeometry,
     TerrainOutput,
     asset_name,
 )
 from mjlab.terrains.utils import (
-    check_flat_patch,
     find_flat_patches_from_heightfield,
     interpolate_cubic,
     lerp,
     resample_linear,
 )
-from mjlab.utils.errors import check_field, check_fields_positive
+from mjlab.utils.errors import check_field
 from mjlab.utils.memory import check_memory
 
 # A thin sheet lets fast or deep contacts through to the other side.
 MIN_BASE_THICKNESS = 0.5
+
+# Minimum bytes per pixel: heights in the spec, the model and the host data's model, and color.
+_BYTES_PER_PIXEL = 14
 
 # Radius around the center of the area robots start in and touch (m).
 SPAWN_RADIUS = 1.0
@@ -88,8 +89,7 @@ class HfDiscreteObstaclesTerrainCfg(SubTerrainCfg):
 
         Obstacles start at every fourth pixel inside the border, and are clipped at the border.
         """
-        check_heightfield(self, "vertical_scale")
-        pixels = divide_into_pixels(self)
+        pixels = divide_into_pixels(self.size, self.horizontal_scale, self.border_width)
         full = int(lerp(self.obstacle_height_range, difficulty) / self.vertical_scale)
         is_choice = self.obstacle_height_mode == "choice"
         heights = [-full, -full // 2, full // 2, full] if is_choice else [full]
@@ -143,8 +143,7 @@ class HfPyramidSlopedTerrainCfg(SubTerrainCfg):
         Heights are `peak a(x) a(y)` with `a(x) = (c - |c - x|) / c`, c half the number of pixels,
         clipped at the height of the platform's edge.
         """
-        check_heightfield(self, "vertical_scale")
-        pixels = divide_into_pixels(self)
+        pixels = divide_into_pixels(self.size, self.horizontal_scale, self.border_width)
         slope = lerp(self.slope_range, difficulty) * (-1.0 if self.inverted else 1.0)
         peak = int(slope * pixels.inner_size[0] / 2 / self.vertical_scale)
         # Triangles: 0 at the start and 1 at the center.
@@ -185,25 +184,16 @@ class HfRandomUniformTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain, with the spawn point at the maximum height within 1 m."""
-        check_heightfield(self, "vertical_scale")
-        pixels = divide_into_pixels(self)
+        pixels = divide_into_pixels(self.size, self.horizontal_scale, self.border_width)
         step = int(self.noise_step / self.vertical_scale)
         check_field(self, "noise_step", step != 0, f">= vertical_scale = {self.vertical_scale:g} m")
-        # At least two heights along each side.
-        coarse, most = self.downsampled_scale, min(pixels.inner_size) / 2
-        fits = coarse is None or self.horizontal_scale <= coarse <= most
-        expected = f"a length from horizontal_scale = {self.horizontal_scale:g} to {most:g} m"
-        check_field(self, "downsampled_scale", fits, expected)
+        coarse = self.downsampled_scale
         spacing = self.horizontal_scale if coarse is None else coarse
         factor = difficulty if self.scale_with_difficulty else 1.0
         low, high = (int(factor * end / self.vertical_scale) for end in self.noise_range)
         # The first axis is the row (y).
         counts = [int(extent / spacing) for extent in pixels.inner_size[::-1]]
-        levels = np.arange(low, high + step, step)
-        check_field(
-            self, "noise_range", len(levels) > 0, "(low, high) in the direction of noise_step"
-        )
-        drawn = rng.choice(levels, size=counts)
+        drawn = rng.choice(np.arange(low, high + step, step), size=counts)
         field = add_noise(self, spec, pixels.with_border(interpolate_cubic(drawn, pixels.inner)))
         return finish(self, field, field.max_height_near_center(), rng)
 
@@ -234,9 +224,7 @@ class HfWaveTerrainCfg(SubTerrainCfg):
         Heights are `A (cos(2 pi n col / L) + sin(2 pi n row / L))` with L the number of rows inside
         the border and A half the amplitude.
         """
-        check_heightfield(self, "vertical_scale")
-        pixels = divide_into_pixels(self)
-        check_fields_positive(self, "num_waves")
+        pixels = divide_into_pixels(self.size, self.horizontal_scale, self.border_width)
         amplitude = int(0.5 * lerp(self.amplitude_range, difficulty) / self.vertical_scale)
         rows, cols = pixels.inner
         turn = 2.0 * np.pi * self.num_waves / rows
@@ -273,8 +261,7 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
         self, difficulty: float, spec: mujoco.MjSpec, rng: np.random.Generator
     ) -> TerrainOutput:
         """Add the terrain, with the spawn point at the maximum height within 1 m."""
-        check_heightfield(self, "resolution")
-        pixels = divide_into_pixels(self, "resolution")
+        pixels = divide_into_pixels(self.size, self.resolution, self.border_width)
         frequency = self.scale * self.resolution / self.horizontal_scale
         noise = fractal_noise(
             pixels.inner, frequency, self.octaves, self.persistence, self.lacunarity, rng
@@ -285,7 +272,7 @@ class HfPerlinNoiseTerrainCfg(SubTerrainCfg):
         return finish(self, field, field.max_height_near_center(), rng, pixel=self.resolution)
 
 
-# Pixels and checks.
+# Pixels.
 
 
 @dataclass(frozen=True)
@@ -316,38 +303,18 @@ class Pixels:
         return np.pad(inner, self.border)
 
 
-def divide_into_pixels(cfg: SubTerrainCfg, pixel_field: str = "horizontal_scale") -> Pixels:
-    """Divide `cfg.size` into pixels of the size in field `pixel_field` of the config.
+def divide_into_pixels(size: tuple[float, float], pixel: float, border_width: float) -> Pixels:
+    """Divide a sub-terrain of `size` (m) into pixels of length `pixel` (m).
 
     Columns divide the x size and rows the y size, both rounded down.
-
-    Raises:
-        ValueError: pixels do not fit the size, or the border is smaller than a pixel.
     """
-    check_fields_positive(cfg, pixel_field)
-    pixel, border_width = getattr(cfg, pixel_field), getattr(cfg, "border_width")  # noqa: B009
-    least = min(pixel, getattr(cfg, "horizontal_scale"))  # noqa: B009
-    expected = f"0 or a length >= {least:g} m (horizontal_scale or {pixel_field})"
-    check_field(cfg, "border_width", border_width <= 0.0 or border_width >= least, expected)
-    # Tiny pixels divide to infinity.
-    cols, rows = (int(min(extent / pixel, 1e18)) for extent in cfg.size)
-    owner = f"{type(cfg).__name__}.{pixel_field} {pixel}: pixels"
-    check_memory(owner, rows * cols, BYTES_PER_PIXEL, "cpu", f"a larger {pixel_field}")
-    border = max(int(min(border_width / pixel, 1e18)), 0)
-    check_field(
-        cfg, "size", min(rows, cols) >= 2, f"at least 2 x 2 pixels with {pixel_field} = {pixel:g}",
-    )  # fmt: skip
-    pixels = Pixels(rows, cols, border, (cfg.size[0], cfg.size[1]))
+    cols, rows = (int(extent / pixel) for extent in size)
+    check_memory(f"Pixels of {pixel:g} m", rows * cols, _BYTES_PER_PIXEL, "cpu", "larger pixels")
+    border = max(int(border_width / pixel), 0)
+    pixels = Pixels(rows, cols, border, (size[0], size[1]))
     if border == 0:
         return pixels
     return Pixels(rows, cols, border, (pixels.inner[1] * pixel, pixels.inner[0] * pixel))
-
-
-def check_heightfield(cfg: SubTerrainCfg, *scales: str) -> None:
-    """Check the fields common to all height fields. `scales`: fields that must be positive."""
-    check_fields_positive(cfg, "horizontal_scale", "base_thickness_ratio", *scales)
-    for name, patch in (cfg.flat_patch_sampling or {}).items():
-        check_flat_patch(type(cfg).__name__, name, patch)
 
 
 # Fields and their colors.

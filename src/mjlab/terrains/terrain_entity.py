@@ -16,7 +16,7 @@ import torch
 from mjlab.entity import Entity, EntityCfg
 from mjlab.terrains.terrain_generator import TerrainGenerator, TerrainGeneratorCfg
 from mjlab.utils import spec_config as spec_cfg
-from mjlab.utils.errors import WrongTypeError, check_field, check_one_of
+from mjlab.utils.errors import WrongTypeError
 
 # Debug sites.
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
@@ -120,10 +120,6 @@ class TerrainEntity(Entity):
         super().__init__(cfg)
 
     def _make_spec(self) -> mujoco.MjSpec:
-        top = self.cfg.max_init_terrain_level
-        expected = "an integer >= 0, or None for all levels"
-        check_field(self.cfg, "max_init_terrain_level", top is None or top >= 0, expected)
-        check_one_of("TerrainEntityCfg.terrain_type", self.cfg.terrain_type, ("plane", "generator"))
         spec = mujoco.MjSpec()
         if self.cfg.terrain_type == "plane":
             body = spec.worldbody.add_body(name="terrain")
@@ -208,7 +204,7 @@ class TerrainEntity(Entity):
                 shares. Use only if each column is a single terrain type, as in a curriculum.
 
         Raises:
-            ValueError: invalid shape of `origins`, or `origins` and `cfg.env_spacing` are None.
+            ValueError: `origins` and `cfg.env_spacing` are None.
         """
         num_envs = self.cfg.num_envs
         if origins is None:
@@ -222,10 +218,6 @@ class TerrainEntity(Entity):
             self.env_origins = grid_origins(num_envs, self.cfg.env_spacing, self._device)
             return
         grid = torch.as_tensor(origins, dtype=torch.float32, device=self._device)
-        if grid.ndim != 3 or grid.shape[2] != 3 or 0 in grid.shape:
-            raise ValueError(
-                f"origins: expected shape (levels, columns, 3), got {tuple(grid.shape)}."
-            )
         num_rows, num_cols = grid.shape[:2]
         top = self.cfg.max_init_terrain_level
         num_initial = num_rows if top is None else min(top + 1, num_rows)

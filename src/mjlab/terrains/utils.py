@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from mjlab.utils.errors import check_count, check_in_range, check_positive
-
 # MuJoCo rejects geoms of size 0.
 _MIN_HALF_SIZE = 1e-6
 
@@ -152,15 +150,6 @@ def find_flat_patches_from_heightfield(
     drawn = rng.choice(len(row), size=cfg.num_patches, replace=len(row) < cfg.num_patches)
     row, col = row[drawn], col[drawn]
     return np.stack((x[col], y[row], z[row, col]), axis=-1)
-
-
-def check_flat_patch(owner: str, name: str, cfg: FlatPatchSamplingCfg) -> None:
-    """Raise `ValueError` for invalid settings of the patch. `owner` opens the message."""
-    field = f"{owner} flat_patch_sampling[{name!r}]"
-    check_count(f"{field} num_patches", cfg.num_patches, minimum=0)
-    check_in_range(f"{field} patch_radius", cfg.patch_radius, 0.0, math.inf)
-    if cfg.grid_resolution is not None:
-        check_positive(f"{field} grid_resolution", cfg.grid_resolution)
 
 
 def interpolate_cubic(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
