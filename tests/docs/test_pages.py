@@ -178,10 +178,9 @@ def _flags_of_gpu() -> set[str]:
 
 
 def _flags_of_sweep() -> set[str]:
-    from mjlab.cli.main import COMMANDS
+    from mjlab.scripts.sweep import SweepFlags
 
-    (command,) = (command for command in COMMANDS if command.name == "sweep")
-    return set(_FLAG.findall(command.details))
+    return {field.name.replace("_", "-") for field in fields(SweepFlags)}
 
 
 def _has(config: object, path: list[str]) -> bool:

@@ -306,7 +306,7 @@ def test_a_policy_that_sees_images_trains_plays_and_is_scored(run, with_images, 
         "--agent.run-name", "wrong",
     )  # fmt: skip
     assert wrong.status == 1
-    assert "expected flat observations" in wrong.message
+    assert "MLPModel" in wrong.message
 
 
 def _truncate(model) -> bytes:
