@@ -234,6 +234,7 @@ def test_every_task_is_in_the_registry():
     assert {f"mjlab/{task}" for task in list_tasks()} <= set(gymnasium.registry)
 
 
+@pytest.mark.slow
 def test_a_task_is_made_by_its_name_alone():
     code = (
         "import gymnasium, numpy as np, warnings\n"

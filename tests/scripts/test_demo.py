@@ -100,7 +100,13 @@ def test_a_bundled_policy_walks_forward_as_told(name):
     assert ((walked > 1.5) & (walked < 2.8)).all()
 
 
-@pytest.mark.parametrize("script", ["play", "evaluate"])
+@pytest.mark.parametrize(
+    "script",
+    [
+        "play",
+        pytest.param("evaluate", marks=pytest.mark.slow),
+    ],
+)
 def test_exported_policies_are_played_and_evaluated_like_checkpoints(run, trained, script):
     (policy,) = trained.glob("*.onnx")
     flags = HEADLESS if script == "play" else ("--num-episodes", "2", "--max-steps", "4")

@@ -112,6 +112,7 @@ def log_out(monkeypatch, folder) -> None:
     monkeypatch.setattr("getpass.getpass", lambda *_: pytest.fail("prompted"))
 
 
+@pytest.mark.slow
 def test_a_policy_with_networks_from_the_command_line_is_played(run, train, tmp_path):
     run_dir = train(tmp_path, 1, "--agent.actor.hidden-dims", "(8,)")
     outcome = run("play", TASK, *HEADLESS, "--checkpoint-file", str(run_dir / "model_0.pt"))

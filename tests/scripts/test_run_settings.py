@@ -110,6 +110,7 @@ def test_typed_flags_come_last_and_stay(train_more):
     assert trained_with(again) == expected
 
 
+@pytest.mark.slow
 def test_the_registered_task_is_resumed_if_asked_for(train_more, first):
     networks = ("--agent.actor.hidden-dims", "(8,)", "--agent.critic.hidden-dims", "(8,)")
     new, _ = train_more("--agent.resume", "True", "--as-registered", "True", *networks)
@@ -134,6 +135,7 @@ def test_auto_resumes_if_there_is_a_run(first, train_more):
     assert new.info.get("resumed") is None
 
 
+@pytest.mark.slow
 def test_auto_resumes_runs_of_its_name_only(first, train_more):
     name = ("--agent.resume", "auto", "--agent.run-name", "seed_2", "--num-envs", "4")
     new, outcome = train_more(*name, iterations=1)

@@ -272,6 +272,7 @@ def test_a_return_does_not_rank_reward_weights(sweep, machine, folder):
     assert not {"Best", "Highest", "Next"} & set(re.findall(r"^\w+", outcome.out, re.MULTILINE))
 
 
+@pytest.mark.slow
 def test_weights_of_a_range_are_sampled_and_compared_by_success(sweep, machine, folder):
     machine.results = by_weight
     argv = ("--over", f"{LIFT_WEIGHT}=1..10", "--trials", "3", "--folder", str(folder))
@@ -282,6 +283,7 @@ def test_weights_of_a_range_are_sampled_and_compared_by_success(sweep, machine, 
     assert "compared by success_rate" in outcome.out
 
 
+@pytest.mark.slow
 def test_goals_in_returns_neither_rank_nor_stop(sweep, machine, folder):
     machine.results = lambda flags: {"mean_return": 900.0}
     stop = "--agent.evaluation.stop-when-solved"
@@ -493,6 +495,7 @@ def test_a_run_whose_resumption_fails_is_not_called_saved(sweep, machine, folder
     assert "Saved" not in outcome.out
 
 
+@pytest.mark.slow
 def test_values_of_ranges_are_sampled(sweep, machine, folder):
     argv = ("--over", f"{RATE}=1e-5..1e-2:log", "--folder", str(folder))
     assert sweep(*argv, "--trials", "1").status == 0
@@ -556,7 +559,7 @@ MIXED = (*SAMPLED[:2], "--over", "agent.algorithm.num-learning-epochs=1..9", "--
     ("over", "damage"),
     [
 (LEARNING, b"garbage" * 99),
-(MIXED, None),
+pytest.param(MIXED, None, marks=pytest.mark.slow),
 ],
 )  # fmt: skip
 def test_damaged_studies_are_rebuilt_from_the_folders(sweep, machine, folder, over, damage):
@@ -581,6 +584,7 @@ def test_damaged_studies_are_rebuilt_from_the_folders(sweep, machine, folder, ov
     assert len(machine.commands) == trained
 
 
+@pytest.mark.slow
 def test_a_lost_definition_keeps_the_trials(sweep, machine, folder):
     argv = (*LEARNING, "--folder", str(folder))
     assert sweep(*argv).status == 0

@@ -318,6 +318,7 @@ def test_a_run_name_may_have_a_separator(attempt, tmp_path):
     assert len(list(tmp_path.glob("logs/cartpole/*_a/b/model_1.pt"))) == 1
 
 
+@pytest.mark.slow
 def test_a_killed_writer_leaves_what_is_removed(tmp_path):
     (tmp_path / "old").mkdir()
     program = (
@@ -488,6 +489,7 @@ def test_a_failed_runner_keeps_its_folder(run, own_task, tmp_path):
     assert (folder / "model_2.pt").exists()
 
 
+@pytest.mark.slow
 def test_a_runner_of_rsl_rl_trains_and_resumes(run, own_task, tmp_path):
     own_task(RslRunner)
     outcome, folder = trains(run, tmp_path)

@@ -141,6 +141,7 @@ def test_resuming_keeps_the_learner_and_takes_its_flags(run, first):
     assert Run(new).info["learner"] == "sac"
 
 
+@pytest.mark.slow
 def test_runs_of_ppo_resume_without_notice(run, trained, tmp_path):
     first = shutil.copytree(trained, tmp_path / "cartpole" / "2026-01-01_00-00-00")
     outcome = resume(run, first)
@@ -198,6 +199,7 @@ def test_play_and_evaluate_need_not_be_told(run, of_sac, tmp_path):
     assert "--learner: expected 'sac'" in outcome.message
 
 
+@pytest.mark.slow
 def test_the_newest_policy_of_a_learner_is_played(run, first, trained):
     newer = shutil.copytree(trained, first.with_name("2026-01-02_00-00-00"))
     write_info(newer, started="2099-01-01T00:00:00")

@@ -172,6 +172,7 @@ def read_until_closed(terminal: int) -> None:
             pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "number",
     [

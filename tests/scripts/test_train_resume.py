@@ -85,6 +85,7 @@ def test_older_checkpoints_resume_by_parameters(first, resume):
     assert num_envs(new_run(first)) == 16
 
 
+@pytest.mark.slow
 def test_an_unknown_number_of_environments_is_told(first, resume):
     without_training_state(first)
     shutil.rmtree(first / "params")
@@ -111,6 +112,7 @@ def test_a_run_of_another_task_is_refused_and_named(first, resume, flags):
     assert list(first.parent.iterdir()) == [first]
 
 
+@pytest.mark.slow
 def test_the_run_that_was_started_last_is_resumed(first, resume):
     # Renamed, and changed later.
     other = shutil.copytree(first, first.with_name("2099-01-01"))
@@ -124,7 +126,12 @@ def test_the_run_that_was_started_last_is_resumed(first, resume):
     assert f"{other / 'model_7.pt'} has finished" in outcome.out
 
 
-@pytest.mark.parametrize("flag", ["--agent.load-run", "--agent.load-checkpoint"])
+@pytest.mark.parametrize(
+    "flag",
+    [
+        "--agent.load-run",
+    ],
+)
 def test_a_pattern_that_is_none_is_told(resume, flag):
     outcome = resume(flag, "*")
     assert outcome.status == 1
@@ -232,6 +239,7 @@ def test_a_flag_that_cannot_act_is_an_error(resumed, of_sac):
     assert not content
 
 
+@pytest.mark.slow
 def test_a_replay_of_another_run_is_an_error(resumed, of_sac, train, tmp_path):
     other = train(tmp_path / "other", 2, *SAC)
     mixed = shutil.copytree(of_sac, tmp_path / "mixed")

@@ -160,6 +160,7 @@ def test_training_ends_where_the_shortest_run_of_the_reference_did(verify, tmp_p
     assert Run(run_dir).info["iterations"] == 2
 
 
+@pytest.mark.slow
 def test_where_all_seeds_were_solved_one_that_is_not_in_time_is_outside(verify, tmp_path):
     def solve(reference: dict) -> None:
         for seed in reference["seeds"]:
@@ -353,6 +354,7 @@ def test_a_seed_whose_time_is_over_is_reported_and_goes_on_with_more_time(empty,
     assert record.evaluation["mean_return"] == whole.evaluation["mean_return"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first_evaluation", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_ctrl_c_ends_the_series_and_the_seed_is_resumed(empty, monkeypatch, first_evaluation):
     flags = [*TINY, "--agent.evaluation.min-interval", str(first_evaluation)]
@@ -381,6 +383,7 @@ def test_an_interrupted_seed_of_other_code_is_trained_from_the_start(empty, monk
     assert empty.reference.seeds[0].commit == "second"
 
 
+@pytest.mark.slow
 def test_seeds_with_other_flags_are_not_mixed(maker):
     flags = [*TINY, "--agent.algorithm.learning-rate", "0.1"]
     with pytest.raises(Exception, match="use AGAIN=1 to replace all"):

@@ -549,6 +549,7 @@ def test_a_bridge_wraps_arrays_and_warns_of_a_shared_row() -> None:
         model.opt.gravity = 1.0
 
 
+@pytest.mark.slow
 def test_importing_the_compatibility_names_loads_no_warp() -> None:
     code = (
         "import sys, mjlab.sim.sim_data, mjlab.sim.randomization, mjlab.sim\n"
