@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
@@ -66,30 +65,15 @@ def test_assignment_is_equal_weighted_or_chosen() -> None:
     ("assignment", "message"),
     [
         ({"huge": 1.0}, r"assignment 'huge'.*\['small', 'large'\]"),
-        ({"small": -1.0}, r"\{'small': -1.0\}.*>= 0"),
+        ({"small": -1.0}, r">= 0.*got \(-1.0, 1.0\)"),
         ({"small": 0.0, "large": 0.0}, "not all zero"),
         ({"small": float("nan")}, "finite.*nan"),
     ],
 )
 def test_weights_that_make_no_sense_are_refused(assignment, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        VariantEntityCfg(variants=BEADS, assignment=assignment)
-
-
-def test_building_checks_again_but_does_not_repeat_a_subclass() -> None:
-    calls = []
-
-    @dataclass(kw_only=True)
-    class Counting(VariantEntityCfg):
-        def __post_init__(self) -> None:
-            calls.append(self)
-
-    cfg = Counting(variants=BEADS)
-    cfg.build()
-    assert len(calls) == 1
-    cfg.assignment = {"huge": 1.0}
-    with pytest.raises(ValueError, match="assignment 'huge'"):
-        cfg.build()
+        entity = VariantEntityCfg(variants=BEADS, assignment=assignment).build()
+        metadata_of(entity).assign_worlds(2)
 
 
 @pytest.mark.parametrize(
@@ -110,8 +94,6 @@ def test_functions_that_assign_nonsense_are_refused(found, message: str) -> None
 
 
 def test_a_config_takes_its_specs_from_variants_alone() -> None:
-    with pytest.raises(ValueError, match="spec_fn.*`variants`"):
-        VariantEntityCfg(spec_fn=BOX, variants={"box": BOX})
     with pytest.raises(ValueError, match="VariantEntityCfg.variants.*at least one"):
         VariantEntityCfg().build()
     with pytest.raises(ValueError, match=r"variants\['a'\].*mujoco.MjSpec, got int"):
@@ -171,10 +153,7 @@ def test_references_to_a_geom_of_every_variant_follow_it() -> None:
     assert (heights[1] - heights[0]).item() == pytest.approx(0.5)
 
 
-def test_reserved_names_and_references_to_geoms_that_differ_are_refused() -> None:
-    reserved = thing("reserved", '<geom name="mjlab/pad/x" size=".1"/>')
-    with pytest.raises(ValueError, match="'b'.*mjlab/pad/.*reserved.*rename"):
-        VariantEntityCfg(variants={"a": BOX, "b": reserved}).build()
+def test_references_to_geoms_that_differ_are_refused() -> None:
     sensor = {
         "</worldbody>": '</worldbody><sensor><framepos name="s" objtype="geom" objname="shell"/>'
         "</sensor>"

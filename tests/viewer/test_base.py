@@ -199,11 +199,6 @@ def test_the_first_interrupt_ends_the_loop_and_the_old_handler_comes_back(viewer
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_frame_rate_that_is_not_positive_is_rejected() -> None:
-    with pytest.raises(ValueError, match="frame_rate.*0"):
-        ListViewer(FakeEnv(1), push(), frame_rate=0)
-
-
 def test_a_subclass_adds_statistics_every_tick() -> None:
     class Viewer(ListViewer):
         def _update_stats(self) -> None:

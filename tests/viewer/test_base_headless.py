@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from viewer_fakes import FakeEnv, push
 
@@ -42,8 +41,3 @@ def test_it_takes_the_four_results_of_the_learning_wrapper() -> None:
 
     env.step = step
     assert run_headless(env, push(), 4).num_episodes == 8
-
-
-def test_a_negative_number_of_steps_is_rejected() -> None:
-    with pytest.raises(ValueError, match="num_steps.*-1"):
-        run_headless(FakeEnv(1), push(), -1)

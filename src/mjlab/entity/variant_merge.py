@@ -102,8 +102,7 @@ def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None
     """Check that specs can be variants of one entity: they may differ in geoms and parameters.
 
     Raises:
-        ValueError: a spec does not have exactly one top-level body with a free joint first; uses a
-            reserved name; or differs from the first spec in bodies, joints, kinds of inertial,
+        ValueError: a spec does not have exactly one top-level body with a free joint first, or differs from the first spec in bodies, joints, kinds of inertial,
             actuators, sensors, tendons or equalities. Differing sites, cameras and lights are a
             warning: the scene has those of the first spec.
     """
@@ -131,7 +130,7 @@ def validate_variant_specs(names: list[str], specs: list[mujoco.MjSpec]) -> None
 
 
 def _check_variant(name: str, spec: mujoco.MjSpec) -> None:
-    """Raise `ValueError` unless a spec is one floating tree without reserved names."""
+    """Raise `ValueError` unless a spec is one floating tree."""
     roots = list(spec.worldbody.bodies)
     if len(roots) != 1:
         raise ValueError(
@@ -148,17 +147,6 @@ def _check_variant(name: str, spec: mujoco.MjSpec) -> None:
         raise ValueError(
             f"Variant {name!r}: geoms and sites in the world body are not supported; move them to the "
             f"body {roots[0].name!r}."
-        )
-    used = [
-        element.name
-        for kind in ("bodies", "geoms", "meshes", "materials", "textures")
-        for element in getattr(spec, kind)
-        if element.name.startswith(RESERVED_NAME_PREFIXES)
-    ]
-    if used:
-        raise ValueError(
-            f"Variant {name!r}: names that start with {RESERVED_NAME_PREFIXES[0]!r} are reserved for "
-            f"merged variants; rename {used}."
         )
 
 

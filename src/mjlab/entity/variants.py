@@ -81,16 +81,6 @@ class VariantEntityCfg(EntityCfg):
     weights by name (default 1), rounded by largest remainders; or a function from the number of
     environments to the variant index of each environment."""
 
-    def __post_init__(self) -> None:
-        if self.spec_fn is not _variant_spec_fn_unset:
-            raise ValueError(
-                "VariantEntityCfg.spec_fn: expected it to be unset, because specs come from "
-                "`variants`; add the function to `variants`, or use EntityCfg for an entity without "
-                "variants."
-            )
-        if self.variants:
-            resolve_assignment(tuple(self.variants), self.assignment)
-
     def build(self) -> Entity:
         """Build the entity.
 
@@ -141,11 +131,7 @@ class VariantMetadata:
 
     def columns(self, model: mujoco.MjModel) -> list[VariantColumns]:
         """Return the values of each variant in `model`, compiled from a spec with the merged spec."""
-        if self.table is None:
-            raise ValueError(
-                "VariantMetadata has no compiled values; use that of a built entity "
-                "(`Entity.variant_metadata`) or of `build_merged_variant_spec`."
-            )
+        assert self.table is not None
         return self.table.columns(model)
 
 
@@ -158,8 +144,6 @@ class VariantEntity(Entity):
 
     def __init__(self, cfg: VariantEntityCfg) -> None:
         """Build and merge all variants. Raises as `VariantEntityCfg.build`."""
-        # The config may have changed since construction; subclasses' methods are not repeated.
-        VariantEntityCfg.__post_init__(cfg)
         names = tuple(cfg.variants)
         if not names:
             raise ValueError(
@@ -278,19 +262,14 @@ def resolve_assignment(
     """Return one weight per variant, or the callable that assigns variants.
 
     Raises:
-        ValueError: `assignment` names an unknown variant or has invalid weights.
+        ValueError: `assignment` names an unknown variant.
     """
     if assignment is not None and not isinstance(assignment, dict):
         return assignment
     weights_by_name: dict[str, float] = {} if assignment is None else assignment
     for name in weights_by_name:
         check_exists("variant in VariantEntityCfg.assignment", name, names)
-    weights = tuple(float(weights_by_name.get(name, 1.0)) for name in names)
-    try:
-        allocate_worlds(weights, 1)
-    except ValueError as error:
-        raise ValueError(f"VariantEntityCfg.assignment {weights_by_name}: {error}") from None
-    return weights
+    return tuple(float(weights_by_name.get(name, 1.0)) for name in names)
 
 
 def assign_worlds(

@@ -9,7 +9,7 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import mujoco
 import numpy as np
@@ -129,24 +129,6 @@ class RayCastData:
     """Positions of the frames (m), world frame, (N, F, 3)."""
     frame_quat_w: torch.Tensor
     """Orientations of the frames, without alignment, (N, F, 4)."""
-
-    @classmethod
-    def with_frames(cls, frame_mat: torch.Tensor, **fields: torch.Tensor) -> Self:
-        """Return data with quaternions computed from `frame_mat`, (N, F, 3, 3), on access.
-
-        Few terms read quaternions, and their computation takes longer than all other fields.
-        """
-        data = cls.__new__(cls)
-        data.__dict__.update(fields, _frame_mat=frame_mat)
-        return data
-
-    def __getattr__(self, name: str) -> Any:
-        # Python calls `__getattr__` only for attributes that do not exist yet.
-        if name not in ("quat_w", "frame_quat_w") or "_frame_mat" not in self.__dict__:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        self.frame_quat_w = quat_from_matrix(self.__dict__["_frame_mat"])
-        self.quat_w = self.frame_quat_w[:, 0]
-        return self.__dict__[name]
 
 
 class RayCastSensor(Sensor[RayCastData]):
@@ -339,17 +321,20 @@ class RayCastSensor(Sensor[RayCastData]):
         self.invalidate_cache()
 
     def _compute_data(self) -> RayCastData:
-        return RayCastData.with_frames(self._frame_mat.clone(), **self._measured())
+        return RayCastData(**self._measured())
 
     def _measured(self) -> dict[str, torch.Tensor]:
-        """Return the fields of the data except the frame orientations."""
+        """Return the fields of the data."""
+        quats = quat_from_matrix(self._frame_mat)
         reach = self._distances.clamp(min=0.0).unsqueeze(-1)
         return {
             "distances": self._distances,
             "normals_w": self._normals,
             "hit_pos_w": torch.addcmul(self._origins, self._directions, reach),
             "pos_w": self._frame_pos[:, 0],
+            "quat_w": quats[:, 0],
             "frame_pos_w": self._frame_pos,
+            "frame_quat_w": quats,
         }
 
     # Drawing.

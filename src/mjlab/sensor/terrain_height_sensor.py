@@ -93,7 +93,7 @@ class TerrainHeightSensor(RayCastSensor):
         if len(self._ground):
             heights = self._zero_below_ground(heights, missed)
         heights = _REDUCE[self.cfg.reduction](heights.unflatten(1, of_frame))
-        return TerrainHeightData.with_frames(self._frame_mat.clone(), **measured, heights=heights)
+        return TerrainHeightData(**measured, heights=heights)
 
     def _zero_below_ground(self, heights: torch.Tensor, missed: torch.Tensor) -> torch.Tensor:
         """Return heights with 0 for rays that missed because they start below the ground."""

@@ -26,7 +26,6 @@ import numpy as np
 import torch
 
 from mjlab.compat import older_names
-from mjlab.utils.errors import check_count, check_positive
 from mjlab.utils.signals import handled_signals
 from mjlab.utils.string import counted
 from mjlab.utils.tracebacks import users_lines
@@ -150,11 +149,7 @@ class BaseViewer(ABC):
             policy: Maps observations to actions.
             frame_rate: Displayed frames per second of wall time.
             verbosity: Log verbosity, a `VerbosityLevel`.
-
-        Raises:
-            ValueError: The frame rate is not positive.
         """
-        check_positive("frame_rate", frame_rate)
         self.env = env
         self.policy = policy
         self.frame_rate = frame_rate
@@ -483,11 +478,7 @@ def run_headless(
         on_step: Called after each step with the number of steps taken.
         reward_unit: Factor from weighted rewards to those that `step` returns
             (`mjlab.rl.evaluation.reward_unit`).
-
-    Raises:
-        ValueError: The number of steps is negative.
     """
-    check_count("num_steps", num_steps, minimum=0)
     reward_sum = torch.zeros((), device=env.device, dtype=torch.float64)
     episodes = torch.zeros((), device=env.device, dtype=torch.int64)
     with torch.no_grad():

@@ -401,7 +401,8 @@ class GroundTable:
         cell = x * self._shape[1] + y
         met = self._covering.take(cell)
         by_ray = normals.reshape(-1, 3)
-        # Most rays start above a geom that covers their cell.
+        # Most rays start above a geom that covers their cell. Without this, a lookup takes twice as
+        # long (Go1 rough).
         distance = self._gaps(met, points, by_ray)
         rays = np.flatnonzero(~(distance >= 0.0))
         distance[rays], met[rays], by_ray[rays] = np.inf, -1, _UP

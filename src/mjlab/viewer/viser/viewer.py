@@ -124,11 +124,8 @@ class ViserPlayViewer(BaseViewer):
         self._scene: MjlabViserScene | None = None
         self._controls: SimulationControls | None = None
         self._term_overlays: ViserTermOverlays | None = None
-        self._camera_overlays: ViserCameraOverlays | None = None
-        self._debug_overlays: ViserDebugOverlays | None = None
-        self._contact_overlays: ViserContactOverlays | None = None
-        self._checkpoint_panel: CheckpointPanel | None = None
         self._clip_panel: ClipPanel | None = None
+        self._checkpoint_panel: CheckpointPanel | None = None
         self._shown_env = 0
         self._next_scene = self._next_panels = 0.0
         # Modify in place only: threads of the server add reasons.
@@ -214,11 +211,9 @@ class ViserPlayViewer(BaseViewer):
             # Clear before drawing: later requests may miss this update and must cause another.
             self._update_reasons.clear()
             env, scene = self.env.unwrapped, self.scene
-            if self._debug_overlays is not None:
-                self._debug_overlays.queue()
+            self._debug_overlays.queue()
             scene.update(env.sim, self._shown_env)
-            if self._camera_overlays is not None and self._camera_overlays.has_cameras:
-                self._camera_overlays.update(env.sim.data, self._shown_env, scene.offset)
+            self._camera_overlays.update(env.sim.data, self._shown_env, scene.offset)
             if self._clip_panel is not None:
                 self._clip_panel.update()
         if self._term_overlays is not None:
@@ -279,8 +274,7 @@ class ViserPlayViewer(BaseViewer):
                 folder.remove()
             with gui.add_folder("Scene"):
                 scene.create_scene_gui(debug_viz_extra_gui=add_debug_vis_switches)
-            if self._camera_overlays is not None:
-                self._camera_overlays.setup_controls()
+            self._camera_overlays.setup_controls()
         with tabs.add_tab("Visualization", icon=viser.Icon.EYE):
             scene.create_overlay_gui()
         if self._term_overlays is not None:
