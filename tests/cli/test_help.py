@@ -137,7 +137,7 @@ def test_a_name_of_several_flags_is_answered_with_them(run):
 
 @pytest.mark.parametrize(
     ("flags", "topic"),
-    [([], None), (["--video"], None), (["-h"], ""), (["--help", "--video"], ""),
+    [([], None), (["--video"], None), (["-h"], ""), (["--help", "--video"], "video"),
      (["--profile", "cpu", "--help", "agent"], "agent"), (["--help=env.sim"], "env.sim"),
      (["--help", "--env.seed"], "env.seed"), (["--help", "--profile", "cpu"], "")],
 )  # fmt: skip

@@ -207,6 +207,14 @@ def test_success_is_by_return_or_by_function():
         counting(), still, success=lambda env: env.episode_length_buf >= 3
     )
     assert by_function.success_rate == 0.25
+    by_name = evaluate_policy(counting(), still, success=f"{__name__}:made_three_steps")
+    assert by_name.success_rate == 0.25
+    with pytest.raises(ValueError, match="expected a return, `survival` or"):
+        evaluate_policy(counting(), still, success="survived")
+
+
+def made_three_steps(env):
+    return env.episode_length_buf >= 3
 
 
 def test_metrics_average_steps_then_episodes():

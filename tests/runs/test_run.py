@@ -125,6 +125,16 @@ def test_a_run_as_registered_keeps_its_profile(tmp_path):
     assert run.cfg().env.decimation == load_env_cfg(TASK).decimation
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "success"),
+    [("success_return", 5.0, 5.0), ("success_is_survival", True, "survival")],
+)
+def test_success_of_earlier_versions_is_kept(tmp_path, name, value, success):
+    make_run(tmp_path, "run", task=TASK, settings={f"agent.evaluation.{name}": value})
+    cfg = Run(tmp_path / "run").cfg()
+    assert (cfg.agent.evaluation.success, cfg.left_out) == (success, {})
+
+
 # State.
 
 

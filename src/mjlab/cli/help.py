@@ -36,7 +36,6 @@ TERM_DICTS = frozenset(
 )  # fmt: skip
 """Fields with terms by name; None removes a term. Observation terms are in `terms` of their group."""
 # Branches whose parts can be named without the branch: `rewards` for `env.rewards`.
-# `seed` is that of the agent, which sets the environment's.
 _SHORTENED = ("", f"{OPTIONS}.", "agent.", "env.")
 
 
@@ -46,8 +45,9 @@ def requested_topic(flags: Sequence[str]) -> str | None:
         name, _, topic = word.partition("=")
         if name in ("-h", "--help"):
             following = "".join(flags[position + 1 : position + 2])
-            # `--help --agent.seed` asks for a flag; in `--help --profile cpu` the profile is one.
-            is_flag = following.startswith("--") and "." in following
+            # `--help --agent.seed` and `--help --num-envs` ask for a flag; `--help --profile cpu` does not.
+            is_last = position + 2 == len(flags)
+            is_flag = following.startswith("--") and (is_last or "." in following)
             if following.startswith("-") and not is_flag:
                 following = ""
             return topic or following.lstrip("-").partition("=")[0]

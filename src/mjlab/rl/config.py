@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
 import math
-import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
@@ -271,9 +271,7 @@ class EvaluationCfg:
     @property
     def criterion(self) -> Callable[[Any], Any] | str | float | None:
         """Success of an episode: `success`, with a function for its name, or else `solved_return`."""
-        if isinstance(self.success, str) and self.success != "survival":
-            return pkgutil.resolve_name(self.success)
-        return self.solved_return if self.success is None else self.success
+        return self.solved_return if self.success is None else resolve_success(self.success)
 
     @property
     def trigger(self) -> float | None:
@@ -282,6 +280,24 @@ class EvaluationCfg:
         if trigger is None and self.solved_return is not None:
             trigger = self.trigger_fraction * self.solved_return
         return None if trigger == -math.inf else trigger
+
+
+def resolve_success(success: Any) -> Any:
+    """Return the success of an episode with the function for a name `module:function`.
+
+    Raises:
+        ValueError: another text than `survival`, or a function that cannot be imported.
+    """
+    if not isinstance(success, str) or success == "survival":
+        return success
+    module, _, name = success.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            "EvaluationCfg success: expected a return, `survival` or `module:function`, got "
+            f"{success!r} ({error})."
+        ) from error
 
 
 @dataclass

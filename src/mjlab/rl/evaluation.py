@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.envs.curriculum_state import config_as_built
+from mjlab.rl.config import resolve_success
 from mjlab.utils.errors import check_positive
 from mjlab.utils.random import evaluation_seed, preserved_rng
 from mjlab.utils.string import suggest
@@ -39,7 +40,8 @@ Policy = Callable[[Any], torch.Tensor]
 PerEnv = Callable[[Any], torch.Tensor]
 """`func(env) -> (num_envs,)`: per-environment value, read at every step."""
 Success = PerEnv | str | float | None
-"""Success of an episode: a function, `survival`, or a minimum return; see `EvaluationCfg.success`."""
+"""Success of an episode: a function or its name, `survival`, or a minimum return; see
+`EvaluationCfg.success`."""
 Progress = Callable[[int, float], None]
 """`func(num_finished, fraction)`: progress of an evaluation."""
 RESULT_FIELDS = ("mean_return", "mean_length", "success_rate", "failure_rate")
@@ -87,7 +89,8 @@ def evaluate_policy(
         max_steps: Number of steps until episodes are truncated; None: the task's episode length,
             after which episodes count as finished.
         success: Success of an episode: a minimum return; `survival`, no termination before the time
-            limit; or `func(env) -> (num_envs,) bool`, read one step before the end. None: not defined.
+            limit; or `func(env) -> (num_envs,) bool`, or its name `module:function`, read one step
+            before the end. None: not defined.
         metrics: Functions by name, `func(env) -> (num_envs,)`, read before every step and averaged
             over the steps of an episode.
         seed: Seed of the evaluation; None: generators are not seeded. With the same seed,
@@ -114,6 +117,7 @@ def evaluate_policy(
         env.seed(seed)
     start = time.perf_counter()
     rounds, levels = [], set()
+    success = resolve_success(success)
     success_func = None if isinstance(success, str | int | float) else success
     unwrapped = env.unwrapped
     terrain = unwrapped.scene.terrain

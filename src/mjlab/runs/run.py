@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -125,7 +125,10 @@ class Run:
     def params(self) -> dict[Literal["env", "agent"], dict[str, Any]]:
         """Resolved configs as plain data (`params/*.yaml`); empty if missing or unreadable."""
         folder = self.folder / "params"
-        return {"env": read_yaml(folder / "env.yaml"), "agent": read_yaml(folder / "agent.yaml")}
+        agent = read_yaml(folder / "agent.yaml")
+        if isinstance(evaluation := agent.get("evaluation"), dict):
+            agent["evaluation"] = _with_success(evaluation)
+        return {"env": read_yaml(folder / "env.yaml"), "agent": agent}
 
     @property
     def task(self) -> str | None:
@@ -277,8 +280,10 @@ class Run:
         Read from `params` if not recorded.
         """
         recorded = self.info.get("settings")
-        if isinstance(recorded, dict) or self.task is None:
-            return recorded or {}
+        if isinstance(recorded, dict):
+            return _with_success(recorded, "agent.evaluation.")
+        if self.task is None:
+            return {}
         env, agent = self._registered("train")
         changes = [
             *differences(env, self.params["env"], "env"),
@@ -401,6 +406,16 @@ class Run:
 def _names(terms: Any) -> dict[str, str]:
     """Return the names of terms that are not switched off, in order, as `other_terms` takes them."""
     return {name: "" for name, cfg in terms.items() if cfg is not None}
+
+
+def _with_success(entries: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return `entries` with `success` for the three fields that it replaced in evaluations."""
+    entries = dict(entries)
+    for name in ("success_func", "success_is_survival", "success_return"):
+        if value := entries.get(prefix + name):
+            del entries[prefix + name]
+            entries.setdefault(f"{prefix}success", "survival" if value is True else value)
+    return entries
 
 
 def _short(value: Any) -> str:
