@@ -168,6 +168,10 @@ def test_environments_take_what_is_reserved(task, engine, num_envs):
 @pytest.mark.parametrize(
     ("learner", "change", "named"),
     [
+        ("ppo", {"actor": {"hidden_dims": (30_000, 30_000)}}, "agent.actor weights"),
+        ("ppo", {"critic": {"hidden_dims": (10**10, 10**10)}}, "agent.critic weights"),
+        ("distillation", {"student": {"hidden_dims": (30_000, 30_000)}}, "agent.student weights"),
+        ("sac", {"actor": {"hidden_dims": (10**20,)}}, "agent.actor weights"),
         ("ppo", {"num_steps_per_env": 10**12}, "num_steps_per_env"),
         ("ppo", {"num_steps_per_env": 10**30}, "num_steps_per_env"),
         ("sac", {"algorithm": {"replay_steps": 10**9}}, "replay_steps"),

@@ -14,7 +14,7 @@ from mjlab.rl.learners import drop_unchanged_additions
 from mjlab.rl.sac_models import SacActorModel
 from mjlab.utils.string import counted
 
-_MODELS = ("actor", "critic", "student", "teacher")
+MODELS = ("actor", "critic", "student", "teacher")
 _PACKAGES = ("mjlab", "rsl_rl")
 _RECURRENT_KEYS = ("rnn_type", "rnn_hidden_dim", "rnn_num_layers")
 
@@ -32,7 +32,7 @@ def prepare_train_cfg(env: Any, cfg: dict[str, Any]) -> None:
     drop_unchanged_additions(cfg)
     check_distribution(cfg)
     observations = env.get_observations()
-    for name in _MODELS:
+    for name in MODELS:
         if not isinstance(model := cfg.get(name), dict):
             continue
         # rsl_rl's constructors accept these keys only if they are used.

@@ -16,6 +16,7 @@ import signal
 import time
 import warnings
 from collections.abc import Generator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +56,7 @@ from mjlab.rl.evaluation import (
 )
 from mjlab.rl.exporter_utils import export_to_onnx, export_with_metadata, get_base_metadata
 from mjlab.rl.networks import (
+    MODELS,
     check_mini_batches,
     deduplicate_parameters,
     prepare_train_cfg,
@@ -115,6 +117,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 networks.
         """
         prepare_train_cfg(env, train_cfg)
+        for model in MODELS:
+            widths = train_cfg.get(model, {}).get("hidden_dims") or ()
+            weights = sum(abs(a * b) for a, b in pairwise((1, *widths)))
+            check_memory(f"agent.{model} weights", weights, 4, device, "smaller hidden_dims")
         # Allocated memory is taken only when it is written to, in the first iteration.
         check_memory(
             "agent num_steps_per_env", train_cfg["num_steps_per_env"], env.get_observations().bytes(),
