@@ -417,10 +417,14 @@ def test_decimation_is_a_count(value):
         ManagerBasedRlEnv(cfg, device="cpu")
 
 
-def test_an_episode_may_last_for_decades():
+@pytest.mark.parametrize("length", [1e9, math.inf])
+def test_an_episode_may_last_for_decades(length):
     cfg = cartpole()
-    cfg.episode_length_s, cfg.decimation = 1e9, 1
+    cfg.episode_length_s, cfg.decimation = length, 1
+    if length == math.inf:
+        cfg.terminations = {}
     env = ManagerBasedRlEnv(cfg, device="cpu")
+    assert "without limit" in str(env)
     env.reset()
     assert not env.step(torch.zeros(NUM_ENVS, 1))[3].any()
     env.close()

@@ -409,11 +409,16 @@ def translate_older(cfg: Any) -> None:
     """Translate an environment config that a package of an older release filled in, in place."""
     groups = [group.terms for group in cfg.observations.values() if group is not None]
     terms = [term for terms in (cfg.rewards, *groups) for term in terms.values()]
+    # The template gives its foot terms sites left empty; packages replace their functions and sensors.
     feet = [
         term
         for term in terms
         if hasattr(getattr(term, "params", {}).get("asset_cfg"), "site_names")
-        and (reads_foot_scan(term) or getattr(term.func, "__name__", "") in _OLDER_PARAMS)
+        and (
+            term.params["asset_cfg"].site_names in ((), [])
+            or reads_foot_scan(term)
+            or getattr(term.func, "__name__", "") in _OLDER_PARAMS
+        )
     ]
     if feet:
         pkgutil.resolve_name("mjlab.compat.older_terms:use_older_foot_terms")(cfg, feet)

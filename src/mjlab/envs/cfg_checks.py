@@ -31,7 +31,9 @@ def report_odd_times(env: ManagerBasedRlEnv) -> None:
             UserWarning,
             stacklevel=3,
         )
-    if limits and env.max_episode_length <= 0:
+    if not limits:
+        return
+    if env.max_episode_length <= 0:
         warnings.warn(
             f"episode_length_s: expected a number > 0 (s), got {env.cfg.episode_length_s!r}; terms "
             f"{limits} end episodes at every step. Set episode_length_s, or remove the terms.",
@@ -44,7 +46,7 @@ def report_odd_times(env: ManagerBasedRlEnv) -> None:
         for name, cfg in env.cfg.events.items()
         if cfg is not None and cfg.mode == "interval" and not cfg.is_global_time
         # Resets resample the timers.
-        if limits and (cfg.interval_range_s or (0.0,))[0] > longest + 0.5 * env.step_dt
+        if (cfg.interval_range_s or (0.0,))[0] > longest + 0.5 * env.step_dt
     }
     if rare:
         warnings.warn(

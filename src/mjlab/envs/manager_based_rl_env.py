@@ -260,9 +260,11 @@ class ManagerBasedRlEnv(Tabular):
     def describe_time(self) -> str:
         """Return timesteps and episode length in words."""
         steps = f"steps of {self.step_dt:.4g} s ({self.cfg.decimation} x {self.physics_dt:.4g} s)"
-        length = f"of {self.max_episode_length_s:g} s ({self.max_episode_length} steps)"
         # Tasks without a time limit set an episode length of years.
-        return f"{steps}, episodes {length if self.max_episode_length_s < 1e6 else 'without limit'}"
+        if self.max_episode_length_s >= 1e6:
+            return f"{steps}, episodes without limit"
+        length = f"{self.max_episode_length_s:g} s ({self.max_episode_length} steps)"
+        return f"{steps}, episodes of {length}"
 
     def tables(self) -> list[Table]:
         """Return the tables of all managers, entities and sensors; empty ones too."""

@@ -21,6 +21,7 @@ from mjlab.utils.noise import NoiseCfg, NoiseModelCfg
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.spaces import Box, Dict, Space, batch_space
 from mjlab.utils.state import (
+    capture_state,
     changes_undone,
     is_stateful,
     mark_stateful,
@@ -306,7 +307,7 @@ class ObservationManager(ManagerBase):
             for name in groups.keys() & self._obs_buffer.keys():
                 now, last = (groups[name].split(obs[name]) for obs in (computed, self._obs_buffer))
                 for key, term in groups[name].terms.items():
-                    if term.stateful_parts():
+                    if any(capture_state(part) for part in term.stateful_parts()):
                         now[key][others] = last[key][others]
         return computed
 

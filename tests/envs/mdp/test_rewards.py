@@ -119,6 +119,8 @@ def test_posture_wants_every_joint_covered(moving: Any) -> None:
         posture(moving, {"hip": 0.5, "knee": 2.0}, joint_names=(".*",))
     with pytest.raises(ValueError, match="elbow"):
         posture(moving, {".*": 0.5, "elbow": 1.0}, joint_names=(".*",))
+    with pytest.raises(ValueError, match="std: "):
+        posture(moving, {".*": 0.5}, joint_names=())
 
 
 # Orientation

@@ -24,7 +24,7 @@ class StandInEnv:
     def __init__(self, num_envs: int = 2, **sensors: Any) -> None:
         self.num_envs = num_envs
         self.device = "cpu"
-        self.step_dt = 0.02
+        self.step_dt, self.common_step_counter = 0.02, 0
         self.extras: dict[str, Any] = {}
         self.data = SimpleNamespace(
             root_link_pos_w=torch.zeros(num_envs, 3),

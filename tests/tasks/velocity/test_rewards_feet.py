@@ -98,14 +98,11 @@ def test_a_landing_costs_the_force_of_the_ground():
 class Swings:
     """The term, with contacts and heights that a test sets step by step."""
 
-    def __init__(self, monkeypatch: Any) -> None:
-        from mjlab.tasks.velocity.mdp import rewards as feet_rewards
-
+    def __init__(self) -> None:
         self.contact = contacts(found=torch.ones(2, 2), landed=torch.zeros(2, 2).bool())
         self.scan = heights((0.0, 0.0), (0.0, 0.0))
         self.env: Any = StandInEnv(feet=self.contact, scan=self.scan)
         self.env.command((1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
-        monkeypatch.setattr(feet_rewards, "check_same_feet", lambda *args: None)
         self.params = {
             "sensor_name": "feet",
             "height_sensor_name": "scan",
@@ -124,8 +121,8 @@ class Swings:
 
 
 @pytest.fixture
-def swings(monkeypatch: Any) -> Swings:
-    return Swings(monkeypatch)
+def swings() -> Swings:
+    return Swings()
 
 
 def test_a_swing_costs_how_far_its_peak_was_from_the_target_when_it_lands(swings):

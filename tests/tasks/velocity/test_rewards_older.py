@@ -157,6 +157,7 @@ def test_empty_sites_stay_if_a_custom_term_takes_them(takes_sites):
     cfg = make_velocity_env_cfg()
     swing = _feet_terms(cfg)[2]
     swing.func = with_sites if takes_sites else without
+    swing.params["height_sensor_name"] = "own_scan"
     compat.translate_older(cfg)
     assert ("asset_cfg" in swing.params) == takes_sites
 

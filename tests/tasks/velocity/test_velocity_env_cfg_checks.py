@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import pytest
 import torch
 from velocity_tasks import GO1_ROUGH
@@ -54,6 +56,22 @@ def test_feet_in_another_order_warn_once(make_env):
     with pytest.warns(UserWarning, match="the same feet") as caught:
         make_env(edit=edit)
     assert len([one for one in caught if "same feet" in str(one.message)]) == 1
+
+
+@pytest.mark.parametrize("name", ["foot_clearance", "foot_slip"])
+@pytest.mark.parametrize("count", [1, 4])
+def test_sites_of_other_feet_warn_in_the_first_step(make_env, name, count):
+    def edit(cfg):
+        sites = cfg.rewards[name].params["asset_cfg"]
+        sites.site_names, sites.preserve_order = sites.site_names[::-1][:count], True
+
+    env = make_env(edit=edit)
+    env.reset()
+    with pytest.warns(UserWarning, match="the same feet"):
+        env.step(torch.zeros(env.num_envs, 12))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.step(torch.zeros(env.num_envs, 12))
 
 
 def test_an_unknown_sensor_of_a_config_is_named_with_those_that_exist():

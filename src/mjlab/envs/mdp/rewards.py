@@ -161,7 +161,8 @@ def values_of_joints(
             starts with `name`.
     """
     # `joint_names` and `joint_ids` have the same order, whatever `preserve_order`.
-    joints = list(asset_cfg.joint_names or env.scene[asset_cfg.name].joint_names)
+    joints = asset_cfg.joint_names
+    joints = list(env.scene[asset_cfg.name].joint_names if joints is None else joints)
     try:
         _, covered, values = resolve_matching_names_values(table, joints)
     except ValueError as error:

@@ -9,7 +9,7 @@ import torch
 
 from mjlab.compat import accepts_older_params, older_names
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.sensor import ContactSensor
+from mjlab.sensor import ContactSensor, RayCastSensor
 
 if TYPE_CHECKING:
     import mujoco
@@ -57,11 +57,14 @@ def check_same_feet(
 ) -> None:
     """Warn unless two sources list the same feet in the same order.
 
-    Sources are contact sensors and height sensors by name, and selections of sites. Two columns are of one
-    foot if they are on the same body, or one is on a descendant of the other's body.
+    Sources are contact sensors and ray sensors by name, and selections of sites; any other source is not
+    checked. Two columns are of one foot if they are on the same body, or one is on a descendant of the
+    other's body.
     """
-    model = env.sim.mj_model
     bodies, others = foot_bodies(env, feet), foot_bodies(env, other)
+    if bodies is None or others is None:
+        return
+    model = env.sim.mj_model
     if len(bodies) == len(others) and all(
         _is_within(model, a, b) or _is_within(model, b, a)
         for a, b in zip(bodies, others, strict=True)
@@ -77,15 +80,17 @@ def check_same_feet(
     )
 
 
-def foot_bodies(env: ManagerBasedRlEnv, feet: str | SceneEntityCfg) -> list[int]:
-    """Return the id of the body of each foot of a contact or height sensor, or of selected sites."""
-    model = env.sim.mj_model
+def foot_bodies(env: ManagerBasedRlEnv, feet: str | SceneEntityCfg) -> list[int] | None:
+    """Return the id of the body of each foot of a sensor or of selected sites; None if unknown."""
     if isinstance(feet, SceneEntityCfg):
         sites = env.scene[feet.name].indexing.site_ids[columns_of(feet, "site", env)]
-        return model.site_bodyid[sites.cpu()].tolist()
+        return env.sim.mj_model.site_bodyid[sites.tolist()].tolist()
     sensor = env.scene[feet]
-    if not isinstance(sensor, ContactSensor):
+    if isinstance(sensor, RayCastSensor):
         return sensor.frame_bodies
+    if not isinstance(sensor, ContactSensor):
+        return None
+    model = env.sim.mj_model
     ids = [model.sensor(f"{feet}_{name}").objid.item() for name in sensor.primary_names]
     return model.geom_bodyid[ids].tolist() if sensor.cfg.primary.mode == "geom" else ids
 

@@ -4,7 +4,8 @@ Derived quantities (link velocities, orientations, contacts) are one physics sub
 one environment step old; see `ManagerBasedRlEnv.step`. Commands are those that the policy observed.
 
 Foot terms combine columns of different sources (contacts, heights, sites), so all sources must list the
-feet in the same order. `feet_swing_height` warns of any other order when it is built.
+feet in the same order. Terms warn of any other order: classes when they are built, functions in the
+first step.
 """
 
 from __future__ import annotations
@@ -304,6 +305,8 @@ def feet_clearance(
         command_threshold: Commanded motion that must be exceeded to enable the cost.
         asset_cfg: Entity, and the sites of the feet in the order of the sensor's frames.
     """
+    if env.common_step_counter == 1:
+        check_same_feet(env, height_sensor_name, asset_cfg)
     error = env.scene[height_sensor_name].data.heights - target_height
     cost = (error.abs() * site_speed(env, asset_cfg)).sum(dim=1)
     return if_commanded(cost, env, command_name, command_threshold)
@@ -380,6 +383,8 @@ def feet_slip(
         command_threshold: Commanded motion that must be exceeded to enable the cost.
         asset_cfg: Entity, and the sites of the feet in the order of the sensor's columns.
     """
+    if env.common_step_counter == 1:
+        check_same_feet(env, sensor_name, asset_cfg)
     in_contact = env.scene[sensor_name].data.found > 0
     speed = site_speed(env, asset_cfg)
     log_metric(env, "slip_velocity_mean", masked_mean(speed, in_contact))
