@@ -111,8 +111,9 @@ def test_the_policy_decides_about_several_secondaries():
     primary = geom("trunk_collision", "robot")
     assert elements(robot(primary, feet))[0][1] == "robot/left_foot"
     assert elements(robot(primary, feet, secondary_policy="any"))[0][1] == ""
-    with pytest.raises(ValueError, match=r"secondary.*\['left_foot', 'right_foot'\]"):
-        robot(primary, feet, secondary_policy="error")
+    for policy in ("error", "last"):
+        with pytest.raises(ValueError, match=r"secondary.*\['left_foot', 'right_foot'\]"):
+            robot(primary, feet, secondary_policy=policy)
     assert elements(robot(primary, geom("left_foot", "robot"), secondary_policy="error"))
 
 
@@ -163,10 +164,14 @@ def test_every_pattern_has_to_match_and_no_name_twice():
     [
         ({"fields": ("found", "forces")}, "fields.*'found', 'force', 'torque'.*'forces'"),
         ({"reduce": "sum"}, "reduce.*'none', 'mindist', 'maxforce', 'netforce'.*'sum'"),
+        (
+            {"primary": ContactMatch("joint", "box")},
+            "primary mode.*'geom', 'body', 'subtree'.*'joint'",
+        ),
     ],
 )
-def test_unknown_fields_and_reductions_list_the_known(fields, message):
-    cfg = ContactSensorCfg(name="feet", primary=geom("box"), **fields)
+def test_unknown_words_list_the_known(fields, message):
+    cfg = ContactSensorCfg(**{"name": "feet", "primary": geom("box"), **fields})
     with pytest.raises(ValueError, match=f"Contact sensor 'feet'.*{message}"):
         compose(cfg, box=BOX)
 

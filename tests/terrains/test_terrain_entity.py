@@ -81,6 +81,8 @@ def test_configs_that_make_no_sense_are_refused():
         terrain(env_spacing=None)
     with pytest.raises(ValueError, match="terrain_generator: .*'generator', got None"):
         terrain(terrain_type="generator")
+    with pytest.raises(ValueError, match="terrain_type: .*'plane', 'generator'.*'hills'"):
+        terrain(terrain_type="hills")
     with pytest.raises(TypeError, match=r"TerrainEntity\(cfg, device\)"):
         TerrainEntityCfg().build()
 

@@ -259,7 +259,7 @@ class ContactSensor(Sensor[ContactData]):
         if cfg.secondary is None or cfg.secondary_policy == "any":
             return None
         found = _resolve_match(f"{owner}: secondary", cfg.secondary, scene_spec, entities)
-        if len(found) > 1 and cfg.secondary_policy == "error":
+        if len(found) > 1 and cfg.secondary_policy != "first":
             raise ValueError(
                 f"{owner}: secondary pattern {cfg.secondary.pattern!r}: expected one match, got "
                 f"{[one.name for one in found]}; narrow the pattern, or set secondary_policy to "
@@ -540,6 +540,7 @@ def _resolve_match(
     """
     if not match.patterns or "" in match.patterns:
         raise ValueError(f"{owner} pattern: expected at least one name, got {match.pattern!r}.")
+    check_one_of(f"{owner} mode", match.mode, get_args(MatchMode))
     if not match.entity:
         return _resolve_literal(owner, match, scene_spec)
     if match.entity not in entities:

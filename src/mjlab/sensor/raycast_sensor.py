@@ -24,6 +24,7 @@ from mjlab.sensor.ray_patterns import (
     RingPatternCfg,
 )
 from mjlab.sensor.sensor import Sensor, SensorCfg
+from mjlab.sim.engine import NUM_GEOM_GROUPS
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.lab_api.math import quat_from_matrix
 from mjlab.utils.memory import check_memory
@@ -149,12 +150,14 @@ class RayCastSensor(Sensor[RayCastData]):
         """Check the config.
 
         Raises:
-            ValueError: unknown alignment.
+            ValueError: unknown alignment, or a geom group that MuJoCo lacks.
         """
         super().__init__()
         self.cfg = cfg
-        owner = f"Ray sensor {cfg.name!r} ray_alignment"
-        check_one_of(owner, cfg.ray_alignment, get_args(RayAlignment))
+        owner = f"Ray sensor {cfg.name!r}"
+        check_one_of(f"{owner} ray_alignment", cfg.ray_alignment, get_args(RayAlignment))
+        for group in cfg.include_geom_groups or ():
+            check_one_of(f"{owner} include_geom_groups", group, range(NUM_GEOM_GROUPS))
         frame = cfg.frame
         self._frame_refs = (frame,) if isinstance(frame, ObjRef) else tuple(frame)
         self._num_rays_per_frame = 0

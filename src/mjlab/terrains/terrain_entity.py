@@ -16,7 +16,7 @@ import torch
 from mjlab.entity import Entity, EntityCfg
 from mjlab.terrains.terrain_generator import TerrainGenerator, TerrainGeneratorCfg
 from mjlab.utils import spec_config as spec_cfg
-from mjlab.utils.errors import WrongTypeError
+from mjlab.utils.errors import WrongTypeError, check_one_of
 
 # Debug sites.
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
@@ -120,6 +120,7 @@ class TerrainEntity(Entity):
         super().__init__(cfg)
 
     def _make_spec(self) -> mujoco.MjSpec:
+        check_one_of("TerrainEntityCfg.terrain_type", self.cfg.terrain_type, ("plane", "generator"))
         spec = mujoco.MjSpec()
         if self.cfg.terrain_type == "plane":
             body = spec.worldbody.add_body(name="terrain")
