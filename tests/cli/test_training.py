@@ -64,3 +64,13 @@ def test_evaluations_have_the_changes_of_a_program():
     assert evaluated.rewards["mine"].weight == 1.0
     assert evaluated.scene.entities["robot"].init_state.pos == (0.0, 0.0, 2.0)
     assert "alive" not in evaluated.rewards
+
+
+def test_another_time_between_actions_is_reported(capsys):
+    flags = ["--profile", "cpu", "--env.decimation", "2"]
+    cfg = parse_train_flags(G1, flags, "train")
+    evaluation_env_cfg(G1, cfg, typed_settings(cfg.env, "env", flags))
+    printed = "".join(capsys.readouterr())
+    assert "every 0.01 s in evaluations, and every 0.01333 s in training" in " ".join(
+        printed.split()
+    )

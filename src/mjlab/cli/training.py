@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from mjlab.rl.learners import learner_of, train_dict
 from mjlab.runs.settings import Settings, apply_settings, with_changes
 from mjlab.tasks.registry import load_env_cfg, load_runner_cls, task_source
 from mjlab.utils.config_fields import check_fields_exist
+from mjlab.utils.logging import print_notice
 from mjlab.utils.processes import ProcessRank, cores_per_process
 from mjlab.utils.random import seed_rng
 from mjlab.utils.torch import prepare_torch
@@ -52,11 +54,22 @@ def evaluation_env_cfg(task: str, cfg: TrainConfig, settings: Settings) -> Manag
     """Return the environment config of evaluations during training.
 
     Config of the task and profile for evaluations, with the changes of the training config `cfg.env`
-    and the `settings` of the run: a typed value counts even if it is that of the profile.
+    and the `settings` of the run: a typed value counts even if it is that of the profile. Prints a
+    notice if evaluations have another time between actions than training.
     """
-    evaluated = load_env_cfg(task, profile=cfg.profile, evaluate=True)
-    changed = with_changes(evaluated, cfg.env, load_env_cfg(task, profile=cfg.profile))
-    return apply_settings(changed, settings, "env")[0]
+    registered = load_env_cfg(task, profile=cfg.profile, evaluate=True)
+    changed = with_changes(registered, cfg.env, load_env_cfg(task, profile=cfg.profile))
+    cfg_of_evaluations = apply_settings(changed, settings, "env")[0]
+    trained, evaluated = (
+        one.decimation * one.sim.mujoco.timestep for one in (cfg.env, cfg_of_evaluations)
+    )
+    if not math.isclose(trained, evaluated):
+        # A profile may have changed the one that was not typed.
+        print_notice(
+            f"The policy acts every {evaluated:.4g} s in evaluations, and every {trained:.4g} s in training; "
+            "to match, set both --env.decimation and --env.sim.mujoco.timestep."
+        )
+    return cfg_of_evaluations
 
 
 def training_runner(
