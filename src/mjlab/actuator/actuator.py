@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
@@ -253,6 +253,8 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         self._ctrl_ids = torch.tensor(own_ids, dtype=torch.int64, device=device)
         self._resets_delay, self._delay_buffer = True, None
         if self.has_delay:
+            # An `ActuatorGroup` replaces it. Created here all the same, because creation draws lags,
+            # and all later random numbers of a seed follow.
             self._delay_buffer = self.make_delay_buffer(data.nworld, device)
 
     def make_delay_buffer(self, num_envs: int, device: str) -> DelayBuffer:
@@ -269,7 +271,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
         )
 
     def share_delay(self, line: DelayBuffer, resets: bool) -> None:
-        """Use a delay line that other actuators use too. Exactly one of them `resets` it."""
+        """Use the delay line of a group, which advances it. Exactly one actuator `resets` a line."""
         self._delay_buffer, self._resets_delay = line, resets
 
     # Control.
@@ -281,7 +283,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     def apply_delay(self, cmd: ActuatorCmd) -> ActuatorCmd:
         """Append the command to the delay buffer and return the delayed command. Feedback is unchanged.
 
-        Not for actuators that share a delay line: `Entity.write_data_to_sim` advances it.
+        Only for actuators outside an `ActuatorGroup`: a group advances the delays of its actuators.
         """
         return self._delayed(cmd, None)
 
@@ -337,8 +339,7 @@ class Actuator(ABC, Generic[ActuatorCfgT]):
     def _delayed(self, cmd: ActuatorCmd, env_ids: EnvIds) -> ActuatorCmd:
         if self._delay_buffer is None:
             return cmd
-        targets = (cmd.position_target, cmd.velocity_target, cmd.effort_target)
-        return ActuatorCmd(*delay_rows(self._delay_buffer, targets, env_ids), cmd.pos, cmd.vel)
+        return delay_together(self._delay_buffer, [cmd], env_ids)[0]
 
     def _initialized(self, value: torch.Tensor | None) -> torch.Tensor:
         if value is None:
@@ -511,29 +512,33 @@ def delay_rows(
     return buffer.peek().split(widths, dim=1)
 
 
-# Actuators that share a delay line.
+def delay_together(
+    buffer: DelayBuffer, commands: Sequence[ActuatorCmd], env_ids: EnvIds
+) -> list[ActuatorCmd]:
+    """Return commands delayed by one buffer, with feedback unchanged; `env_ids` as in `delay_rows`."""
+    targets = [t for c in commands for t in (c.position_target, c.velocity_target, c.effort_target)]
+    late = delay_rows(buffer, tuple(targets), env_ids)
+    return [
+        ActuatorCmd(*late[3 * k : 3 * k + 3], cmd.pos, cmd.vel) for k, cmd in enumerate(commands)
+    ]
+
+
+# Groups of actuators.
 
 
 @dataclass
-class SharedDelay:
-    """Actuators delayed by one line, hence with one lag per environment."""
+class DelayedWriter:
+    """Writer of the controls of actuators with one delay line, hence one lag per environment."""
 
     actuators: list[Actuator]
     line: DelayBuffer
-    has_delay = True
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
-        """Write the controls of all actuators; see `Actuator.apply_controls`."""
+        """Advance the line and write the controls; see `Actuator.apply_controls`."""
         commands = [actuator.get_command(data) for actuator in self.actuators]
-        targets = (
-            target
-            for cmd in commands
-            for target in (cmd.position_target, cmd.velocity_target, cmd.effort_target)
-        )
-        delayed = iter(delay_rows(self.line, tuple(targets), env_ids))
-        for actuator, cmd in zip(self.actuators, commands, strict=True):
-            late = ActuatorCmd(next(delayed), next(delayed), next(delayed), cmd.pos, cmd.vel)
-            actuator.write_controls(data, late, env_ids)
+        delayed = delay_together(self.line, commands, env_ids)
+        for actuator, cmd in zip(self.actuators, delayed, strict=True):
+            actuator.write_controls(data, cmd, env_ids)
 
 
 @dataclass
@@ -548,8 +553,8 @@ class ActuatorGroup:
     """Objects that write controls by `apply_controls`, in order. Empty before `initialize`."""
 
     def initialize(self, num_envs: int, device: str) -> None:
-        """Create the delay lines. The actuators must be initialized."""
-        self.writers = [actuator for actuator in self._actuators if not actuator.has_delay]
+        """Create the writers and delay lines. The actuators must be initialized."""
+        self.writers = self._writers_without_delay(device)
         members: dict[Any, list[Actuator]] = {}
         for actuator in self._actuators:
             if actuator.has_delay:
@@ -558,7 +563,7 @@ class ActuatorGroup:
             line = sharing[0].make_delay_buffer(num_envs, device)
             for k, actuator in enumerate(sharing):
                 actuator.share_delay(line, resets=k == 0)
-            self.writers.append(SharedDelay(sharing, line) if len(sharing) > 1 else sharing[0])
+            self.writers.append(DelayedWriter(sharing, line))
 
     def apply_controls(self, data: EntityData, env_ids: EnvIds = None) -> None:
         """Write the controls of all actuators in the group.
@@ -567,6 +572,10 @@ class ActuatorGroup:
         """
         for writer in self.writers:
             writer.apply_controls(data, env_ids)
+
+    def _writers_without_delay(self, device: str) -> list[Any]:
+        """Return the writers of the actuators without delay."""
+        return [actuator for actuator in self._actuators if not actuator.has_delay]
 
     def _delay_settings(self, actuator: Actuator) -> tuple[Any, ...]:
         """Return the settings that must agree for actuators to share a delay line."""

@@ -54,10 +54,8 @@ class BuiltinActuatorGroup(ActuatorGroup):
         others = tuple(actuator for actuator in actuators if actuator not in members)
         return BuiltinActuatorGroup(members), others
 
-    def initialize(self, num_envs: int, device: str) -> None:
-        """Create the delay lines, and plan the copies. The actuators must be initialized."""
-        super().initialize(num_envs, device)
-        copies = [
+    def _writers_without_delay(self, device: str) -> list[Any]:
+        return [
             _Copy(
                 str(target_field(actuator.transmission_type, command)),
                 as_columns(actuator.target_ids.tolist(), device),
@@ -71,7 +69,6 @@ class BuiltinActuatorGroup(ActuatorGroup):
                 strict=True,
             )
         ]
-        self.writers = [*copies, *(writer for writer in self.writers if writer.has_delay)]
 
     def _delay_settings(self, actuator: Any) -> tuple[Any, ...]:
         own = None if actuator.shares_delay else id(actuator)
