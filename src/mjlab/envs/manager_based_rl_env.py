@@ -363,7 +363,7 @@ class ManagerBasedRlEnv(Tabular):
         self._forward(ids, moved)
         self.command_manager.compute(dt=0.0, env_ids=ids)
         # Commands update what they move.
-        self.scene.take_moved_envs()
+        self.scene.forget_moved_envs()
         self.sim.sense()
         self.obs_buf = self.observation_manager.compute(update_history=True, env_ids=ids)
         self.recorder_manager.record_post_reset(ids)
@@ -485,8 +485,9 @@ class ManagerBasedRlEnv(Tabular):
         self.reset_buf = manager.compute()
         self.reset_terminated = manager.terminated
         self.reset_time_outs = manager.time_outs
-        self.reset_terminated |= self.diverged
-        self.reset_buf |= self.diverged
+        # In place: the manager's `terminated` and `dones` are these tensors.
+        self.reset_terminated.logical_or_(self.diverged)
+        self.reset_buf.logical_or_(self.diverged)
         self._nan_resets += self.diverged
         self.extras["log"]["Simulation/nan_resets"] = self.diverged.sum()
         self.extras["log"]["Simulation/nan_terminations"] = manager.nonfinite.count
@@ -494,7 +495,7 @@ class ManagerBasedRlEnv(Tabular):
     def _compute_rewards(self) -> None:
         manager = self.reward_manager
         self.reward_buf = manager.compute(dt=self.step_dt)
-        # Covers rewards added by subclasses of the manager.
+        # The manager zeroes its terms; subclasses of it may add rewards.
         self.reward_buf.masked_fill_(self.diverged, 0.0)
         self.extras["log"]["Simulation/nan_rewards"] = manager.nonfinite.count
 
@@ -571,7 +572,7 @@ class ManagerBasedRlEnv(Tabular):
             dt[reset_ids] = 0.0
         self.command_manager.compute(dt=dt)
         # Moves by resets are up to date after `_forward`; commands update their own moves.
-        self.scene.take_moved_envs()
+        self.scene.forget_moved_envs()
 
     def _record(self, reset_ids: torch.Tensor) -> None:
         if len(reset_ids) > 0:

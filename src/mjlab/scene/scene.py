@@ -407,16 +407,22 @@ class Scene(Tabular):
             entity.write_data_to_sim(env_ids)
 
     def take_moved_envs(self) -> torch.Tensor | None:
-        """Return environments with an entity placed since the last substep, (N,) bool.
+        """Return environments with an entity placed since the last substep, (N,) bool; forget them.
 
-        Clears them. None if no entity was placed: see `EntityData.moved_envs`.
+        None if no entity was placed: see `EntityData.moved_envs`.
         """
         moved = None
         for entity in self._entities.values():
-            envs, entity.data.moved_envs = entity.data.moved_envs, None
+            envs = entity.data.moved_envs
             if envs is not None:
                 moved = envs if moved is None else moved | envs
+        self.forget_moved_envs()
         return moved
+
+    def forget_moved_envs(self) -> None:
+        """Mark no environment as moved: all are up to date."""
+        for entity in self._entities.values():
+            entity.data.moved_envs = None
 
     def invalidate_sensor_caches(self, stage: Stage = "acc") -> None:
         """Invalidate cached data of sensors that a forward pass up to `stage` has changed."""
