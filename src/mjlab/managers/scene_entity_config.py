@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 
@@ -100,8 +100,9 @@ class SceneEntityCfg:
     preserve_order: bool = False
     """Order the selection by pattern instead of the entity's natural order."""
 
-    # Kinds with elements that a resolved selection selects, or that follow from these. No field.
-    _kinds = tuple[str, ...]()
+    # Kinds with elements that a resolved selection selects, or that follow from these. Without an
+    # annotation, because an annotation would make it a field.
+    _kinds = cast("tuple[str, ...]", ())
 
     def __str__(self) -> str:
         """Return the entity and its selected elements: `robot`, `robot joint hip`, `robot 12 joints`."""

@@ -227,7 +227,7 @@ class FieldRow:
     recompute: RecomputeLevel = RecomputeLevel.none
     """Constants that depend on the field."""
     rotation: bool = False
-    """Treat the field as a quaternion, perturbed by roll, pitch and yaw."""
+    """Label of functions by `rotation_term`, for tables of functions."""
     unit: bool = False
     """Treat the field as a direction of length 1. Untargeted axes start from their defaults,
     because their current values depend on the previous samples."""
