@@ -155,9 +155,12 @@ def test_a_running_run_is_named_and_not_restarted(run, first, train_more):
     write_info(first, ended=None)
     with create_locked(first / RUNNING_FILE):
         argv = (TASK, "--device", "cpu", "--log-root", str(first.parents[1]))
-        outcome = run("train", *argv, "--agent.resume", "auto")
-        assert outcome.status == 1
-        assert f"{first} is still running" in outcome.message
+        # Before its first checkpoint as well.
+        for checkpoint in (".*", "none"):
+            flags = ("--agent.resume", "auto", "--agent.load-checkpoint", checkpoint)
+            outcome = run("train", *argv, *flags)
+            assert outcome.status == 1
+            assert f"{first} is still running" in outcome.message
         _, outcome = train_more("--agent.resume", "True")
         assert outcome.err.count("is still running") == 1
 

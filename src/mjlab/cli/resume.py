@@ -14,7 +14,7 @@ from mjlab.runs.policy import has_foreign_runner
 from mjlab.runs.settings import Settings, apply_settings
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import get_checkpoint_path, get_wandb_checkpoint_path
+from mjlab.utils.os import get_wandb_checkpoint_path, matching_names, newest_match
 from mjlab.utils.random import draw_seed
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Checkpoint | None:
         UserError: the matching runs are of other tasks or learners; or the run to resume is still
             running, and resume is `auto`; or a pattern is not a regular expression.
         ValueError: run or checkpoint not found, and resume is not `auto`; the message lists the
-            available ones.
+            available runs.
     """
     if not cfg.agent.resume:
         return None
@@ -50,24 +50,21 @@ def checkpoint_to_resume(task: str, cfg: TrainConfig) -> Checkpoint | None:
             raise UserError(
                 f"--agent.load-{flag}: expected a regular expression, got {pattern!r}: {error}."
             ) from error
-    runs = _runs_to_resume(task, cfg)
-    for run in runs:
-        try:
-            folder = re.escape(run.folder.name)
-            path = get_checkpoint_path(experiment, folder, agent.load_checkpoint)
-        except ValueError:
-            # No checkpoint of this name.
-            continue
-        if run.state == "running" and agent.resume == "auto":
+    for run in _runs_to_resume(task, cfg):
+        # Also before its first checkpoint.
+        if agent.resume == "auto" and run.state == "running":
             raise UserError(
                 f"{run.folder} is still running; stop it, or name this run by --agent.run-name."
             )
-        return Checkpoint(path)
+        if (path := newest_match(run.folder, agent.load_checkpoint)) is not None:
+            return Checkpoint(path)
     if agent.resume == "auto":
         return None
-    own = "|".join(re.escape(run.folder.name) for run in runs)
-    # Raises an error that lists the runs and checkpoints.
-    return Checkpoint(get_checkpoint_path(experiment, own or agent.load_run, agent.load_checkpoint))
+    available = [run.folder.name for run in runs_in(experiment, task, cfg.learner)]
+    raise ValueError(
+        f"--agent.resume: expected a run matching {agent.load_run!r} with a checkpoint matching "
+        f"{agent.load_checkpoint!r} in {str(experiment)!r}, got the runs {available}; train the task first."
+    )
 
 
 def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Run]:
@@ -79,10 +76,9 @@ def _runs_to_resume(task: str, cfg: TrainConfig) -> list[Run]:
     experiment, pattern, learner = cfg.experiment_folder, cfg.agent.load_run, cfg.learner
     # Jobs that run side by side are told apart by their names.
     run_name = cfg.agent.run_name if cfg.agent.resume == "auto" else ""
-    # Matching rule of `get_checkpoint_path`.
     runs = runs_in(experiment, run_name=run_name or None)
-    matching = [run for run in runs if re.fullmatch(pattern, run.folder.name)]
-    matching = matching or [run for run in runs if re.match(pattern, run.folder.name)]
+    names = matching_names([run.folder.name for run in runs], pattern)
+    matching = [run for run in runs if run.folder.name in names]
     others = [run for run in matching if not run.is_of(task, learner)]
     if others and len(others) == len(matching) and cfg.agent.resume != "auto":
         listed = [

@@ -172,21 +172,32 @@ def get_checkpoint_path(
         raise ValueError(f"Log folder {str(log_path)!r} not found; train the task first.")
     folders = [p for p in log_path.iterdir() if p.is_dir() and p.name != WANDB_CACHE]
     folders.sort(key=lambda p: p.name if sort_alpha else (p.stat().st_mtime_ns, p.name))
-    runs = [p for p in folders if re.fullmatch(run_dir, p.name)]
-    runs = runs or [p for p in folders if re.match(run_dir, p.name)]
+    names = matching_names([p.name for p in folders], run_dir)
+    runs = [p for p in folders if p.name in names]
     if not runs:
         raise ValueError(
             f"No run in {str(log_path)!r} matches {run_dir!r}. "
             f"Available: {[p.name for p in folders]}."
         )
     for run in reversed(runs):
-        files = [p for p in files_in(run, "*") if re.fullmatch(checkpoint, p.name)]
-        if files:
-            return max(files, key=_checkpoint_age)
+        if (path := newest_match(run, checkpoint)) is not None:
+            return path
     raise ValueError(
         f"No checkpoint matching {checkpoint!r} in the runs {[p.name for p in runs]} of "
         f"{str(log_path)!r}."
     )
+
+
+def matching_names(names: list[str], pattern: str) -> list[str]:
+    """Return the names that match a regular expression, or else those that match at the start."""
+    full = [name for name in names if re.fullmatch(pattern, name)]
+    return full or [name for name in names if re.match(pattern, name)]
+
+
+def newest_match(run: Path, checkpoint: str) -> Path | None:
+    """Return the newest file in a run folder whose name matches a regular expression, if any."""
+    files = [path for path in files_in(run, "*") if re.fullmatch(checkpoint, path.name)]
+    return max(files, key=_checkpoint_age, default=None)
 
 
 def _checkpoint_age(path: Path) -> tuple[bool, int, str]:
