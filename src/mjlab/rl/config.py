@@ -281,6 +281,14 @@ class EvaluationCfg:
             trigger = self.trigger_fraction * self.solved_return
         return None if trigger == -math.inf else trigger
 
+    def earliest_after(self, last: int) -> int:
+        """Return the number of finished iterations from which an evaluation may follow that after `last`."""
+        return max(last + self.min_interval, self.first_iteration)
+
+    def is_triggered(self, mean_step_reward: float, episode_steps: float) -> bool:
+        """Return True if an episode of the training data's mean reward would reach `trigger`."""
+        return self.trigger is None or mean_step_reward * episode_steps >= self.trigger
+
 
 def resolve_success(success: Any) -> Any:
     """Return the success of an episode with the function for a name `module:function`.

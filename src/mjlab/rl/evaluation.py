@@ -363,13 +363,11 @@ class SolvedCheck:
             mean_step_reward: Mean weighted reward per step of the last iteration, before scaling by
                 the step's duration.
         """
-        cfg, trigger = self.cfg, self.cfg.trigger
-        is_wanted = bool(self._bounds) or cfg.trigger_return is not None
-        if not is_wanted or iteration - self.last_iteration < cfg.min_interval:
+        if not self._bounds and self.cfg.trigger_return is None:
             return False
-        if iteration < cfg.first_iteration:
-            return False
-        return trigger is None or mean_step_reward * int(self._env.max_episode_length) >= trigger
+        return iteration >= self.cfg.earliest_after(self.last_iteration) and self.cfg.is_triggered(
+            mean_step_reward, int(self._env.max_episode_length)
+        )
 
     def is_solved_by(self, result: EvaluationResult) -> bool:
         """Return True if `result` meets all conditions of the config."""
@@ -410,6 +408,7 @@ class SolvedCheck:
     def _score(self, env: Any, seed: int, is_stopped: Callable[[], bool]) -> EvaluationResult:
         training: Any = self._env.unwrapped
         if hasattr(training, "curriculum_state"):
+            # The command `evaluate` names parts that do not fit.
             load_curricula(env, training.curriculum_state())
         elif hasattr(training, "common_step_counter"):
             env.unwrapped.common_step_counter = training.common_step_counter

@@ -173,20 +173,16 @@ class TrainingProgress(TrainingObserver):
         """Return when the policy is evaluated next, None if nothing solves the task."""
         if not self._bounds or self.stats is None:
             return None
-        cfg = self._cfg.evaluation
+        cfg, stats, steps = self._cfg.evaluation, self.stats, self._cfg.episode_steps or 0.0
         last = self._evaluations[-1][0] if self._evaluations else 0
-        after = max(last + cfg.min_interval, cfg.first_iteration)
-        trigger, stats = cfg.trigger, self.stats
-        # Evaluations are triggered by the return at full length, without failures.
-        at_full_length = stats.mean_step_reward * (self._cfg.episode_steps or 0.0)
-        if trigger is None or at_full_length >= trigger:
-            return f"at iteration {max(after, self.iteration + 1)}"
-        length = stats.exploring_length
-        if length is None or length == self._cfg.episode_steps:
-            return f"from exploring return {trigger:,.0f} on"
-        return (
-            f"from exploring return {trigger:,.0f} on, at full length ({at_full_length:,.0f} now)"
-        )
+        if cfg.is_triggered(stats.mean_step_reward, steps):
+            return f"at iteration {max(cfg.earliest_after(last), self.iteration + 1)}"
+        start = f"from exploring return {cfg.trigger:,.0f} on"
+        if stats.exploring_length in (None, steps):
+            return start
+        # Episodes that fail are shorter.
+        now = stats.mean_step_reward * steps
+        return f"{start}, at full length ({now:,.0f} now)"
 
     # Text.
 
