@@ -157,7 +157,7 @@ def test_actions_that_are_not_finite_are_logged_once(env, caplog, bad):
     for _ in range(2):
         manager.process_action(action)
     assert torch.equal(manager.action.nan_to_num(9.0), action.nan_to_num(9.0))
-    assert manager.nonfinite.count == 1
+    assert manager.bad_values.count == 1
     assert [record.getMessage().count("1 of 4 env") for record in caplog.records] == [1]
 
 
@@ -165,7 +165,7 @@ def test_large_finite_actions_are_accepted(env, caplog):
     # The sum overflows; the check must not report finite values as infinite.
     manager = make(env, 2)
     manager.process_action(torch.full((4, 2), 3e38))
-    assert manager.nonfinite.count == 0
+    assert manager.bad_values.count == 0
     assert not caplog.records
 
 

@@ -490,14 +490,14 @@ class ManagerBasedRlEnv(Tabular):
         self.reset_buf.logical_or_(self.diverged)
         self._nan_resets += self.diverged
         self.extras["log"]["Simulation/nan_resets"] = self.diverged.sum()
-        self.extras["log"]["Simulation/nan_terminations"] = manager.nonfinite.count
+        self.extras["log"]["Simulation/nan_terminations"] = manager.bad_values.count
 
     def _compute_rewards(self) -> None:
         manager = self.reward_manager
         self.reward_buf = manager.compute(dt=self.step_dt)
         # The manager zeroes its terms; subclasses of it may add rewards.
         self.reward_buf.masked_fill_(self.diverged, 0.0)
-        self.extras["log"]["Simulation/nan_rewards"] = manager.nonfinite.count
+        self.extras["log"]["Simulation/nan_rewards"] = manager.bad_values.count
 
     def _reset_ended(self) -> torch.Tensor:
         """Reset the environments that are done, with `auto_reset`; return their ids."""

@@ -12,7 +12,7 @@ import torch
 
 from mjlab.actuator.actuator import is_constant_within_step
 from mjlab.managers.manager_base import BuiltTermsManager, ManagerTermBase
-from mjlab.managers.nonfinite import NonFiniteWatch
+from mjlab.managers.nonfinite import BadValueWatch
 from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import as_index
 from mjlab.utils.spaces import Box, Space, batch_space
@@ -79,10 +79,10 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
     """Splits the action among its terms and stores the last three actions.
 
     Terms may be objects of any class with the methods of `ActionTerm`. The config is kept by
-    reference. `nonfinite` counts NaN and infinite actions.
+    reference. `bad_values` counts NaN and infinite actions.
     """
 
-    _transient = {"_action", "_prev_action", "_prev_prev_action", "_action_parts", "nonfinite"}
+    _transient = {"_action", "_prev_action", "_prev_prev_action", "_action_parts", "bad_values"}
     _title = "actions"
     _cfg_type = ActionTermCfg
 
@@ -93,7 +93,7 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         self._history = torch.zeros(size, dtype=torch.float32, device=self.device)
         self._action, self._prev_action, self._prev_prev_action = self._history
         self._action_parts = self._action.split(self.action_term_dim, dim=1)
-        self.nonfinite = NonFiniteWatch(["Action"], "NaN or infinite", "reaches the physics", env)
+        self.bad_values = BadValueWatch(["Action"], "NaN or infinite", "reaches the physics", env)
 
     def tables(self) -> list[Table]:
         """Return the table of the active terms; `targets` are the driven joints, tendons or sites."""
@@ -176,7 +176,7 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
         self._action.copy_(action)
         # x - x is NaN unless x is finite; a sum of large values may overflow.
         nans = (self._action - self._action).sum(dim=1).unsqueeze(0)
-        self.nonfinite.check(nans, self._env.common_step_counter + 1)
+        self.bad_values.check(nans, self._env.common_step_counter + 1)
         for term, part in zip(self._terms.values(), self._action_parts, strict=True):
             term.process_actions(part)
 

@@ -1,4 +1,4 @@
-"""NaN and infinite term values: counted, logged once per term, left out of means."""
+"""Bad term values, such as NaN: counted, logged once per term, left out of means."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class NonFiniteWatch:
-    """Counts NaN and infinite term values without synchronizing with the GPU.
+class BadValueWatch:
+    """Counts bad term values, such as NaN, without synchronizing with the GPU.
 
     Args:
         labels: Name of each term in messages.
@@ -45,7 +45,7 @@ class NonFiniteWatch:
         self._named: set[int] = set()
 
     def check(self, values: torch.Tensor, step: int) -> torch.Tensor | None:
-        """Return a mask of NaN and infinite values, (terms, N), of environment step `step`.
+        """Record NaN and infinite values, (terms, N), and return their mask.
 
         On a CPU, None if all values are finite.
         """
@@ -55,7 +55,13 @@ class NonFiniteWatch:
             self._streaks = torch.zeros_like(self._streaks)
             self.count = self._none
             return None
-        bad, diverged = ~torch.isfinite(values), self._env.diverged
+        bad = ~torch.isfinite(values)
+        self.record(bad, step)
+        return bad
+
+    def record(self, bad: torch.Tensor, step: int) -> None:
+        """Count the bad values of environment step `step`, given as a mask (terms, N)."""
+        diverged = self._env.diverged
         counts = (bad & ~diverged).sum(dim=1)
         found = counts > 0
         everywhere = found & (bad | diverged).all(dim=1)
@@ -66,7 +72,6 @@ class NonFiniteWatch:
         self.count = counts.sum()
         if self._on_cpu:
             self.report()
-        return bad
 
     def report(self) -> None:
         """Log each term with a bad value, once per term."""

@@ -11,7 +11,7 @@ import torch
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.debug_vis import TermFunctionSwitches
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
-from mjlab.managers.nonfinite import NonFiniteWatch
+from mjlab.managers.nonfinite import BadValueWatch
 from mjlab.utils.indexing import as_index, is_empty
 from mjlab.utils.screen import shown
 
@@ -41,7 +41,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     _title = "rewards"
     _shown = {"weight": "weight"}
     # Views of `_rates`, settings, and a name that state of earlier releases uses.
-    _transient = {"_step_reward", "_rows", "_scale_by_dt", "nonfinite", "_episode_sums"}
+    _transient = {"_step_reward", "_rows", "_scale_by_dt", "bad_values", "_episode_sums"}
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
         self._reward_buf = torch.zeros(self.num_envs, dtype=torch.float32, device=self.device)
         self._rows = list(self._rates)
         labels = [self._label(name) for name in self._term_names]
-        self.nonfinite = NonFiniteWatch(labels, "NaN or infinite", "counts as 0", env)
+        self.bad_values = BadValueWatch(labels, "NaN or infinite", "counts as 0", env)
         # Weighted rates of the last step, not multiplied by dt, (num_envs, terms).
         self._step_reward = self._rates.t()
 
@@ -76,7 +76,7 @@ class RewardManager(TermFunctionSwitches, TermListManager):
                 continue
             torch.mul(self._evaluate(name, cfg), cfg.weight, out=row)
         self._rates.masked_fill_(self._env.diverged, 0.0)
-        bad = self.nonfinite.check(self._rates, self._env.common_step_counter)
+        bad = self.bad_values.check(self._rates, self._env.common_step_counter)
         if bad is not None:
             self._rates.masked_fill_(bad, 0.0)
         scale = dt if self._scale_by_dt else 1.0

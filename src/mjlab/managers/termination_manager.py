@@ -11,7 +11,7 @@ import torch
 
 from mjlab.compat import offers_older_attributes
 from mjlab.managers.manager_base import ManagerTermBaseCfg, TermListManager
-from mjlab.managers.nonfinite import NonFiniteWatch
+from mjlab.managers.nonfinite import BadValueWatch
 from mjlab.utils.errors import UnknownNameError, check_exists
 from mjlab.utils.indexing import as_index, is_empty
 
@@ -36,7 +36,7 @@ class TerminationManager(TermListManager):
     _cfg_type = TerminationTermCfg
     _title = "terminations"
     _shown = {"time-out": "time_out"}
-    _transient = {"_rows", "_numeric", "nonfinite"}
+    _transient = {"_rows", "_not_bool", "bad_values"}
 
     def __init__(
         self, cfg: Mapping[str, TerminationTermCfg | None], env: ManagerBasedRlEnv
@@ -50,10 +50,9 @@ class TerminationManager(TermListManager):
         self._rows = list(self._values)
         self._terminated, self._time_outs, self._dones = falses(), falses(), falses()
         labels = [self._label(name) for name in self._term_names]
-        self.nonfinite = NonFiniteWatch(labels, "neither 0 nor 1", "counts as true", env)
-        # Index of a term that returns floats to NaN if the value is neither 0 nor 1, else 0,
-        # (num_envs,).
-        self._numeric: dict[int, torch.Tensor] = {}
+        self.bad_values = BadValueWatch(labels, "neither 0 nor 1", "counts as true", env)
+        # Index of a term that returns floats to its values that are neither 0 nor 1, (num_envs,) bool.
+        self._not_bool: dict[int, torch.Tensor] = {}
 
     @property
     def dones(self) -> torch.Tensor:
@@ -82,19 +81,19 @@ class TerminationManager(TermListManager):
         for k, (name, cfg, row) in enumerate(terms):
             value = self._evaluate(name, cfg)
             if value.is_floating_point():
-                if k not in self._numeric:
+                if k not in self._not_bool:
                     logger.warning(
                         "%s: expected bool, got %s; nonzero counts as true. Compare the value in "
                         "the term.",
                         *(self._label(name), str(value.dtype).removeprefix("torch.")),
                     )
-                self._numeric[k] = torch.where((value == 0) | (value == 1), 0.0, torch.nan)
+                self._not_bool[k] = (value != 0) & (value != 1)
             row.copy_(value)
             (self._time_outs if cfg.time_out else self._terminated).logical_or_(row)
-        if self._numeric:
-            none = torch.zeros(self.num_envs, device=self.device)
-            rows = [self._numeric.get(k, none) for k in range(len(self._term_names))]
-            self.nonfinite.check(torch.stack(rows), self._env.common_step_counter)
+        if self._not_bool:
+            none = torch.zeros_like(self._dones)
+            rows = [self._not_bool.get(k, none) for k in range(len(self._term_names))]
+            self.bad_values.record(torch.stack(rows), self._env.common_step_counter)
         return torch.logical_or(self._terminated, self._time_outs, out=self._dones)
 
     def get_term(self, name: str) -> torch.Tensor:

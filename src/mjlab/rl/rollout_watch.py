@@ -88,11 +88,11 @@ class RolloutWatch:
             remedy = "correct the term, or set it to None"
             if manager is env.action_manager:
                 remedy = "check the policy, and use a smaller learning rate"
-            manager.nonfinite.report()
-            for term, steps in manager.nonfinite.streaks().items():
+            manager.bad_values.report()
+            for term, steps in manager.bad_values.streaks().items():
                 if steps >= max(num_steps, _MIN_BROKEN_STEPS):
                     raise BrokenTermError(
-                        f"{term} was {manager.nonfinite.fault} in every environment for {steps} steps in a "
+                        f"{term} was {manager.bad_values.fault} in every environment for {steps} steps in a "
                         f"row; {remedy}."
                     )
 
