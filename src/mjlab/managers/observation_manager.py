@@ -225,10 +225,7 @@ class ObservationManager(ManagerBase):
             )
         if self._is_current and not update_history:
             return self._obs_buffer
-        if update_history and env_ids is None:
-            computed = {name: group.compute(True, None) for name, group in self._groups.items()}
-        else:
-            computed = self._compute(self._groups, update_history, env_ids)
+        computed = self._compute(self._groups, update_history, env_ids)
         if update_history:
             self._obs_buffer, self._is_current = computed, True
         return computed
@@ -288,8 +285,10 @@ class ObservationManager(ManagerBase):
         update_history: bool,
         env_ids: torch.Tensor | None,
     ) -> dict[str, Observation]:
+        """Compute groups. Arguments as in `compute`, but the last result is not reused as a whole."""
         ids = None if env_ids is None else as_ids(env_ids, self.num_envs, self.device)
-        if update_history and (ids is None or len(ids.unique()) == self.num_envs):
+        all_advance = update_history and (ids is None or len(ids.unique()) == self.num_envs)
+        if all_advance:
             return {name: group.compute(True, ids) for name, group in groups.items()}
         terms = _terms(groups)
         parts = [part for term in terms for part in term.stateful_parts()]
@@ -301,15 +300,27 @@ class ObservationManager(ManagerBase):
             with preserved_rng(), changes_undone([*parts, *terms]):
                 computed = {name: group.compute(False, None) for name, group in groups.items()}
         if update_history or self._is_current:
-            # Differences to the last call would be zero: show those of the last step.
             others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-            others[[] if ids is None else ids] = False
-            for name in groups.keys() & self._obs_buffer.keys():
-                now, last = (groups[name].split(obs[name]) for obs in (computed, self._obs_buffer))
-                for key, term in groups[name].terms.items():
-                    if any(capture_state(part) for part in term.stateful_parts()):
-                        now[key][others] = last[key][others]
+            if ids is not None:
+                others[ids] = False
+            self._copy_last(groups, computed, others)
         return computed
+
+    def _copy_last(
+        self,
+        groups: Mapping[str, ObservationGroup],
+        computed: dict[str, Observation],
+        rows: torch.Tensor,
+    ) -> None:
+        """Copy the last values of terms with state into `computed`, in environments `rows` (a mask).
+
+        A new value would depend on the time since the last call: differences would be zero.
+        """
+        for name in groups.keys() & self._obs_buffer.keys():
+            now, last = (groups[name].split(obs[name]) for obs in (computed, self._obs_buffer))
+            for key, term in groups[name].terms.items():
+                if any(capture_state(part) for part in term.stateful_parts()):
+                    now[key][rows] = last[key][rows]
 
     def _prepare_terms(self) -> None:
         for name, group_cfg in self._enabled(self.cfg, ObservationGroupCfg):
@@ -503,16 +514,13 @@ class ObservationTerm:
                 self._delay.append(value)
                 value = self._delay.compute()
             else:
-                ids = self._delay.empty_rows if env_ids is None else env_ids
-                self._delay.backfill(value, ids)
+                _backfill(self._delay, value, env_ids)
                 value = self._delay.peek()
         if self._history is not None:
             if is_step or not self._history.is_initialized:
                 self._history.append(value)
             else:
-                self._history.backfill(
-                    value, self._history.empty_rows if env_ids is None else env_ids
-                )
+                _backfill(self._history, value, env_ids)
             frames = self._history.buffer
             value = frames.flatten(1) if cfg.flatten_history_dim else frames
         return value
@@ -593,6 +601,14 @@ class ObservationTerm:
 
 def _warn(message: str) -> None:
     warnings.warn(message, UserWarning, stacklevel=3)
+
+
+def _backfill(
+    buffer: DelayBuffer | CircularBuffer, value: torch.Tensor, env_ids: torch.Tensor | None
+) -> None:
+    """Fill rows `env_ids` with `value`. None: rows without a value since their reset."""
+    ids = buffer.empty_rows.nonzero().flatten() if env_ids is None else env_ids
+    buffer.backfill(value, ids)
 
 
 def _terms(groups: Mapping[str, ObservationGroup]) -> list[ObservationTerm]:
