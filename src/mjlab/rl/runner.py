@@ -82,9 +82,12 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     """Runner that trains a policy with rsl_rl's algorithms.
 
     Unlike rsl_rl's runner, it counts total iterations: `learn(10)` is equal, bit for bit, to
-    `learn(5)`, `load` in a new process, and `learn(10)`. `current_learning_iteration` is the number
-    of iterations finished. Progress goes to `observers` instead of the console; in a notebook, it is
-    shown in one output.
+    `learn(5)`, `load` in a new process, and `learn(10)`. Progress goes to `observers` instead of the
+    console; in a notebook, it is shown in one output.
+
+    Two numbers name an iteration. `done` counts those finished: `current_learning_iteration`,
+    observers, messages, `iterations_finished` of checkpoints. `index`, one less, counts from 0 as in
+    rsl_rl: names of checkpoints, event files, `iter` of checkpoints.
 
     After `learn`, `stop_reason` is `finished`, `solved`, `interrupted` (by the signal `stop_signal`)
     or `failed`, and `last_evaluation` is the result of the last evaluation, if any. In a solved run,
@@ -158,8 +161,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self._resumed_from = ""
         # Seed of the numbers drawn after a resume. None: the generators are restored.
         self._new_seed: int | None = None
-        # True if an evaluation is due after the last iteration, and not finished.
-        self._owes_evaluation = False
+        self.owes_evaluation = False
+        """True if an evaluation is due after the last iteration, and was not finished; in checkpoints."""
         # Path and content of the checkpoint written last.
         self._written: tuple[str, dict[str, Any]] | None = None
         evaluation = EvaluationCfg.of(self.cfg.get("evaluation"))
@@ -202,14 +205,14 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         with self._session() as stop, RunRescue(self._run_folder) as rescue:
             observations = self._initial_observations(init_at_random_ep_len)
             self._notify("on_start", first, total)
-            owed = self._owes_evaluation
+            owed = self.owes_evaluation
             if first > 0:
                 is_solved = owed and self._evaluate_solved(first, stop)
                 reason = self._agree_to_stop(is_solved, stop, is_last=first >= total)
-            while not reason and (iteration := self.current_learning_iteration) < total:
+            while not reason and (index := self.current_learning_iteration) < total:
                 begin = time.perf_counter()
                 last = self._snapshot() if self._is_main_process else {}
-                if self._run_folder is not None and iteration > first:
+                if self._run_folder is not None and index > first:
                     rescue.learned = last
                 try:
                     with (
@@ -225,20 +228,19 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                     break
                 learned = time.perf_counter()
                 self._observations = observations
-                self.current_learning_iteration = done = iteration + 1
+                self.current_learning_iteration = done = index + 1
                 stats = self._report(losses, collected - begin, learned - collected, first, total)
-                self._owes_evaluation = self._solved_check.should_evaluate(
-                    done, stats.mean_step_reward
-                )
-                rescue.check_folder(self.save, f"model_{iteration}.pt")
+                is_due = self._solved_check.should_evaluate(done, stats.mean_step_reward)
+                self.owes_evaluation = is_due
+                rescue.check_folder(self.save, f"model_{index}.pt")
                 # Before the evaluation, which may take longer than there is time for.
-                is_saving = self._owes_evaluation or stop.requested or done == total
+                is_saving = is_due or stop.requested or done == total
                 if self._run_folder is not None and (
-                    is_saving or iteration % self.cfg["save_interval"] == 0
+                    is_saving or index % self.cfg["save_interval"] == 0
                 ):
                     self._save_checkpoint()
                     rescue.learned = None
-                is_solved = self._owes_evaluation and self._evaluate_solved(done, stop)
+                is_solved = is_due and self._evaluate_solved(done, stop)
                 reason = self._agree_to_stop(is_solved, stop, is_last=done >= total)
             rescue.learned = None
             # Without further iterations, too: the evaluation that a resumed run made up for.
@@ -485,7 +487,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
 
         After the last iteration, a signal interrupts nothing but the evaluation that is owed.
         """
-        code, is_owed = int(is_solved), self._is_main_process and self._owes_evaluation
+        code, is_owed = int(is_solved), self._is_main_process and self.owes_evaluation
         if stop.number is not None and (is_owed or not is_last):
             code = 1 + stop.number
         if self.is_distributed:
@@ -512,13 +514,8 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         self.last_evaluation = self._solved_check.evaluate()
         return self.last_evaluation
 
-    @property
-    def owes_evaluation(self) -> bool:
-        """True if an evaluation is due after the last iteration, and was not finished."""
-        return self._owes_evaluation
-
-    def _evaluate_solved(self, iteration: int, stop: StopRequest) -> bool:
-        """Evaluate the policy after `iteration` iterations; return True to stop training.
+    def _evaluate_solved(self, done: int, stop: StopRequest) -> bool:
+        """Evaluate the policy after `done` iterations; return True to stop training.
 
         Evaluates only in the first process; False in others, and if a signal stops the evaluation.
         """
@@ -530,17 +527,17 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 result = check.evaluate(lambda: stop.requested)
             self.last_evaluation = result
             is_good = check.is_solved_by(result)
-            self._notify("on_evaluation", iteration, result, is_good)
-            self.logger.write_evaluation(result, iteration - 1)
+            self._notify("on_evaluation", done, result, is_good)
+            self.logger.write_evaluation(result, done - 1)
             if is_good and check.cfg.stop_when_solved:
                 with stop.interruptible():
-                    result = check.confirm(iteration, lambda: stop.requested)
+                    result = check.confirm(done, lambda: stop.requested)
                 self.last_evaluation, solved = result, check.is_solved_by(result)
-                self._notify("on_confirmation", iteration, result, solved)
-                self.logger.write_evaluation(result, iteration - 1, "Confirmation")
+                self._notify("on_confirmation", done, result, solved)
+                self.logger.write_evaluation(result, done - 1, "Confirmation")
         except (EvaluationStopped, Interrupted):
             return False
-        check.last_iteration, self._owes_evaluation = iteration, False
+        check.last_iteration, self.owes_evaluation = done, False
         if self._is_written and self._written is not None:
             path, content = self._written
             save_checkpoint({**content, **self._evaluation_entries()}, path)
@@ -634,7 +631,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         if load_algorithm(self.alg, checkpoint, load_cfg, strict, str(path)):
             self.current_learning_iteration = finished
             self._solved_check.last_iteration = evaluated
-            self._owes_evaluation = bool(checkpoint.get("owes_evaluation", False))
+            self.owes_evaluation = bool(checkpoint.get("owes_evaluation", False))
         if counter is not None:
             self.env.unwrapped.common_step_counter = counter
         self._state_to_resume = checkpoint.get("training_state") if load_cfg is None else None
@@ -720,7 +717,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         done = self.current_learning_iteration
         counter = getattr(self.env.unwrapped, "common_step_counter", 0)
         return {
-            # rsl_rl's index of the last finished iteration; 0 for both none and one.
+            # Also 0 if none is finished.
             "iter": max(done - 1, 0),
             "iterations_finished": done,
             "infos": {**(infos or {}), "env_state": {"common_step_counter": int(counter)}},
@@ -735,7 +732,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         """Return the checkpoint entries that an evaluation changes."""
         return {
             "last_evaluated": self._solved_check.last_iteration,
-            "owes_evaluation": self._owes_evaluation,
+            "owes_evaluation": self.owes_evaluation,
         }
 
     def _training_state(self) -> dict[str, Any]:
