@@ -124,21 +124,17 @@ def load_env_cfg(
     """
     if profile is not None:
         return _with_profile(task_name, profile, play, evaluate)[0]
-    task = _find(task_name)
-    if play and task.play_env_cfg is not None:
-        return _make_cfg(task_name, task.play_env_cfg)
-    purpose = {"play": True} if play else {"evaluate": True} if evaluate else {}
-    return _make_cfg(task_name, task.env_cfg, **purpose)
+    return _registered_env_cfg(task_name, play, evaluate)
 
 
 def load_rl_cfg(
     task_name: str, profile: str | None = None, learner: Learner | None = None
 ) -> RslRlBaseRunnerCfg:
-    """Return a copy of the learner config of a task.
+    """Return a copy of the learner config of a task, to train.
 
     Args:
         task_name: Name of the task.
-        profile: Name of a task profile to apply. None: no profile.
+        profile: Name of a task profile to apply, with its easing. None: no profile.
         learner: `ppo`, `sac` or `distillation`. None: the learner of the profile or task. If the
             profile replaces a task config that is of `learner`, the task config is used, with the
             task settings of the profile. Otherwise `mjlab.rl.learners.with_learner` converts the
@@ -211,7 +207,8 @@ class Profile:
     """Alternative settings of a task: edits of its configs, in place, as functions `(env_cfg, rl_cfg)`.
 
     Each may return the config of another learner to use instead of `rl_cfg`, such as
-    `with_learner(rl_cfg, "sac")` of `mjlab.rl.learners`.
+    `with_learner(rl_cfg, "sac")` of `mjlab.rl.learners`. A function registered as a profile is its
+    `policy`: none of its edits is limited to training.
     """
 
     policy: ProfileEdit
@@ -296,19 +293,29 @@ class _Task:
     """Module whose import registered the task. None: not imported by `_discover`."""
 
 
+def _registered_env_cfg(task_name: str, play: bool, evaluate: bool) -> ManagerBasedRlEnvCfg:
+    """Return a copy of the environment config of a task, without a profile."""
+    task = _find(task_name)
+    if play and task.play_env_cfg is not None:
+        return _make_cfg(task_name, task.play_env_cfg)
+    purpose = {"play": True} if play else {"evaluate": True} if evaluate else {}
+    return _make_cfg(task_name, task.env_cfg, **purpose)
+
+
 def _with_profile(
     task_name: str, profile: str, play: bool = False, evaluate: bool = False
 ) -> tuple[ManagerBasedRlEnvCfg, RslRlBaseRunnerCfg, RslRlBaseRunnerCfg]:
     """Return copies of both configs of a task with `profile` applied, and the edited task config.
 
-    The third config differs from the second if the profile replaces the task's learner config.
+    The third config differs from the second if the profile replaces the task's learner config. Eased
+    unless to play or evaluate.
     """
     from mjlab.rl.config import RslRlBaseRunnerCfg
 
     found = _resolve(task_name, require_profile(task_name, profile))
     edits = found if isinstance(found, Profile) else Profile(policy=found)
-    env_cfg = load_env_cfg(task_name, play, evaluate=evaluate)
-    rl_cfg = task_cfg = load_rl_cfg(task_name)
+    env_cfg = _registered_env_cfg(task_name, play, evaluate)
+    rl_cfg = task_cfg = _make_cfg(task_name, _find(task_name).rl_cfg)
     num_envs, experiment = env_cfg.scene.num_envs, task_cfg.experiment_name
     # Copied, because a profile may return a module constant.
     rl_cfg = copy.deepcopy(edits.policy(env_cfg, rl_cfg)) or rl_cfg
