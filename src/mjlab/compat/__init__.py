@@ -47,7 +47,8 @@ _REQUIRES = _at("mjlab.managers.event_manager", "requires_model_fields")
 _SENSORS = "BuiltinSensor CameraSensor ContactSensor RayCastSensor TerrainHeightSensor"
 _LOADERS = "list_tasks load_env_cfg load_rl_cfg load_runner_cls"
 # Names that modules of these releases import for internal use, and packages import from there. Found
-# in every module with `older_names`, without a warning.
+# in every module with `older_names`, even if no release had them there (`mjlab.utils.os.quat_mul`),
+# without a warning.
 _PASSED_ON = {
     **_MATH,
     **_REQUIRES,

@@ -1,4 +1,4 @@
-"""Legacy names of 1.x releases without a replacement; resolved through the tables of `mjlab.compat`.
+"""Functions and classes of 1.x releases without a replacement; `mjlab.compat` maps names to them.
 
 The tasks' `mdp` packages export functions of this module, so module-level imports are limited to
 `mjlab.envs` and its imports; other imports are inside functions.

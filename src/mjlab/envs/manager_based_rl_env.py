@@ -380,7 +380,7 @@ class ManagerBasedRlEnv(Tabular):
 
         Args:
             action: Float tensor, (N, A); arrays and lists are converted. NaN and infinite values
-                are logged once.
+                are logged once (on a GPU: in training only).
 
         Returns:
             Observations (of the new episode in environments that were reset); reward (N,);

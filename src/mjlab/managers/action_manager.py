@@ -157,7 +157,8 @@ class ActionManager(BuiltTermsManager[ActionTerm]):
     def process_action(self, action: torch.Tensor) -> None:
         """Split the action of this step, (num_envs, total_action_dim), among the terms.
 
-        Arrays and lists are converted by `as_action`. NaN and infinite values are logged once.
+        Arrays and lists are converted by `as_action`. NaN and infinite values are reported by
+        `bad_values`.
 
         Raises `ValueError` for a wrong shape.
         """

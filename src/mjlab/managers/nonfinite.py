@@ -1,4 +1,4 @@
-"""Bad term values, such as NaN: counted, logged once per term, left out of means."""
+"""Bad term values, such as NaN: counted, reported once per term, left out of means."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ logger = logging.getLogger(__name__)
 
 class BadValueWatch:
     """Counts bad term values, such as NaN, without synchronizing with the GPU.
+
+    On a CPU, they are logged at once. On a GPU, only `report` logs; training calls it each iteration.
 
     Args:
         labels: Name of each term in messages.

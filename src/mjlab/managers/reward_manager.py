@@ -66,9 +66,9 @@ class RewardManager(TermFunctionSwitches, TermListManager):
     def compute(self, dt: float) -> torch.Tensor:
         """Return the reward of a step of `dt` seconds, (num_envs,), in a buffer reused every step.
 
-        NaN and infinite term values count as 0 and are logged once per term. All terms are 0 in
-        environments whose physics diverged. Raises `ValueError` if a term
-        returns a shape other than (num_envs,).
+        NaN and infinite term values count as 0 and are reported by `bad_values`. All terms are 0 in
+        environments whose physics diverged. Raises `ValueError` if a term returns a shape other than
+        (num_envs,).
         """
         for name, cfg, row in zip(self._term_names, self._term_cfgs, self._rows, strict=True):
             if cfg.weight == 0.0:
