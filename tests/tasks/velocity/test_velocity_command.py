@@ -324,18 +324,6 @@ def test_what_makes_no_sense_is_refused_when_the_command_is_built(fields, messag
         velocity_command(**fields)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"resampling_time_range": (-1.0, 2.0)}, "resampling_time_range"),
-    ],
-)
-def test_odd_numbers_of_the_command_warn(fields, message):
-    with pytest.warns(UserWarning, match=message) as caught:
-        velocity_command(**fields)
-    assert len(caught) == 1
-
-
 def test_unknown_entity(make_env):
     name = "robto"
 
