@@ -396,6 +396,7 @@ def test_an_environment_that_has_diverged_does_not_disturb_the_others():
             "'knee' type.*'body', 'site', 'geom'.*'joint'",
         ),
         ({"ray_alignment": "gravity"}, "ray_alignment.*'base', 'yaw', 'world'.*'gravity'"),
+        ({"frame": ()}, r"frame.*\(\)"),
         ({"include_geom_groups": (0, 6)}, r"include_geom_groups.*\[0, 1, 2, 3, 4, 5\].* 6"),
         ({"pattern": PinholeCameraPatternCfg.from_mujoco_camera("eye")}, "robot/eye"),
     ],

@@ -170,8 +170,13 @@ class RayCastSensor(Sensor[RayCastData]):
         """Check the frames. The spec is unchanged.
 
         Raises:
-            ValueError: a frame is not a body, site or geom, or has an unknown entity.
+            ValueError: `frame` is empty, is not a body, site or geom, or has an unknown entity.
         """
+        # As in a template that is not filled in.
+        if not self._frame_refs:
+            raise ValueError(
+                f"Ray sensor {self.cfg.name!r} frame: expected at least one ObjRef, got ()."
+            )
         for frame in self._frame_refs:
             owner = f"Ray sensor {self.cfg.name!r} frame {frame.name!r}"
             check_one_of(f"{owner} type", frame.type, _FRAMES)
