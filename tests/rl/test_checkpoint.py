@@ -187,6 +187,15 @@ def test_an_edited_checkpoint_is_told(make_runner, tmp_path: Path, caplog, saved
     assert "model_0.pt" in said
 
 
+@pytest.mark.parametrize("way", [WEIGHT, MOMENT])
+def test_nan_without_checksum_is_refused(make_runner, tmp_path: Path, saved, way):
+    content = copied(saved)
+    way(content, lambda x: x * math.nan)
+    torch.save(content, tmp_path / "model_1.pt")
+    with pytest.raises(CheckpointError, match=r"model_1.pt.*is NaN or infinite"):
+        make_runner().load(str(tmp_path / "model_1.pt"))
+
+
 def test_contents_without_checksum_are_not_judged(tmp_path: Path, caplog):
     torch.save({"a": torch.zeros(2)}, tmp_path / "model_0.pt")
     assert list(load_checkpoint(tmp_path / "model_0.pt")) == ["a"]

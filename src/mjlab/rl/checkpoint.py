@@ -355,6 +355,9 @@ def load_algorithm(
     # rsl_rl loads one part after the other: an error leaves the algorithm partly loaded.
     before = copied(algorithm.save())
     try:
+        parts = [f"{name}_state_dict" for name in (*_NETWORKS, "optimizer")]
+        if bad := not_finite({key: checkpoint[key] for key in parts if key in checkpoint}):
+            raise ValueError(f"{bad[0]} is NaN or infinite")
         if (saved := checkpoint.get("optimizer_state_dict")) is not None:
             changed_from = _other_kind(optimizer, saved)
         if changed_from is not None:

@@ -140,6 +140,10 @@ class SAC:
             value_range=alg_cfg.value_range or _SCALED_RANGE,
             **critic_cfg,
         )
+        if not isinstance(actor, SacActorModel):
+            raise ValueError(
+                f"agent.actor class_name: expected a SacActorModel, got {type(actor).__name__}."
+            )
         groups = list(dict.fromkeys([*actor.obs_groups, *critic.obs_groups]))
         if (teacher := alg_cfg.teacher) is not None:
             shape = tuple(obs[teacher].shape[1:]) if teacher in obs else None
