@@ -112,7 +112,7 @@ class Run:
 
     @functools.cached_property
     def unchanged(self) -> dict[str, torch.Tensor]:
-        """What is learned under the settings of the run."""
+        """Weights and learning rates after an iteration under the settings of the run."""
         return self.learned({})
 
 

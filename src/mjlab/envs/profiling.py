@@ -85,8 +85,12 @@ def profiled_steps(env: ManagerBasedRlEnv) -> Generator[StepProfile]:
     On a GPU every part is synchronized to attribute times correctly; this slows down the steps. The
     environment is restored after the block, also on errors.
     """
-    with contextlib.ExitStack() as undo:
-        yield _StepTimer(env, undo).profile
+    timer = _StepTimer(env)
+    try:
+        timer.start(env)
+        yield timer.profile
+    finally:
+        timer.restore()
 
 
 def device_time(device: torch.device) -> float:
@@ -97,14 +101,18 @@ def device_time(device: torch.device) -> float:
 
 
 class _StepTimer:
-    """Times the methods called in a step, and registers their restoration in `undo`."""
+    """Stopwatch of the methods called in a step, from `start` to `restore`."""
 
-    def __init__(self, env: ManagerBasedRlEnv, undo: contextlib.ExitStack) -> None:
+    def __init__(self, env: ManagerBasedRlEnv) -> None:
         self.profile = StepProfile()
         self._device = torch.device(env.device)
-        self._undo = undo
+        # Owner, name and former instance attribute (None: inherited) of each replaced method.
+        self._replaced: list[tuple[Any, str, Any]] = []
         # Running phase and term, () for a step outside all phases; None outside steps.
         self._running: tuple[str, ...] | None = None
+
+    def start(self, env: ManagerBasedRlEnv) -> None:
+        """Replace the methods by timed ones."""
         self._replace(env, "step", self.step(env.step))
         for owner, methods in ((env.sim, _SIMULATION), (env.scene, _SCENE)):
             for method, phase in methods.items():
@@ -174,12 +182,16 @@ class _StepTimer:
         self._replace(owner, method, self.timed(getattr(owner, method), *names))
 
     def _replace(self, owner: Any, name: str, value: Any) -> None:
-        own = vars(owner)
-        if name in own:
-            self._undo.callback(setattr, owner, name, own[name])
-        else:
-            self._undo.callback(delattr, owner, name)
+        self._replaced.append((owner, name, vars(owner).get(name)))
         setattr(owner, name, value)
+
+    def restore(self) -> None:
+        """Put the methods back."""
+        for owner, name, own in reversed(self._replaced):
+            if own is None:
+                delattr(owner, name)
+            else:
+                setattr(owner, name, own)
 
 
 class _TimedFunction:
