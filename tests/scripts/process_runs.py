@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -43,11 +44,13 @@ class ProcessRun:
     ) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        store = folder / "store"
-        store.touch()
+        # A new file, as of each launcher: a forked process ends without destructors, so it may leave the
+        # file of its own run, in which all processes have joined already.
+        descriptor, store = tempfile.mkstemp(prefix="store-", dir=folder)
+        os.close(descriptor)
         argv = [TASK, *SMALL, "--log-root", str(folder / "logs"), *flags]
         shared = {
-            "MJLAB_PROCESS_STORE": str(store),
+            "MJLAB_PROCESS_STORE": store,
             "WORLD_SIZE": str(count),
             "LOCAL_WORLD_SIZE": str(count),
             "OMP_NUM_THREADS": "1",
