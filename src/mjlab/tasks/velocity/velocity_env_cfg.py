@@ -1,8 +1,8 @@
 """Base config of the velocity task: track commanded linear velocity and yaw rate.
 
 `make_legged_env_cfg` returns the task of a robot, from the names of its parts; see `config/go1` and
-`config/g1`. `make_flat` and `make_playable` adapt it to flat ground and to play mode.
-`make_velocity_env_cfg` returns the template, whose names are left to fill in.
+`config/g1`. `make_flat`, `remove_state_estimation` and `make_playable` adapt it to flat ground, to
+the sensors of a robot and to play mode. `make_velocity_env_cfg` returns the template, whose names are left to fill in.
 """
 
 from __future__ import annotations
@@ -218,6 +218,18 @@ def make_playable(cfg: ManagerBasedRlEnvCfg) -> None:
         terrain.terrain_generator.num_rows = 5
         terrain.terrain_generator.num_cols = 5
         terrain.terrain_generator.border_width = 10.0
+
+
+def remove_state_estimation(cfg: ManagerBasedRlEnvCfg) -> None:
+    """Let the actor observe only what a robot measures, in place.
+
+    Removes base velocity and height scan from the group `actor`; the critic keeps both. On terrain,
+    the actor observes the last ten steps: a foot contact affects measurements for about 0.2 s.
+    """
+    actor = cfg.observations["actor"]
+    del actor.terms["base_lin_vel"]
+    if actor.terms.pop("height_scan", None) is not None:
+        actor.history_length = 10
 
 
 def get_sensor(cfg: ManagerBasedRlEnvCfg, name: str) -> Any:

@@ -24,13 +24,15 @@ _RL_CFG = "mjlab.tasks.velocity.config.g1.rl_cfg"
 _RUNNER = "mjlab.tasks.velocity.rl"
 
 for _terrain in ("Flat", "Rough"):
-    register_mjlab_task(
-        task_id=f"Mjlab-Velocity-{_terrain}-Unitree-G1",
-        env_cfg=f"{_ENV_CFGS}:unitree_g1_{_terrain.lower()}_env_cfg",
-        rl_cfg=f"{_RL_CFG}:unitree_g1_ppo_runner_cfg",
-        runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
-        profiles={"cpu": f"{_RL_CFG}:cpu"},
-    )
+    for _suffix in ("", "-No-State-Estimation"):
+        _env_cfg = f"unitree_g1_{_terrain}{_suffix}_env_cfg".lower().replace("-", "_")
+        register_mjlab_task(
+            task_id=f"Mjlab-Velocity-{_terrain}-Unitree-G1{_suffix}",
+            env_cfg=f"{_ENV_CFGS}:{_env_cfg}",
+            rl_cfg=f"{_RL_CFG}:unitree_g1_ppo_runner_cfg",
+            runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
+            profiles={"cpu": f"{_RL_CFG}:cpu"},
+        )
 
 __getattr__ = lazy_names(
     __name__,

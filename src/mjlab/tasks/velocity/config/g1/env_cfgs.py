@@ -10,7 +10,12 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.managers import RewardTermCfg
 from mjlab.sensor import ContactMatch, ContactSensorCfg, RingPatternCfg
 from mjlab.tasks.velocity import mdp
-from mjlab.tasks.velocity.velocity_env_cfg import make_flat, make_legged_env_cfg, make_playable
+from mjlab.tasks.velocity.velocity_env_cfg import (
+    make_flat,
+    make_legged_env_cfg,
+    make_playable,
+    remove_state_estimation,
+)
 
 # Model order, the order of contacts and sites.
 _FEET = ("left_foot", "right_foot")
@@ -105,4 +110,18 @@ def unitree_g1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     """Return the flat-ground task, for training or for `play`."""
     cfg = unitree_g1_rough_env_cfg(play=play)
     make_flat(cfg, play)
+    return cfg
+
+
+def unitree_g1_flat_no_state_estimation_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the flat-ground task without base velocity in the actor's observations."""
+    cfg = unitree_g1_flat_env_cfg(play=play)
+    remove_state_estimation(cfg)
+    return cfg
+
+
+def unitree_g1_rough_no_state_estimation_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the rough-terrain task without base velocity and height scan in the actor's observations."""
+    cfg = unitree_g1_rough_env_cfg(play=play)
+    remove_state_estimation(cfg)
     return cfg

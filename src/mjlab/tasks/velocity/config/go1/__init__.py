@@ -24,16 +24,18 @@ _RL_CFG = "mjlab.tasks.velocity.config.go1.rl_cfg"
 _RUNNER = "mjlab.tasks.velocity.rl"
 
 for _terrain in ("Flat", "Rough"):
-    _profiles = {"cpu": "mjlab.tasks.velocity.rl.ppo:cpu"}
-    if _terrain == "Rough":
-        _profiles["blind"] = "mjlab.tasks.velocity.rl.ppo:blind"
-    register_mjlab_task(
-        task_id=f"Mjlab-Velocity-{_terrain}-Unitree-Go1",
-        env_cfg=f"{_ENV_CFGS}:unitree_go1_{_terrain.lower()}_env_cfg",
-        rl_cfg=f"{_RL_CFG}:unitree_go1_ppo_runner_cfg",
-        runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
-        profiles=_profiles,
-    )
+    for _suffix in ("", "-No-State-Estimation"):
+        _profiles = {"cpu": "mjlab.tasks.velocity.rl.ppo:cpu"}
+        if _terrain == "Rough" and not _suffix:
+            _profiles["blind"] = "mjlab.tasks.velocity.rl.ppo:blind"
+        _env_cfg = f"unitree_go1_{_terrain}{_suffix}_env_cfg".lower().replace("-", "_")
+        register_mjlab_task(
+            task_id=f"Mjlab-Velocity-{_terrain}-Unitree-Go1{_suffix}",
+            env_cfg=f"{_ENV_CFGS}:{_env_cfg}",
+            rl_cfg=f"{_RL_CFG}:unitree_go1_ppo_runner_cfg",
+            runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
+            profiles=_profiles,
+        )
 
 __getattr__ = lazy_names(
     __name__,

@@ -17,6 +17,7 @@ from mjlab.tasks.velocity.velocity_env_cfg import (
     make_playable,
     make_velocity_env_cfg,
     remove_sensors,
+    remove_state_estimation,
 )
 
 TerrainType = Literal["rough", "obstacles"]
@@ -114,6 +115,20 @@ def unitree_go1_flat_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
         cfg.rewards.pop(name)
     cfg.terminations.pop("illegal_contact")
     cfg.terminations["fell_over"] = make_velocity_env_cfg().terminations["fell_over"]
+    return cfg
+
+
+def unitree_go1_flat_no_state_estimation_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the flat-ground task without base velocity in the actor's observations."""
+    cfg = unitree_go1_flat_env_cfg(play=play)
+    remove_state_estimation(cfg)
+    return cfg
+
+
+def unitree_go1_rough_no_state_estimation_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
+    """Return the rough-terrain task without base velocity and height scan in the actor's observations."""
+    cfg = unitree_go1_rough_env_cfg(play=play)
+    remove_state_estimation(cfg)
     return cfg
 
 
