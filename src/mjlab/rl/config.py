@@ -245,6 +245,9 @@ class EvaluationCfg:
     length, must reach before an evaluation. Saves time; below 1, because training explores."""
     trigger_return: Number | None = None
     """Return of the training data that triggers an evaluation, instead of `trigger_fraction`."""
+    trigger_below: Annotated[dict[str, float], Range()] = field(default_factory=dict)
+    """Upper bounds of `metrics` in the training environments that trigger an evaluation, together with
+    the return if that is set: means over the environments after an iteration, with exploration."""
     min_interval: CountOrZero = 3
     """Minimum number of iterations between evaluations."""
     first_iteration: CountOrZero = 0
@@ -285,9 +288,18 @@ class EvaluationCfg:
         """Return the number of finished iterations from which an evaluation may follow that after `last`."""
         return max(last + self.min_interval, self.first_iteration)
 
-    def is_triggered(self, mean_step_reward: float, episode_steps: float) -> bool:
-        """Return True if an episode of the training data's mean reward would reach `trigger`."""
-        return self.trigger is None or mean_step_reward * episode_steps >= self.trigger
+    def is_triggered(
+        self, mean_step_reward: float, episode_steps: float, exploring: Mapping[str, float]
+    ) -> bool:
+        """Return True if the training data reach `trigger` and `trigger_below`.
+
+        Args:
+            mean_step_reward: Mean weighted reward per step.
+            episode_steps: Length of an episode.
+            exploring: Metrics of the training environments by name.
+        """
+        has_return = self.trigger is None or mean_step_reward * episode_steps >= self.trigger
+        return has_return and all(exploring[n] <= v for n, v in self.trigger_below.items())
 
 
 def resolve_success(success: Any) -> Any:

@@ -32,6 +32,7 @@ from mjlab.utils.torch import threads_for_policy
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
     from mjlab.rl.config import EvaluationCfg
+    from mjlab.rl.run_logger import IterationStats
     from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
 
 logger = logging.getLogger(__name__)
@@ -351,22 +352,28 @@ class SolvedCheck:
             known.discard("success_rate")
         for bound in self._bounds:
             check_measured(bound, cfg, known)
+        for name in cfg.trigger_below:
+            if name not in cfg.metrics:
+                raise ValueError(
+                    f"EvaluationCfg trigger_below: {name!r} is not in `metrics`; "
+                    f"{suggest(name, sorted(cfg.metrics))}"
+                )
         self._eval_env: Any = None
         self.env_cfg: ManagerBasedRlEnvCfg | None = None
         self.last_iteration = 0
 
-    def should_evaluate(self, iteration: int, mean_step_reward: float) -> bool:
-        """Return True if the training data suggest that the policy may be good enough.
+    def exploring_metrics(self) -> dict[str, float]:
+        """Return the metrics in `trigger_below` of the environments of the run, now."""
+        metrics, env = self.cfg.metrics, self._env.unwrapped
+        return {name: metrics[name](env).mean().item() for name in self.cfg.trigger_below}
 
-        Args:
-            iteration: Number of iterations finished.
-            mean_step_reward: Mean weighted reward per step of the last iteration, before scaling by
-                the step's duration.
-        """
-        if not self._bounds and self.cfg.trigger_return is None:
+    def should_evaluate(self, stats: IterationStats) -> bool:
+        """Return True if the data of the last iteration suggest that the policy may be good enough."""
+        cfg = self.cfg
+        if not self._bounds and cfg.trigger_return is None and not cfg.trigger_below:
             return False
-        return iteration >= self.cfg.earliest_after(self.last_iteration) and self.cfg.is_triggered(
-            mean_step_reward, int(self._env.max_episode_length)
+        return stats.iteration >= cfg.earliest_after(self.last_iteration) and cfg.is_triggered(
+            stats.mean_step_reward, int(self._env.max_episode_length), stats.exploring
         )
 
     def is_solved_by(self, result: EvaluationResult) -> bool:

@@ -175,8 +175,12 @@ class TrainingProgress(TrainingObserver):
             return None
         cfg, stats, steps = self._cfg.evaluation, self.stats, self._cfg.episode_steps or 0.0
         last = self._evaluations[-1][0] if self._evaluations else 0
-        if cfg.is_triggered(stats.mean_step_reward, steps):
+        if cfg.is_triggered(stats.mean_step_reward, steps, stats.exploring):
             return f"at iteration {max(cfg.earliest_after(last), self.iteration + 1)}"
+        for name, value in stats.exploring.items():
+            if value > (most := cfg.trigger_below[name]):
+                words = f"exploring {name.replace('_', ' ')}"
+                return f"from {words} {most:g} {cfg.units.get(name, '')} on ({value:.2f} now)"
         start = f"from exploring return {cfg.trigger:,.0f} on"
         if stats.exploring_length in (None, steps):
             return start

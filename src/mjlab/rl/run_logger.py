@@ -72,6 +72,9 @@ class IterationStats:
     """Learning rate after this iteration."""
     action_std: float
     """Mean standard deviation of the actions."""
+    exploring: dict[str, float] = field(default_factory=dict)
+    """Means of metrics over the environments after this iteration, by the names in
+    `EvaluationCfg.trigger_below`."""
     losses: dict[str, float] = field(default_factory=dict)
     """Mean losses of the update, by name."""
     environment: dict[str, float] = field(default_factory=dict)
@@ -283,6 +286,7 @@ class RunLogger(Logger):
         learning_rate: float,
         action_std: torch.Tensor,
         rnd_weight: float | None,
+        exploring: dict[str, float],
     ) -> IterationStats:
         """Write the statistics of iteration number `iteration` (from 0), and return them."""
         steps = int(self.cfg["num_steps_per_env"]) * self.num_envs * self.gpu_world_size
@@ -307,6 +311,7 @@ class RunLogger(Logger):
             learning_rate=learning_rate,
             action_std=action_std.mean().item(),
             losses=losses,
+            exploring=exploring,
             environment=self._environment_means(),
         )
         self._write(stats, iteration, rnd_weight)
@@ -471,6 +476,7 @@ class RunLogger(Logger):
             "Perf/collection_time": stats.collection_time,
             "Perf/learning_time": stats.learning_time,
             "Train/mean_step_reward": stats.mean_step_reward,
+            **{f"Train/{name}": value for name, value in stats.exploring.items()},
         }
         if stats.exploring_return is not None:
             scalars["Train/exploring_return"] = stats.exploring_return

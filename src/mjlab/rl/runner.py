@@ -230,7 +230,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
                 self._observations = observations
                 self.current_learning_iteration = done = index + 1
                 stats = self._report(losses, collected - begin, learned - collected, first, total)
-                is_due = self._solved_check.should_evaluate(done, stats.mean_step_reward)
+                is_due = self._solved_check.should_evaluate(stats)
                 self.owes_evaluation = is_due
                 rescue.check_folder(self.save, f"model_{index}.pt")
                 # Before the evaluation, which may take longer than there is time for.
@@ -447,6 +447,7 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             learning_rate=self.alg.learning_rate,
             action_std=self.alg.get_policy().output_std.detach(),
             rnd_weight=None if rnd is None else rnd.weight,
+            exploring=self._solved_check.exploring_metrics(),
         )
         self._notify("on_iteration", stats)
         self.logger.report_broken_losses(stats)

@@ -31,6 +31,7 @@ def cpu_profile(
     entropy_coef: float = 0.01,
     desired_kl: float = 0.03,
     gamma: float = 0.97,
+    num_epochs: int = 5,
     max_iterations: int = 2000,
     save_interval: int = 100,
     physics_steps: int | None = None,
@@ -51,6 +52,7 @@ def cpu_profile(
         entropy_coef: Entropy bonus coefficient.
         desired_kl: Target KL divergence (nats) of the adaptive learning rate.
         gamma: Discount factor per environment step.
+        num_epochs: Passes over the samples of an iteration.
         max_iterations: Number of training iterations.
         save_interval: Iterations between checkpoints.
         physics_steps: Decimation, less than the task's; the physics timestep grows accordingly. None:
@@ -75,7 +77,7 @@ def cpu_profile(
         rl_cfg.save_interval = save_interval
         algorithm = rl_cfg.algorithm
         algorithm.entropy_coef, algorithm.desired_kl = entropy_coef, desired_kl
-        algorithm.gamma = gamma
+        algorithm.gamma, algorithm.num_learning_epochs = gamma, num_epochs
         if mirror is not None:
             algorithm.symmetry_cfg = {
                 "data_augmentation_func": mirror,

@@ -16,7 +16,7 @@ import torch
 from mjlab.envs.mdp.rewards import values_of_joints
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.tasks.velocity.mdp.rewards import command_speed
+from mjlab.tasks.velocity.mdp.rewards import command_speed, if_commanded
 from mjlab.utils.lab_api.math import quat_apply_inverse
 from mjlab.utils.torch import constant_tensor
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "GaitClockCommand",
     "GaitClockCommandCfg",
+    "feet_alternate",
     "feet_apart_l2",
     "feet_height_by_phase",
     "feet_tilt",
@@ -201,6 +202,35 @@ def feet_height_by_phase(
     target = clock.swing(offsets).mul_(swing_height)
     error = env.scene[height_sensor_name].data.heights - rest_height - target
     return torch.exp(error.square().sum(dim=1) / -variance)
+
+
+def feet_alternate(
+    env: ManagerBasedRlEnv,
+    sensor_name: str,
+    groups: tuple[tuple[int, ...], tuple[int, ...]],
+    longest_swing: float = 0.35,
+    command_name: str | None = None,
+    command_threshold: float = 0.1,
+) -> torch.Tensor:
+    """Reward a stance in which all feet of one group are on the ground and all others in the air.
+
+    The reward is 1 in such stances, else 0. With diagonal feet as groups, the gait that earns most is a
+    trot; with a foot each, a walk. A swing longer than `longest_swing` earns nothing, so that the groups
+    take turns.
+
+    Args:
+        env: The environment.
+        sensor_name: Contact sensor of the feet, with `track_air_time`.
+        groups: Feet of each group, by their position in the sensor; together all feet.
+        longest_swing: Longest air time of a foot (s).
+        command_name: Velocity command that enables the reward. None: always enabled.
+        command_threshold: Commanded motion that must be exceeded to enable the reward.
+    """
+    air_time = env.scene[sensor_name].data.current_air_time
+    first, second = (air_time[:, list(group)] > 0.0 for group in groups)
+    alternate = (first.all(dim=1) & ~second.any(dim=1)) | (second.all(dim=1) & ~first.any(dim=1))
+    alternate &= (air_time < longest_swing).all(dim=1)
+    return if_commanded(alternate.float(), env, command_name, command_threshold)
 
 
 class weighted_joint_deviation:

@@ -1,11 +1,16 @@
-"""Learner config of the velocity tasks of the Unitree Go1."""
+"""Learner configs of the velocity tasks of the Unitree Go1."""
 
 from __future__ import annotations
 
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg
-from mjlab.tasks.velocity.rl.ppo import velocity_ppo_runner_cfg
+from mjlab.tasks.velocity.rl.ppo import velocity_cpu_profile, velocity_ppo_runner_cfg
 
 
 def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO config of both tasks."""
+    """Return the PPO config of all tasks."""
     return velocity_ppo_runner_cfg(experiment_name="go1_velocity", max_iterations=10_000)
+
+
+# A trot: FR and RL, FL and RR.
+cpu = velocity_cpu_profile(gait=((0, 3), (1, 2)))
+"""The `cpu` profile of all tasks."""
