@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -107,6 +108,8 @@ UNITS = {"lin_vel_error": "m/s", "ang_vel_error": "rad/s"}
 
 def velocity_cpu_profile(
     gait: tuple[tuple[int, ...], tuple[int, ...]] | None = None,
+    *,
+    evaluate: Callable[[EvaluationCfg], None] | None = None,
 ) -> Profile:
     """Return the `cpu` profile of a legged robot.
 
@@ -114,6 +117,7 @@ def velocity_cpu_profile(
         gait: Two groups of feet, by their position in the sensor `feet_ground_contact`, that take turns in
             swinging: diagonal feet for a quadruped, one foot each for a biped. None: a reward for air time
             that fades out, which takes about twice as long.
+        evaluate: Edit of the evaluation, in place, such as `evaluate_long`.
     """
 
     def ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
@@ -146,6 +150,8 @@ def velocity_cpu_profile(
             "ang_vel_error": 0.35,
             "failure_rate": 0.05,
         }
+        if evaluate is not None:
+            evaluate(evaluation)
 
     return cpu_profile(
         ease,
@@ -159,6 +165,14 @@ def velocity_cpu_profile(
         unpushed_samples=_UNPUSHED_SAMPLES,
         mirror="mjlab.tasks.velocity.symmetry:mirror_left_right",
     )
+
+
+def evaluate_long(evaluation: EvaluationCfg) -> None:
+    """Require fewer falls and smaller errors, judged by more episodes, for `cpu-long` profiles."""
+    evaluation.num_episodes = 200
+    evaluation.first_iteration, evaluation.min_interval = 700, 200
+    evaluation.trigger_below = {"lin_vel_error": 0.21}
+    evaluation.solved_below = {"lin_vel_error": 0.2, "ang_vel_error": 0.2, "failure_rate": 0.02}
 
 
 cpu = velocity_cpu_profile()

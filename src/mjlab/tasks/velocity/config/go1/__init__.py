@@ -25,7 +25,7 @@ _RUNNER = "mjlab.tasks.velocity.rl"
 
 for _terrain in ("Flat", "Rough"):
     for _suffix in ("", "-No-State-Estimation"):
-        _profiles = {"cpu": f"{_RL_CFG}:cpu"}
+        _profiles = {"cpu": f"{_RL_CFG}:cpu", "cpu-long": f"{_RL_CFG}:cpu_long"}
         if _terrain == "Rough" and not _suffix:
             _profiles["blind"] = "mjlab.tasks.velocity.rl.ppo:blind"
         _env_cfg = f"unitree_go1_{_terrain}{_suffix}_env_cfg".lower().replace("-", "_")

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg
-from mjlab.tasks.velocity.rl.ppo import velocity_cpu_profile, velocity_ppo_runner_cfg
+from mjlab.tasks.velocity.rl.ppo import (
+    evaluate_long,
+    velocity_cpu_profile,
+    velocity_ppo_runner_cfg,
+)
 
 
 def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
@@ -12,5 +16,8 @@ def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
 
 
 # A trot: FR and RL, FL and RR.
-cpu = velocity_cpu_profile(gait=((0, 3), (1, 2)))
-"""The `cpu` profile of all tasks."""
+_TROT = ((0, 3), (1, 2))
+cpu = velocity_cpu_profile(_TROT)
+"""The `cpu` profile of all tasks: training stops once robots walk."""
+cpu_long = velocity_cpu_profile(_TROT, evaluate=evaluate_long)
+"""The `cpu-long` profile of all tasks: `cpu`, until robots hardly fall."""
