@@ -28,8 +28,12 @@ class Demo:
 
 
 DEMOS = {
-    "go1": Demo("Mjlab-Velocity-Flat-Unitree-Go1", None, _FOLDER / "go1_velocity.onnx"),
-    "g1": Demo("Mjlab-Velocity-Flat-Unitree-G1", "cpu", _FOLDER / "g1_velocity.onnx"),
+    "go1": Demo(
+        "Mjlab-Velocity-Flat-Unitree-Go1-No-State-Estimation", None, _FOLDER / "go1_velocity.onnx"
+    ),
+    "g1": Demo(
+        "Mjlab-Velocity-Flat-Unitree-G1-No-State-Estimation", "cpu", _FOLDER / "g1_velocity.onnx"
+    ),
 }
 
 
