@@ -101,7 +101,9 @@ def table(found: dict[str, Any]) -> str:
         minutes = max(steps[name], 1) * found["step_dt"] / 60.0
         share, time = count / falls["all"], steps[name] / steps["all"]
         lines.append(
-            f"| {name} | {count} | {share:.0%} | {time:.0%} | {count / minutes:.3f} |".replace("%", " %")
+            f"| {name} | {count} | {share:.0%} | {time:.0%} | {count / minutes:.3f} |".replace(
+                "%", " %"
+            )
         )
     return "\n".join(lines)
 

@@ -51,7 +51,13 @@ from mjlab.runs.reference import (  # noqa: E402
     trained_seconds,
 )
 from mjlab.runs.run import DONE  # noqa: E402
-from mjlab.tasks.registry import UnknownTaskError, list_profiles, list_tasks, require_task  # noqa: E402
+from mjlab.tasks.registry import (  # noqa: E402
+    UnknownTaskError,
+    list_profiles,
+    list_tasks,
+    load_rl_cfg,
+    require_task,
+)
 from mjlab.utils.errors import UserError  # noqa: E402
 from mjlab.utils.processes import available_cores  # noqa: E402
 
@@ -134,7 +140,9 @@ def _is_stale(record: SeedRecord, commit: str, options: Options) -> bool:
 def _reference(task: str, options: Options) -> Reference:
     """Return the file of a task, or a reference without seeds."""
     profile = PROFILE if PROFILE in list_profiles(task) else None
-    flags = [*([] if profile else _FLAGS), *_EVALUATIONS, *options.flags]
+    bounds = load_rl_cfg(task, profile=profile).evaluation.trigger_below
+    unbounded = [f for name in bounds for f in (f"--agent.evaluation.trigger-below.{name}", "inf")]
+    flags = [*([] if profile else _FLAGS), *_EVALUATIONS, *unbounded, *options.flags]
     new = Reference(task=task, kind=options.kind, profile=profile, flags=flags)
     path = reference_path(options.data, task, options.kind)
     if not path.is_file():
@@ -321,8 +329,6 @@ def _summary(reference: Reference | None) -> tuple[str, str, str]:
 
 def _deciding(reference: Reference) -> list[str]:
     """Return the metrics that solve the task, by default the return."""
-    from mjlab.tasks.registry import load_rl_cfg
-
     cfg = load_rl_cfg(reference.task, profile=reference.profile).evaluation
     names = [METRIC] if cfg.solved_return is not None else []
     names += [*cfg.solved_below, *cfg.solved_above]

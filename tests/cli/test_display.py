@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import shlex
 import sys
 
@@ -111,6 +112,15 @@ def test_the_exploring_return_stands_beside_the_return_that_solves():
     assert "return=741(exploring) goal=900 steps/s=51200" in shown.text
     shown.iterate(4, mean_step_reward=0.5, exploring_return=500.0)
     assert "from exploring return 720 on" in shown.drawn()
+
+
+@pytest.mark.parametrize("value", [0.4, float("nan")])
+def test_an_exploring_bound_that_waits_is_shown(value):
+    shown = Shown({**BOUNDS, "trigger_return": -math.inf, "trigger_below": {"lin_vel_error": 0.3}})
+    shown.iterate(3, exploring={"lin_vel_error": value})
+    assert f"from exploring lin vel error 0.3 m/s on ({value:.2f} now)" in shown.drawn()
+    shown.iterate(4, exploring={"lin_vel_error": 0.2})
+    assert "at iteration" in shown.drawn()
 
 
 def test_other_bounds_have_the_last_evaluation_beside_them_and_its_trend():

@@ -178,6 +178,27 @@ def test_endless_runs_are_evaluated_unconfirmed():
     assert told.told[-1][2]
 
 
+def test_evaluations_wait_for_an_exploring_metric(tmp_path: Path):
+    rates = {"rate": lambda env: torch.full((env.num_envs,), env.rate)}
+    bound = {"rate": 0.1}
+    runner, told = learner(
+        SEED, tmp_path / "run", metrics=rates, trigger_below=bound, stop_when_solved=False
+    )
+    runner.learn(15)
+    iterations, values = read_scalars(tmp_path / "run", "Train/rate")
+    below = [int(it) + 1 for it, value in zip(iterations, values, strict=True) if value <= 0.1]
+    assert 0 < len(below) < len(iterations)
+    assert [iteration for _, iteration, _, _ in told.told] == below
+
+
+def test_an_unknown_exploring_metric_suggests_names():
+    rates = {"rate": lambda env: torch.zeros(env.num_envs)}
+    with pytest.raises(ValueError, match=r"trigger_below: 'rat'.*'rate'"):
+        SolvedCheck(
+            failing_env(1), Still(), evaluation(metrics=rates, trigger_below={"rat": 0.1}), 1
+        )
+
+
 class Still:
     """A policy, and the algorithm that holds it."""
 

@@ -71,7 +71,7 @@ def test_every_tag_of_rsl_rl_is_written_with_its_value_and_step(rnd, entry, caps
             continue
         ours.finish_iteration(
             iteration=it, first_iteration=0, total_iterations=3, losses=losses,
-            collection_time=0.8, learning_time=0.7, **report,
+            collection_time=0.8, learning_time=0.7, exploring={}, **report,
         )  # fmt: skip
     expected, written = theirs.writer.scalars, ours.writer.scalars
     own = {("Train/mean_step_reward", it) for it in range(3)}
@@ -86,7 +86,7 @@ def test_every_tag_of_rsl_rl_is_written_with_its_value_and_step(rnd, entry, caps
 def finish(logger: Any, it: int) -> IterationStats:
     return logger.finish_iteration(
         iteration=it, first_iteration=it, total_iterations=9, losses={}, collection_time=0.8,
-        learning_time=0.7, rnd_weight=0.1, **REPORT,
+        learning_time=0.7, rnd_weight=0.1, exploring={}, **REPORT,
     )  # fmt: skip
 
 
@@ -128,7 +128,7 @@ def test_the_time_left_is_without_the_warm_up(monkeypatch):
         logger.process_env_step(torch.zeros(NUM_ENVS), torch.zeros(NUM_ENVS), {})
         stats = logger.finish_iteration(
             iteration=it, first_iteration=3, total_iterations=9, losses={}, collection_time=0.8,
-            learning_time=0.7, rnd_weight=None, **REPORT,
+            learning_time=0.7, rnd_weight=None, exploring={}, **REPORT,
         )  # fmt: skip
         left.append(stats.time_left)
     assert left == [None, None, 2.0 * 3, 4.0 * 2, 3.5, 0.0]

@@ -26,6 +26,9 @@ from mjlab.viewer.debug_visualizer import NullDebugVisualizer
 NUM_ENVS = 7
 
 every_task = pytest.mark.parametrize("task", list_tasks())
+no_state_estimation = pytest.mark.parametrize(
+    "task", [task for task in list_tasks() if task.endswith("-No-State-Estimation")]
+)
 FAMILIES = {
     "Mjlab-Cartpole-Swingup",
     "Mjlab-Lift-Cube-Yam",
@@ -366,3 +369,28 @@ def test_its_help_lists_the_flags_of_its_terms(task):
 def test_its_runner_can_be_loaded(task):
     runner = load_runner_cls(task)
     assert runner is None or isinstance(runner, type)
+
+
+@no_state_estimation
+def test_actors_do_not_observe_what_needs_an_estimate(task):
+    """Position and linear velocity of the base are not measured: they do not change observations."""
+
+    def observed(env, change):
+        robot = env.scene["robot"]
+        state = torch.cat([robot.data.root_link_pose_w, robot.data.root_link_vel_w], dim=1)
+        state[:, :3] += change
+        state[:, 7:10] += change
+        robot.write_root_state_to_sim(state)
+        env.scene.write_data_to_sim()
+        env.sim.forward()
+        env.sim.sense()
+        return {
+            name: group.clone()
+            for name, group in env.observation_manager.compute(update_history=True).items()
+        }
+
+    with making(task, noisy=False) as env:
+        env.reset()
+        before, after = (observed(env, change) for change in (0.0, 0.3))
+        torch.testing.assert_close(after["actor"], before["actor"], atol=1e-4, rtol=1e-4)
+        assert not torch.allclose(after["critic"], before["critic"], atol=0.1)

@@ -177,10 +177,12 @@ class TrainingProgress(TrainingObserver):
         last = self._evaluations[-1][0] if self._evaluations else 0
         if cfg.is_triggered(stats.mean_step_reward, steps, stats.exploring):
             return f"at iteration {max(cfg.earliest_after(last), self.iteration + 1)}"
-        for name, value in stats.exploring.items():
-            if value > (most := cfg.trigger_below[name]):
-                words = f"exploring {name.replace('_', ' ')}"
-                return f"from {words} {most:g} {cfg.units.get(name, '')} on ({value:.2f} now)"
+        for name, most in cfg.trigger_below.items():
+            value = stats.exploring[name]
+            # NaN is not below, either.
+            if not value <= most:
+                bound = f"{name.replace('_', ' ')} {most:g} {cfg.units.get(name, '')}".rstrip()
+                return f"from exploring {bound} on ({value:.2f} now)"
         start = f"from exploring return {cfg.trigger:,.0f} on"
         if stats.exploring_length in (None, steps):
             return start

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import itertools
+import math
 import os
 import signal
 import subprocess
@@ -301,6 +302,7 @@ def _evaluations(sweep: Sweep, setting: Setting) -> list[str]:
         "trigger-return": -1e9,
         "min-interval": interval,
         "first-iteration": max(0, total - (_EVALUATIONS - 1) * interval),
+        **{f"trigger-below.{name}": math.inf for name in agent.evaluation.trigger_below},
     }
     return [f"--agent.evaluation.{name}={value}" for name, value in settings.items()]
 

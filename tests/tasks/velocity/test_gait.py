@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from stand_ins import StandInEnv, contacts
 from tensordict import TensorDict
 from velocity_tasks import task_cfg
 
@@ -333,6 +334,51 @@ def test_the_reward_of_heights_is_one_on_target_and_less_off_it(make_env, task):
     heights[:, 0] += 0.03
     expected = [math.exp(-(0.03**2) / 0.005)] * 4
     assert mdp.feet_height_by_phase(env, **params).tolist() == pytest.approx(expected)
+
+
+TROT = ((0, 3), (1, 2))
+
+
+def alternation(air_time: torch.Tensor, groups: Any = TROT, speed: float = 1.0, **params: Any):
+    env: Any = StandInEnv(len(air_time), feet=contacts(current_air_time=air_time))
+    env.command(*[(speed, 0.0, 0.0)] * len(air_time))
+    return mdp.feet_alternate(env, "feet", groups, command_name="twist", **params)
+
+
+def test_feet_alternate_in_stances_of_one_group():
+    torch.manual_seed(0)
+    air_time = 0.5 * torch.rand(512, 4) * (torch.rand(512, 4) < 0.5)
+    reward = alternation(air_time)
+    for row, value in zip(air_time.tolist(), reward.tolist(), strict=True):
+        swinging = tuple(foot for foot, time in enumerate(row) if time > 0.0)
+        assert value == float(swinging in TROT and max(row) < 0.35)
+    assert 0.0 < reward.mean() < 1.0
+    # Groups and feet within groups in other orders, and mirror images, earn the same.
+    for groups in (TROT[::-1], tuple(group[::-1] for group in TROT)):
+        assert torch.equal(alternation(air_time, groups), reward)
+    assert torch.equal(alternation(air_time[:, [1, 0, 3, 2]]), reward)
+
+
+@pytest.mark.parametrize(
+    ("air_time", "reward"),
+    [
+        ([0.1, 0.0, 0.0, 0.1], 1.0),
+        ([0.0, 0.02, 0.3, 0.0], 1.0),
+        ([0.0, 0.0, 0.0, 0.0], 0.0),
+        ([0.1, 0.1, 0.1, 0.1], 0.0),
+        ([0.1, 0.0, 0.0, 0.0], 0.0),
+        ([0.1, 0.0, 0.0, 0.4], 0.0),
+    ],
+)
+def test_a_trot_earns_one(air_time, reward):
+    assert alternation(torch.tensor([air_time])).tolist() == [reward]
+    assert alternation(torch.tensor([air_time]), speed=0.05).tolist() == [0.0]
+
+
+def test_a_longer_swing_may_be_allowed():
+    air_time = torch.tensor([[0.5, 0.0]])
+    assert alternation(air_time, ((0,), (1,))).tolist() == [0.0]
+    assert alternation(air_time, ((0,), (1,)), longest_swing=0.6).tolist() == [1.0]
 
 
 def test_heights_by_phase_need_a_gait_clock(make_env):

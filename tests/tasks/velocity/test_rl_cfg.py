@@ -7,13 +7,10 @@ import torch
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
-from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
+from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg
+from mjlab.tasks.velocity.rl.ppo import velocity_cpu_profile
 
-TASKS = [
-    f"Mjlab-Velocity-{terrain}-Unitree-{robot}"
-    for terrain in ("Flat", "Rough")
-    for robot in ("Go1", "G1")
-]
+TASKS = [task for task in list_tasks() if task.startswith("Mjlab-Velocity")]
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -27,15 +24,32 @@ def test_contacts_are_simple_in_training(task):
         assert max(dims) <= 3
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if task.endswith("Go1")])
-def test_penalties_are_eased_and_nothing_else(task):
-    env_cfg, table = load_env_cfg(task, profile="cpu"), load_env_cfg(task)
-    eased = {name for name, term in table.rewards.items() if term.weight < 0} | {"air_time"}
+@pytest.mark.parametrize("task", [task for task in TASKS if "Go1" in task])
+@pytest.mark.parametrize("gait", [((0, 3), (1, 2)), None])
+def test_penalties_are_eased_and_nothing_else(task, gait):
+    """Of the rewards: a gait is added, or without one, a reward for air time fades out."""
+    table, rl_cfg = load_env_cfg(task), load_rl_cfg(task)
+    env_cfg = load_env_cfg(task)
+    velocity_cpu_profile(gait).easing(env_cfg, rl_cfg)
+    added = set() if gait is None else {"gait"}
+    assert env_cfg.rewards.keys() - table.rewards.keys() == added
+    eased = {name for name, term in table.rewards.items() if term.weight < 0}
+    eased |= {"air_time"} - ({"air_time"} if gait else set())
     for name, term in table.rewards.items():
         easing = env_cfg.curriculum.get(f"eased_{name}")
         assert (easing is not None) == (name in eased)
         if name in eased - {"air_time"}:
             assert easing.params["first"] == pytest.approx(0.02 * term.weight)
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if "Go1" in task])
+def test_the_gait_of_the_go1_is_a_trot(task):
+    cfg = load_env_cfg(task, profile="cpu")
+    (sensor,) = [s for s in cfg.scene.sensors if s.name == "feet_ground_contact"]
+    feet = [name[:2] for name in sensor.primary.pattern]
+    groups = {frozenset(feet[i] for i in g) for g in cfg.rewards["gait"].params["groups"]}
+    assert groups == {frozenset({"FR", "RL"}), frozenset({"FL", "RR"})}
+    assert sensor.track_air_time
 
 
 @pytest.mark.parametrize("terrain", ["Flat", "Rough"])

@@ -8,9 +8,11 @@ import pytest
 import torch
 from velocity_tasks import GO1_FLAT, GO1_ROUGH
 
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity.config.g1 import unitree_g1_flat_env_cfg, unitree_g1_rough_env_cfg
+from mjlab.tasks.velocity.config.g1.env_cfgs import unitree_g1_rough_no_state_estimation_env_cfg
 from mjlab.tasks.velocity.config.go1 import unitree_go1_flat_env_cfg, unitree_go1_rough_env_cfg
+from mjlab.tasks.velocity.config.go1.env_cfgs import unitree_go1_flat_no_state_estimation_env_cfg
 from mjlab.tasks.velocity.velocity_env_cfg import make_velocity_env_cfg
 from mjlab.terrains.config import ROUGH_TERRAINS_CFG
 from mjlab.utils.os import to_plain
@@ -21,7 +23,10 @@ MAKERS = [
     unitree_go1_flat_env_cfg,
     unitree_g1_rough_env_cfg,
     unitree_g1_flat_env_cfg,
+    unitree_go1_flat_no_state_estimation_env_cfg,
+    unitree_g1_rough_no_state_estimation_env_cfg,
 ]
+SUFFIX = "-No-State-Estimation"
 
 
 def mutable_parts(value: object, path: str = "", found: dict[int, str] | None = None):
@@ -86,6 +91,25 @@ def test_the_base_config_is_that_of_the_g1_but_for_what_a_robot_brings():
     assert (base.sim.nconmax, base.sim.mujoco.ccd_iterations) == (35, 50)
     assert base.sim.contact_sensor_maxmatch == 64
     assert not base.scene.terrain.terrain_generator.curriculum  # ty: ignore
+
+
+@pytest.mark.parametrize("play", [False, True])
+@pytest.mark.parametrize(
+    "task", [t for t in list_tasks() if t.startswith("Mjlab-Velocity") and t.endswith(SUFFIX)]
+)
+def test_only_the_actor_lacks_state_estimation(task, play):
+    cfg, whole = (load_env_cfg(t, play=play) for t in (task, task.removesuffix(SUFFIX)))
+    actor, complete = cfg.observations["actor"], whole.observations["actor"]
+    removed = complete.terms.keys() - actor.terms.keys()
+    assert removed == {"base_lin_vel"} | (complete.terms.keys() & {"height_scan"})
+    assert actor.history_length == (10 if "height_scan" in removed else None)
+    for name in removed:
+        del complete.terms[name]
+    actor.history_length = complete.history_length
+    assert list(actor.terms) == list(complete.terms)
+    assert to_plain(cfg) == to_plain(whole)
+    learners = [to_plain(load_rl_cfg(t)) for t in (task, task.removesuffix(SUFFIX))]
+    assert learners[0] == learners[1]
 
 
 def take_from_base(kind: str, name: str):
@@ -162,6 +186,8 @@ def test_playing_ends_no_episode_by_time(make_env):
         (GO1_FLAT, 48, 72, 12),
         ("Mjlab-Velocity-Rough-Unitree-G1", 286, 298, 29),
         ("Mjlab-Velocity-Flat-Unitree-G1", 99, 111, 29),
+        (GO1_FLAT + SUFFIX, 45, 72, 12),
+        (GO1_ROUGH + SUFFIX, 450, 259, 12),
     ],
 )
 def test_observations_and_actions_are_as_wide_as_documented(make_env, task, actor, critic, actions):
