@@ -123,7 +123,8 @@ class RunLogger(Logger):
     """rsl_rl's logger, silent on the console and without a GPU synchronization per step.
 
     Step data stays on the device until `finish_iteration` reads all of it at once. Tags in the
-    event files are rsl_rl's, `Train/mean_step_reward` and `Train/exploring_return`.
+    event files are rsl_rl's, `Train/mean_step_reward`, `Train/exploring_return` and `Train/<metric>` of
+    `IterationStats.exploring`.
 
     Runners with a custom loop, written against rsl_rl, call `log` instead.
     """
