@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
-from mjlab.tasks.registry import list_tasks, load_env_cfg, load_rl_cfg
+from mjlab.rl.evaluation import wilson_interval
+from mjlab.tasks.registry import list_profiles, list_tasks, load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity.rl.ppo import velocity_cpu_profile
 
 TASKS = [task for task in list_tasks() if task.startswith("Mjlab-Velocity")]
@@ -50,6 +53,36 @@ def test_the_gait_of_the_go1_is_a_trot(task):
     groups = {frozenset(feet[i] for i in g) for g in cfg.rewards["gait"].params["groups"]}
     assert groups == {frozenset({"FR", "RL"}), frozenset({"FL", "RR"})}
     assert sensor.track_air_time
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if "Go1" in task])
+def test_cpu_long_is_cpu_with_stricter_bounds(task):
+    assert load_env_cfg(task, profile="cpu-long") == load_env_cfg(task, profile="cpu")
+    long, cpu = (load_rl_cfg(task, profile=profile) for profile in ("cpu-long", "cpu"))
+    assert dataclasses.replace(long, evaluation=cpu.evaluation) == cpu
+    assert long.evaluation.solved_below.keys() == cpu.evaluation.solved_below.keys()
+    for name, limit in long.evaluation.solved_below.items():
+        assert limit < cpu.evaluation.solved_below[name]
+    assert long.evaluation.num_episodes > cpu.evaluation.num_episodes
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_episodes_suffice_for_the_bound_on_failures(task):
+    """Half as many failures as the bound meet it, judged by the center of an interval."""
+    for profile in list_profiles(task):
+        cfg = load_rl_cfg(task, profile=profile).evaluation
+        limit = cfg.solved_below.get("failure_rate", 1.0)
+        rate = int(0.5 * limit * cfg.num_episodes) / cfg.num_episodes
+        assert sum(wilson_interval(rate, cfg.num_episodes)) / 2 <= limit
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_exploring_errors_trigger_before_the_bound(task):
+    """Exploration adds to errors, so a policy that meets a bound is evaluated."""
+    for profile in list_profiles(task):
+        cfg = load_rl_cfg(task, profile=profile).evaluation
+        for name, limit in cfg.trigger_below.items():
+            assert cfg.solved_below[name] < limit
 
 
 @pytest.mark.parametrize("terrain", ["Flat", "Rough"])
