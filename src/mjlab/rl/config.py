@@ -247,7 +247,8 @@ class EvaluationCfg:
     """Return of the training data that triggers an evaluation, instead of `trigger_fraction`."""
     trigger_below: Annotated[dict[str, float], Range()] = field(default_factory=dict)
     """Upper bounds of `metrics` in the training environments that trigger an evaluation, together with
-    the return if that is set: means over the environments after an iteration, with exploration."""
+    the return if that is set: means over the environments of the first process after an iteration, with
+    exploration."""
     min_interval: CountOrZero = 3
     """Minimum number of iterations between evaluations."""
     first_iteration: CountOrZero = 0
@@ -289,17 +290,23 @@ class EvaluationCfg:
         return max(last + self.min_interval, self.first_iteration)
 
     def is_triggered(
-        self, mean_step_reward: float, episode_steps: float, exploring: Mapping[str, float]
+        self,
+        mean_step_reward: float,
+        episode_steps: float,
+        exploring: Mapping[str, float] | None = None,
     ) -> bool:
         """Return True if the training data reach `trigger` and `trigger_below`.
 
         Args:
             mean_step_reward: Mean weighted reward per step.
             episode_steps: Length of an episode.
-            exploring: Metrics of the training environments by name.
+            exploring: Metrics of the training environments by name. A missing one is not below.
         """
         has_return = self.trigger is None or mean_step_reward * episode_steps >= self.trigger
-        return has_return and all(exploring[n] <= v for n, v in self.trigger_below.items())
+        found = exploring or {}
+        return has_return and all(
+            found.get(name, math.inf) <= most for name, most in self.trigger_below.items()
+        )
 
 
 def resolve_success(success: Any) -> Any:

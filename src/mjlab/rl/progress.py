@@ -178,7 +178,7 @@ class TrainingProgress(TrainingObserver):
         if cfg.is_triggered(stats.mean_step_reward, steps, stats.exploring):
             return f"at iteration {max(cfg.earliest_after(last), self.iteration + 1)}"
         for name, most in cfg.trigger_below.items():
-            value = stats.exploring[name]
+            value = stats.exploring.get(name, math.nan)
             # NaN is not below, either.
             if not value <= most:
                 bound = f"{name.replace('_', ' ')} {most:g} {cfg.units.get(name, '')}".rstrip()

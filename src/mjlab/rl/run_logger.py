@@ -287,7 +287,7 @@ class RunLogger(Logger):
         learning_rate: float,
         action_std: torch.Tensor,
         rnd_weight: float | None,
-        exploring: dict[str, float],
+        exploring: dict[str, float] | None = None,
     ) -> IterationStats:
         """Write the statistics of iteration number `iteration` (from 0), and return them."""
         steps = int(self.cfg["num_steps_per_env"]) * self.num_envs * self.gpu_world_size
@@ -312,7 +312,7 @@ class RunLogger(Logger):
             learning_rate=learning_rate,
             action_std=action_std.mean().item(),
             losses=losses,
-            exploring=exploring,
+            exploring=exploring or {},
             environment=self._environment_means(),
         )
         self._write(stats, iteration, rnd_weight)
@@ -476,8 +476,8 @@ class RunLogger(Logger):
             "Perf/total_fps": int(stats.steps_per_second),
             "Perf/collection_time": stats.collection_time,
             "Perf/learning_time": stats.learning_time,
-            "Train/mean_step_reward": stats.mean_step_reward,
             **{f"Train/{name}": value for name, value in stats.exploring.items()},
+            "Train/mean_step_reward": stats.mean_step_reward,
         }
         if stats.exploring_return is not None:
             scalars["Train/exploring_return"] = stats.exploring_return

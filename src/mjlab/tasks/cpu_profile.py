@@ -31,7 +31,7 @@ def cpu_profile(
     entropy_coef: float = 0.01,
     desired_kl: float = 0.03,
     gamma: float = 0.97,
-    num_epochs: int = 5,
+    num_epochs: int | None = None,
     max_iterations: int = 2000,
     save_interval: int = 100,
     physics_steps: int | None = None,
@@ -52,7 +52,7 @@ def cpu_profile(
         entropy_coef: Entropy bonus coefficient.
         desired_kl: Target KL divergence (nats) of the adaptive learning rate.
         gamma: Discount factor per environment step.
-        num_epochs: Passes over the samples of an iteration.
+        num_epochs: Passes over the samples of an iteration. None: the task's.
         max_iterations: Number of training iterations.
         save_interval: Iterations between checkpoints.
         physics_steps: Decimation, less than the task's; the physics timestep grows accordingly. None:
@@ -77,7 +77,9 @@ def cpu_profile(
         rl_cfg.save_interval = save_interval
         algorithm = rl_cfg.algorithm
         algorithm.entropy_coef, algorithm.desired_kl = entropy_coef, desired_kl
-        algorithm.gamma, algorithm.num_learning_epochs = gamma, num_epochs
+        algorithm.gamma = gamma
+        if num_epochs is not None:
+            algorithm.num_learning_epochs = num_epochs
         if mirror is not None:
             algorithm.symmetry_cfg = {
                 "data_augmentation_func": mirror,

@@ -375,6 +375,12 @@ def test_a_trot_earns_one(air_time, reward):
     assert alternation(torch.tensor([air_time]), speed=0.05).tolist() == [0.0]
 
 
+@pytest.mark.parametrize("groups", [((0,), (1, 2)), ((0, 3), (1, 3)), ((0, 3), (1, 2, 4))])
+def test_each_foot_is_in_one_group(groups):
+    with pytest.raises(ValueError, match="each of 4 feet of the sensor 'feet'"):
+        alternation(torch.zeros(1, 4), groups)
+
+
 def test_a_longer_swing_may_be_allowed():
     air_time = torch.tensor([[0.5, 0.0]])
     assert alternation(air_time, ((0,), (1,))).tolist() == [0.0]

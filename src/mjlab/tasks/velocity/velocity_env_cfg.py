@@ -2,7 +2,8 @@
 
 `make_legged_env_cfg` returns the task of a robot, from the names of its parts; see `config/go1` and
 `config/g1`. `make_flat`, `remove_state_estimation` and `make_playable` adapt it to flat ground, to
-the sensors of a robot and to play mode. `make_velocity_env_cfg` returns the template, whose names are left to fill in.
+the sensors of a robot and to play mode. `make_velocity_env_cfg` returns the template, whose names
+are left to fill in.
 """
 
 from __future__ import annotations

@@ -225,10 +225,21 @@ def feet_alternate(
         longest_swing: Longest air time of a foot (s).
         command_name: Velocity command that enables the reward. None: always enabled.
         command_threshold: Commanded motion that must be exceeded to enable the reward.
+
+    Raises `ValueError` unless each foot is in one group.
     """
     air_time = env.scene[sensor_name].data.current_air_time
-    first, second = (air_time[:, list(group)] > 0.0 for group in groups)
-    alternate = (first.all(dim=1) & ~second.any(dim=1)) | (second.all(dim=1) & ~first.any(dim=1))
+    first, second = groups
+    if sorted((*first, *second)) != list(range(air_time.shape[1])):
+        raise ValueError(
+            f"feet_alternate groups: expected each of {air_time.shape[1]} feet of the sensor {sensor_name!r} "
+            f"in one group, got {groups}."
+        )
+    swings = air_time > 0.0
+    swings_in_turn = constant_tensor(
+        tuple(foot in first for foot in range(air_time.shape[1])), air_time.device, torch.bool
+    )
+    alternate = (swings == swings_in_turn).all(dim=1) | (swings != swings_in_turn).all(dim=1)
     alternate &= (air_time < longest_swing).all(dim=1)
     return if_commanded(alternate.float(), env, command_name, command_threshold)
 

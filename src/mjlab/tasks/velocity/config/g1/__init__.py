@@ -12,7 +12,13 @@ if TYPE_CHECKING:
         unitree_g1_flat_env_cfg as unitree_g1_flat_env_cfg,
     )
     from mjlab.tasks.velocity.config.g1.env_cfgs import (
+        unitree_g1_flat_no_state_estimation_env_cfg as unitree_g1_flat_no_state_estimation_env_cfg,
+    )
+    from mjlab.tasks.velocity.config.g1.env_cfgs import (
         unitree_g1_rough_env_cfg as unitree_g1_rough_env_cfg,
+    )
+    from mjlab.tasks.velocity.config.g1.env_cfgs import (
+        unitree_g1_rough_no_state_estimation_env_cfg as unitree_g1_rough_no_state_estimation_env_cfg,
     )
     from mjlab.tasks.velocity.config.g1.rl_cfg import (
         unitree_g1_ppo_runner_cfg as unitree_g1_ppo_runner_cfg,
@@ -39,7 +45,9 @@ __getattr__ = lazy_names(
     {
         "VelocityOnPolicyRunner": _RUNNER,
         "unitree_g1_flat_env_cfg": _ENV_CFGS,
+        "unitree_g1_flat_no_state_estimation_env_cfg": _ENV_CFGS,
         "unitree_g1_ppo_runner_cfg": _RL_CFG,
         "unitree_g1_rough_env_cfg": _ENV_CFGS,
+        "unitree_g1_rough_no_state_estimation_env_cfg": _ENV_CFGS,
     },
 )

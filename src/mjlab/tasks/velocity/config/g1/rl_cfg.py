@@ -7,8 +7,9 @@ the experiments.
 - A textbook controller steps in place (`stepping_action`). The controller acts for the first 60 environment
   steps, and the policy imitates it, with decreasing weight, for the first 1,200 of about 3,000. Without
   imitation, policies only learn to stand.
-- Actions are bounded, and policies observe a gait clock and a history of five linear velocities, angular
-  velocities and gravity directions, to filter sensor noise. Policies keep all three.
+- Actions are bounded, and policies observe a gait clock, Unitree's `gait_phase`, and the last five joint
+  positions, velocities and gravity directions of the base. The history filters noise; without state
+  estimation, it also shows how fast the base moves over its standing foot. Policies keep all three.
 - Rewards define the gait: feet at the height given by the clock and apart from each other, a pelvis at constant
   height and upright, joints near the default pose. The penalties of the task stay.
 - Commands and pushes grow with a curriculum.
@@ -119,7 +120,7 @@ _LIMBS = tuple(
 
 
 def unitree_g1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
-    """Return the PPO config of both tasks."""
+    """Return the PPO config of all tasks."""
     return velocity_ppo_runner_cfg(experiment_name="g1_velocity", max_iterations=30_000)
 
 
@@ -229,4 +230,4 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
 
 
 cpu = Profile(_set_policy, _ease)
-"""The `cpu` profile of both tasks."""
+"""The `cpu` profile of all tasks."""

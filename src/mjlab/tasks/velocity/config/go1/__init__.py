@@ -12,7 +12,13 @@ if TYPE_CHECKING:
         unitree_go1_flat_env_cfg as unitree_go1_flat_env_cfg,
     )
     from mjlab.tasks.velocity.config.go1.env_cfgs import (
+        unitree_go1_flat_no_state_estimation_env_cfg as unitree_go1_flat_no_state_estimation_env_cfg,
+    )
+    from mjlab.tasks.velocity.config.go1.env_cfgs import (
         unitree_go1_rough_env_cfg as unitree_go1_rough_env_cfg,
+    )
+    from mjlab.tasks.velocity.config.go1.env_cfgs import (
+        unitree_go1_rough_no_state_estimation_env_cfg as unitree_go1_rough_no_state_estimation_env_cfg,
     )
     from mjlab.tasks.velocity.config.go1.rl_cfg import (
         unitree_go1_ppo_runner_cfg as unitree_go1_ppo_runner_cfg,
@@ -25,8 +31,10 @@ _RUNNER = "mjlab.tasks.velocity.rl"
 
 for _terrain in ("Flat", "Rough"):
     for _suffix in ("", "-No-State-Estimation"):
-        _profiles = {"cpu": f"{_RL_CFG}:cpu", "cpu-long": f"{_RL_CFG}:cpu_long"}
-        if _terrain == "Rough" and not _suffix:
+        _profiles = {"cpu": f"{_RL_CFG}:cpu"}
+        if _terrain == "Flat":
+            _profiles["cpu-long"] = f"{_RL_CFG}:cpu_long"
+        elif not _suffix:
             _profiles["blind"] = "mjlab.tasks.velocity.rl.ppo:blind"
         _env_cfg = f"unitree_go1_{_terrain}{_suffix}_env_cfg".lower().replace("-", "_")
         register_mjlab_task(
@@ -42,7 +50,9 @@ __getattr__ = lazy_names(
     {
         "VelocityOnPolicyRunner": _RUNNER,
         "unitree_go1_flat_env_cfg": _ENV_CFGS,
+        "unitree_go1_flat_no_state_estimation_env_cfg": _ENV_CFGS,
         "unitree_go1_ppo_runner_cfg": _RL_CFG,
         "unitree_go1_rough_env_cfg": _ENV_CFGS,
+        "unitree_go1_rough_no_state_estimation_env_cfg": _ENV_CFGS,
     },
 )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from mjlab.rl.config import RslRlOnPolicyRunnerCfg
 from mjlab.tasks.velocity.rl.ppo import (
+    cpu_with_gait,
     evaluate_long,
-    velocity_cpu_profile,
     velocity_ppo_runner_cfg,
 )
 
@@ -17,7 +17,7 @@ def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
 
 # A trot: FR and RL, FL and RR.
 _TROT = ((0, 3), (1, 2))
-cpu = velocity_cpu_profile(_TROT)
+cpu = cpu_with_gait(_TROT)
 """The `cpu` profile of all tasks: training stops once robots walk."""
-cpu_long = velocity_cpu_profile(_TROT, evaluate=evaluate_long)
-"""The `cpu-long` profile of all tasks: `cpu`, until robots hardly fall."""
+cpu_long = cpu_with_gait(_TROT, evaluate=evaluate_long)
+"""The `cpu-long` profile of the flat tasks: `cpu`, until robots hardly fall."""
