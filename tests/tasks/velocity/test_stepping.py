@@ -10,19 +10,27 @@ import torch
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.envs import mdp as envs_mdp
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.symmetry import mirror_left_right, mirror_of_joints
 
 G1, GO1 = "Mjlab-Velocity-Flat-Unitree-G1", "Mjlab-Velocity-Flat-Unitree-Go1"
 
 
-def make_env(task: str = G1, profile: str | None = "cpu", num_envs: int = 4, **params: Any):
+def make_env(
+    task: str = G1,
+    profile: str | None = "cpu",
+    num_envs: int = 4,
+    fade_s: float | None = None,
+    **params: Any,
+):
     cfg = load_env_cfg(task, profile=profile)
     cfg.scene.num_envs, cfg.seed = num_envs, 0
     cfg.events.pop("push_robot")
     if profile is None:
         cfg.commands["gait"] = mdp.GaitClockCommandCfg()
+    if fade_s is not None:
+        cfg.commands["gait"].fade_s = fade_s
     teacher = ObservationTermCfg(func=mdp.stepping_action, params=params)
     cfg.observations["teacher"] = ObservationGroupCfg(terms={"step": teacher})
     return ManagerBasedRlEnv(cfg, device="cpu")
@@ -30,7 +38,8 @@ def make_env(task: str = G1, profile: str | None = "cpu", num_envs: int = 4, **p
 
 @pytest.fixture
 def env():
-    env = make_env(num_envs=8)
+    """Robots that start to step gradually."""
+    env = make_env(num_envs=8, fade_s=0.3)
     yield env
     env.close()
 
@@ -60,6 +69,16 @@ def test_driven_robots_step_and_stand(env):
         heights = env.scene["foot_height_scan"].data.heights
         highest = torch.maximum(highest, heights.median(dim=0).values)
     assert (highest > 0.02).all()
+
+
+def test_robots_stand_while_the_teacher_acts():
+    """With the clock of training, which steps at once, robots stand for long enough."""
+    env = make_env(num_envs=8)
+    steps = load_rl_cfg(G1, profile="cpu").algorithm.teacher_steps
+    try:
+        assert (lives(env, steps, follow=True) == steps).all()
+    finally:
+        env.close()
 
 
 def test_the_image_of_what_it_does_is_what_it_does_in_the_mirror(env):

@@ -22,11 +22,12 @@ def walk(env, steps: int, seed: int = 0) -> torch.Tensor:
     return torch.stack([env.step(action)[1].clone() for action in actions])
 
 
-def test_all_four_tasks_are_registered():
+def test_all_eight_tasks_are_registered():
     assert {name for name in list_tasks() if "Velocity" in name} == {
-        f"Mjlab-Velocity-{ground}-Unitree-{robot}"
+        f"Mjlab-Velocity-{ground}-Unitree-{robot}{suffix}"
         for ground in ("Flat", "Rough")
         for robot in ("Go1", "G1")
+        for suffix in ("", "-No-State-Estimation")
     }
 
 
