@@ -31,7 +31,7 @@ def test_commands_come_first_then_tasks():
         (["--video", "--hel"], ["--help"]),
         (["--help", "ag"], ["agent"]),
         (["--engine", ""], ["auto", "native", "warp"]),
-        (["--profile", ""], ["cpu"]),
+        (["--profile", ""], ["cpu", "cpu-long"]),
     ],
 )
 def test_flags_and_their_values_are_completed(words, completed):
