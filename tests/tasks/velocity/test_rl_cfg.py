@@ -33,7 +33,7 @@ def test_penalties_are_eased_and_nothing_else(task, gait):
     """Of the rewards: a gait is added, or where it is unknown, a reward for air time fades out."""
     table, rl_cfg = load_env_cfg(task), load_rl_cfg(task)
     env_cfg = load_env_cfg(task)
-    profile = ppo.cpu if gait is None else ppo.cpu_with_gait(gait)
+    profile = ppo.cpu if gait is None else ppo.cpu_with_gait(gait, minimum_height=0.1)
     profile.easing(env_cfg, rl_cfg)
     added = set() if gait is None else {"gait"}
     assert env_cfg.rewards.keys() - table.rewards.keys() == added

@@ -17,7 +17,9 @@ def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
 
 # A trot: FR and RL, FL and RR.
 _TROT = ((0, 3), (1, 2))
-cpu = cpu_with_gait(_TROT)
+# The trunk of a standing robot is 0.25 m above its feet.
+_MINIMUM_HEIGHT = 0.17
+cpu = cpu_with_gait(_TROT, minimum_height=_MINIMUM_HEIGHT)
 """The `cpu` profile of all tasks: training stops once robots walk."""
-cpu_long = cpu_with_gait(_TROT, evaluate=evaluate_long)
+cpu_long = cpu_with_gait(_TROT, minimum_height=_MINIMUM_HEIGHT, evaluate=evaluate_long)
 """The `cpu-long` profile of the flat tasks: `cpu`, until robots hardly fall."""
