@@ -57,8 +57,11 @@ def press(panel: Any, client: Client) -> None:
 
 def finish(viewer: ViserPlayViewer, panel: Any) -> None:
     """Wait for the thread that renders, and update the page."""
+    before = panel._recording
     show(viewer)
-    panel._recording.join()
+    # A thread that failed at once may have been noticed already.
+    if (recording := before or panel._recording) is not None:
+        recording.join()
     viewer._next_scene = 0.0
     viewer.sync_env_to_viewer()
 
