@@ -44,6 +44,10 @@ from mjlab.utils.errors import UnknownNameError
 from mjlab.utils.string import suggest
 from mjlab.viewer import ViewerConfig
 
+BLIND_HISTORY = 10
+"""Number of steps that policies without height scan observe on terrain: a foot contact affects
+measurements for about 0.2 s."""
+
 
 def make_legged_env_cfg(
     robot: EntityCfg,
@@ -225,12 +229,12 @@ def remove_state_estimation(cfg: ManagerBasedRlEnvCfg) -> None:
     """Let the actor observe only what a robot measures, in place.
 
     Removes base velocity and height scan from the group `actor`; the critic keeps both. On terrain,
-    the actor observes the last ten steps: a foot contact affects measurements for about 0.2 s.
+    the actor observes the last `BLIND_HISTORY` steps.
     """
     actor = cfg.observations["actor"]
     del actor.terms["base_lin_vel"]
     if actor.terms.pop("height_scan", None) is not None:
-        actor.history_length = 10
+        actor.history_length = BLIND_HISTORY
 
 
 def get_sensor(cfg: ManagerBasedRlEnvCfg, name: str) -> Any:

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -48,11 +47,10 @@ from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.tasks.easing import ease_weight
 from mjlab.tasks.registry import Profile
 from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.velocity_env_cfg import BLIND_HISTORY
 
 _STUDENT = "student"
 _SCAN = "height_scan"
-# A foot contact affects proprioception for about 0.2 s.
-_BLIND_HISTORY = 10
 _BLIND_STEPS = 24
 _ROBOT = "robot"
 _COMMAND = "twist"
@@ -141,7 +139,6 @@ def cpu_with_gait(
     groups: tuple[tuple[int, ...], tuple[int, ...]],
     *,
     minimum_height: float,
-    evaluate: Callable[[EvaluationCfg], None] | None = None,
 ) -> Profile:
     """Return the `cpu` profile of a legged robot whose gait is known.
 
@@ -153,7 +150,6 @@ def cpu_with_gait(
             in swinging, such as the diagonals of a quadruped.
         minimum_height: Height of the root above the lowest foot (m) below which training episodes terminate.
             Otherwise some seeds learn to lie down, and need five times the samples.
-        evaluate: Edit of the evaluation, in place, such as `evaluate_long`.
     """
 
     def ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
@@ -172,16 +168,16 @@ def cpu_with_gait(
             func=mdp.root_near_feet, params={"minimum_height": minimum_height, "asset_cfg": feet}
         )
         evaluation = rl_cfg.evaluation
-        # Takes as long as 20 iterations.
-        evaluation.num_episodes, evaluation.min_interval = 60, 10
         evaluation.trigger_return = -math.inf
-        # Training errors on terrain are those of its current level.
-        evaluation.trigger_below = {"lin_vel_error": 0.26 if _is_flat(env_cfg) else 0.35}
         evaluation.solved_below = dict(_SOLVED)
-        if not _is_flat(env_cfg):
+        if _is_flat(env_cfg):
+            # Takes as long as 20 iterations.
+            evaluation.num_episodes, evaluation.min_interval = 60, 10
+            evaluation.trigger_below = {"lin_vel_error": 0.26}
+        else:
             evaluation.num_episodes, evaluation.min_interval = 200, 100
-        if evaluate is not None:
-            evaluate(evaluation)
+            # Training errors on terrain are those of its current level.
+            evaluation.trigger_below = {"lin_vel_error": 0.35}
 
     return cpu_profile(
         ease,
@@ -197,14 +193,6 @@ def cpu_with_gait(
     )
 
 
-def evaluate_long(evaluation: EvaluationCfg) -> None:
-    """Require fewer falls and smaller errors, judged by more episodes, for `cpu-long` profiles."""
-    evaluation.num_episodes = 200
-    evaluation.first_iteration, evaluation.min_interval = 700, 200
-    evaluation.trigger_below = {"lin_vel_error": 0.21}
-    evaluation.solved_below = {"lin_vel_error": 0.2, "ang_vel_error": 0.2, "failure_rate": 0.02}
-
-
 def _is_flat(env_cfg: ManagerBasedRlEnvCfg) -> bool:
     terrain = env_cfg.scene.terrain
     return terrain is not None and terrain.terrain_type == "plane"
@@ -217,7 +205,7 @@ def _add_student(
     cpu.policy(env_cfg, rl_cfg)
     student = copy.deepcopy(env_cfg.observations["actor"])
     del student.terms[_SCAN]
-    student.history_length = _BLIND_HISTORY
+    student.history_length = BLIND_HISTORY
     env_cfg.observations[_STUDENT] = student
     rl_cfg.num_steps_per_env = _BLIND_STEPS
     cfg = with_learner(rl_cfg, "distillation")
