@@ -1,0 +1,382 @@
+"""Parts of a robot: trunk, feet, legs, hands, IMU and actuators, from its compiled model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from mjlab.own_robot import geometry as geo
+from mjlab.own_robot.guess import Guess
+from mjlab.own_robot.mirror import mirror_pairs
+
+Kind = Literal["legged", "arm", "other"]
+Drive = Literal["motor", "position", "other", "none"]
+
+SOLE_DEPTH = 0.01
+"""Distance above the lowest point of a foot within which a geom is part of the sole (m)."""
+FOOT_BAND = 0.05
+"""Height of the lowest points of feet above the lowest of them, as a share of the trunk's height."""
+
+
+ANKLE_SHARE = 0.15
+"""Distance of an ankle's joint to the foot, as a share of the leg's length."""
+
+
+@dataclass(frozen=True)
+class Foot:
+    """A foot."""
+
+    link: str
+    """Body of the foot."""
+    sole: tuple[str, ...]
+    """Geoms that touch the ground."""
+    site: str | None
+    """Site on the foot; None if there is none."""
+    position: tuple[float, float, float]
+    """Middle of the sole in the frame of the body (m)."""
+
+
+@dataclass(frozen=True)
+class Leg:
+    """Joints from the trunk to a foot."""
+
+    foot: str
+    """Body of the foot."""
+    joints: tuple[str, ...]
+    """Hinges from the trunk to the foot."""
+
+
+@dataclass(frozen=True)
+class Hand:
+    """End of an arm."""
+
+    link: str
+    """Last body before the gripper."""
+    site: str | None
+    """Site at the grasp; None if there is none."""
+    joints: tuple[str, ...]
+    """Joints of the arm, without the gripper."""
+    gripper: tuple[str, ...]
+    """Joints of the fingers."""
+    position: tuple[float, float, float]
+    """Grasp in the frame of the body (m)."""
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Parts of a robot, by the names of the model's elements."""
+
+    kind: Guess[Kind]
+    trunk: Guess[str]
+    feet: Guess[tuple[Foot, ...]]
+    legs: Guess[tuple[Leg, ...]]
+    """Legs in the order of the feet: front before rear, left before right."""
+    hands: Guess[tuple[Hand, ...]]
+    mirror: Guess[dict[str, tuple[str, float]]]
+    """Partner of each joint and sign of its motion; empty for a robot without left and right."""
+    imu_site: Guess[str | None]
+    """Site of the IMU; None: the trunk's origin."""
+    drives: Guess[dict[str, Drive]]
+    """Actuator of each joint in the file."""
+    colliding: Guess[tuple[str, ...]]
+    """Geoms that collide."""
+    fall_bodies: Guess[tuple[str, ...]]
+    """Bodies whose contact with the ground is a fall: all that collide but feet and ankles."""
+
+    @property
+    def leg_joints(self) -> tuple[str, ...]:
+        """Joints of all legs, leg after leg."""
+        return tuple(joint for leg in self.legs.value for joint in leg.joints)
+
+
+def find_anatomy(model: mujoco.MjModel, *, kind: Kind | None = None) -> Anatomy:
+    """Return the parts of a robot with named elements (see `name_elements`).
+
+    Args:
+        model: Robot.
+        kind: Answer to the question what the robot is; None to find it.
+    """
+    free = geo.free_joint(model)
+    trunk = int(model.jnt_bodyid[free]) if free is not None else 0
+    feet = _feet(model, trunk) if free is not None or kind == "legged" else ()
+    mirror = mirror_pairs(model, trunk)
+    has_sides = any(partner != joint for joint, (partner, _) in mirror.items())
+    legs = tuple(_leg(model, trunk, foot) for foot in feet)
+    hands = tuple(_hands(model, trunk, {foot.link for foot in feet}))
+    found = _kind(model, free, feet, hands) if kind is None else Guess(kind, "as set", "set")
+    return Anatomy(
+        kind=found,
+        trunk=_trunk(model, free, trunk),
+        feet=Guess(feet, "end links lowest in a standing pose; soles: geoms within 1 cm of it"),
+        legs=Guess(legs, "joints from the trunk to a foot"),
+        hands=Guess(hands, "last link before the finger joints"),
+        mirror=Guess(
+            mirror if has_sides else {}, "anchor mirrored, axis parallel, same depth and range"
+        ),
+        imu_site=_imu(model, trunk),
+        drives=Guess(drives(model), "bias of the actuator: none, a motor; affine, a servo", "file"),
+        colliding=_colliding(model),
+        fall_bodies=_fall_bodies(model, legs),
+    )
+
+
+def _kind(
+    model: mujoco.MjModel, free: int | None, feet: tuple[Foot, ...], hands: tuple[Hand, ...]
+) -> Guess[Kind]:
+    if free is not None and len(feet) >= 2:
+        return Guess("legged", f"a free joint and {len(feet)} feet")
+    if free is None and any(len(hand.joints) >= 4 for hand in hands):
+        return Guess("arm", "no free joint, at least four joints in a row")
+    return Guess("other", "neither feet below a free joint, nor four joints in a row")
+
+
+def _trunk(model: mujoco.MjModel, free: int | None, trunk: int) -> Guess[str]:
+    if free is not None:
+        return Guess(model.body(trunk).name, "body of the free joint")
+    bases = [b for b in range(1, model.nbody) if model.body_parentid[b] == 0]
+    base = max(bases, key=lambda b: model.body_subtreemass[b], default=0)
+    return Guess(model.body(base).name, "first body of the heaviest tree")
+
+
+# Feet.
+
+
+def foot_links(model: mujoco.MjModel, data: mujoco.MjData, trunk: int) -> list[int]:
+    """Return the end links that are lowest in the pose of `data`: the feet, if it stands."""
+    colliding = geo.colliding_geoms(model)
+    ends = {}
+    for link in geo.leaf_links(model):
+        geoms = [g for g in colliding if model.body_weldid[model.geom_bodyid[g]] == link]
+        if geoms and geo.chain_joints(model, link, trunk):
+            ends[link] = geo.lowest_height(model, data, geoms)
+    if not ends:
+        return []
+    lowest = min(ends.values())
+    height = float(data.xpos[trunk][2]) - lowest
+    return [link for link, z in ends.items() if z < lowest + FOOT_BAND * max(height, 0.0)]
+
+
+def candidate_poses(model: mujoco.MjModel) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield poses in which a robot may stand: keyframes, then `qpos0` moved into the ranges."""
+    for key in range(model.nkey):
+        yield f"keyframe {model.key(key).name or key}", model.key_qpos[key].copy()
+    qpos = model.qpos0.copy()
+    for joint in geo.joint_ids(model):
+        low, high = geo.joint_range(model, joint)
+        qpos[model.jnt_qposadr[joint]] = np.clip(qpos[model.jnt_qposadr[joint]], low, high)
+    yield "zero pose", qpos
+
+
+def _feet(model: mujoco.MjModel, trunk: int) -> tuple[Foot, ...]:
+    """Return the feet in the candidate pose in which the trunk is highest above them."""
+    data, best, links = mujoco.MjData(model), -np.inf, []
+    heights = []
+    for _, qpos in candidate_poses(model):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        found = foot_links(model, data, trunk)
+        if len(found) not in (2, 4, 6):
+            continue
+        geoms = geo.colliding_geoms(model)
+        height = float(data.xpos[trunk][2]) - geo.lowest_height(model, data, geoms)
+        heights.append(height)
+        if height > best:
+            best, links, pose = height, found, qpos
+    if not links:
+        return ()
+    data.qpos[:] = pose
+    mujoco.mj_kinematics(model, data)
+    frame, origin = data.xmat[trunk].reshape(3, 3), data.xpos[trunk].copy()
+    feet = [(_foot(model, data, link), (data.xpos[link] - origin) @ frame) for link in links]
+    return tuple(foot for foot, _ in sorted(feet, key=lambda item: _row_order(item[1], feet)))
+
+
+def _row_order(position: np.ndarray, feet: list) -> tuple[float, float]:
+    """Order feet front to rear in rows, left to right in a row."""
+    spread = max(float(np.ptp([p[0] for _, p in feet])), 1e-6)
+    row = round(3.0 * float(position[0]) / spread) if spread > 0.05 else 0
+    return -row, -float(position[1])
+
+
+def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
+    colliding = geo.colliding_geoms(model)
+    geoms = [g for g in colliding if model.body_weldid[model.geom_bodyid[g]] == link]
+    points = {g: geo.lowest_point(model, data, g) for g in geoms}
+    lowest = min(point[2] for point in points.values())
+    sole = [g for g, point in points.items() if point[2] < lowest + SOLE_DEPTH]
+    middle = np.mean([points[g] for g in sole], axis=0)
+    local = data.xmat[link].reshape(3, 3).T @ (middle - data.xpos[link])
+    sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == link]
+    sites.sort(key=lambda s: float(np.linalg.norm(data.site_xpos[s] - middle)))
+    return Foot(
+        link=model.body(link).name,
+        sole=tuple(model.geom(g).name for g in sole),
+        site=model.site(sites[0]).name or None if sites else None,
+        position=(float(local[0]), float(local[1]), float(local[2])),
+    )
+
+
+def _leg(model: mujoco.MjModel, trunk: int, foot: Foot) -> Leg:
+    joints = geo.chain_joints(model, model.body(foot.link).id, trunk)
+    return Leg(foot.link, tuple(model.joint(j).name for j in joints))
+
+
+def _fall_bodies(model: mujoco.MjModel, legs: tuple[Leg, ...]) -> Guess[tuple[str, ...]]:
+    """Return the bodies that collide, without feet and ankles."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    allowed = set()
+    for leg in legs:
+        link = model.body(leg.foot).id
+        allowed.add(link)
+        hip = data.xanchor[model.joint(leg.joints[0]).id]
+        length = float(np.linalg.norm(data.xpos[link] - hip))
+        while link := geo.parent_link(model, link):
+            anchor = data.xanchor[model.body_jntadr[link]]
+            if np.linalg.norm(anchor - data.xpos[model.body(leg.foot).id]) > ANKLE_SHARE * length:
+                break
+            allowed.add(link)
+    bodies = {int(model.geom_bodyid[g]) for g in geo.colliding_geoms(model)}
+    names = tuple(model.body(b).name for b in sorted(bodies) if model.body_weldid[b] not in allowed)
+    return Guess(names, "bodies that collide, without feet and ankles")
+
+
+# Hands.
+
+
+def _hands(model: mujoco.MjModel, trunk: int, feet: set[str]) -> Iterator[Hand]:
+    fingers = finger_joints(model)
+    seen = set()
+    for leaf in geo.leaf_links(model):
+        links = geo.chain(model, leaf, trunk)
+        first = next(
+            (n for n, b in enumerate(links) if fingers & set(geo.link_joints(model, b))), len(links)
+        )
+        if first == 0 or model.body(leaf).name in feet:
+            continue
+        link = links[first - 1]
+        joints = geo.chain_joints(model, link, trunk)
+        if link in seen or len(joints) < 3:
+            continue
+        seen.add(link)
+        below = [j for j in fingers if link in geo.chain(model, int(model.jnt_bodyid[j]), trunk)]
+        site, position = _grasp(model, link, below)
+        yield Hand(
+            link=model.body(link).name,
+            site=site,
+            joints=tuple(model.joint(j).name for j in joints),
+            gripper=tuple(model.joint(j).name for j in sorted(below)),
+            position=position,
+        )
+
+
+def finger_joints(model: mujoco.MjModel) -> set[int]:
+    """Return the joints of grippers: slides at the end of a chain, coupled, or named so."""
+    words = ("finger", "grip", "knuckle", "thumb")
+    found = set()
+    coupled = set()
+    for equality in range(model.neq):
+        if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT and model.eq_obj2id[equality] >= 0:
+            coupled |= {int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])}
+    leaves = set(geo.leaf_links(model))
+    for joint in geo.joint_ids(model):
+        body = int(model.jnt_bodyid[joint])
+        named = any(
+            word in name.lower()
+            for word in words
+            for name in (model.joint(joint).name, model.body(body).name)
+        )
+        is_end_slide = model.jnt_type[joint] == geo.SLIDE and body in leaves
+        if (named or is_end_slide or joint in coupled) and geo.parent_link(model, body):
+            found.add(joint)
+    return found
+
+
+def _grasp(
+    model: mujoco.MjModel, link: int, fingers: list[int]
+) -> tuple[str | None, tuple[float, float, float]]:
+    """Return the site at the grasp, if any, and the grasp in the frame of the hand."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    words = ("grasp", "grip", "tcp", "ee", "end_eff", "pinch", "attachment", "tool", "center")
+    sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == link]
+    ranked = [
+        (rank, s)
+        for s in sites
+        for rank, word in enumerate(words)
+        if word in model.site(s).name.lower()
+    ]
+    if ranked:
+        site = min(ranked)[1]
+        point, name = data.site_xpos[site], model.site(site).name
+    else:
+        name = None
+        bodies = {int(model.jnt_bodyid[j]) for j in fingers}
+        geoms = [
+            g
+            for g in geo.colliding_geoms(model)
+            if model.body_weldid[model.geom_bodyid[g]] in bodies
+        ]
+        point = np.mean(data.geom_xpos[geoms], axis=0) if geoms else data.xipos[link]
+    local = data.xmat[link].reshape(3, 3).T @ (point - data.xpos[link])
+    return name, (float(local[0]), float(local[1]), float(local[2]))
+
+
+# Sensors and actuators.
+
+
+def _imu(model: mujoco.MjModel, trunk: int) -> Guess[str | None]:
+    kinds = (mujoco.mjtSensor.mjSENS_GYRO, mujoco.mjtSensor.mjSENS_ACCELEROMETER)
+    sites = [
+        int(model.sensor_objid[s])
+        for kind in kinds
+        for s in range(model.nsensor)
+        if model.sensor_type[s] == kind
+    ]
+    # Several IMUs: the one on the trunk, whose velocity is what the task commands.
+    on_trunk = [s for s in sites if model.body_weldid[model.site_bodyid[s]] == trunk]
+    for site in (*on_trunk, *sites):
+        return Guess(model.site(site).name, "site of the gyro", "file")
+    named = [s for s in range(model.nsite) if "imu" in model.site(s).name.lower()]
+    named.sort(key=lambda s: model.body_weldid[model.site_bodyid[s]] != trunk)
+    for site in named:
+        return Guess(model.site(site).name, "site named imu", "file")
+    return Guess(None, "no gyro and no site named imu: the trunk's origin", "asked")
+
+
+def drives(model: mujoco.MjModel) -> dict[str, Drive]:
+    """Return the kind of the actuator of each joint."""
+    found: dict[str, Drive] = {model.joint(j).name: "none" for j in geo.joint_ids(model)}
+    for actuator in range(model.nu):
+        joint = actuated_joint(model, actuator)
+        if joint is None:
+            continue
+        bias = model.actuator_biastype[actuator]
+        if bias == mujoco.mjtBias.mjBIAS_NONE:
+            kind: Drive = "motor"
+        elif bias == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[actuator, 1] < 0:
+            kind = "position"
+        else:
+            kind = "other"
+        found[model.joint(joint).name] = kind
+    return found
+
+
+def actuated_joint(model: mujoco.MjModel, actuator: int) -> int | None:
+    """Return the joint of an actuator; None for tendons, sites and bodies."""
+    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    if model.actuator_trntype[actuator] not in kinds:
+        return None
+    return int(model.actuator_trnid[actuator, 0])
+
+
+def _colliding(model: mujoco.MjModel) -> Guess[tuple[str, ...]]:
+    geoms = geo.colliding_geoms(model)
+    names = tuple(model.geom(g).name for g in geoms)
+    if any(model.geom_contype[g] or model.geom_conaffinity[g] for g in geoms):
+        return Guess(names, "contype or conaffinity", "file")
+    return Guess(names, "nothing collides by itself: geoms of contact pairs, or the highest group")

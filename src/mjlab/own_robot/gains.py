@@ -1,0 +1,334 @@
+"""Effort limits, rotor inertias and gains of position actuators.
+
+Gains of a leg joint: the effort limit per rad, or the static torque of the standing pose per
+`STATIC_SAG`, whichever is larger, and at most (`STABLE` / dt)^2 I with the inertia I at the joint, so
+that the oscillation is resolved by the time step. Joints that sag by more than `MAX_SAG` in simulation
+get more.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from scipy.optimize import nnls
+
+from mjlab.own_robot import geometry as geo
+from mjlab.own_robot.anatomy import Anatomy, actuated_joint, drives
+from mjlab.own_robot.guess import Guess, Question
+from mjlab.own_robot.posture import sole_points
+
+MAX_SAG = 0.15
+"""Greatest deflection of a leg joint under the robot's weight (rad)."""
+STATIC_SAG = 0.12
+"""Deflection that gains are computed for (rad)."""
+STABLE = 0.5
+"""Greatest product of a joint's angular frequency and the time step."""
+TIMESTEP = 0.005
+"""Time step of the velocity tasks (s)."""
+ARM_ERROR = 0.15
+"""Position error at which the joint of an arm has its effort limit (rad)."""
+MAX_EFFORT = 3.0
+"""Effort limit that is plausible, as a multiple of weight x height."""
+DAMPING_RATIO = 0.7
+
+
+def effort_limits(
+    model: mujoco.MjModel, size: float, answers: dict[str, float] | None = None
+) -> tuple[Guess[dict[str, float]], list[Question]]:
+    """Return the effort limit of each joint (N m, N), with questions about missing and implausible ones.
+
+    Args:
+        model: Robot.
+        size: Height of the trunk, or reach of the arm (m).
+        answers: Effort limits set by the user, by joint.
+    """
+    answers = answers or {}
+    weight = float(model.body_mass.sum()) * 9.81
+    limits, missing, implausible = {}, [], []
+    for joint in geo.joint_ids(model):
+        name = model.joint(joint).name
+        limit = answers.get(name, _file_effort(model, joint))
+        if name not in answers and limit is not None and limit > MAX_EFFORT * weight * size:
+            implausible.append(name)
+            limit = None
+        if limit is None:
+            if name not in implausible:
+                missing.append(name)
+            continue
+        limits[name] = limit
+    stand_in = 0.25 * weight * size
+    questions = []
+    for names, reason in ((missing, "no effort limit in the file"), (implausible, "implausible")):
+        if names:
+            questions.append(
+                Question(
+                    f"effort.{names[0]}" if len(names) == 1 else "effort",
+                    f"effort limit of {_some(names)}: {reason}",
+                    f"{stand_in:.3g} N m",
+                )
+            )
+            limits |= dict.fromkeys(names, stand_in)
+    source = "asked" if questions else "set" if answers else "file"
+    rule = "forcerange, else actuatorfrcrange, else ctrlrange x gear of a motor"
+    return Guess(limits, rule, source), questions
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+def _file_effort(model: mujoco.MjModel, joint: int) -> float | None:
+    """Return the effort limit that the file has; None without one."""
+    limits = []
+    for actuator in range(model.nu):
+        if actuated_joint(model, actuator) != joint:
+            continue
+        gear = abs(float(model.actuator_gear[actuator, 0]))
+        if model.actuator_forcelimited[actuator]:
+            limits.append(gear * float(np.abs(model.actuator_forcerange[actuator]).max()))
+        elif model.jnt_actfrclimited[joint]:
+            pass
+        elif (
+            model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+            and model.actuator_ctrllimited[actuator]
+        ):
+            gain = abs(float(model.actuator_gainprm[actuator, 0]))
+            limits.append(gear * gain * float(np.abs(model.actuator_ctrlrange[actuator]).max()))
+    if model.jnt_actfrclimited[joint] and not limits:
+        limits.append(float(np.abs(model.jnt_actfrcrange[joint]).max()))
+    return min(limits, default=None)
+
+
+def rotor_inertias(
+    model: mujoco.MjModel,
+    effort: dict[str, float],
+    is_arm: bool,
+    answers: dict[str, float] | None = None,
+) -> tuple[Guess[dict[str, float]], list[Question]]:
+    """Return the armature of each joint (kg m^2, kg), with a question where the file has 0."""
+    answers = answers or {}
+    # 1.1e-4 to 2.5e-4 kg m^2 per N m on Go1 and G1; 1e-3 on UR5e and Panda, with gears of 100.
+    share = 1e-3 if is_arm else 2e-4
+    inertias, missing = {}, []
+    for joint in geo.joint_ids(model):
+        name = model.joint(joint).name
+        own = float(model.dof_armature[model.jnt_dofadr[joint]])
+        if name not in answers and own == 0.0:
+            missing.append(name)
+        inertias[name] = answers.get(name, own or share * effort[name])
+    if not missing:
+        source = "set" if answers else "file"
+        return Guess(inertias, "armature of the file", source), []
+    low, high = min(inertias[n] for n in missing), max(inertias[n] for n in missing)
+    question = Question(
+        "armature" if len(missing) > 1 else f"armature.{missing[0]}",
+        f"rotor inertia times squared gear ratio of {_some(missing)}: 0 in the file",
+        f"{share:g} s^2 x effort limit: {low:.2g} to {high:.2g} kg m^2",
+    )
+    return Guess(inertias, "armature of the file; where it is 0, a share of the effort", "asked"), [
+        question
+    ]
+
+
+def joint_inertias(
+    model: mujoco.MjModel, joint_pos: dict[str, float], armature: dict[str, float]
+) -> dict[str, float]:
+    """Return the inertia at each joint in a pose: diagonal of the mass matrix (kg m^2, kg)."""
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, joint_pos)
+    mujoco.mj_makeM(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    return {
+        name: float(mass[dof, dof]) - float(model.dof_armature[dof]) + armature[name]
+        for name in joint_pos
+        for dof in [model.jnt_dofadr[model.joint(name).id]]
+    }
+
+
+def static_torques(
+    model: mujoco.MjModel, anatomy: Anatomy, joint_pos: dict[str, float]
+) -> dict[str, float]:
+    """Return the torque that holds each joint in the pose (N m, N).
+
+    Of a legged robot, the ground pushes vertically on the soles with the forces (non-negative least
+    squares) that carry the trunk.
+    """
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, joint_pos)
+    gravity = model.opt.gravity.copy()
+    if not gravity.any():
+        model.opt.gravity[2] = -9.81
+    mujoco.mj_comVel(model, data)
+    mujoco.mj_rne(model, data, 0, data.qfrc_bias)
+    model.opt.gravity[:] = gravity
+    torque = data.qfrc_bias.copy()  # (nv,)
+    free = geo.free_joint(model)
+    if free is not None and anatomy.feet.value:
+        jacobians = []
+        for foot in anatomy.feet.value:
+            for point in sole_points(model, data, foot):
+                jacobian = np.zeros((3, model.nv))
+                mujoco.mj_jac(model, data, jacobian, None, point, model.body(foot.link).id)
+                jacobians.append(jacobian[2])
+        lift = np.array(jacobians).T  # (nv, P)
+        root = slice(int(model.jnt_dofadr[free]), int(model.jnt_dofadr[free]) + 6)
+        # Of many solutions, the one with even forces: a small penalty on their squares.
+        weight = 1e-2 * np.eye(lift.shape[1])
+        rows = np.vstack([lift[root], weight])
+        force, _ = nnls(rows, np.concatenate([torque[root], np.zeros(lift.shape[1])]))
+        torque = torque - lift @ force
+    return {name: float(torque[model.jnt_dofadr[model.joint(name).id]]) for name in joint_pos}
+
+
+def servo_stiffness(model: mujoco.MjModel) -> dict[str, float]:
+    """Return the stiffness of each position servo of the file (N m/rad, N/m)."""
+    kinds = drives(model)
+    found = {}
+    for actuator in range(model.nu):
+        joint = actuated_joint(model, actuator)
+        if joint is not None and kinds[model.joint(joint).name] == "position":
+            gear = float(model.actuator_gear[actuator, 0])
+            found[model.joint(joint).name] = -float(model.actuator_biasprm[actuator, 1]) * gear**2
+    return found
+
+
+def find_gains(
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    anatomy: Anatomy,
+    joint_pos: dict[str, float],
+    height: float,
+    effort: dict[str, float],
+    armature: dict[str, float],
+    answers: dict[str, float] | None = None,
+) -> tuple[Guess[dict[str, float]], Guess[dict[str, float]]]:
+    """Return stiffness (N m/rad, N/m) and damping (N m s/rad, N s/m) of each joint."""
+    answers = answers or {}
+    legged = anatomy.kind.value == "legged"
+    torque = static_torques(model, anatomy, joint_pos)
+    inertia = joint_inertias(model, joint_pos, armature)
+    own = servo_stiffness(model)
+    stiffness, cap = {}, {}
+    for name in joint_pos:
+        cap[name] = (STABLE / TIMESTEP) ** 2 * inertia[name]
+        wanted = max(effort[name] / (1.0 if legged else ARM_ERROR), abs(torque[name]) / STATIC_SAG)
+        if own.get(name, 0.0) * 0.2 > abs(torque[name]):
+            wanted = own[name]
+        stiffness[name] = answers.get(name, min(wanted, cap[name]))
+    rule = (
+        "servo of the file, or effort per rad and static torque per 0.12 rad, at most (0.5/dt)^2 I"
+    )
+    if legged:
+        for _ in range(6):
+            damping = _damping(stiffness, inertia)
+            sag = simulated_sag(
+                spec, anatomy, joint_pos, height, stiffness, damping, effort, armature
+            )
+            low = [n for n in anatomy.leg_joints if sag[n] > MAX_SAG - 0.01 and n not in answers]
+            if not low:
+                break
+            for name in low:
+                stiffness[name] *= min(2.0, 1.1 * sag[name] / STATIC_SAG)
+        rule += f"; sag in simulation at most {max(sag[n] for n in anatomy.leg_joints):.2f} rad"
+    source = "set" if answers else "rule"
+    return Guess(stiffness, rule, source), Guess(
+        _damping(stiffness, inertia), "damping ratio 0.7 with the inertia at the joint"
+    )
+
+
+def _damping(stiffness: dict[str, float], inertia: dict[str, float]) -> dict[str, float]:
+    return {
+        name: float(
+            np.clip(2.0 * DAMPING_RATIO * np.sqrt(kp * inertia[name]), kp / 40.0, kp / 10.0)
+        )
+        for name, kp in stiffness.items()
+    }
+
+
+def simulated_sag(
+    spec: mujoco.MjSpec,
+    anatomy: Anatomy,
+    joint_pos: dict[str, float],
+    height: float,
+    stiffness: dict[str, float],
+    damping: dict[str, float],
+    effort: dict[str, float],
+    armature: dict[str, float],
+    seconds: float = 1.5,
+) -> dict[str, float]:
+    """Return the deflection of each joint (rad, m) when the robot stands with its trunk kept level.
+
+    The trunk slides on a vertical rail, so that falls of bipeds do not hide the sag.
+    """
+    model = rail_model(spec, anatomy, effort, armature)
+    set_gains(model, stiffness, damping)
+    data = mujoco.MjData(model)
+    for name, position in joint_pos.items():
+        data.qpos[model.jnt_qposadr[model.joint(name).id]] = position
+        data.ctrl[model.actuator(name).id] = position
+    data.qpos[model.jnt_qposadr[model.joint(RAIL).id]] = height
+    for _ in range(round(seconds / TIMESTEP)):
+        mujoco.mj_step(model, data)
+    return {
+        name: abs(float(data.qpos[model.jnt_qposadr[model.joint(name).id]]) - position)
+        for name, position in joint_pos.items()
+    }
+
+
+RAIL = "trunk_rail"
+"""Slide joint that takes the place of the free joint."""
+
+
+def rail_model(
+    spec: mujoco.MjSpec, anatomy: Anatomy, effort: dict[str, float], armature: dict[str, float]
+) -> mujoco.MjModel:
+    """Return the robot on level ground, its trunk on a vertical rail, with a position servo per joint."""
+    spec = spec.copy()
+    for elements in (spec.keys, spec.actuators, spec.sensors, spec.pairs):
+        for element in list(elements):
+            spec.delete(element)
+    trunk = spec.body(anatomy.trunk.value)
+    for joint in list(trunk.joints):
+        spec.delete(joint)
+    trunk.pos, trunk.quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    trunk.add_joint(name=RAIL, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0.0, 0.0, 1.0))
+    colliding = set(anatomy.colliding.value)
+    for geom in spec.geoms:
+        on_robot = geom.name in colliding
+        # The ground collides with the robot; the robot, not with itself.
+        geom.contype, geom.conaffinity = 0, int(on_robot)
+        if geom.name in {name for foot in anatomy.feet.value for name in foot.sole}:
+            geom.condim = max(3, geom.condim)
+    spec.worldbody.add_geom(
+        name="rail_ground",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(5.0, 5.0, 0.1),
+        contype=1,
+        conaffinity=0,
+        friction=(1.0, 0.005, 0.0001),
+    )
+    for joint in spec.joints:
+        if joint.name not in armature:
+            continue
+        joint.armature = armature[joint.name]
+        actuator = spec.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
+        actuator.set_to_position(kp=1.0, kv=1.0)
+        limit = effort[joint.name]
+        actuator.forcelimited, actuator.forcerange = True, (-limit, limit)
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.gravity = (0.0, 0.0, -9.81)
+    return spec.compile()
+
+
+def set_gains(
+    model: mujoco.MjModel, stiffness: dict[str, float], damping: dict[str, float]
+) -> None:
+    """Write the gains of position servos named like their joints."""
+    for name, kp in stiffness.items():
+        actuator = model.actuator(name).id
+        model.actuator_gainprm[actuator, 0] = kp
+        model.actuator_biasprm[actuator, 1:3] = -kp, -damping[name]

@@ -1,0 +1,306 @@
+"""Standing pose of a legged robot: the keyframe that passes the checks, else a searched one.
+
+Poses are joint positions by name, with the trunk level. The search bends the pitch joints of one leg
+until the sole is level and below the center of mass at `EXTENSION` of the leg's length, and mirrors it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial import ConvexHull, QhullError
+
+from mjlab.own_robot import geometry as geo
+from mjlab.own_robot.anatomy import Anatomy, Foot, Leg, candidate_poses, foot_links
+from mjlab.own_robot.guess import Guess, Question
+from mjlab.own_robot.mirror import mirror_pose
+
+EXTENSION = 0.88
+"""Height of the hip above the sole in a searched pose, as a share of the leg's length."""
+MIN_TRUNK_HEIGHT = 0.55
+"""Height of the trunk in a standing pose, as a share of that with straight legs."""
+MARGIN = 0.05
+"""Share of a joint's range kept free at both ends in a searched pose."""
+
+
+@dataclass(frozen=True)
+class Posture:
+    """Standing pose."""
+
+    joint_pos: Guess[dict[str, float]]
+    """Position of each hinge and slide (rad, m)."""
+    root_height: Guess[float]
+    """Height of the trunk's frame with the lowest colliding geom on the ground (m)."""
+    leg_length: float
+    """Height of the trunk's frame above the soles with straight legs (m)."""
+    questions: tuple[Question, ...] = ()
+
+
+def find_posture(
+    model: mujoco.MjModel, anatomy: Anatomy, answers: dict[str, float] | None = None
+) -> Posture:
+    """Return the standing pose of a legged robot.
+
+    Args:
+        model: Robot.
+        anatomy: Parts of the robot.
+        answers: Positions of joints set by the user; the searched pose starts from them.
+    """
+    answers = answers or {}
+    data = mujoco.MjData(model)
+    straight = straight_height(model, anatomy)
+    rejected = []
+    for name, qpos in candidate_poses(model):
+        joint_pos = {
+            model.joint(j).name: float(qpos[model.jnt_qposadr[j]]) for j in geo.joint_ids(model)
+        }
+        faults = check_pose(model, anatomy, joint_pos, straight)
+        if name != "zero pose" and not faults:
+            pose = Guess(joint_pos, f"{name}: stands, inside limits, feet mirrored", "file")
+            questions: tuple[Question, ...] = ()
+            break
+        rejected.append((name, faults))
+    else:
+        joint_pos, questions = _searched_pose(model, anatomy, straight, answers)
+        why = "; ".join(f"{name}: {faults[0]}" for name, faults in rejected[:-1]) or "no keyframe"
+        source = "asked" if questions else "rule"
+        pose = Guess(joint_pos, f"{why}; feet below the hips at 0.88 of the leg, mirrored", source)
+    if answers:
+        pose = dataclasses.replace(pose, value=pose.value | answers, source="set")
+    height = ground_height(model, data, anatomy, pose.value)
+    return Posture(pose, Guess(height, "lowest colliding geom on the ground"), straight, questions)
+
+
+def ground_height(
+    model: mujoco.MjModel, data: mujoco.MjData, anatomy: Anatomy, joint_pos: dict[str, float]
+) -> float:
+    """Return the height of the trunk's frame at which the lowest colliding geom touches the ground."""
+    geo.set_pose(model, data, joint_pos)
+    geoms = [model.geom(name).id for name in anatomy.colliding.value]
+    trunk = model.body(anatomy.trunk.value).id
+    return float(data.xpos[trunk][2]) - geo.lowest_height(model, data, geoms)
+
+
+def check_pose(
+    model: mujoco.MjModel, anatomy: Anatomy, joint_pos: dict[str, float], straight: float
+) -> list[str]:
+    """Return the reasons why a robot cannot stand in a pose; empty if it can.
+
+    Args:
+        model: Robot.
+        anatomy: Parts of the robot.
+        joint_pos: Position of each joint.
+        straight: Height of the trunk with straight legs (m); see `straight_height`.
+    """
+    data = mujoco.MjData(model)
+    faults = []
+    for name, position in joint_pos.items():
+        low, high = geo.joint_range(model, model.joint(name).id)
+        if not low - 0.01 <= position <= high + 0.01:
+            faults.append(f"{name} at {position:.2f} outside [{low:.2f}, {high:.2f}]")
+    geo.set_pose(model, data, joint_pos)
+    trunk = model.body(anatomy.trunk.value).id
+    feet = {model.body(foot.link).id for foot in anatomy.feet.value}
+    lowest = set(foot_links(model, data, trunk))
+    if not feet <= lowest:
+        names = [model.body(link).name for link in feet - lowest]
+        faults.append(f"feet {names} off the ground")
+    height = ground_height(model, data, anatomy, joint_pos)
+    if height < MIN_TRUNK_HEIGHT * straight:
+        faults.append(f"trunk at {height:.2f} m, {height / straight:.0%} of straight legs")
+    if not _over_soles(model, data, anatomy):
+        faults.append("center of mass outside the soles")
+    if not _feet_mirrored(data, model, anatomy):
+        faults.append("left and right feet not mirrored")
+    return faults
+
+
+def sole_points(model: mujoco.MjModel, data: mujoco.MjData, foot: Foot) -> np.ndarray:
+    """Return the points of a foot that touch level ground, (P, 3), from the pose of `data`."""
+    points = []
+    for name in foot.sole:
+        for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0)):
+            direction = np.array([0.2 * x, 0.2 * y, -1.0])
+            direction /= np.linalg.norm(direction)
+            points.append(geo.support_point(model, data, model.geom(name).id, direction))
+    return np.array(points)
+
+
+def straight_height(model: mujoco.MjModel, anatomy: Anatomy) -> float:
+    """Return the greatest height of the trunk above a sole, over the pitch joints of a leg (m)."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    clipped = _clipped_zero(model)
+    best = 0.0
+    for leg, foot in zip(anatomy.legs.value[:2], anatomy.feet.value[:2], strict=True):
+        joints = pitch_joints(model, leg)
+        ranges = np.array([geo.joint_range(model, model.joint(j).id) for j in joints])
+
+        def depth(angles: np.ndarray, joints=joints, foot=foot) -> float:
+            geo.set_pose(model, data, clipped | dict(zip(joints, angles, strict=True)))
+            return -float(_sole_position(model, data, anatomy, foot)[2])
+
+        if not joints:
+            best = max(best, depth(np.zeros(0)))
+            continue
+        samples = rng.uniform(ranges[:, 0], ranges[:, 1], (300, len(joints)))
+        start = max(samples, key=depth)
+        for width in (0.2, 0.05, 0.02):
+            for _ in range(40):
+                trial = np.clip(start + width * rng.normal(size=len(joints)), *ranges.T)
+                if depth(trial) > depth(start):
+                    start = trial
+        best = max(best, depth(start))
+    return best
+
+
+def pitch_joints(model: mujoco.MjModel, leg: Leg) -> list[str]:
+    """Return the joints of a leg that turn about the trunk's y axis at `qpos0`."""
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, {})
+    return [name for name in leg.joints if abs(float(data.xaxis[model.joint(name).id][1])) > 0.7]
+
+
+def _searched_pose(
+    model: mujoco.MjModel, anatomy: Anatomy, straight: float, answers: dict[str, float]
+) -> tuple[dict[str, float], tuple[Question, ...]]:
+    """Return the searched pose, and a question for each knee that may bend both ways."""
+    pose = _clipped_zero(model) | answers
+    mirror, questions, solved = anatomy.mirror.value, [], set()
+    for leg, foot in zip(anatomy.legs.value, anatomy.feet.value, strict=True):
+        if leg.joints[0] in solved:
+            continue
+        angles, other = _bend(model, anatomy, leg, foot, pose, straight, answers)
+        pose |= angles
+        solved |= set(leg.joints)
+        if all(name in mirror for name in leg.joints):
+            image = mirror_pose(mirror, {name: pose[name] for name in leg.joints})
+            pose |= {name: value for name, value in image.items() if name not in answers}
+            solved |= set(image)
+        if other is not None and angles:
+            knee = max(angles, key=lambda name: abs(angles[name] - other[name]))
+            direction = "forward" if _knee_forward(model, anatomy, leg, pose) else "backward"
+            questions.append(
+                Question(
+                    f"pose.{knee}",
+                    f"direction of the knee of {leg.foot}: it may bend both ways "
+                    f"({angles[knee]:.2f} or {other[knee]:.2f} rad)",
+                    f"{direction}, {knee} = {angles[knee]:.2f}",
+                )
+            )
+    return pose, tuple(questions)
+
+
+def _bend(
+    model: mujoco.MjModel,
+    anatomy: Anatomy,
+    leg: Leg,
+    foot: Foot,
+    pose: dict[str, float],
+    straight: float,
+    answers: dict[str, float],
+) -> tuple[dict[str, float], dict[str, float] | None]:
+    """Return the angles of a leg's free pitch joints, and those with the knee the other way if any."""
+    joints = [name for name in pitch_joints(model, leg) if name not in answers]
+    if not joints:
+        return {}, None
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, pose)
+    hip = data.xanchor[model.joint(joints[0]).id].copy()
+    drop = float(hip[2])
+    length = straight + drop
+    # Two legs carry the center of mass above the soles; four and more stand below their hips.
+    x = float(data.subtree_com[model.body(anatomy.trunk.value).id][0])
+    target = np.array([x if len(anatomy.legs.value) == 2 else hip[0], drop - EXTENSION * length])
+    link = model.body(foot.link).id
+    up = data.xmat[link].reshape(3, 3)[2].copy() if len(joints) > 2 else None
+    ranges = np.array([geo.joint_range(model, model.joint(j).id) for j in joints])
+    slack = MARGIN * np.ptp(ranges, axis=1)
+    low, high = ranges[:, 0] + slack, ranges[:, 1] - slack
+
+    def residual(angles: np.ndarray) -> np.ndarray:
+        geo.set_pose(model, data, pose | dict(zip(joints, angles, strict=True)))
+        position = _sole_position(model, data, anatomy, foot)[[0, 2]]
+        tilt = np.zeros(3) if up is None else data.xmat[link].reshape(3, 3)[2] - up
+        return np.concatenate([(position - target) / length, 0.3 * tilt, 1e-3 * angles])
+
+    rng, found = np.random.default_rng(0), []
+    for _ in range(12):
+        start = rng.uniform(low, high)
+        result = least_squares(residual, start, bounds=(low, high), max_nfev=60)
+        found.append((float(result.cost), result.x))
+    found.sort(key=lambda item: item[0])
+    good = [x for cost, x in found if cost < found[0][0] + 1e-4]
+
+    def forward(angles: np.ndarray) -> bool:
+        return _knee_forward(model, anatomy, leg, pose | dict(zip(joints, angles, strict=True)))
+
+    # Two legs bend their knees forward as humans do; four, backward, as nearly all do.
+    want = len(anatomy.legs.value) == 2
+    chosen = next((x for x in good if forward(x) == want), good[0])
+    other = next((x for x in good if forward(x) != forward(chosen)), None)
+    as_dict = {name: float(a) for name, a in zip(joints, chosen, strict=True)}
+    return as_dict, None if other is None else dict(zip(joints, map(float, other), strict=True))
+
+
+def _knee_forward(
+    model: mujoco.MjModel, anatomy: Anatomy, leg: Leg, pose: dict[str, float]
+) -> bool:
+    """Return True if the second pitch joint of a leg is ahead of the line from the first to the foot."""
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, pose)
+    joints = pitch_joints(model, leg)
+    foot = next(foot for foot in anatomy.feet.value if foot.link == leg.foot)
+    if len(joints) < 2:
+        return False
+    hip, knee = (data.xanchor[model.joint(name).id] for name in joints[:2])
+    last = joints[2] if len(joints) > 2 else None
+    end = data.xanchor[model.joint(last).id] if last else _sole_world(model, data, foot)
+    share = (hip[2] - knee[2]) / max(hip[2] - end[2], 1e-6)
+    return bool(knee[0] > hip[0] + share * (end[0] - hip[0]))
+
+
+def _clipped_zero(model: mujoco.MjModel) -> dict[str, float]:
+    """Return `qpos0`, moved into the ranges with a margin."""
+    pose = {}
+    for joint in geo.joint_ids(model):
+        low, high = geo.joint_range(model, joint)
+        zero = float(model.qpos0[model.jnt_qposadr[joint]])
+        slack = MARGIN * (high - low) if not low < zero < high else 0.0
+        pose[model.joint(joint).name] = float(np.clip(zero, low + slack, high - slack))
+    return pose
+
+
+def _sole_world(model: mujoco.MjModel, data: mujoco.MjData, foot: Foot) -> np.ndarray:
+    link = model.body(foot.link).id
+    return data.xpos[link] + data.xmat[link].reshape(3, 3) @ np.array(foot.position)
+
+
+def _sole_position(
+    model: mujoco.MjModel, data: mujoco.MjData, anatomy: Anatomy, foot: Foot
+) -> np.ndarray:
+    """Return the middle of the sole from the trunk's origin, (3,), world axes."""
+    return _sole_world(model, data, foot) - data.xpos[model.body(anatomy.trunk.value).id]
+
+
+def _over_soles(model: mujoco.MjModel, data: mujoco.MjData, anatomy: Anatomy) -> bool:
+    """Return True if the center of mass is above the convex hull of the soles."""
+    points = np.vstack([sole_points(model, data, foot) for foot in anatomy.feet.value])[:, :2]
+    com = data.subtree_com[model.body(anatomy.trunk.value).id][:2]
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        return bool((points.min(axis=0) <= com).all() and (com <= points.max(axis=0)).all())
+    return bool((hull.equations[:, :2] @ com + hull.equations[:, 2] < 0.005).all())
+
+
+def _feet_mirrored(data: mujoco.MjData, model: mujoco.MjModel, anatomy: Anatomy) -> bool:
+    """Return True if the feet in order are mirror images of each other, left and right."""
+    at = np.array([_sole_position(model, data, anatomy, foot) for foot in anatomy.feet.value])
+    image = at * np.array([1.0, -1.0, 1.0])
+    size = float(np.ptp(at, axis=0).max())
+    nearest = np.linalg.norm(at[:, None] - image[None], axis=2).min(axis=1)
+    return bool((nearest < 0.1 * size).all())
