@@ -368,7 +368,8 @@ def drives(model: mujoco.MjModel) -> dict[str, Drive]:
 
 def actuated_joint(model: mujoco.MjModel, actuator: int) -> int | None:
     """Return the joint of an actuator; None for tendons, sites and bodies."""
-    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    # A numpy integer is in no tuple of enum members.
+    kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     if model.actuator_trntype[actuator] not in kinds:
         return None
     return int(model.actuator_trnid[actuator, 0])

@@ -47,7 +47,7 @@ def effort_limits(
     limits, missing, implausible = {}, [], []
     for joint in geo.joint_ids(model):
         name = model.joint(joint).name
-        limit = answers.get(name, _file_effort(model, joint))
+        limit = answers.get(name, file_effort(model, joint))
         if name not in answers and limit is not None and limit > MAX_EFFORT * weight * size:
             implausible.append(name)
             limit = None
@@ -77,7 +77,7 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def _file_effort(model: mujoco.MjModel, joint: int) -> float | None:
+def file_effort(model: mujoco.MjModel, joint: int) -> float | None:
     """Return the effort limit that the file has; None without one."""
     limits = []
     for actuator in range(model.nu):

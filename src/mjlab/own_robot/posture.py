@@ -112,7 +112,7 @@ def check_pose(
     height = ground_height(model, data, anatomy, joint_pos)
     if height < MIN_TRUNK_HEIGHT * straight:
         faults.append(f"trunk at {height:.2f} m, {height / straight:.0%} of straight legs")
-    if not _over_soles(model, data, anatomy):
+    if not over_soles(model, data, anatomy):
         faults.append("center of mass outside the soles")
     if not _feet_mirrored(data, model, anatomy):
         faults.append("left and right feet not mirrored")
@@ -286,7 +286,7 @@ def _sole_position(
     return _sole_world(model, data, foot) - data.xpos[model.body(anatomy.trunk.value).id]
 
 
-def _over_soles(model: mujoco.MjModel, data: mujoco.MjData, anatomy: Anatomy) -> bool:
+def over_soles(model: mujoco.MjModel, data: mujoco.MjData, anatomy: Anatomy) -> bool:
     """Return True if the center of mass is above the convex hull of the soles."""
     points = np.vstack([sole_points(model, data, foot) for foot in anatomy.feet.value])[:, :2]
     com = data.subtree_com[model.body(anatomy.trunk.value).id][:2]
