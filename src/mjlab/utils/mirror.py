@@ -194,7 +194,7 @@ def mirror_elements(
     distances = _distances((points[ids] - origin) @ rotation)
     tolerance = _DISTANCE * _joints_below(model, root).size
     names = [getattr(model, kind)(i).name for i in ids]
-    movers = [_joint_that_moves(model, int(bodies[i])) for i in ids]
+    movers = [joint_that_moves(model, int(bodies[i])) for i in ids]
     images = [of_joints[mover].joint if mover in of_joints else mover for mover in movers]
     by_name = {_local(name): index for index, name in enumerate(names)}
     found = {}
@@ -239,6 +239,15 @@ def reference_pose(
     return data, data.xpos[root], data.xmat[root].reshape(3, 3)
 
 
+def joint_that_moves(model: mujoco.MjModel, body: int) -> int:
+    """Return the id of the last hinge, slide or ball joint at or above `body`; -1: it moves with the root."""
+    for ancestor in _bodies_above(model, body):
+        first, count = int(model.body_jntadr[ancestor]), int(model.body_jntnum[ancestor])
+        if count and model.jnt_type[first] != mujoco.mjtJoint.mjJNT_FREE:
+            return first + count - 1
+    return -1
+
+
 def _joints_below(model: mujoco.MjModel, root: int) -> _Joints:
     data, origin, rotation = reference_pose(model, root)
     has_axis = (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) | (
@@ -275,15 +284,6 @@ def _bodies_above(model: mujoco.MjModel, body: int) -> list[int]:
         above.append(body)
         body = int(model.body_parentid[body])
     return above
-
-
-def _joint_that_moves(model: mujoco.MjModel, body: int) -> int:
-    """Return the id of the last hinge or slide at or above `body`, or -1."""
-    for ancestor in _bodies_above(model, body):
-        first, count = int(model.body_jntadr[ancestor]), int(model.body_jntnum[ancestor])
-        if count and model.jnt_type[first] != mujoco.mjtJoint.mjJNT_FREE:
-            return first + count - 1
-    return -1
 
 
 def _distances(points: np.ndarray) -> np.ndarray:

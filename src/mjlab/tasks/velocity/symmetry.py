@@ -5,12 +5,16 @@ For a robot that is symmetric, the mirror image of each sample is a further samp
 `mirror_left_right` in `symmetry_cfg` of `RslRlPpoAlgorithmCfg`.
 
 The mirror plane is the x-z plane of the robot's root. Mirroring flips the sign of y of polar vectors, and
-of x and z of axial vectors.
+of x and z of axial vectors. Joints and feet find their partners by geometry, see `mjlab.utils.mirror`, or
+by the argument `pairs`, in a function of the task's own:
+
+    def mirror(env, obs=None, actions=None):
+        return mirror_left_right(env, obs, actions, pairs={"port_knee": "starboard_knee"})
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -23,18 +27,22 @@ import torch
 from mjlab.envs import mdp as envs_mdp
 from mjlab.sensor import ContactSensor
 from mjlab.tasks.velocity import mdp
+from mjlab.utils.mirror import (
+    DIRECTION,
+    ROTATION,
+    describe_unpaired,
+    joint_that_moves,
+    mirror_elements,
+    mirror_pairs,
+    reference_pose,
+)
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
-DIRECTION = (1.0, -1.0, 1.0)
-ROTATION = (-1.0, 1.0, -1.0)
-_SIDES = {"left": "right", "FL": "FR", "RL": "RR"}
-_OTHER_SIDE = _SIDES | {right: left for left, right in _SIDES.items()}
-
-# Tolerances between partners: axes (unit vectors), default positions (rad), anchor positions (m).
-_AXIS_TOLERANCE, _POSE_TOLERANCE, _ANCHOR_TOLERANCE = 1e-4, 1e-3, 5e-3
+# Tolerances: default positions of partners (rad or m), distance from the mirror plane (m).
+_POSE_TOLERANCE, _PLANE_TOLERANCE = 1e-3, 5e-3
 _HINT = "To learn without mirror images, set agent.algorithm.symmetry_cfg to None."
 _ROBOT = "robot"
 _PLANAR_VELOCITY = (1.0, -1.0, -1.0)
@@ -47,12 +55,15 @@ _SENSOR_SIGNS = {
 }
 # Tolerance of ray positions (m) and axes (unit vectors).
 _TOLERANCE = 1e-4
-# Building the mirrors of a Go1 takes 11 ms, mirroring 3072 samples 1.3 ms.
+# Building the mirrors of a Go1 takes 25 ms, mirroring 3072 samples 1.3 ms.
 _cache: WeakKeyDictionary[Any, _Mirrors] = WeakKeyDictionary()
 
 
 def mirror_left_right(
-    env: Any, obs: Any = None, actions: torch.Tensor | None = None
+    env: Any,
+    obs: Any = None,
+    actions: torch.Tensor | None = None,
+    pairs: Mapping[str, str] | None = None,
 ) -> tuple[Any, torch.Tensor | None]:
     """Append mirror images to observations and actions.
 
@@ -60,6 +71,8 @@ def mirror_left_right(
         env: Environment, wrapped or not.
         obs: TensorDict of observation groups, each (N, D), or None.
         actions: Actions (N, A), or None.
+        pairs: Names of joints and feet (geoms, bodies, sites) and of their partners on the other side, in
+            either direction. Others are found by geometry; None: all are.
 
     Returns:
         Observations and actions with 2 N rows, the originals first.
@@ -69,8 +82,8 @@ def mirror_left_right(
     """
     env = env.unwrapped
     mirrors = _cache.get(env)
-    if mirrors is None:
-        mirrors = _cache[env] = _Mirrors(env)
+    if mirrors is None or mirrors.pairs != (pairs or {}):
+        mirrors = _cache[env] = _Mirrors(env, pairs or {})
     if obs is not None:
         image = obs.clone()
         for group in set(image.keys()):
@@ -84,7 +97,9 @@ def mirror_left_right(
 class _Mirrors:
     """Mirrors of the observation groups and actions of an environment."""
 
-    def __init__(self, env: ManagerBasedRlEnv) -> None:
+    def __init__(self, env: ManagerBasedRlEnv, pairs: Mapping[str, str]) -> None:
+        self.pairs = dict(pairs)
+        robot = _Robot(env, self.pairs)
         manager = env.observation_manager
         self.groups: dict[str, Mirror] = {}
         for group, names in manager.active_terms.items():
@@ -97,19 +112,55 @@ class _Mirrors:
             instants = [max(1, manager.get_term_cfg(group, n).history_length) for n in names]
             shapes = manager.group_obs_term_dim[group]
             terms = [
-                _mirror_of_term(env, group, name, count, shape)
+                _mirror_of_term(robot, group, name, count, shape)
                 for name, count, shape in zip(names, instants, shapes, strict=True)
             ]
             starts = accumulate(map(len, terms), initial=0)
             spans = dict(zip(names, zip(starts, instants, strict=False), strict=True))
-            self.groups[group] = Mirror.concatenate(terms, _lever_arms(env, group, spans))
-        self.actions = _of_actions(env)
+            self.groups[group] = Mirror.concatenate(terms, _lever_arms(robot, group, spans))
+        self.actions = _of_actions(robot)
+
+
+class _Robot:
+    """Robot of an environment before the mirror: model, pose at `qpos0`, and partners."""
+
+    def __init__(self, env: ManagerBasedRlEnv, pairs: Mapping[str, str]) -> None:
+        self.env, self.pairs = env, pairs
+        self.model = env.sim.mj_model
+        self.entity: Entity = env.scene[_ROBOT]
+        self.root = int(self.entity.indexing.root_body_id)
+        self.data, self.origin, self.rotation = reference_pose(self.model, self.root)
+
+    def is_central(self, body: int) -> bool:
+        """True if `body` moves with the root or with a joint on the mirror plane."""
+        joint = joint_that_moves(self.model, body)
+        joints = mirror_pairs(self.model, self.root, self.pairs)
+        return joint < 0 or (joint in joints and joints[joint].joint == joint)
+
+    def left_of_plane(self, point: np.ndarray) -> float:
+        """Return the distance of a world position from the mirror plane (m), positive to the left."""
+        return float((point - self.origin) @ self.rotation[:, 1])
+
+    def partners(self, owner: str, kind: Any, ids: Sequence[int]) -> list[int]:
+        """Return the indices in `ids` of the partners of bodies, sites or geoms `ids`.
+
+        Raises:
+            ValueError: an element has no mirror image among `ids`.
+        """
+        found = mirror_elements(self.model, kind, ids, self.root, self.pairs)
+        missing = [getattr(self.model, kind)(i).name for i in ids if i not in found]
+        if missing:
+            raise ValueError(
+                f"{owner}: mirror_left_right expected the {kind} of the other side for each, got none for "
+                f"{', '.join(missing)}; add it, or name partners in `pairs`. {_HINT}"
+            )
+        return [list(ids).index(found[i]) for i in ids]
 
 
 def _mirror_of_term(
-    env: ManagerBasedRlEnv, group: str, name: str, instants: int, shape: tuple[int, ...]
+    robot: _Robot, group: str, name: str, instants: int, shape: tuple[int, ...]
 ) -> Mirror:
-    cfg = env.cfg.observations[group].terms[name]
+    cfg = robot.env.cfg.observations[group].terms[name]
     owner = f"Observation {group}/{name}"
     kind = _KINDS.get(cfg.func)
     if kind is None:
@@ -125,7 +176,7 @@ def _mirror_of_term(
             f"{owner}: mirror_left_right expected a scalar scale and a clip (-c, c), got scale "
             f"{cfg.scale!r} and clip {clip!r}. {_HINT}"
         )
-    mirror = Mirror.concatenate([kind(env, cfg.params)] * instants)
+    mirror = Mirror.concatenate([kind(robot, cfg.params)] * instants)
     if shape != (len(mirror),):
         raise ValueError(
             f"{owner}: mirror_left_right expected shape ({len(mirror)},) per environment, got {shape}; "
@@ -137,10 +188,10 @@ def _mirror_of_term(
 # Mirrors of terms.
 
 
-def _of_sensor(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
+def _of_sensor(robot: _Robot, params: dict[str, Any]) -> Mirror:
     """Return the mirror of a gyro, velocimeter or accelerometer, without lever arm effects."""
-    sensor = _sensor(env, params["sensor_name"])
-    is_off_center = abs(sensor.y) > _ANCHOR_TOLERANCE
+    sensor = _sensor(robot, params["sensor_name"])
+    is_off_center = abs(sensor.y) > _PLANE_TOLERANCE
     if sensor.kind == mujoco.mjtSensor.mjSENS_ACCELEROMETER and is_off_center:
         raise ValueError(
             f"Accelerometer {sensor.name!r}: expected a position on the mirror plane, got "
@@ -161,9 +212,9 @@ class _Sensor(NamedTuple):
     """Distance from the mirror plane (m), positive to the left."""
 
 
-def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
+def _sensor(robot: _Robot, name: str) -> _Sensor:
     """Return a gyro, velocimeter or accelerometer. Raises unless its site is aligned with the root."""
-    model = env.sim.mj_model
+    model = robot.model
     found = model.sensor(name)
     kind, site = mujoco.mjtSensor(int(found.type.item())), int(found.objid.item())
     if kind not in _SENSOR_SIGNS:
@@ -171,35 +222,21 @@ def _sensor(env: ManagerBasedRlEnv, name: str) -> _Sensor:
             f"Sensor {name!r}: mirror_left_right expected a gyro, velocimeter or accelerometer, got "
             f"{kind.name}. {_HINT}"
         )
-    data, origin, rotation = _reference_pose(model, env.scene[_ROBOT])
     body = int(model.site_bodyid[site])
-    if np.abs(data.site_xmat[site] - rotation.ravel()).max() > _TOLERANCE:
+    if np.abs(robot.data.site_xmat[site] - robot.rotation.ravel()).max() > _TOLERANCE:
         raise ValueError(
             f"Sensor {name!r}: mirror_left_right expected the orientation of the robot's root at qpos0, got "
             f"a rotated site. {_HINT}"
         )
-    body_name = model.body(body).name
-    if other_side(body_name.split("/")[-1]) != body_name.split("/")[-1]:
+    if not robot.is_central(body):
         raise ValueError(
-            f"Sensor {name!r}: expected a body on the mirror plane, got {body_name!r} on one side of "
-            f"the robot. {_HINT}"
+            f"Sensor {name!r}: expected a body on the mirror plane, got {model.body(body).name!r} on one "
+            f"side of the robot. {_HINT}"
         )
-    return _Sensor(name, kind, body, float((data.site_xpos[site] - origin) @ rotation[:, 1]))
+    return _Sensor(name, kind, body, robot.left_of_plane(robot.data.site_xpos[site]))
 
 
-def _reference_pose(
-    model: mujoco.MjModel, robot: Entity
-) -> tuple[mujoco.MjData, np.ndarray, np.ndarray]:
-    """Return the kinematics at `qpos0`, and position and rotation matrix of the robot's root."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    root = int(robot.indexing.root_body_id)
-    return data, data.xpos[root], data.xmat[root].reshape(3, 3)
-
-
-def _lever_arms(
-    env: ManagerBasedRlEnv, group: str, spans: dict[str, tuple[int, int]]
-) -> list[Coupling]:
+def _lever_arms(robot: _Robot, group: str, spans: dict[str, tuple[int, int]]) -> list[Coupling]:
     """Return the lever arm corrections of mirrored linear velocities.
 
     The mirror image of a sensor at distance y from the mirror plane is at -y, but the sensor of the
@@ -208,27 +245,26 @@ def _lever_arms(
         v' = S v + w' x (0, 2 y, 0) = S v + 2 y (w_z, 0, -w_x).
 
     Args:
-        env: The environment.
+        robot: The robot.
         group: Observation group name.
         spans: First column and number of time steps of each term of the group.
 
     Raises:
         ValueError: the group does not observe the required angular velocity.
     """
-    terms = {name: env.cfg.observations[group].terms[name] for name in spans}
+    terms = {name: robot.env.cfg.observations[group].terms[name] for name in spans}
     # `_mirror_of_term` accepts no other scales.
     scales = {name: cast("float | None", cfg.scale) for name, cfg in terms.items()}
     factors = {name: 1.0 if scale is None else scale for name, scale in scales.items()}
     sensors = {
-        name: _sensor(env, cfg.params["sensor_name"])
+        name: _sensor(robot, cfg.params["sensor_name"])
         for name, cfg in terms.items()
         if cfg.func is envs_mdp.builtin_sensor
     }
     turning = {n: s.body for n, s in sensors.items() if s.kind == mujoco.mjtSensor.mjSENS_GYRO}
-    robot: Entity = env.scene[_ROBOT]
     for name, cfg in terms.items():
         if cfg.func is envs_mdp.base_ang_vel:
-            turning[name] = robot.indexing.root_body_id
+            turning[name] = robot.root
     # Angular velocities by body, number of time steps and delay, which must not be random.
     gyros: dict[tuple[int, ...], str] = {}
     for name, body in turning.items():
@@ -246,19 +282,19 @@ def _lever_arms(
             for shift in range(0, 3 * instants, 3):
                 v, w = start + shift, spans[gyro][0] + shift
                 couplings += [Coupling(v, w + 2, factor), Coupling(v + 2, w, -factor)]
-        elif abs(sensor.y) > _ANCHOR_TOLERANCE:
+        elif abs(sensor.y) > _PLANE_TOLERANCE:
             raise ValueError(
                 f"Observation {group}/{name}: expected a velocimeter on the mirror plane, got one "
                 f"{sensor.y:.3g} m to its left. Its mirror image depends on the angular velocity of "
-                f"{env.sim.mj_model.body(sensor.body).name!r}; add that to group {group!r}, with the same "
+                f"{robot.model.body(sensor.body).name!r}; add that to group {group!r}, with the same "
                 "history_length, and without delay or with the same fixed delay, or use "
                 f"base_lin_vel. {_HINT}"
             )
     return couplings
 
 
-def _of_command(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
-    term = env.command_manager.get_term(params["command_name"])
+def _of_command(robot: _Robot, params: dict[str, Any]) -> Mirror:
+    term = robot.env.command_manager.get_term(params["command_name"])
     if isinstance(term, mdp.UniformVelocityCommand):
         return Mirror(range(3), _PLANAR_VELOCITY)
     if isinstance(term, mdp.GaitClockCommand):
@@ -269,21 +305,23 @@ def _of_command(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
     )
 
 
-def _of_joints(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
+def _of_joints(robot: _Robot, params: dict[str, Any]) -> Mirror:
     asset_cfg = params.get("asset_cfg")
-    if asset_cfg is not None and asset_cfg.preserve_order:
+    if asset_cfg is None:
+        return mirror_of_joints(robot.model, robot.entity, robot.pairs)
+    if asset_cfg.preserve_order:
         raise ValueError(
             f"mirror_left_right asset_cfg: expected joints in model order, got preserve_order=True. {_HINT}"
         )
-    return mirror_of_joints(
-        env.sim.mj_model, env.scene[_ROBOT if asset_cfg is None else asset_cfg.name]
-    )
+    entity: Entity = robot.env.scene[asset_cfg.name]
+    names = None
+    if asset_cfg.joint_names is not None:
+        names = entity.find_joints(asset_cfg.joint_names)[1]
+    return mirror_of_joints(robot.model, entity, robot.pairs, names)
 
 
-def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) -> Mirror:
-    robot: Entity = env.scene[_ROBOT]
-    joints = mirror_of_joints(env.sim.mj_model, robot)
-    manager = env.action_manager
+def _of_actions(robot: _Robot, params: dict[str, Any] | None = None) -> Mirror:
+    manager = robot.env.action_manager
     terms = {name: manager.get_term(name) for name in manager.active_terms}
     (term, *others) = terms.values()
     if others or not isinstance(term, envs_mdp.JointPositionAction):
@@ -291,48 +329,46 @@ def _of_actions(env: ManagerBasedRlEnv, params: dict[str, Any] | None = None) ->
         raise ValueError(
             f"mirror_left_right actions: expected one JointPositionAction, got {kinds}. {_HINT}"
         )
-    driven = [robot.joint_names.index(name) for name in term.target_names]
-    partner_ids = joints.sources[driven].tolist()
-    if set(partner_ids) != set(driven):
-        raise ValueError(
-            f"mirror_left_right actions: expected joints of both sides, got {term.target_names}. {_HINT}"
-        )
-    sources = [driven.index(joint) for joint in partner_ids]
-    scale = torch.as_tensor(term.scale, dtype=torch.float32).expand(env.num_envs, len(driven))
-    if not torch.allclose(scale[:, sources], scale):
+    mirror = mirror_of_joints(robot.model, robot.entity, robot.pairs, term.target_names)
+    size = len(mirror)
+    scale = torch.as_tensor(term.scale, dtype=torch.float32).expand(robot.env.num_envs, size)
+    if not torch.allclose(scale[:, mirror.sources], scale):
         raise ValueError(
             f"mirror_left_right actions: expected the same scale on both sides, got {term.cfg.scale}. {_HINT}"
         )
-    return Mirror(sources, joints.signs[driven].tolist())
+    return mirror
 
 
-def _of_feet(
-    env: ManagerBasedRlEnv, params: dict[str, Any], signs: tuple[float, ...] = (1.0,)
-) -> Mirror:
+def _of_feet(robot: _Robot, params: dict[str, Any], signs: tuple[float, ...] = (1.0,)) -> Mirror:
     """Return the mirror of foot vectors with `signs`, of a contact or height sensor."""
-    sensor = env.scene[params["sensor_name"]]
-    is_contact = isinstance(sensor, ContactSensor)
-    names = sensor.primary_names if is_contact else [frame.name for frame in sensor.cfg.frame]
-    size, feet = len(signs), partners(names)
+    sensor, model = robot.env.scene[params["sensor_name"]], robot.model
+    if isinstance(sensor, ContactSensor):
+        found = [model.sensor(f"{sensor.cfg.name}_{name}") for name in sensor.primary_names]
+        is_geom = found[0].objtype.item() == mujoco.mjtObj.mjOBJ_GEOM
+        kind, ids = "geom" if is_geom else "body", [int(foot.objid.item()) for foot in found]
+    else:
+        kind = sensor.cfg.frame[0].type
+        ids = [getattr(model, frame.type)(frame.prefixed_name()).id for frame in sensor.cfg.frame]
+    size, feet = len(signs), robot.partners(f"Sensor {params['sensor_name']!r}", kind, ids)
     return Mirror([size * foot + i for foot in feet for i in range(size)], signs * len(feet))
 
 
-def _of_rays(env: ManagerBasedRlEnv, params: dict[str, Any]) -> Mirror:
+def _of_rays(robot: _Robot, params: dict[str, Any]) -> Mirror:
     """Return the mirror of the rays of a sensor with one frame on the mirror plane."""
-    cfg = env.scene[params["sensor_name"]].cfg
+    cfg = robot.env.scene[params["sensor_name"]].cfg
     frames = cfg.frame if isinstance(cfg.frame, tuple) else (cfg.frame,)
-    rays = torch.cat(cfg.pattern.generate_rays(env.sim.mj_model, "cpu"), dim=1)
+    rays = torch.cat(cfg.pattern.generate_rays(robot.model, "cpu"), dim=1)
     distances = (
         (rays * torch.tensor(2 * DIRECTION, dtype=torch.float32))[:, None] - rays[None]
     ).norm(dim=-1)
-    data, origin, rotation = _reference_pose(env.sim.mj_model, env.scene[_ROBOT])
-    frame = frames[0]
-    element = getattr(env.sim.mj_model, frame.type)(frame.prefixed_name())
+    data, model, frame = robot.data, robot.model, frames[0]
+    element = getattr(model, frame.type)(frame.prefixed_name())
+    body = element.id if frame.type == "body" else int(element.bodyid.item())
     points = {"body": data.xpos, "site": data.site_xpos, "geom": data.geom_xpos}[frame.type]
     is_central = (
         len(frames) == 1
-        and other_side(frame.name) == frame.name
-        and abs((points[element.id] - origin) @ rotation[:, 1]) <= _ANCHOR_TOLERANCE
+        and robot.is_central(body)
+        and abs(robot.left_of_plane(points[element.id])) <= _PLANE_TOLERANCE
     )
     if not is_central or (distances.min(dim=1).values > _TOLERANCE).any():
         raise ValueError(
@@ -412,57 +448,49 @@ class Coupling(NamedTuple):
     factor: float
 
 
-def mirror_of_joints(model: mujoco.MjModel, robot: Entity) -> Mirror:
-    """Return the mirror of the joints of entity `robot`, in entity order.
+def mirror_of_joints(
+    model: mujoco.MjModel,
+    robot: Entity,
+    pairs: Mapping[str, str] | None = None,
+    names: Sequence[str] | None = None,
+) -> Mirror:
+    """Return the mirror of joints of entity `robot`.
 
-    Partners are found by name. The sign of a joint is -1 if the mirror image of its axis is opposite to
-    the partner's axis.
+    The sign of a joint is -1 if the mirror image of its axis is opposite to the partner's axis.
 
-    Raises:
-        ValueError: a joint is not the mirror image of its partner.
-    """
-    names = robot.joint_names
-    pairs = partners(names)
-    data, origin, rotation = _reference_pose(model, robot)
-    ids = robot.indexing.joint_ids.tolist()
-    axes = data.xaxis[ids] @ rotation
-    anchors = (data.xanchor[ids] - origin) @ rotation
-    is_slide = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
-    images = axes * np.where(is_slide[:, None], DIRECTION, ROTATION)
-    signs = (images[pairs] * axes).sum(axis=1)
-    pose = robot.data.default_joint_pos[0].cpu().numpy()
-    is_image = (
-        (np.abs(np.abs(signs) - 1) <= _AXIS_TOLERANCE)
-        & (np.linalg.norm(anchors[pairs] * DIRECTION - anchors, axis=1) <= _ANCHOR_TOLERANCE)
-        & (np.abs(pose - signs * pose[pairs]) <= _POSE_TOLERANCE)
-    )
-    if not is_image.all():
-        pair = [is_image.argmin(), pairs[is_image.argmin()]]
-        raise ValueError(
-            f"Joint {names[pair[0]]!r} is not the mirror image of {names[pair[1]]!r}: axes "
-            f"{axes[pair].round(3).tolist()}, anchors {anchors[pair].round(3).tolist()}, default "
-            f"positions {pose[pair].round(4).tolist()}. Partners are found by these parts of names: "
-            f"{', '.join(_OTHER_SIDE)}. {_HINT}"
-        )
-    return Mirror(pairs, signs.round().tolist())
-
-
-def partners(names: Sequence[str]) -> list[int]:
-    """Return the index of the left-right partner of each name; central names are their own partner.
+    Args:
+        model: Model of the scene.
+        robot: The robot.
+        pairs: Names of joints and of their partners; others are found by geometry (`mirror_pairs`).
+        names: Names of the joints, in the order of the mirror. None: all, in entity order.
 
     Raises:
-        ValueError: a name has no partner in `names`.
+        ValueError: a joint has no mirror image, or its default position is not that of its partner.
     """
-    others = [other_side(name) for name in names]
-    missing = sorted(set(others) - set(names))
-    if missing:
+    names = list(robot.joint_names if names is None else names)
+    ids = [int(robot.indexing.joint_ids[robot.joint_names.index(name)]) for name in names]
+    root = int(robot.indexing.root_body_id)
+    found = mirror_pairs(model, root, pairs)
+    if any(joint not in found for joint in ids):
+        described = describe_unpaired(model, root, pairs)
         raise ValueError(
-            f"mirror_left_right: {', '.join(missing)} not found. Available: {', '.join(names)}. "
-            f"Sides are found by these parts of names: {', '.join(_OTHER_SIDE)}. {_HINT}"
+            "mirror_left_right joints: expected mirror images in the x-z plane of "
+            f"{model.body(root).name!r}, got none of {', '.join(described[i] for i in ids if i in described)}"
+            f"; name partners in `pairs`. {_HINT}"
         )
-    return [list(names).index(other) for other in others]
-
-
-def other_side(name: str) -> str:
-    """Return the name of the left-right partner; central names are returned unchanged."""
-    return "_".join(_OTHER_SIDE.get(part, part) for part in name.split("_"))
+    if {found[joint].joint for joint in ids} != set(ids):
+        raise ValueError(
+            f"mirror_left_right joints: expected joints of both sides, got {names}. {_HINT}"
+        )
+    sources = [ids.index(found[joint].joint) for joint in ids]
+    signs = np.array([found[joint].sign for joint in ids])
+    columns = [robot.joint_names.index(name) for name in names]
+    pose = robot.data.default_joint_pos[0].cpu().numpy()[columns]
+    differences = np.abs(pose - signs * pose[sources])
+    if differences.max() > _POSE_TOLERANCE:
+        pair = [int(differences.argmax()), sources[int(differences.argmax())]]
+        raise ValueError(
+            f"Joint {names[pair[0]]!r} is not the mirror image of {names[pair[1]]!r}: default positions "
+            f"{pose[pair].round(4).tolist()}, sign {signs[pair[0]]:+.0f}. {_HINT}"
+        )
+    return Mirror(sources, signs.tolist())
