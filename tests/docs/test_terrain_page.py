@@ -9,15 +9,16 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from mjlab.terrains import TerrainGenerator
+from mjlab.terrains import TerrainEntity, TerrainGenerator
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TEXT = (DOCS / "how-to" / "terrains.md").read_text(encoding="utf-8")
 
 
-def test_the_code_of_the_page_builds_its_terrain():
+def test_the_code_of_the_page_builds_its_terrain(tmp_path, monkeypatch):
     """All blocks, one after the other, then the generator that they have put together."""
+    monkeypatch.chdir(tmp_path)
     names: dict = {"__name__": "page"}
     for block in re.findall(r"^```python\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL):
         exec(compile(block, "terrains.md", "exec", dont_inherit=True), names)
@@ -27,6 +28,9 @@ def test_the_code_of_the_page_builds_its_terrain():
     assert spec.compile().ngeom > 100
     assert generator.flat_patches["spawn"].shape == (10, 5, 20, 3)
     np.testing.assert_array_equal(generator.terrain_origins[:, 3, 2], 0.0)
+    hills = TerrainEntity(names["hills"], "cpu")
+    assert hills.compile().hfield_nrow.tolist() == [161]
+    assert hills.terrain_origins.shape == (1, 49, 3)
 
 
 def test_the_table_has_every_preset():

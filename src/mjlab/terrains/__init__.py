@@ -1,4 +1,4 @@
-"""Terrains: plane, or a grid of height field and box sub-terrains."""
+"""Terrains: plane, grid of height field and box sub-terrains, or ground from a file."""
 
 from mjlab.compat import older_names
 from mjlab.terrains.heightfield_terrains import (
@@ -31,6 +31,7 @@ from mjlab.terrains.primitive_terrains import (
 from mjlab.terrains.primitive_terrains import BoxTiltedGridTerrainCfg as BoxTiltedGridTerrainCfg
 from mjlab.terrains.terrain_entity import TerrainEntity as TerrainEntity
 from mjlab.terrains.terrain_entity import TerrainEntityCfg as TerrainEntityCfg
+from mjlab.terrains.terrain_file import TerrainFileCfg as TerrainFileCfg
 from mjlab.terrains.terrain_generator import FlatPatchSamplingCfg as FlatPatchSamplingCfg
 from mjlab.terrains.terrain_generator import SubTerrainCfg as SubTerrainCfg
 from mjlab.terrains.terrain_generator import TerrainGenerator as TerrainGenerator

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from mjlab.entity import Entity, EntityCfg
+from mjlab.terrains.terrain_file import TerrainFileCfg, add_ground
 from mjlab.terrains.terrain_generator import TerrainGenerator, TerrainGeneratorCfg
 from mjlab.utils import spec_config as spec_cfg
 from mjlab.utils.errors import WrongTypeError, check_one_of
@@ -61,18 +62,22 @@ class TerrainEntityCfg(EntityCfg):
     """Textures to add."""
     materials: tuple[spec_cfg.MaterialCfg, ...] = (_GROUND_MATERIAL,)
     """Materials to add and to assign to geoms."""
-    terrain_type: Literal["generator", "plane"] = "plane"
-    """Terrain type: `plane` (one infinite plane) or `generator` (grid of sub-terrains)."""
+    terrain_type: Literal["generator", "plane", "mesh", "heightmap"] = "plane"
+    """Terrain type: `plane` (one infinite plane), `generator` (grid of sub-terrains), or `mesh` or
+    `heightmap` (ground from a file)."""
     terrain_generator: TerrainGeneratorCfg | None = None
     """Sub-terrain grid of type `generator`."""
     env_spacing: float | None = 2.0
-    """Distance between environment origins on a plane (m). A scene sets this field."""
+    """Distance between environment origins on a plane or a ground from a file (m). A scene sets this
+    field."""
     max_init_terrain_level: int | None = None
     """Highest initial level (row) of environments on a generated terrain. None: all levels."""
     num_envs: int = 1
     """Number of environments. A scene sets this field."""
     debug_vis: bool = False
     """Add sites at environment origins, and at the terrain's spawn points and flat patches."""
+    terrain_file: TerrainFileCfg | None = dataclasses.field(default=None, kw_only=True)
+    """File and placement of types `mesh` and `heightmap`."""
 
     def build(self) -> NoReturn:
         """Raise `TypeError`: a terrain needs a device. Use `TerrainEntity(cfg, device)`."""
@@ -86,7 +91,7 @@ class TerrainEntity(Entity):
     """Ground of the scene: one static body `terrain`, and the environment origins."""
 
     # The config defines the ground; checkpoints hold the levels and columns of environments.
-    _transient = {"_device", "_flat_patches", "_flat_patch_radii", "_holds_levels"}
+    _transient = {"_device", "_flat_patches", "_flat_patch_radii", "_holds_levels", "bounds"}
 
     cfg: TerrainEntityCfg
 
@@ -108,26 +113,33 @@ class TerrainEntity(Entity):
         self.max_terrain_level = 0
         """Number of levels. 0 on a plane."""
         self.terrain_generator: TerrainGenerator | None = None
-        """Generator of the terrain. None on a plane."""
+        """Generator of the terrain. None for other types."""
+        self.bounds: tuple[tuple[float, float], tuple[float, float]] | None = None
+        """World x and y of the low and high corner of a ground from a file (m). None for other types."""
         self._holds_levels = False
         self._flat_patches: dict[str, torch.Tensor] = {}
         self._flat_patch_radii: dict[str, float] = {}
-        if cfg.terrain_type == "generator":
-            # A generated terrain has no geom `terrain` for the default material.
+        if cfg.terrain_type != "plane":
+            # Other terrains are colored by height, without the default material.
             added_only = dataclasses.replace(_GROUND_MATERIAL, geom_names_expr=None)
             materials = tuple(added_only if m == _GROUND_MATERIAL else m for m in cfg.materials)
             cfg = dataclasses.replace(cfg, materials=materials)
         super().__init__(cfg)
 
     def _make_spec(self) -> mujoco.MjSpec:
-        check_one_of("TerrainEntityCfg.terrain_type", self.cfg.terrain_type, ("plane", "generator"))
+        kind = self.cfg.terrain_type
+        check_one_of(
+            "TerrainEntityCfg.terrain_type", kind, ("plane", "generator", "mesh", "heightmap")
+        )
         spec = mujoco.MjSpec()
-        if self.cfg.terrain_type == "plane":
+        if kind == "plane":
             body = spec.worldbody.add_body(name="terrain")
             body.add_geom(name="terrain", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0.0, 0.0, 0.01))
             self.configure_env_origins()
-        else:
+        elif kind == "generator":
             self._generate(spec)
+        else:
+            self._read(spec, kind)
         if self.cfg.debug_vis:
             self._add_debug_sites(spec.body("terrain"))
         return spec
@@ -151,6 +163,19 @@ class TerrainEntity(Entity):
         # Without a curriculum a column mixes types, even if columns and types are equal in number.
         shares = generator.proportions if generator.cfg.curriculum else None
         self.configure_env_origins(generator.terrain_origins, shares)
+
+    def _read(self, spec: mujoco.MjSpec, kind: Literal["mesh", "heightmap"]) -> None:
+        """Add the configured ground and spread environments over it, as over cells of one level."""
+        if self.cfg.terrain_file is None:
+            raise ValueError(
+                f"TerrainEntityCfg.terrain_file: expected a TerrainFileCfg for terrain_type {kind!r}, got "
+                'None; use TerrainFileCfg(path="...").'
+            )
+        ground = add_ground(spec, self.cfg.terrain_file, kind)
+        low, high = ground.low.tolist(), ground.high.tolist()
+        self.bounds = ((low[0], low[1]), (high[0], high[1]))
+        spacing = 2.0 if self.cfg.env_spacing is None else self.cfg.env_spacing
+        self.configure_env_origins(ground.spawn_points(spacing, self.cfg.terrain_file.origins))
 
     def _add_debug_sites(self, body: mujoco.MjsBody) -> None:
         """Add sites `env_origin_<i>` (group 4), `terrain_origin_<r>_<c>` (group 5), and

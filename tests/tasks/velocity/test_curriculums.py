@@ -6,6 +6,7 @@ import copy
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from stand_ins import StandInEnv, velocity_command
@@ -13,6 +14,7 @@ from velocity_tasks import GO1_ROUGH
 
 from mjlab.tasks.velocity import mdp
 from mjlab.tasks.velocity.mdp.curriculums import VelocityStage
+from mjlab.terrains import TerrainFileCfg
 
 ALL = torch.arange(4)
 
@@ -23,6 +25,7 @@ class Terrain:
     def __init__(self, num_cols: int = 2) -> None:
         generator = SimpleNamespace(size=(8.0, 6.0), sub_terrains={"flat": 1, "stairs": 2})
         self.cfg = SimpleNamespace(terrain_generator=generator)
+        self.terrain_generator = SimpleNamespace(cfg=generator)
         self.terrain_origins = torch.zeros(5, num_cols, 3)
         self.terrain_levels = torch.tensor([0, 1, 2, 4])
         self.terrain_types = torch.tensor([0, 0, 1, 1])
@@ -99,6 +102,27 @@ def test_levels_stay_after_a_resume(make_env):
     env.reset()
     assert (env.scene.terrain.terrain_levels <= before).all()
     assert (env.scene.terrain.terrain_levels < before).any()
+
+
+def test_rough_task_runs_on_ground_from_a_file(make_env, tmp_path):
+    """Environments stand on the ground, and their scans see it; there are no levels."""
+    x = np.linspace(-6, 6, 121)
+    np.save(tmp_path / "slope.npy", np.tile(0.1 * x, (121, 1)))
+
+    def edit(cfg):
+        cfg.scene.terrain.terrain_type = "heightmap"
+        cfg.scene.terrain.terrain_file = TerrainFileCfg(path=str(tmp_path / "slope.npy"))
+
+    env = make_env(GO1_ROUGH, num_envs=4, edit=edit)
+    env.reset()
+    for _ in range(3):
+        env.step(torch.zeros(4, 12))
+    origins = env.scene.env_origins
+    torch.testing.assert_close(origins[:, 2], 0.1 * (origins[:, 0] + 1.0), atol=0.011, rtol=0.0)
+    hits = env.scene["terrain_scan"].data.hit_pos_w
+    torch.testing.assert_close(hits[..., 2], 0.1 * hits[..., 0], atol=1e-3, rtol=0.0)
+    terrain_levels = mdp.terrain_levels_vel(env, torch.arange(4), "twist")
+    assert terrain_levels == {}
 
 
 def test_with_the_elapsed_time_an_episode_cut_short_does_not_send_down():

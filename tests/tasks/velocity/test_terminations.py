@@ -41,7 +41,9 @@ def on_terrain(*positions: tuple[float, float], rows: int = 10, cols: int = 7, *
     generator = SimpleNamespace(**{"size": (8.0, 8.0), "border_width": 20.0, "num_cols": 20, **cfg})
     env.scene.terrain = SimpleNamespace(
         terrain_origins=torch.zeros(rows, cols, 3),
+        terrain_generator=SimpleNamespace(cfg=generator),
         cfg=SimpleNamespace(terrain_generator=generator),
+        bounds=None,
     )
     env.scene.env_origins = torch.zeros(len(xy), 3)
     env.episode_length_buf = torch.full((len(xy),), 3)
@@ -72,6 +74,13 @@ def test_the_edge_of_the_cell_is_a_share_of_half_its_size_away():
     assert mdp.terrain_edge_reached(env, threshold_fraction=0.99).tolist()[:3] == [False] * 3
     env.episode_length_buf[:] = torch.tensor([3, 3, 2, 1])
     assert mdp.terrain_edge_reached(env).tolist() == [False, True, False, False]
+
+
+def test_ground_from_a_file_ends_at_its_bounds():
+    env = on_terrain((0.5, 1.5), (6.5, 1.5), (6.9, 1.5), (0.5, 0.1))
+    env.scene.terrain.bounds = ((-1.0, 0.0), (7.0, 3.0))
+    assert mdp.out_of_terrain_bounds(env).tolist() == [False, False, True, True]
+    assert mdp.out_of_terrain_bounds(env, margin=1.0).tolist() == [False, True, True, True]
 
 
 @pytest.mark.parametrize("term", [mdp.out_of_terrain_bounds, mdp.terrain_edge_reached])

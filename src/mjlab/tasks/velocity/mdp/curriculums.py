@@ -70,10 +70,9 @@ def terrain_levels_vel(
     sub-terrain has one column.
     """
     terrain = env.scene.terrain
-    if terrain is None or terrain.terrain_origins is None:
+    if terrain is None or terrain.terrain_origins is None or terrain.terrain_generator is None:
         return {}
-    generator = terrain.cfg.terrain_generator
-    assert generator is not None
+    generator = terrain.terrain_generator.cfg
     asset: Entity = env.scene[asset_cfg.name]
     offset = asset.data.root_link_pos_w[env_ids, :2] - env.scene.env_origins[env_ids, :2]
     distance = torch.linalg.vector_norm(offset, dim=1)

@@ -28,13 +28,17 @@ _MIN_STEPS = 2
 def out_of_terrain_bounds(
     env: ManagerBasedRlEnv, margin: float = 0.3, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
-    """Root outside the generated terrain, or within `margin` (m) of its edge.
+    """Root outside the terrain, or within `margin` (m) of its edge.
 
-    Never on a plane. The extent is that of the grid as built, including the border.
+    Never on a plane. The extent of a generated terrain is that of the grid as built, including the border.
     """
     asset: Entity = env.scene[asset_cfg.name]
     position = asset.data.root_link_pos_w
     terrain = env.scene.terrain
+    if terrain is not None and terrain.bounds is not None:
+        low, high = torch.tensor(terrain.bounds, device=position.device)
+        x_y = position[:, :2]
+        return ((x_y < low + margin) | (x_y > high - margin)).any(dim=1)
     if terrain is None or terrain.terrain_origins is None or terrain.cfg.terrain_generator is None:
         return torch.zeros_like(position[:, 0], dtype=torch.bool)
     rows, cols = terrain.terrain_origins.shape[:2]
@@ -58,9 +62,9 @@ def terrain_edge_reached(
     asset: Entity = env.scene[asset_cfg.name]
     offset = (asset.data.root_link_pos_w - env.scene.env_origins)[:, :2].abs()
     terrain = env.scene.terrain
-    if terrain is None or terrain.terrain_origins is None or terrain.cfg.terrain_generator is None:
+    if terrain is None or terrain.terrain_origins is None or terrain.terrain_generator is None:
         return torch.zeros_like(offset[:, 0], dtype=torch.bool)
-    size_x, size_y = terrain.cfg.terrain_generator.size
+    size_x, size_y = terrain.terrain_generator.cfg.size
     reached_x = offset[:, 0] > size_x / 2.0 * threshold_fraction
     reached_y = offset[:, 1] > size_y / 2.0 * threshold_fraction
     return (reached_x | reached_y) & (env.episode_length_buf > _MIN_STEPS)
