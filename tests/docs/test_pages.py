@@ -140,6 +140,7 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.scripts.describe import DescribeConfig
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.export_scene import ExportSceneConfig
+    from mjlab.scripts.new_robot import NewRobotConfig
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
     from mjlab.scripts.train import TrainConfig
@@ -165,6 +166,7 @@ def _flags_of() -> dict[str, list[object]]:
         "csv_to_npz": [CsvToNpzConfig()],
         "profile-env": [ProfileConfig(env=train.env)],
         "export-scene": [ExportSceneConfig()],
+        "new-robot": [NewRobotConfig()],
         "visualize_terrain": [VisualizeTerrainConfig()],
         "viz-nan": [VizNanConfig()],
         "verify": [VerifyConfig()],

@@ -227,6 +227,21 @@ module:function that returns an EntityCfg) or a task.""",
         ),
     ),
     Command(
+        "new-robot",
+        "build",
+        "a package of tasks for a robot of yours",
+        argument="MODEL",
+        details="""\
+Write a small package for a robot: model, initial pose, gains, task, registration and a test, each
+value with its reason. MODEL is an MJCF or URDF file, a folder or zip with one and its meshes,
+module:function that returns an MjSpec, or menagerie:NAME.""",
+        examples=(
+            "mjlab new-robot robot.xml",
+            "mjlab new-robot robot.urdf --set floating_base=true --set armature=0.01",
+            "mjlab new-robot robots.zip --name rex --output ~/rex --install",
+        ),
+    ),
+    Command(
         "visualize-terrain",
         "build",
         "terrains, in the browser",

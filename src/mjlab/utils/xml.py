@@ -185,6 +185,16 @@ def strip_buffer_textures(spec: mujoco.MjSpec) -> None:
             geom.material = _STAND_IN
 
 
+def asset_files(spec: mujoco.MjSpec) -> list[Path]:
+    """Return the files on disk that a spec refers to: meshes, height fields, textures, skins."""
+    paths = (
+        Path(spec.modelfiledir, place.folder, place.path)
+        for place in _file_places(spec)
+        if _asset_key(spec, place) is None
+    )
+    return [path for path in dict.fromkeys(paths) if path.is_file()]
+
+
 class _FilePlace:
     """Attribute of an element that holds a file path."""
 

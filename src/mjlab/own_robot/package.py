@@ -1,0 +1,178 @@
+"""A small package of the user's own from a model file: robot, task, registration, README and test."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mjlab.own_robot.guess import Guess
+from mjlab.own_robot.model_files import copy_model
+from mjlab.own_robot.python_text import number
+from mjlab.own_robot.report import RobotReport
+from mjlab.own_robot.robot_source import by_pattern, robot_source, shared
+from mjlab.own_robot.task_source import velocity_source
+from mjlab.own_robot.templates import template
+from mjlab.utils.tables import Table
+
+Task = Literal["velocity", "bare"]
+
+
+@dataclass(frozen=True)
+class Package:
+    """Package to write."""
+
+    name: str
+    """Python module: letters, digits and underscores."""
+    task: Task
+    """Task of the robot."""
+    report: RobotReport
+    """Values of the robot."""
+
+    @property
+    def title(self) -> str:
+        """Name of the robot in text and tasks, such as `Mini-Cheetah`."""
+        return "-".join(word[:1].upper() + word[1:] for word in self.name.split("_") if word)
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Names of the registered tasks."""
+        if self.task == "bare":
+            return ()
+        return tuple(f"Velocity-{terrain}-{self.title}" for terrain in ("Flat", "Rough"))
+
+    def files(self, command: str, folder: Path) -> dict[str, bytes]:
+        """Return the content of each file by its path in the package.
+
+        Args:
+            command: Command line that writes the package, for the README.
+            folder: Folder of the package, for the README.
+        """
+        module, title, report = f"src/{self.name}", self.title, self.report
+        names = {"package": self.name, "title": title, "task_name": title}
+        kind = "legged" if self.task == "velocity" else "bare"
+        with tempfile.TemporaryDirectory() as temporary:
+            models = Path(temporary) / "model"
+            model = copy_model(report.model, models)
+            found = {
+                f"{module}/model/{path.relative_to(models).as_posix()}": path.read_bytes()
+                for path in sorted(models.rglob("*"))
+                if path.is_file()
+            }
+        text = {
+            "pyproject.toml": template("pyproject.toml").substitute(
+                names, distribution=self.name.replace("_", "-")
+            ),
+            f"{module}/__init__.py": template(f"{kind}_init.py").substitute(names),
+            f"{module}/robot.py": robot_source(report, title, model),
+            f"tests/test_{self.name}.py": self._test(kind, names),
+            "README.md": self._readme(command, folder),
+        }
+        if self.task == "velocity":
+            text[f"{module}/task.py"] = velocity_source(report, self.name, title, title)
+        return found | {name: content.encode() for name, content in text.items()}
+
+    def _test(self, kind: str, names: dict[str, str]) -> str:
+        if kind == "bare":
+            return template("bare_test.py").substitute(names)
+        has_two = len(self.report.anatomy.feet.value) == 2
+        reason = (
+            "Two legs fall after a second without a policy." if has_two else "Legs yield a little."
+        )
+        return template("legged_test.py").substitute(
+            names,
+            seconds=0.4 if has_two else 2.0,
+            seconds_name="a_moment" if has_two else "two_seconds",
+            seconds_reason=reason,
+        )
+
+    def _readme(self, command: str, folder: Path) -> str:
+        module = f"src/{self.name}"
+        contents = {
+            f"{module}/robot.py": "initial pose, motors, parts: each value with its reason",
+            f"{module}/model/": "the model file and its meshes",
+            f"{module}/__init__.py": "registration of the tasks",
+            f"tests/test_{self.name}.py": "stands, and its tasks can be stepped (`uv run pytest`)",
+        }
+        if self.tasks:
+            contents[f"{module}/task.py"] = "commands, rewards, terminations, profile for a CPU"
+        questions = questions_table(self.report)
+        asked = ["", "## Questions", "", questions.markdown()] if questions.rows else []
+        if self.task == "velocity" and len(self.report.anatomy.feet.value) == 2:
+            asked += ["", _TWO_LEGS]
+        return template("README.md").substitute(
+            title=self.title,
+            command=command,
+            contents="\n".join(f"| `{file}` | {what} |" for file, what in contents.items()),
+            folder=folder.as_posix(),
+            run="\n".join(self.commands()),
+            values=values_table(self.report).markdown(),
+            questions="\n".join(asked),
+        )
+
+    def commands(self) -> list[str]:
+        """Return the command lines to start with."""
+        view = f"uv run mjlab view {self.name}.robot:get_robot_cfg"
+        if not self.tasks:
+            return [view]
+        task = self.tasks[0]
+        return [
+            view,
+            f"uv run mjlab describe {task}",
+            f"uv run play {task} --agent zero",
+            f"uv run train {task} --profile cpu",
+            f"uv run play {task}",
+        ]
+
+
+_TWO_LEGS = """\
+## Two legs
+
+The profile `cpu` rewards air time of the feet, without a teacher. It has taught robots with four
+legs to walk, not yet with two: train on a GPU without a profile, or expect a robot that stands."""
+
+
+def values_table(report: RobotReport) -> Table:
+    """Return the table of all values: found in the file, guessed and by which rule, set, or asked."""
+    anatomy = report.anatomy
+    parts: dict[str, tuple[object, Guess]] = {
+        "kind": (anatomy.kind.value, anatomy.kind),
+        "trunk": (anatomy.trunk.value, anatomy.trunk),
+    }
+    if anatomy.feet.value:
+        soles = [name for foot in anatomy.feet.value for name in foot.sole]
+        parts |= {
+            "feet": ([foot.link for foot in anatomy.feet.value], anatomy.feet),
+            "soles": (soles, anatomy.feet),
+            "IMU": (anatomy.imu_site.value or "(trunk's origin)", anatomy.imu_site),
+        }
+    if anatomy.hands.value:
+        parts["hands"] = ([hand.link for hand in anatomy.hands.value], anatomy.hands)
+    pairs = [name for name, (partner, _) in anatomy.mirror.value.items() if partner != name]
+    parts["mirror pairs"] = (len(pairs) // 2, anatomy.mirror)
+    parts["height"] = (float(number(report.root_height.value)), report.root_height)
+    for name, guess in (
+        ("pose", report.joint_pos),
+        ("effort", report.effort),
+        ("armature", report.armature),
+        ("stiffness", report.stiffness),
+        ("damping", report.damping),
+        ("action_scale", report.action_scale),
+    ):
+        values = guess.value if name in ("pose", "armature") else shared(guess.value, report)
+        parts[name] = (by_pattern(values, report), guess)
+    if anatomy.kind.value == "legged":
+        speeds = {k: float(number(high)) for k, (_, high) in report.commands.value.items()}
+        parts["commands"] = (speeds, report.commands)
+    labels = {"file": "found", "rule": "guessed", "set": "set", "asked": "asked"}
+    rows = [
+        (name, value, labels[guess.source], guess.rule) for name, (value, guess) in parts.items()
+    ]
+    return Table("values", ("value", "is", "from", "reason"), rows)
+
+
+def questions_table(report: RobotReport) -> Table:
+    """Return the table of the questions that the model leaves open."""
+    rows = [(q.key, q.text, q.used) for q in report.questions]
+    return Table("questions", ("setting", "question", "used until set"), rows)

@@ -1,0 +1,338 @@
+"""Source of the robot file of a written package."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from mjlab.own_robot import geometry
+from mjlab.own_robot.anatomy import Foot
+from mjlab.own_robot.guess import Guess
+from mjlab.own_robot.python_text import (
+    comment_lines,
+    commented,
+    dict_source,
+    number,
+    pattern,
+    tuple_source,
+)
+from mjlab.own_robot.report import RobotReport
+from mjlab.own_robot.templates import template
+
+SOLE_FRICTION = 0.8
+"""Sliding friction of soles, in the middle of the range that velocity tasks randomize."""
+_RAY_GROUP, _VISUAL_GROUP, _COLLISION_GROUP = 0, 2, 3
+
+
+def robot_source(report: RobotReport, title: str, model: Path) -> str:
+    """Return the source of the robot file.
+
+    Args:
+        report: Values of the robot.
+        title: Name of the robot.
+        model: Model file, relative to the folder of models.
+    """
+    is_urdf = model.suffix.lower() == ".urdf"
+    joints = driven_joints(report)
+    imports = []
+    if _unnamed(report):
+        imports.append("from mjlab.own_robot.model_source import name_elements")
+    if is_urdf:
+        imports.append("from mjlab.utils.urdf import read_urdf")
+    motor_reasons, motors = _motors(report, joints)
+    scale = shared({name: report.action_scale.value[name] for name in joints}, report)
+    return template("robot.py").substitute(
+        title=title,
+        imports="".join(f"{line}\n" for line in imports),
+        model=model.as_posix(),
+        parts="\n".join(_parts(report)),
+        pose="\n".join(_pose(report)),
+        motor_reasons="\n".join(motor_reasons),
+        motors="\n".join(motors),
+        scale="\n".join(reason_lines("Joint target (rad) per unit action", report.action_scale)),
+        action_scale=dict_source(by_pattern(scale, report)),
+        spec="\n".join(f"    {line}" if line else "" for line in _spec(report, is_urdf)),
+    )
+
+
+def driven_joints(report: RobotReport) -> tuple[str, ...]:
+    """Return the joints with motors: those with an actuator in the file; all if it has none."""
+    drives = report.anatomy.drives.value
+    return tuple(name for name, drive in drives.items() if drive != "none") or tuple(drives)
+
+
+def feet_in_model_order(report: RobotReport) -> tuple[Foot, ...]:
+    """Return the feet in the order of contact sensors and sites."""
+    return tuple(
+        sorted(report.anatomy.feet.value, key=lambda foot: report.compiled.body(foot.link).id)
+    )
+
+
+def foot_contacts(report: RobotReport) -> tuple[str, tuple[str, ...]]:
+    """Return how contacts of feet are matched, and one name per foot in model order.
+
+    Geoms if each foot has one sole; else the bodies of the soles.
+    """
+    feet = feet_in_model_order(report)
+    if all(len(foot.sole) == 1 for foot in feet):
+        return "geom", tuple(foot.sole[0] for foot in feet)
+    bodies = [{int(report.compiled.geom(name).bodyid[0]) for name in foot.sole} for foot in feet]
+    if all(len(found) == 1 for found in bodies):
+        return "body", tuple(report.compiled.body(found.pop()).name for found in bodies)
+    return "subtree", tuple(foot.link for foot in feet)
+
+
+def foot_names(report: RobotReport) -> tuple[str, ...]:
+    """Return a new name for the site of each foot, in model order."""
+    taken = {site.name for site in report.spec.sites}
+    names = []
+    for foot in feet_in_model_order(report):
+        body = report.compiled.body(int(report.compiled.geom(foot.sole[0]).bodyid[0])).name
+        name = body if "foot" in body.lower() else f"{body}_foot"
+        while name in taken:
+            name += "_sole"
+        taken.add(name)
+        names.append(name)
+    return tuple(names)
+
+
+def roles(report: RobotReport) -> list[tuple[str, ...]]:
+    """Return the joints in groups of the same role: the knees of all legs, both shoulders, a waist."""
+    anatomy = report.anatomy
+    legs = [leg.joints for leg in anatomy.legs.value]
+    groups = []
+    if len({len(leg) for leg in legs}) == 1:
+        groups = list(zip(*legs, strict=True))
+    grouped = {name for group in groups for name in group}
+    for name in anatomy.drives.value:
+        if name not in grouped:
+            partner, _ = anatomy.mirror.value.get(name, (name, 1.0))
+            groups.append((name,) if partner == name else (name, partner))
+            grouped |= {name, partner}
+    return groups
+
+
+def shared(values: Mapping[str, float], report: RobotReport) -> dict[str, float]:
+    """Return values that joints of the same role share: the largest, if it is near the smallest.
+
+    Masses and rotor inertias that were identified for each joint separately differ from leg to leg.
+    """
+    result = dict(values)
+    for role in roles(report):
+        found = [values[name] for name in role if name in values]
+        if found and max(found) < 1.5 * min(found):
+            result |= dict.fromkeys((name for name in role if name in values), max(found))
+    return result
+
+
+def by_pattern(values: Mapping[str, float], report: RobotReport) -> dict[str, float]:
+    """Return values by joint name pattern; joints of the same role and value share one."""
+    among, patterns = report.joint_pos.value, {}
+    for role in roles(report):
+        groups: dict[str, list[str]] = {}
+        for name in role:
+            if name in values:
+                groups.setdefault(number(values[name]), []).append(name)
+        patterns |= {pattern(names, among): float(value) for value, names in groups.items()}
+    return patterns
+
+
+def reason_lines(what: str, guess: Guess) -> list[str]:
+    """Return a comment with the reason of a value."""
+    marks = {"asked": " (ASKED: not in the file)", "set": " (as set)"}
+    return comment_lines(f"{what}: {guess.rule}{marks.get(guess.source, '')}.")
+
+
+def _parts(report: RobotReport) -> list[str]:
+    anatomy = report.anatomy
+    lines = [commented(f'TRUNK = "{anatomy.trunk.value}"', anatomy.trunk.rule)]
+    if anatomy.kind.value != "legged":
+        return lines
+    imu, reason = imu_site(report)
+    lines.append(commented(f'IMU = "{imu}"', reason))
+    feet, names = feet_in_model_order(report), foot_names(report)
+    soles = [name for foot in feet for name in foot.sole]
+    _, contacts = foot_contacts(report)
+    lines += [
+        *comment_lines(f"Feet, in model order: {anatomy.feet.rule}."),
+        "# Sites that `get_spec` adds: body, and middle of the sole in its frame.",
+        "FOOT_SITES = {",
+        *(
+            f'    "{name}": ("{foot.link}", {tuple(round(x, 4) + 0.0 for x in foot.position)}),'
+            for name, foot in zip(names, feet, strict=True)
+        ),
+        "}",
+        "FEET = tuple(FOOT_SITES)",
+        f"SOLES = {tuple_source(soles, 8)}",
+        f"FOOT_CONTACTS = {tuple_source(contacts, 16)}",
+    ]
+    return lines
+
+
+def imu_site(report: RobotReport) -> tuple[str, str]:
+    """Return the site whose velocity is measured, and the reason.
+
+    The site of the file if it is on the trunk and has the trunk's axes, which mirror images expect;
+    else one that `get_spec` adds at the trunk's origin.
+    """
+    found, model = report.anatomy.imu_site, report.compiled
+    taken = {site.name for site in report.spec.sites}
+    new = "imu" if "imu" not in taken else "trunk_imu"
+    if found.value is None:
+        return new, f"added: {found.rule}"
+    site = model.site(found.value)
+    trunk = model.body(report.anatomy.trunk.value).id
+    if int(site.bodyid[0]) != trunk:
+        return new, f"added at the trunk's origin: {found.value} is on another body"
+    if np.abs(np.abs(site.quat[0]) - 1.0) > 1e-6:
+        return new, f"added at the trunk's origin: {found.value} is rotated"
+    return found.value, found.rule
+
+
+def _pose(report: RobotReport) -> list[str]:
+    pose, height = report.joint_pos, report.root_height
+    values = {name: value for name, value in pose.value.items() if number(value) != "0.0"}
+    return [
+        commented(f"HEIGHT = {number(height.value)}", height.rule),
+        *reason_lines("Joint positions (others: 0)", pose),
+        f"POSE = {dict_source(by_pattern(values, report))}",
+    ]
+
+
+def _motors(report: RobotReport, joints: tuple[str, ...]) -> tuple[list[str], list[str]]:
+    """Return the comment with the reasons, and one actuator config per group of equal motors."""
+    fields = {
+        "stiffness": report.stiffness,
+        "damping": report.damping,
+        "effort_limit": report.effort,
+        "armature": report.armature,
+    }
+    reasons = [line for name, guess in fields.items() for line in reason_lines(name, guess)]
+    if report.armature.source == "file":
+        # What the file has stays as it is.
+        del fields["armature"]
+    values_of = {
+        name: shared(guess.value, report) if name in ("stiffness", "damping") else guess.value
+        for name, guess in fields.items()
+    }
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for role in roles(report):
+        for joint in role:
+            if joint in joints:
+                key = tuple(number(values[joint], 3) for values in values_of.values())
+                groups.setdefault((role[0], *key), []).append(joint)
+    lines = []
+    for (_, *values), names in groups.items():
+        target = f'"{pattern(names, report.joint_pos.value)}",'
+        lines += [
+            "    BuiltinPositionActuatorCfg(",
+            f"        target_names_expr=({target}),",
+            *(f"        {field}={value}," for field, value in zip(fields, values, strict=True)),
+            "    ),",
+        ]
+    return reasons, lines
+
+
+def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
+    """Return the body of `get_spec`."""
+    spec = report.model.spec
+    if is_urdf:
+        floating = geometry.free_joint(report.compiled) is not None
+        lines = [f"spec = read_urdf(MODEL, floating_base={floating})"]
+    else:
+        lines = ["spec = mujoco.MjSpec.from_file(str(MODEL))"]
+    unnamed = _unnamed(report)
+    if unnamed:
+        shown = ", ".join(unnamed[:3]) + (", ..." if len(unnamed) > 3 else "")
+        lines += [*comment_lines(f"The file leaves {len(unnamed)} elements unnamed: {shown}."),
+                  "name_elements(spec)"]  # fmt: skip
+    lines += _removals(report, spec)
+    if any(g.group == _RAY_GROUP for b in spec.bodies[1:] for g in b.geoms):
+        has_visuals = any(not (g.contype or g.conaffinity) for g in spec.geoms)
+        group = f"{_COLLISION_GROUP} if geom.contype or geom.conaffinity else {_VISUAL_GROUP}"
+        lines += [
+            "# Rays of the terrain scan see geom group 0.",
+            "for geom in spec.geoms:",
+            "    if geom.group == 0:",
+            f"        geom.group = {group if has_visuals else _VISUAL_GROUP}",
+        ]
+    if report.anatomy.colliding.source == "rule":
+        lines += [
+            *comment_lines(f"{report.anatomy.colliding.rule}. They collide with the ground."),
+            f"for name in {tuple_source(report.anatomy.colliding.value, 30)}:",
+            "    spec.geom(name).conaffinity = 1",
+        ]
+    if report.anatomy.kind.value == "legged":
+        lines += _legged_spec(report)
+    return lines
+
+
+def _removals(report: RobotReport, spec: mujoco.MjSpec) -> list[str]:
+    lines = []
+    joints = set(driven_joints(report))
+    replaced = [a for a in spec.actuators if a.target in joints]
+    if replaced or spec.keys:
+        actuators = (
+            "*spec.actuators" if len(replaced) == len(spec.actuators)
+            else f"*(a for a in spec.actuators if a.target in {tuple_source(sorted(joints), 40)})"
+        )  # fmt: skip
+        parts = [actuators] * bool(replaced) + ["*spec.keys"] * bool(spec.keys)
+        what = ["the actuators"] * bool(replaced) + ["keyframes"] * bool(spec.keys)
+        lines += [
+            f"# ACTUATORS and POSE take the place of {' and '.join(what)}.",
+            f"for element in ({', '.join(parts)}{',' if len(parts) == 1 else ''}):",
+            "    spec.delete(element)",
+        ]
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    if any(geom.type == plane for geom in spec.worldbody.geoms):
+        lines += [
+            "# The task has its own ground.",
+            "for geom in list(spec.worldbody.geoms):",
+            "    if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:",
+            "        spec.delete(geom)",
+        ]
+    return lines
+
+
+def _legged_spec(report: RobotReport) -> list[str]:
+    lines = [
+        "for name in SOLES:",
+        "    sole = spec.geom(name)",
+        "    # Priority: the friction of the sole counts, not that of the ground. condim: there is friction.",
+        "    sole.priority, sole.condim = 1, 3",
+        f"    sole.friction[0] = {SOLE_FRICTION}  # middle of the range of the event foot_friction",
+        "for name, (body, position) in FOOT_SITES.items():",
+        "    spec.body(body).add_site(name=name, pos=position)",
+    ]
+    if imu_site(report)[0] not in {site.name for site in report.spec.sites}:
+        lines.append("spec.body(TRUNK).add_site(name=IMU)")
+    taken = {sensor.name for sensor in report.spec.sensors}
+    sensors = {
+        "imu_lin_vel": ("VELOCIMETER", "SITE", "IMU"),
+        "imu_ang_vel": ("GYRO", "SITE", "IMU"),
+        "root_angmom": ("SUBTREEANGMOM", "BODY", "TRUNK"),
+    }
+    lines.append("# Sensors that the task reads.")
+    for name, (kind, object_type, owner) in sensors.items():
+        if name in taken:
+            continue
+        lines += [
+            "spec.add_sensor(",
+            f'    name="{name}",',
+            f"    type=mujoco.mjtSensor.mjSENS_{kind},",
+            f"    objtype=mujoco.mjtObj.mjOBJ_{object_type},",
+            f"    objname={owner},",
+            ")",
+        ]
+    return lines
+
+
+def _unnamed(report: RobotReport) -> list[str]:
+    """Return the names that `name_elements` gives."""
+    spec = report.model.spec
+    old = {(type(e), e.name) for e in (*spec.bodies, *spec.joints, *spec.geoms)}
+    new = report.spec
+    return [e.name for e in (*new.bodies, *new.joints, *new.geoms) if (type(e), e.name) not in old]

@@ -1,0 +1,90 @@
+"""Source of the task file of a written package."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjlab.own_robot.python_text import comment_lines, dict_source, number, tuple_source
+from mjlab.own_robot.report import RobotReport
+from mjlab.own_robot.robot_source import (
+    by_pattern,
+    driven_joints,
+    feet_in_model_order,
+    foot_contacts,
+    reason_lines,
+)
+from mjlab.own_robot.templates import template
+
+STANDING_SHARE = 0.65
+"""Height of the trunk below which training episodes end, as a share of the standing height."""
+
+
+def velocity_source(report: RobotReport, package: str, title: str, task_name: str) -> str:
+    """Return the source of the velocity task."""
+    mode, _ = foot_contacts(report)
+    tolerance = {name: report.pose_tolerance.value[name] for name in driven_joints(report)}
+    fallen = report.anatomy.fall_bodies
+    commands = report.commands.value
+    has_gait = len(report.anatomy.feet.value) == 4
+    names = ["ACTION_SCALE", "FEET", "FOOT_CONTACTS", *["HEIGHT"] * has_gait, "SOLES", "TRUNK"]
+    return template("legged_task.py").substitute(
+        package=package,
+        title=title,
+        task_name=task_name,
+        profile="cpu_with_gait" if has_gait else "cpu as cpu",
+        robot_names=", ".join([*names, "get_robot_cfg"]),
+        commands="\n".join(reason_lines("Commands", report.commands)),
+        lin_vel=_range(commands["lin_vel_x"]),
+        ang_vel=_range(commands["ang_vel_z"]),
+        tolerance_reason="\n".join(
+            reason_lines("Tolerance of joints around the initial pose (rad)", report.pose_tolerance)
+        ),
+        std_walking=dict_source(by_pattern(tolerance, report)),
+        fallen_reason="\n".join(reason_lines("Bodies that touch the ground after a fall", fallen)),
+        fallen=tuple_source(fallen.value, 9),
+        contact_mode=f'"{mode}"',
+        ray_radius=number(_sole_radius(report)),
+        gait=_gait(report),
+    )
+
+
+def _range(bounds: tuple[float, float]) -> str:
+    return f"({number(bounds[0])}, {number(bounds[1])})"
+
+
+def _sole_radius(report: RobotReport) -> float:
+    """Return the radius (m) of the rays about a foot: that of the Go1's for a leg of 0.28 m."""
+    return round(0.04 * float(np.clip(report.root_height.value / 0.28, 0.5, 1.5)), 3)
+
+
+def _gait(report: RobotReport) -> str:
+    if len(report.anatomy.feet.value) != 4:
+        return "\n".join(
+            [
+                *comment_lines(
+                    "`cpu`, imported above, is the profile of robots of unknown gait: it rewards air time of "
+                    "the feet. It has taught four legs to walk, not yet two."
+                ),
+            ]
+        )
+    first, second = diagonals(report)
+    return "\n".join(
+        [
+            *comment_lines(
+                f"A trot: the feet {first} and {second} of FEET, the diagonals, take turns. Episodes end "
+                f"when the trunk sinks below {STANDING_SHARE:.0%} of its height."
+            ),
+            f"cpu = cpu_with_gait(({first}, {second}), minimum_height={STANDING_SHARE} * HEIGHT)",
+        ]
+    )
+
+
+def diagonals(report: RobotReport) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the feet on both diagonals of a quadruped, by their place in model order."""
+    order = [foot.link for foot in feet_in_model_order(report)]
+    front_left, front_right, rear_left, rear_right = (
+        order.index(foot.link) for foot in report.anatomy.feet.value
+    )
+    first = (min(front_left, rear_right), max(front_left, rear_right))
+    second = (min(front_right, rear_left), max(front_right, rear_left))
+    return (first, second) if first < second else (second, first)

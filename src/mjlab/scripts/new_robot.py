@@ -1,0 +1,181 @@
+"""Write a package for a robot of one's own: `mjlab new-robot MODEL [flags]`."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from mjlab.cli.flags import parse_own_flags
+from mjlab.cli.help import requested_topic
+from mjlab.cli.main import run_alias
+from mjlab.own_robot.guess import Question
+from mjlab.own_robot.model_source import identifier, load_model, model_file
+from mjlab.own_robot.package import Package, Task, questions_table, values_table
+from mjlab.own_robot.report import RobotReport, describe_robot
+from mjlab.own_robot.rewriting import read_record, write_files
+from mjlab.utils.errors import BadCallError, UserError
+from mjlab.utils.string import suggest
+from mjlab.utils.tables import WIDTH, tables_text
+
+
+@dataclass(frozen=True)
+class NewRobotConfig:
+    """Flags of `new-robot`."""
+
+    name: str | None = None
+    """Name of the package, letters, digits and underscores. None: that of the model."""
+    task: Literal["velocity", "bare"] | None = None
+    """Task: `velocity` (legs), `bare` (robot only). None: by the kind of the robot."""
+    output: str | None = None
+    """Folder of the package. None: the name, in the current folder."""
+    set: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="KEY=VALUE")
+    ] = ()
+    """Answer to a question, such as `armature=0.01` or `pose.FL_knee=-1.5`."""
+    install: bool = False
+    """Install the package in this environment, with uv."""
+
+
+def command(argv: list[str], prog: str) -> None:
+    """Run `mjlab new-robot`."""
+    source, *flags = argv
+    cfg, others = parse_own_flags(NewRobotConfig(), flags, f"{prog} MODEL")
+    if requested_topic(others) is not None:
+        return
+    if others:
+        names = [f"--{field.name}" for field in fields(NewRobotConfig)]
+        raise BadCallError(f"{prog}: unknown flag {others[0]!r}; {suggest(others[0], names)}")
+    run_new_robot(source, cfg)
+
+
+def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
+    """Write the package of a robot, print its values, and return its folder.
+
+    Raises:
+        UserError: no robot at `source`, an unknown setting, or a folder with other files.
+    """
+    answers = dict(_setting(text) for text in cfg.set)
+    path = Path(source).expanduser()
+    # An archive is unpacked once.
+    file = str(model_file(path)) if path.exists() else source
+    name = cfg.name or (identifier(path.stem) if path.suffix == ".zip" else _model_name(file))
+    folder = Path(cfg.output or name).expanduser()
+    _check_name(name, folder)
+    record = read_record(folder)
+    # A later run keeps the answers of earlier ones.
+    settings = record.settings | answers
+    report = describe_robot(file, settings)
+    if report.questions and not answers and on_terminal():
+        settings |= _ask(report.questions)
+        report = describe_robot(file, settings)
+    package = Package(name, cfg.task or _task(report), report)
+    files = package.files(_command_line(source, cfg, settings), folder)
+    kept = write_files(folder, files, replace(record, model=source, settings=settings))
+    tables = [values_table(report), questions_table(report)]
+    print(tables_text([table for table in tables if table.rows], WIDTH))
+    print(_summary(package, folder, kept))
+    if cfg.install:
+        _install(folder)
+    return folder
+
+
+def _model_name(source: str) -> str:
+    if os.getcwd() not in sys.path:
+        # As `python -m` does: modules in the working folder can be imported.
+        sys.path.append(os.getcwd())
+    try:
+        return load_model(source).name
+    except ModuleNotFoundError as error:
+        raise UserError(str(error)) from error
+
+
+def _setting(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not (key and equals and value):
+        raise BadCallError(f"--set {text!r}: expected KEY=VALUE, such as armature=0.01.")
+    return key, value
+
+
+def _check_name(name: str, folder: Path) -> None:
+    """Raise `UserError` for a name that is none, or that of another module."""
+    if not name.isidentifier():
+        raise UserError(
+            f"--name {name!r}: expected a Python name; use e.g. --name {identifier(name)}."
+        )
+    found = importlib.util.find_spec(name)
+    if found is not None and folder.resolve() not in Path(found.origin or "/").resolve().parents:
+        raise UserError(f"--name {name!r}: a module of this name exists; use another.")
+
+
+def _task(report: RobotReport) -> Task:
+    return "velocity" if report.anatomy.kind.value == "legged" else "bare"
+
+
+def on_terminal() -> bool:
+    """Return True if a person can answer."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def _ask(questions: tuple[Question, ...]) -> dict[str, str]:
+    """Return the user's answers on the terminal, by setting."""
+    print("The model does not tell (Enter: the value in brackets):")
+    answers = {}
+    for question in questions:
+        answer = input(f"  {question.key}: {question.text} [{question.used}]: ").strip()
+        if answer:
+            answers[question.key] = answer
+    return answers
+
+
+def _command_line(source: str, cfg: NewRobotConfig, settings: dict[str, str]) -> str:
+    words = ["uv", "run", "mjlab", "new-robot", source]
+    for flag in ("name", "task", "output"):
+        if value := getattr(cfg, flag):
+            words += [f"--{flag}", value]
+    for key, value in settings.items():
+        words += ["--set", f"{key}={value}"]
+    return shlex.join(words)
+
+
+def _summary(package: Package, folder: Path, kept: list[str]) -> str:
+    lines = ["", f"Wrote {folder}. Read {folder}/src/{package.name}/robot.py."]
+    if kept:
+        lines.append(
+            f"Edited by you, and kept: {', '.join(kept)}. The new ones: FILE.new beside them."
+        )
+    if package.report.questions:
+        lines.append("Answer questions with --set KEY=VALUE, or edit the values.")
+    lines += ["Next:", f"    uv pip install -e {folder}"]
+    return "\n".join([*lines, *(f"    {line}" for line in package.commands())])
+
+
+def _install(folder: Path) -> None:
+    """Install the package into the environment of this process."""
+    uv = shutil.which("uv")
+    pip = (
+        [uv, "pip", "install", "--python", sys.executable]
+        if uv
+        else [sys.executable, "-m", "pip", "install"]
+    )
+    outcome = subprocess.run([*pip, "-e", str(folder)], capture_output=True, text=True, check=False)
+    if outcome.returncode:
+        raise UserError(f"--install: {' '.join(pip)} -e {folder} failed:\n{outcome.stderr.strip()}")
+    print(f"Installed {folder}.")
+
+
+def main() -> None:
+    """Entry point of `python -m mjlab.scripts.new_robot`."""
+    run_alias("new-robot")
+
+
+if __name__ == "__main__":
+    main()

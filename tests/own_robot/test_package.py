@@ -1,0 +1,219 @@
+"""Packages of small robots import, build and stand, and a user's edits are kept."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import runpy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import mujoco
+import pytest
+import torch
+from small_robots import arm_spec, write_archive, write_quadruped, write_urdf
+from tensordict import TensorDict
+
+from mjlab.entity import EntityCfg
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.own_robot.model_source import RobotModel, model_file
+from mjlab.own_robot.package import Package, questions_table, values_table
+from mjlab.own_robot.report import describe_robot
+from mjlab.own_robot.rewriting import Record, read_record, write_files
+from mjlab.tasks.velocity.symmetry import mirror_left_right
+from mjlab.utils.errors import UserError
+
+ROBOT = "src/dog/robot.py"
+
+
+@pytest.fixture
+def registered(monkeypatch) -> list[dict]:
+    """Tasks registered by packages; those of this process stay as they are."""
+    tasks: list[dict] = []
+    monkeypatch.setattr(
+        "mjlab.tasks.registry.register_mjlab_task", lambda **task: tasks.append(task)
+    )
+    return tasks
+
+
+@pytest.fixture
+def imported(monkeypatch, registered: list[dict]) -> Iterator:
+    """Function that imports a module of a written package."""
+    names: list[str] = []
+
+    def load(folder: Path, module: str) -> ModuleType:
+        monkeypatch.syspath_prepend(str(folder / "src"))
+        names.append(module.partition(".")[0])
+        return importlib.import_module(module)
+
+    yield load
+    for name in list(sys.modules):
+        if name.partition(".")[0] in names:
+            del sys.modules[name]
+
+
+def written(folder: Path, package: Package) -> Path:
+    write_files(folder, package.files("mjlab new-robot", folder), Record())
+    return folder
+
+
+def quadruped(folder: Path, **settings: str) -> Package:
+    return Package("dog", "velocity", describe_robot(str(write_quadruped(folder)), settings))
+
+
+@pytest.fixture(params=["mjcf", "urdf", "zip"])
+def dog(request, tmp_path: Path) -> Path:
+    """Package of the quadruped, from one of its forms."""
+    settings = {}
+    if request.param == "mjcf":
+        source = write_quadruped(tmp_path / "model")
+    elif request.param == "zip":
+        source = model_file(write_archive(tmp_path / "model"))
+    else:
+        source = write_urdf(tmp_path / "model")
+        settings = {"floating_base": "true", "armature": "0.005"}
+    report = describe_robot(str(source), settings)
+    return written(tmp_path / "dog_package", Package("dog", "velocity", report))
+
+
+def test_robot_is_that_of_the_model(dog: Path, imported) -> None:
+    cfg: EntityCfg = imported(dog, "dog.robot").get_robot_cfg()
+    model = cfg.build().compile()
+    assert model.njnt == 13
+    assert model.nu == 12
+    # All that the package needs is in its folder.
+    meshes = [Path(mesh.file) for mesh in cfg.spec_fn().meshes]
+    assert len(meshes) == 1
+    assert (dog / "src" / "dog" / "model" / "meshes" / meshes[0].name).is_file()
+    for sole in imported(dog, "dog.robot").SOLES:
+        geom = model.geom(sole)
+        assert (geom.priority.item(), geom.condim.item()) == (1, 3)
+        assert geom.group.item() != 0
+
+
+def test_registered_names_resolve(dog: Path, imported, registered: list[dict]) -> None:
+    imported(dog, "dog")
+    assert [task["task_id"] for task in registered] == ["Velocity-Flat-Dog", "Velocity-Rough-Dog"]
+    for task in registered:
+        for name in (task["env_cfg"], task["rl_cfg"], task["profiles"]["cpu"]):
+            assert pkgutil.resolve_name(name)
+
+
+@pytest.mark.parametrize("terrain", ["flat", "rough"])
+def test_task_stands_and_mirrors(tmp_path: Path, imported, terrain: str) -> None:
+    folder = written(tmp_path / "dog_package", quadruped(tmp_path / "model"))
+    cfg = getattr(imported(folder, "dog.task"), f"{terrain}_env_cfg")(play=True)
+    cfg.scene.num_envs = 2
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    observations, _ = env.reset()
+    for _ in range(20):
+        _, _, terminated, _, _ = env.step(torch.zeros(2, 12))
+        assert not terminated.any()
+    assert "base_lin_vel" not in cfg.observations["actor"].terms
+    mirrored, _ = mirror_left_right(env, TensorDict(observations, batch_size=[2]))
+    assert mirrored["actor"].shape[0] == 4
+    env.close()
+
+
+def test_trunk_on_the_ground_is_a_fall(tmp_path: Path, imported) -> None:
+    folder = written(tmp_path / "dog_package", quadruped(tmp_path / "model"))
+    cfg = imported(folder, "dog.task").flat_env_cfg(play=True)
+    cfg.scene.num_envs = 1
+    cfg.scene.entities["robot"].init_state.pos = (0.0, 0.0, 0.06)
+    cfg.scene.entities["robot"].init_state.joint_pos = {".*_thigh": 2.5, ".*_calf": -0.5}
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    ended = [bool(env.step(torch.zeros(1, 12))[2].any()) for _ in range(25)]
+    assert any(ended)
+    env.close()
+
+
+def test_trot_pairs_diagonal_feet(tmp_path: Path, imported) -> None:
+    folder = written(tmp_path / "dog_package", quadruped(tmp_path / "model"))
+    feet = imported(folder, "dog.robot").FEET
+    assert feet == ("FL_calf_foot", "FR_calf_foot", "RL_calf_foot", "RR_calf_foot")
+    task = (folder / "src" / "dog" / "task.py").read_text()
+    assert "((0, 3), (1, 2))" in task
+
+
+def test_own_tests_pass(tmp_path: Path, imported) -> None:
+    folder = written(tmp_path / "dog_package", quadruped(tmp_path / "model"))
+    imported(folder, "dog.task")
+    tests = runpy.run_path(str(folder / "tests" / "test_dog.py"))
+    tests["test_stands_for_two_seconds"]()
+    tests["test_steps"](tests["rough_env_cfg"])
+
+
+def test_arm_of_a_function(tmp_path: Path, imported) -> None:
+    model = RobotModel(arm_spec(), "crane", "cranes:arm_spec", None, None)
+    package = Package("crane", "bare", describe_robot(model))
+    folder = written(tmp_path, package)
+    robot = imported(folder, "crane.robot")
+    built = robot.get_robot_cfg().build()
+    assert built.num_joints == 6
+    # The servos of the file are replaced, not doubled.
+    assert built.compile().nu == 6
+    assert [row[0] for row in questions_table(package.report).rows] == ["pose"]
+
+
+def test_setting_changes_a_value_and_its_reason(tmp_path: Path) -> None:
+    before = quadruped(tmp_path / "a")
+    after = quadruped(tmp_path / "b", stiffness="33", **{"pose.FL_calf": "-1.5"})
+    assert "stiffness=33.0" in after.files("", Path("dog"))[ROBOT].decode()
+    assert "stiffness=33.0" not in before.files("", Path("dog"))[ROBOT].decode()
+    sources = {row[0]: row[2] for row in values_table(after.report).rows}
+    assert sources["stiffness"] == "set"
+    assert sources["pose"] == "set"
+    assert "(as set)" in after.files("", Path("dog"))[ROBOT].decode()
+
+
+# Later runs.
+
+
+def test_edits_are_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "dog_package"
+    package = quadruped(tmp_path / "model")
+    files = package.files("", folder)
+    assert write_files(folder, files, read_record(folder)) == []
+    (folder / ROBOT).write_text("# mine\n")
+    changed = files | {ROBOT: b"# new\n", "README.md": b"new\n"}
+    assert write_files(folder, changed, read_record(folder)) == [ROBOT]
+    assert (folder / ROBOT).read_text() == "# mine\n"
+    assert (folder / f"{ROBOT}.new").read_text() == "# new\n"
+    assert (folder / "README.md").read_text() == "new\n"
+    # The next run keeps the edits too.
+    assert write_files(folder, files, read_record(folder)) == [ROBOT]
+    assert (folder / ROBOT).read_text() == "# mine\n"
+
+
+def test_other_folders_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="--output"):
+        read_record(tmp_path)
+
+
+# Parts of robots that files have otherwise.
+
+
+def spec_of(package: Package, folder: Path, imported) -> mujoco.MjSpec:
+    return imported(written(folder, package), "dog.robot").get_spec()
+
+
+def test_own_ground_goes_and_other_geoms_leave_the_ray_group(tmp_path: Path, imported) -> None:
+    spec = spec_of(quadruped(tmp_path / "model"), tmp_path / "package", imported)
+    assert not spec.worldbody.geoms
+    assert all(geom.group != 0 for geom in spec.geoms)
+
+
+def test_rotated_imu_is_replaced(tmp_path: Path, imported) -> None:
+    path = write_quadruped(tmp_path / "model")
+    path.write_text(
+        path.read_text().replace('<site name="imu"/>', '<site name="imu" euler="0 0 1.57"/>')
+    )
+    package = Package("dog", "velocity", describe_robot(str(path)))
+    spec = spec_of(package, tmp_path / "package", imported)
+    gyro = next(sensor for sensor in spec.sensors if sensor.name == "imu_ang_vel")
+    assert gyro.objname == "trunk_imu"
+    assert spec.site("imu") is not None
