@@ -32,6 +32,7 @@ no_state_estimation = pytest.mark.parametrize(
 FAMILIES = {
     "Mjlab-Cartpole-Swingup",
     "Mjlab-Lift-Cube-Yam",
+    "Mjlab-Reach-Yam",
     "Mjlab-Tracking-Flat-Unitree-G1",
     "Mjlab-Velocity-Rough-Unitree-Go1",
 }

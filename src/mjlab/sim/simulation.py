@@ -128,6 +128,10 @@ class Simulation:
         # Root of each body, (nbody,), and mask of degrees of freedom that move it, (nbody, nv).
         self._body_roots = torch.as_tensor(self.mj_model.body_rootid, device=device).long()
         self._moving_dofs = torch.as_tensor(moving_dofs(self.mj_model), device=device).float()
+        # Row and column of each entry of `data.M`, which are those of the lower triangle.
+        rows = np.repeat(np.arange(self.mj_model.nv), self.mj_model.M_rownnz)
+        entries = np.stack((rows, self.mj_model.M_colind))
+        self._mass_entries = torch.as_tensor(entries, device=device).long()
         if variant_info:
             self._apply_variants(variant_info)
         self._forward_callbacks: list[Callable[[Stage], None]] = []
@@ -550,6 +554,16 @@ class Simulation:
         arms = (points.float() - centers)[:, None].expand_as(rotational)
         translational = translational + torch.linalg.cross(rotational, arms)
         return translational.mT, rotational.mT
+
+    def mass_matrix(self) -> torch.Tensor:
+        """Return the joint-space inertia matrix, (N, nv, nv), armature included.
+
+        Like `xpos`, of the state before the last substep, until `forward`.
+        """
+        rows, columns = self._mass_entries
+        matrix = self.data.M.new_zeros(self.num_envs, self.mj_model.nv, self.mj_model.nv)
+        matrix[:, rows, columns] = matrix[:, columns, rows] = self.data.M
+        return matrix
 
     def copy_to_host(self, env_idx: int, mj_data: mujoco.MjData | None = None) -> mujoco.MjData:
         """Copy the state of one environment to host data, for viewers, without a forward pass."""

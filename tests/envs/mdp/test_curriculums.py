@@ -60,6 +60,18 @@ def test_terminations_have_stages_too() -> None:
     assert cfg.time_out is True
 
 
+def test_a_reward_weight_changes_once() -> None:
+    cfg = RewardTermCfg(func=None, weight=1.0)
+    env = make_env(cfg)
+    weights = []
+    for env.common_step_counter in (0, 10, 11, 20):
+        weights.append(
+            curriculums.modify_reward_weight(env, torch.tensor([0]), "term", -2.0, num_steps=10)
+        )
+    assert weights == [1.0, 1.0, -2.0, -2.0]
+    assert cfg.weight == -2.0
+
+
 @pytest.mark.parametrize(
     ("stages", "error", "message"),
     [

@@ -82,6 +82,22 @@ def test_joint_positions_are_clamped_to_soft_limits_and_velocities_are_not(
     torch.testing.assert_close(data.joint_vel - data.default_joint_vel, torch.full((4, 3), speed))
 
 
+def test_joints_are_scaled_within_their_soft_limits(world: Any) -> None:
+    data = world.robot.data
+    before = data.joint_pos.clone()
+    ids = torch.tensor([0, 2])
+    events.reset_joints_by_scale(world, ids, (0.5, 0.5), (2.0, 2.0), ROBOT)
+    torch.testing.assert_close(data.joint_pos[ids], 0.5 * data.default_joint_pos[ids])
+    torch.testing.assert_close(data.joint_vel[ids], 2.0 * data.default_joint_vel[ids])
+    assert torch.equal(data.joint_pos[[1, 3]], before[[1, 3]])
+    events.reset_joints_by_scale(world, None, (50.0, 100.0), (0.0, 1.0), ROBOT)
+    limits = data.soft_joint_pos_limits
+    assert (data.joint_pos >= limits[..., 0]).all()
+    assert (data.joint_pos <= limits[..., 1]).all()
+    # A default of 0 is a factor of nothing.
+    assert torch.equal(data.joint_pos[:, 2], torch.zeros(4))
+
+
 def test_only_the_selected_joints_move(world: Any) -> None:
     chosen = SceneEntityCfg("robot", joint_names=("ankle", "hip"))
     chosen.resolve(world.scene)

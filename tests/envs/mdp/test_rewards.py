@@ -160,3 +160,72 @@ def test_collisions_count_substeps_with_a_strong_contact() -> None:
 def test_without_a_history_collisions_count_contacts() -> None:
     env = touched(found=torch.tensor([[2.0, 1.0], [0.0, 0.0]]))
     assert rewards.self_collision_cost(env, "touch").tolist() == [3.0, 0.0]
+
+
+def touching(slots: int, **data: Any) -> Any:
+    values = {"force_history": None, "force": None, "found": None, **data}
+    cfg = SimpleNamespace(num_slots=slots)
+    return SimpleNamespace(
+        scene={"touch": SimpleNamespace(data=SimpleNamespace(**values), cfg=cfg)}
+    )
+
+
+def test_undesired_contacts_count_primaries() -> None:
+    # Two primaries of two slots.
+    found = torch.tensor([[1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    assert rewards.undesired_contacts(touching(2, found=found), "touch").tolist() == [1, 2, 0]
+    force = found[..., None] * torch.tensor([3.0, 0.0, 4.0])
+    env = touching(2, found=found, force=force)
+    assert rewards.undesired_contacts(env, "touch").tolist() == [1, 2, 0]
+    assert rewards.undesired_contacts(env, "touch", force_threshold=5.0).tolist() == [0, 0, 0]
+    # Contact in any substep counts.
+    history = torch.zeros(3, 4, 3, 3)
+    history[1, 3, 2, 0] = 20.0
+    env = touching(2, found=found, force=force, force_history=history)
+    assert rewards.undesired_contacts(env, "touch").tolist() == [0, 1, 0]
+
+
+# Deviations
+
+
+def test_absolute_sums_and_deviations(moving: Any) -> None:
+    data = moving.robot.data
+    torch.testing.assert_close(rewards.joint_vel_l1(moving), torch.full((4,), 6.0))
+    chosen = resolved(moving, joint_names=("hip", "ankle"))
+    expected = (data.joint_pos - data.default_joint_pos)[:, [0, 2]].abs().sum(dim=1)
+    torch.testing.assert_close(rewards.joint_deviation_l1(moving, chosen), expected)
+    data.default_joint_pos[:] = data.joint_pos
+    assert rewards.joint_deviation_l1(moving).tolist() == [0.0] * 4
+
+
+def test_velocities_of_the_base_by_axis(moving: Any) -> None:
+    moving.sim.data.qvel[:, :6] = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    moving.sim.forward()
+    data = moving.robot.data
+    torch.testing.assert_close(rewards.lin_vel_z_l2(moving), data.root_link_lin_vel_b[:, 2] ** 2)
+    torch.testing.assert_close(rewards.ang_vel_xy_l2(moving), torch.full((4,), 0.41))
+
+
+def test_the_height_of_the_base_above_the_ground(moving: Any) -> None:
+    moving.sim.data.qpos[:, 2] = torch.tensor([0.4, 0.5, 0.6, 0.7])
+    moving.sim.forward()
+    expected = torch.tensor([0.01, 0.0, 0.01, 0.04])
+    torch.testing.assert_close(rewards.base_height_l2(moving, 0.5), expected)
+    # Rays: a step of 0.1 m, a half of it with one miss, a hole, and a hill of which one ray misses.
+    hits = torch.zeros(4, 2, 3)
+    hits[..., 2] = torch.tensor([[0.1, 0.1], [0.1, 0.0], [9.0, 9.0], [0.2, 9.0]])
+    distances = torch.tensor([[0.3, 0.3], [0.4, 0.5], [-1.0, -1.0], [0.5, -1.0]])
+    moving.scene["rays"] = SimpleNamespace(
+        data=SimpleNamespace(hit_pos_w=hits, distances=distances)
+    )
+    above = torch.tensor([0.3, 0.45, 0.6, 0.5])
+    torch.testing.assert_close(
+        rewards.base_height_l2(moving, 0.5, sensor_name="rays"), (above - 0.5) ** 2
+    )
+
+
+def test_size_of_the_action() -> None:
+    env: Any = SimpleNamespace(
+        action_manager=SimpleNamespace(action=torch.tensor([[3.0, -4.0], [0.0, 1.0]]))
+    )
+    assert rewards.action_l2(env).tolist() == [25.0, 1.0]

@@ -14,6 +14,7 @@ from mjlab.envs.mdp import (
     events,
     metrics,
     observations,
+    pose_command,
     rewards,
     terminations,
 )
@@ -23,6 +24,7 @@ from mjlab.envs.mdp.events import *  # noqa: F403
 from mjlab.envs.mdp.events import sample_uniform
 from mjlab.envs.mdp.metrics import *  # noqa: F403
 from mjlab.envs.mdp.observations import *  # noqa: F403
+from mjlab.envs.mdp.pose_command import *  # noqa: F403
 from mjlab.envs.mdp.rewards import *  # noqa: F403
 from mjlab.envs.mdp.rewards import resolve_matching_names_values
 from mjlab.envs.mdp.terminations import *  # noqa: F403
@@ -45,6 +47,7 @@ __all__ = [
     *events.__all__,
     *metrics.__all__,
     *observations.__all__,
+    *pose_command.__all__,
     *rewards.__all__,
     *terminations.__all__,
 ]

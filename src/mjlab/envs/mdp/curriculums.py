@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = [
     "RewardCurriculumStage",
     "TerminationCurriculumStage",
+    "modify_reward_weight",
     "reward_curriculum",
     "termination_curriculum",
 ]
@@ -131,6 +132,22 @@ class termination_curriculum(_StagedCurriculum):
         stages: list[TerminationCurriculumStage],
     ) -> dict[str, torch.Tensor]:
         return self._apply(env, termination_name, stages)
+
+
+def modify_reward_weight(
+    env: ManagerBasedRlEnv, env_ids: torch.Tensor, term_name: str, weight: float, num_steps: int
+) -> float:
+    """Set the weight of a reward term after `num_steps` environment steps; return the weight.
+
+    For several changes, and for parameters, see `reward_curriculum`.
+
+    Raises:
+        ValueError: unknown term.
+    """
+    cfg = env.reward_manager.get_term_cfg(term_name)
+    if env.common_step_counter > num_steps:
+        cfg.weight = weight
+    return cfg.weight
 
 
 def _fields(stage: Any) -> list[str]:

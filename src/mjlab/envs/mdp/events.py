@@ -37,6 +37,7 @@ __all__ = [
     "push_by_setting_velocity",
     "randomize_terrain",
     "reset_joints_by_offset",
+    "reset_joints_by_scale",
     "reset_root_state_from_flat_patches",
     "reset_root_state_uniform",
     "reset_scene_to_default",
@@ -158,6 +159,33 @@ def reset_joints_by_offset(
     position.clamp_(min=limits[..., 0], max=limits[..., 1])
     velocity = data.default_joint_vel[ids][:, joints]
     velocity += sample_uniform(*velocity_range, velocity.shape, env.device)
+    asset.write_joint_state_to_sim(position, velocity, joint_ids=joints, env_ids=ids)
+
+
+def reset_joints_by_scale(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    position_range: tuple[float, float],
+    velocity_range: tuple[float, float],
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> None:
+    """Reset joints to their defaults times uniform factors, clamped to the soft position limits.
+
+    Joints with a default of 0 stay at 0; use `reset_joints_by_offset` to move them.
+
+    Args:
+        position_range: Bounds of the factor of the default positions.
+        velocity_range: Bounds of the factor of the default velocities.
+    """
+    ids = resolve_env_ids(env, env_ids)
+    asset: Entity = env.scene[asset_cfg.name]
+    data, joints = asset.data, columns_of(asset_cfg, "joint", env)
+    position = data.default_joint_pos[ids][:, joints]
+    position *= sample_uniform(*position_range, position.shape, env.device)
+    limits = data.soft_joint_pos_limits[ids][:, joints]
+    position.clamp_(min=limits[..., 0], max=limits[..., 1])
+    velocity = data.default_joint_vel[ids][:, joints]
+    velocity *= sample_uniform(*velocity_range, velocity.shape, env.device)
     asset.write_joint_state_to_sim(position, velocity, joint_ids=joints, env_ids=ids)
 
 

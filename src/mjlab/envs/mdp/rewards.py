@@ -18,17 +18,24 @@ if TYPE_CHECKING:
 
 __all__ = [
     "action_acc_l2",
+    "action_l2",
     "action_rate_l2",
+    "ang_vel_xy_l2",
+    "base_height_l2",
     "electrical_power_cost",
     "flat_orientation_l2",
     "is_alive",
     "is_terminated",
     "joint_acc_l2",
+    "joint_deviation_l1",
     "joint_pos_limits",
     "joint_torques_l2",
+    "joint_vel_l1",
     "joint_vel_l2",
+    "lin_vel_z_l2",
     "posture",
     "self_collision_cost",
+    "undesired_contacts",
 ]
 
 _DEFAULT_ASSET_CFG = SceneEntityCfg("robot")
@@ -54,6 +61,14 @@ def joint_torques_l2(
     return forces.square().sum(dim=1)
 
 
+def joint_vel_l1(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Sum of absolute joint velocities."""
+    asset: Entity = env.scene[asset_cfg.name]
+    return asset.data.joint_vel[:, columns_of(asset_cfg, "joint", env)].abs().sum(dim=1)
+
+
 def joint_vel_l2(
     env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
@@ -70,6 +85,20 @@ def joint_acc_l2(
     asset: Entity = env.scene[asset_cfg.name]
     accelerations = asset.data.joint_acc[:, columns_of(asset_cfg, "joint", env)]
     return accelerations.square().sum(dim=1)
+
+
+def joint_deviation_l1(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Sum of absolute deviations of the joints from their default positions (rad or m)."""
+    asset: Entity = env.scene[asset_cfg.name]
+    data, joints = asset.data, columns_of(asset_cfg, "joint", env)
+    return (data.joint_pos[:, joints] - data.default_joint_pos[:, joints]).abs().sum(dim=1)
+
+
+def action_l2(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """Sum of squares of the raw action."""
+    return env.action_manager.action.square().sum(dim=1)
 
 
 def action_rate_l2(env: ManagerBasedRlEnv) -> torch.Tensor:
@@ -108,6 +137,65 @@ def flat_orientation_l2(
     """Squared horizontal component of projected gravity: sin^2 of the root's tilt."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.projected_gravity_b[:, :2].square().sum(dim=1)
+
+
+def lin_vel_z_l2(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Squared velocity of the root link along its z axis (m^2/s^2)."""
+    asset: Entity = env.scene[asset_cfg.name]
+    return asset.data.root_link_lin_vel_b[:, 2].square()
+
+
+def ang_vel_xy_l2(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Squared angular velocity of the root link about its x and y axes (rad^2/s^2)."""
+    asset: Entity = env.scene[asset_cfg.name]
+    return asset.data.root_link_ang_vel_b[:, :2].square().sum(dim=1)
+
+
+def base_height_l2(
+    env: ManagerBasedRlEnv,
+    target_height: float,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+    sensor_name: str | None = None,
+) -> torch.Tensor:
+    """Squared difference of the root's height and `target_height` (m^2).
+
+    Args:
+        target_height: Height of the root link's origin (m).
+        asset_cfg: Entity.
+        sensor_name: Ray-cast sensor of the ground. The height is that above the mean of its hits, or
+            above z = 0 if no ray hits. None: above z = 0 of the world.
+    """
+    asset: Entity = env.scene[asset_cfg.name]
+    height = asset.data.root_link_pos_w[:, 2]
+    if sensor_name is not None:
+        data = env.scene[sensor_name].data
+        is_hit = data.distances >= 0.0
+        ground = torch.where(is_hit, data.hit_pos_w[..., 2], 0.0).sum(dim=1)
+        height = height - ground / is_hit.sum(dim=1).clamp(min=1)
+    return (height - target_height).square()
+
+
+def undesired_contacts(
+    env: ManagerBasedRlEnv, sensor_name: str, force_threshold: float = 1.0
+) -> torch.Tensor:
+    """Number of primaries of a contact sensor, such as thighs, in contact.
+
+    With a force history: primaries with a force above `force_threshold` (N) in any substep of the
+    history. With forces: those above it in the last substep. Without: all primaries in contact.
+    """
+    sensor = env.scene[sensor_name]
+    data, slots = sensor.data, sensor.cfg.num_slots
+    if data.force_history is not None:
+        hits = (data.force_history.norm(dim=-1) > force_threshold).any(dim=2)
+    elif data.force is not None:
+        hits = data.force.norm(dim=-1) > force_threshold
+    else:
+        hits = data.found > 0
+    return hits.unflatten(1, (-1, slots)).any(dim=2).sum(dim=1).float()
 
 
 def self_collision_cost(

@@ -21,13 +21,23 @@ from mjlab.envs.mdp.actions.actions import (
     TendonVelocityAction,
     TendonVelocityActionCfg,
 )
+from mjlab.envs.mdp.actions.binary import (
+    BinaryJointPositionAction,
+    BinaryJointPositionActionCfg,
+)
 from mjlab.envs.mdp.actions.differential_ik import (
     DifferentialIKAction,
     DifferentialIKActionCfg,
 )
+from mjlab.envs.mdp.actions.operational_space import (
+    OperationalSpaceControllerAction,
+    OperationalSpaceControllerActionCfg,
+)
 
 __all__ = [
     "BaseActionCfg",
+    "BinaryJointPositionAction",
+    "BinaryJointPositionActionCfg",
     "DifferentialIKAction",
     "DifferentialIKActionCfg",
     "JointEffortAction",
@@ -36,6 +46,8 @@ __all__ = [
     "JointPositionActionCfg",
     "JointVelocityAction",
     "JointVelocityActionCfg",
+    "OperationalSpaceControllerAction",
+    "OperationalSpaceControllerActionCfg",
     "RelativeJointPositionAction",
     "RelativeJointPositionActionCfg",
     "SiteEffortAction",

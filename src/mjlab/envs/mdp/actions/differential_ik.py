@@ -6,11 +6,12 @@ import logging
 import math
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, get_args
 
 import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names
+from mjlab.envs.mdp.frames import Frame, FrameType
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_columns
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 logger = logging.getLogger(__name__)
-FrameType = Literal["body", "site", "geom"]
 
 # Minimum damping: with less, a singular arm has no solution.
 _MIN_DAMPING = 1.0e-6
@@ -267,30 +267,12 @@ class DifferentialIKAction(ActionTerm):
         return self._frame_pos, quat_from_matrix(self._frame_rotation)
 
     def _find_frame(self) -> None:
-        cfg, entity, sim = self.cfg, self._entity, self._env.sim
-        find = {"body": entity.find_bodies, "site": entity.find_sites, "geom": entity.find_geoms}
-        ids, names = find[cfg.frame_type](cfg.frame_name)
-        if len(ids) != 1:
-            text = (
-                f"frame_name {cfg.frame_name!r}: expected to match exactly one {cfg.frame_type} of "
-                f"entity {cfg.entity_name!r}, got {len(ids)}: {names}"
-            )
-            if not ids:
-                raise ValueError(f"{text}.")
-            warnings.warn(f"{text}; using {names[0]!r}.", UserWarning, stacklevel=2)
-        kinds = {"body": "body_ids", "site": "site_ids", "geom": "geom_ids"}
-        frame = int(getattr(entity.indexing, kinds[cfg.frame_type])[ids[0]])
-        body = frame
-        if cfg.frame_type == "body":
-            self._frame_pos, self._frame_rotation = (
-                sim.data.xpos[:, frame],
-                sim.data.xquat[:, frame],
-            )
-        else:
-            body = int(getattr(sim.mj_model, f"{cfg.frame_type}_bodyid")[frame])
-            self._frame_pos = getattr(sim.data, f"{cfg.frame_type}_xpos")[:, frame]
-            self._frame_rotation = getattr(sim.data, f"{cfg.frame_type}_xmat")[:, frame]
-        self._body_ids = torch.full((self.num_envs,), body, dtype=torch.int32, device=self.device)
+        cfg = self.cfg
+        frame = Frame(self._env.sim, self._entity, cfg.entity_name, cfg.frame_type, cfg.frame_name)
+        self._frame_pos, self._frame_rotation = frame.pos, frame.rotation
+        self._body_ids = torch.full(
+            (self.num_envs,), frame.body, dtype=torch.int32, device=self.device
+        )
 
 
 def damped_least_squares(
