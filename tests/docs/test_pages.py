@@ -22,7 +22,7 @@ _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
     r"\b(train-seeds|train|demo|describe|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
-    r"|csv_to_npz|verify)"
+    r"|csv_to_npz|verify|(?<=mjlab )check)"
     r"((?: [^\s`#]+)*)"
 )
 _MAKE = re.compile(r"\bmake ([a-z-]+)")
@@ -136,6 +136,7 @@ def test_links_have_a_text_and_lead_to_files_and_headings(page: Path) -> None:
 @cache
 def _flags_of() -> dict[str, list[object]]:
     """Each command's flags: configs, whose fields they are, and sets of names."""
+    from mjlab.scripts.check import CheckConfig
     from mjlab.scripts.csv_to_npz import CsvToNpzConfig
     from mjlab.scripts.describe import DescribeConfig
     from mjlab.scripts.evaluate import EvaluateConfig
@@ -170,6 +171,7 @@ def _flags_of() -> dict[str, list[object]]:
         "visualize_terrain": [VisualizeTerrainConfig()],
         "viz-nan": [VizNanConfig()],
         "verify": [VerifyConfig()],
+        "check": [CheckConfig()],
     }
 
 

@@ -242,6 +242,23 @@ module:function that returns an MjSpec, or menagerie:NAME.""",
         ),
     ),
     Command(
+        "check",
+        "build",
+        "faults of a model or task that MuJoCo accepts",
+        argument="TARGET",
+        details="""\
+Look for faults that MuJoCo accepts and training would meet later: gains, limits, masses, feet,
+initial pose, left and right. Each finding has file and line, the reason and the cure.
+
+TARGET is a file (MJCF or URDF), a folder or zip archive with one, menagerie:NAME, a robot (g1,
+go1, yam, or module:function that returns an MjSpec or EntityCfg) or a task.""",
+        examples=(
+            "mjlab check robot.xml",
+            "mjlab check robot.urdf --floating-base",
+            "mjlab check Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
+        ),
+    ),
+    Command(
         "visualize-terrain",
         "build",
         "terrains, in the browser",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import json
 import shutil
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
 from mjlab.cli.flags import (
     parse_flags,
@@ -20,6 +20,9 @@ from mjlab.utils.errors import BadCallError
 from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
 from mjlab.utils.tables import WIDTH, json_value, tables_text
+
+if TYPE_CHECKING:
+    from mjlab.own_robot.findings import Finding
 
 _MIN_WIDTH = 80
 
@@ -42,6 +45,8 @@ class DescribeConfig(ConfigChoice):
     """Print JSON, with all columns and lists in full."""
     markdown: bool = field(default=False, metadata=shown("run"))
     """Print Markdown."""
+    check: bool = field(default=False, metadata=shown("run"))
+    """Add the findings of `mjlab check`."""
     env: ManagerBasedRlEnvCfg | None = None
     """Environment. None: config of the task."""
 
@@ -57,13 +62,26 @@ def command(argv: list[str], prog: str) -> None:
     if cfg.json and cfg.markdown:
         raise BadCallError("describe: expected one of --json and --markdown, got both.")
     description = describe(task, cfg)
+    findings = _findings(cfg.env or env_cfg) if cfg.check else None
     if cfg.json:
-        print(json.dumps(description.as_json(), indent=2, allow_nan=False))
-    elif cfg.markdown:
+        found = {} if findings is None else {"findings": [asdict(one) for one in findings]}
+        print(json.dumps(description.as_json() | found, indent=2, allow_nan=False))
+        return
+    if cfg.markdown:
         print(description.markdown())
     else:
         columns = shutil.get_terminal_size((WIDTH, 24)).columns
         print(description.text(min(max(columns, _MIN_WIDTH), WIDTH)))
+    if findings is not None:
+        from mjlab.scripts.check import report
+
+        print(f"\n{report(task, findings)}")
+
+
+def _findings(env_cfg: ManagerBasedRlEnvCfg) -> list[Finding]:
+    from mjlab.scripts.check import check_task
+
+    return check_task(env_cfg)
 
 
 def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:

@@ -104,6 +104,20 @@ def robot_cfg(name: str) -> EntityCfg:
     """
     from mjlab.entity import EntityCfg
 
+    made = made_robot(name)
+    if not isinstance(made, EntityCfg):
+        raise UserError(
+            f"{name!r}: expected a function that returns an EntityCfg, got {type(made).__name__}."
+        )
+    return made
+
+
+def made_robot(name: str) -> Any:
+    """Return what the function of a robot returns: that of a short name, or `module:function`.
+
+    Raises:
+        UserError: unknown name, or failed import.
+    """
     module, colon, function = name.partition(":")
     if not colon:
         if name not in ROBOTS:
@@ -119,12 +133,7 @@ def robot_cfg(name: str) -> EntityCfg:
         make = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(f"{name!r} cannot be imported: {error}.") from error
-    made = make() if callable(make) else make
-    if not isinstance(made, EntityCfg):
-        raise UserError(
-            f"{name!r}: expected a function that returns an EntityCfg, got {type(made).__name__}."
-        )
-    return made
+    return make() if callable(make) else make
 
 
 def _destination(cfg: ExportSceneConfig) -> tuple[Path, Path]:

@@ -29,6 +29,8 @@ class ViewConfig:
     """Port of the page; the next free port if taken."""
     open_browser: bool = True
     """Open the page in the browser of this machine."""
+    check: bool = False
+    """Print the findings of `mjlab check` first."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -46,6 +48,10 @@ def run_view(target: str, cfg: ViewConfig) -> None:
     """
     check_address(cfg.host, cfg.port, "--")
     model = load_model(target)
+    if cfg.check:
+        from mjlab.scripts.check import check, report
+
+        print(report(target, check(target)), end="\n\n", flush=True)
     server = serve_page(cfg.host, cfg.port)
     page = ModelPage(server, target, model, lambda: load_model(target))
     print(f"Open {page_url(server)} in a browser. Ctrl-C ends.", flush=True)
