@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 
 from mjlab.cli.flags import parse_flags
+from mjlab.own_robot.anatomy import finger_joints
 from mjlab.own_robot.findings import Finding, find_faults, missed_joints
 from mjlab.own_robot.gains import servo_stiffness
 from mjlab.own_robot.model_source import load_model, name_elements
@@ -130,7 +131,7 @@ def check_entity(
     subject = _subject_of_entity(name, entity, env_cfg)
     findings = find_faults(subject)
     if env_cfg is not None:
-        findings += _missed_by_patterns(name, entity, sorted(subject.driven), env_cfg)
+        findings += _missed_by_patterns(name, _pattern_joints(subject), env_cfg)
     return findings
 
 
@@ -179,8 +180,17 @@ def _subject_of_entity(name: str, entity: Entity, env_cfg: ManagerBasedRlEnvCfg 
 # Patterns.
 
 
+def _pattern_joints(subject: Subject) -> list[str]:
+    """Return the joints that patterns should match: those with an actuator, without fingers.
+
+    A task may well leave the gripper alone.
+    """
+    fingers = {subject.model.joint(j).name for j in finger_joints(subject.model)}
+    return [name for name in subject.joint_pos if name in subject.driven - fingers]
+
+
 def _missed_by_patterns(
-    name: str, entity: Entity, driven: list[str], env_cfg: ManagerBasedRlEnvCfg
+    name: str, driven: list[str], env_cfg: ManagerBasedRlEnvCfg
 ) -> Iterator[Finding]:
     """Yield findings of actions and observations that leave out joints with an actuator."""
     actions = {
