@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -38,16 +39,18 @@ class Foot:
     """Site on the foot; None if there is none."""
     position: tuple[float, float, float]
     """Middle of the sole in the frame of the body (m)."""
+    size: tuple[float, float]
+    """Length and width of the sole (m)."""
 
 
 @dataclass(frozen=True)
 class Leg:
-    """Joints from the trunk to a foot."""
+    """Joints of a leg."""
 
     foot: str
     """Body of the foot."""
     joints: tuple[str, ...]
-    """Hinges from the trunk to the foot."""
+    """Joints from the trunk to the foot, without those that carry several feet, such as a waist's."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,10 @@ class Anatomy:
     feet: Guess[tuple[Foot, ...]]
     legs: Guess[tuple[Leg, ...]]
     """Legs in the order of the feet: front before rear, left before right."""
+    front: Guess[float]
+    """Sign of the trunk's x axis in the direction of the robot's front: 1 or -1."""
+    upright: Guess[str]
+    """Body that a task keeps upright."""
     hands: Guess[tuple[Hand, ...]]
     mirror: Guess[dict[str, tuple[str, float]]]
     """Partner of each joint and sign of its motion; empty for a robot without left and right."""
@@ -105,7 +112,7 @@ def find_anatomy(model: mujoco.MjModel, *, kind: Kind | None = None) -> Anatomy:
     feet = _feet(model, trunk) if free is not None or kind == "legged" else ()
     mirror = mirror_pairs(model, trunk)
     has_sides = any(partner != joint for joint, (partner, _) in mirror.items())
-    legs = tuple(_leg(model, trunk, foot) for foot in feet)
+    legs = _legs(model, trunk, feet)
     hands = tuple(_hands(model, trunk, {foot.link for foot in feet}))
     found = _kind(model, free, feet, hands) if kind is None else Guess(kind, "as set", "set")
     return Anatomy(
@@ -113,6 +120,8 @@ def find_anatomy(model: mujoco.MjModel, *, kind: Kind | None = None) -> Anatomy:
         trunk=_trunk(model, free, trunk),
         feet=Guess(feet, "end links lowest in a standing pose; soles: geoms within 1 cm of it"),
         legs=Guess(legs, "joints from the trunk to a foot"),
+        front=_front(model, legs, feet),
+        upright=_upright(model, trunk, legs),
         hands=Guess(hands, "last link before the finger joints"),
         mirror=Guess(
             mirror if has_sides else {}, "anchor mirrored, axis parallel, same depth and range"
@@ -205,10 +214,11 @@ def _row_order(position: np.ndarray, feet: list) -> tuple[float, float]:
 def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
     colliding = geo.colliding_geoms(model)
     geoms = [g for g in colliding if model.body_weldid[model.geom_bodyid[g]] == link]
-    points = {g: geo.lowest_point(model, data, g) for g in geoms}
-    lowest = min(point[2] for point in points.values())
-    sole = [g for g, point in points.items() if point[2] < lowest + SOLE_DEPTH]
-    middle = np.mean([points[g] for g in sole], axis=0)
+    points = {g: geo.ground_points(model, data, g) for g in geoms}
+    lowest = min(float(p[0, 2]) for p in points.values())
+    sole = [g for g, p in points.items() if p[0, 2] < lowest + SOLE_DEPTH]
+    low, high = (f([f(points[g], axis=0) for g in sole], axis=0) for f in (np.min, np.max))
+    middle = np.array([*(0.5 * (low + high))[:2], lowest])
     local = data.xmat[link].reshape(3, 3).T @ (middle - data.xpos[link])
     sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == link]
     sites.sort(key=lambda s: float(np.linalg.norm(data.site_xpos[s] - middle)))
@@ -217,12 +227,46 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
         sole=tuple(model.geom(g).name for g in sole),
         site=model.site(sites[0]).name or None if sites else None,
         position=(float(local[0]), float(local[1]), float(local[2])),
+        size=(float(high[0] - low[0]), float(high[1] - low[1])),
     )
 
 
-def _leg(model: mujoco.MjModel, trunk: int, foot: Foot) -> Leg:
-    joints = geo.chain_joints(model, model.body(foot.link).id, trunk)
-    return Leg(foot.link, tuple(model.joint(j).name for j in joints))
+def _legs(model: mujoco.MjModel, trunk: int, feet: tuple[Foot, ...]) -> tuple[Leg, ...]:
+    chains = [geo.chain_joints(model, model.body(foot.link).id, trunk) for foot in feet]
+    carried = Counter(joint for chain in chains for joint in chain)
+    return tuple(
+        Leg(foot.link, tuple(model.joint(j).name for j in chain if carried[j] == 1))
+        for foot, chain in zip(feet, chains, strict=True)
+    )
+
+
+def _front(model: mujoco.MjModel, legs: tuple[Leg, ...], feet: tuple[Foot, ...]) -> Guess[float]:
+    """Return the direction that the toes of two feet point in, from the last joints of the legs."""
+    if len(feet) != 2:
+        return Guess(1.0, "along the trunk's x axis")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    ahead = 0.0
+    for leg, foot in zip(legs, feet, strict=True):
+        link = model.body(foot.link).id
+        sole = data.xpos[link] + data.xmat[link].reshape(3, 3) @ np.array(foot.position)
+        ahead += float((sole - data.xanchor[model.joint(leg.joints[-1]).id])[0])
+    if ahead < -0.01:
+        return Guess(-1.0, "toes point along -x from the ankles", "asked")
+    return Guess(1.0, "toes point along x from the ankles")
+
+
+def _upright(model: mujoco.MjModel, trunk: int, legs: tuple[Leg, ...]) -> Guess[str]:
+    """Return the heaviest link outside the legs for two legs, else the trunk."""
+    if len(legs) != 2:
+        return Guess(model.body(trunk).name, "the trunk")
+    in_legs = {int(model.jnt_bodyid[model.joint(j).id]) for leg in legs for j in leg.joints}
+    mass = {
+        link: sum(model.body_mass[b] for b in range(model.nbody) if model.body_weldid[b] == link)
+        for link in geo.links(model)
+        if link not in in_legs and model.body_rootid[link] == model.body_rootid[trunk]
+    }
+    return Guess(model.body(max(mass, key=lambda b: mass[b])).name, "heaviest link outside the legs")
 
 
 def _fall_bodies(model: mujoco.MjModel, legs: tuple[Leg, ...]) -> Guess[tuple[str, ...]]:
@@ -280,7 +324,10 @@ def finger_joints(model: mujoco.MjModel) -> set[int]:
     found = set()
     coupled = set()
     for equality in range(model.neq):
-        if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT and model.eq_obj2id[equality] >= 0:
+        if (
+            int(model.eq_type[equality]) == mujoco.mjtEq.mjEQ_JOINT
+            and model.eq_obj2id[equality] >= 0
+        ):
             coupled |= {int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])}
     leaves = set(geo.leaf_links(model))
     for joint in geo.joint_ids(model):
@@ -321,7 +368,10 @@ def _grasp(
             for g in geo.colliding_geoms(model)
             if model.body_weldid[model.geom_bodyid[g]] in bodies
         ]
-        point = np.mean(data.geom_xpos[geoms], axis=0) if geoms else data.xipos[link]
+        # Without fingers: the flange, the last body welded to the link.
+        flange = max(b for b in range(model.nbody) if model.body_weldid[b] == link)
+        end = data.xpos[flange] if flange != link else data.xipos[link]
+        point = np.mean(data.geom_xpos[geoms], axis=0) if geoms else end
     local = data.xmat[link].reshape(3, 3).T @ (point - data.xpos[link])
     return name, (float(local[0]), float(local[1]), float(local[2]))
 
@@ -335,7 +385,7 @@ def _imu(model: mujoco.MjModel, trunk: int) -> Guess[str | None]:
         int(model.sensor_objid[s])
         for kind in kinds
         for s in range(model.nsensor)
-        if model.sensor_type[s] == kind
+        if int(model.sensor_type[s]) == kind
     ]
     # Several IMUs: the one on the trunk, whose velocity is what the task commands.
     on_trunk = [s for s in sites if model.body_weldid[model.site_bodyid[s]] == trunk]
@@ -355,7 +405,7 @@ def drives(model: mujoco.MjModel) -> dict[str, Drive]:
         joint = actuated_joint(model, actuator)
         if joint is None:
             continue
-        bias = model.actuator_biastype[actuator]
+        bias = int(model.actuator_biastype[actuator])
         if bias == mujoco.mjtBias.mjBIAS_NONE:
             kind: Drive = "motor"
         elif bias == mujoco.mjtBias.mjBIAS_AFFINE and model.actuator_biasprm[actuator, 1] < 0:

@@ -19,27 +19,35 @@ from mjlab.own_robot.posture import sole_points
 
 MAX_SAG = 0.15
 """Greatest deflection of a leg joint under the robot's weight (rad)."""
-STATIC_SAG = 0.12
+STATIC_SAG = 0.14
 """Deflection that gains are computed for (rad)."""
 STABLE = 0.5
 """Greatest product of a joint's angular frequency and the time step."""
 TIMESTEP = 0.005
 """Time step of the velocity tasks (s)."""
-ARM_ERROR = 0.15
+ARM_ERROR = 0.1
 """Position error at which the joint of an arm has its effort limit (rad)."""
 MAX_EFFORT = 3.0
 """Effort limit that is plausible, as a multiple of weight x height."""
 DAMPING_RATIO = 0.7
+SETTLE_TIME = 1.5
+"""Time in which a robot settles on its legs (s)."""
+MAX_ROUNDS = 8
+"""Rounds of raising the stiffness of joints that sag."""
 
 
 def effort_limits(
-    model: mujoco.MjModel, size: float, answers: dict[str, float] | None = None
+    model: mujoco.MjModel,
+    size: float,
+    main_joints: tuple[str, ...] = (),
+    answers: dict[str, float] | None = None,
 ) -> tuple[Guess[dict[str, float]], list[Question]]:
-    """Return the effort limit of each joint (N m, N), with questions about missing and implausible ones.
+    """Return the effort limit of each joint (N m, N), with questions about doubtful ones.
 
     Args:
         model: Robot.
         size: Height of the trunk, or reach of the arm (m).
+        main_joints: Joints of the legs or of the arm, whose motors hardly are all the same.
         answers: Effort limits set by the user, by joint.
     """
     answers = answers or {}
@@ -68,9 +76,20 @@ def effort_limits(
                 )
             )
             limits |= dict.fromkeys(names, stand_in)
+    if same := _same_limits(limits, main_joints, answers):
+        text = f"effort limit: {same:g} N m for all of {_some(list(main_joints))}, like a stand-in"
+        questions.append(Question("effort", text, f"{same:g} N m"))
     source = "asked" if questions else "set" if answers else "file"
-    rule = "forcerange, else actuatorfrcrange, else ctrlrange x gear of a motor"
+    rule = "tightest of forcerange, actuatorfrcrange and a motor's ctrlrange x gear"
     return Guess(limits, rule, source), questions
+
+
+def _same_limits(
+    limits: dict[str, float], joints: tuple[str, ...], answers: dict[str, float]
+) -> float | None:
+    """Return the limit that all joints share; None if they differ or one is an answer."""
+    values = {limits[name] for name in joints}
+    return values.pop() if len(values) == 1 and not set(joints) & set(answers) else None
 
 
 def _some(names: list[str]) -> str:
@@ -78,24 +97,20 @@ def _some(names: list[str]) -> str:
 
 
 def file_effort(model: mujoco.MjModel, joint: int) -> float | None:
-    """Return the effort limit that the file has; None without one."""
+    """Return the tightest effort limit that the file has; None without one."""
     limits = []
+    if model.jnt_actfrclimited[joint]:
+        limits.append(float(np.abs(model.jnt_actfrcrange[joint]).max()))
     for actuator in range(model.nu):
         if actuated_joint(model, actuator) != joint:
             continue
         gear = abs(float(model.actuator_gear[actuator, 0]))
+        is_motor = int(model.actuator_biastype[actuator]) == mujoco.mjtBias.mjBIAS_NONE
         if model.actuator_forcelimited[actuator]:
             limits.append(gear * float(np.abs(model.actuator_forcerange[actuator]).max()))
-        elif model.jnt_actfrclimited[joint]:
-            pass
-        elif (
-            model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
-            and model.actuator_ctrllimited[actuator]
-        ):
+        if is_motor and model.actuator_ctrllimited[actuator]:
             gain = abs(float(model.actuator_gainprm[actuator, 0]))
             limits.append(gear * gain * float(np.abs(model.actuator_ctrlrange[actuator]).max()))
-    if model.jnt_actfrclimited[joint] and not limits:
-        limits.append(float(np.abs(model.jnt_actfrcrange[joint]).max()))
     return min(limits, default=None)
 
 
@@ -217,19 +232,22 @@ def find_gains(
             wanted = own[name]
         stiffness[name] = answers.get(name, min(wanted, cap[name]))
     rule = (
-        "servo of the file, or effort per rad and static torque per 0.12 rad, at most (0.5/dt)^2 I"
+        "servo of the file, or effort per rad and static torque per 0.14 rad, at most (0.5/dt)^2 I"
     )
     if legged:
-        for _ in range(6):
+        railed = rail_model(spec, model, anatomy, effort, armature)
+        for _ in range(MAX_ROUNDS):
             damping = _damping(stiffness, inertia)
-            sag = simulated_sag(
-                spec, anatomy, joint_pos, height, stiffness, damping, effort, armature
-            )
-            low = [n for n in anatomy.leg_joints if sag[n] > MAX_SAG - 0.01 and n not in answers]
+            sag = settle(railed, joint_pos, height, stiffness, damping)
+            low = {
+                name: min(sag[name] / STATIC_SAG, 2.0) * stiffness[name]
+                for name in anatomy.leg_joints
+                if sag[name] > 0.5 * (STATIC_SAG + MAX_SAG) and name not in answers
+            }
             if not low:
                 break
-            for name in low:
-                stiffness[name] *= min(2.0, 1.1 * sag[name] / STATIC_SAG)
+            # Up to w dt = 1 the joint is stable, though not well resolved.
+            stiffness |= {name: min(kp, 4.0 * cap[name]) for name, kp in low.items()}
         rule += f"; sag in simulation at most {max(sag[n] for n in anatomy.leg_joints):.2f} rad"
     source = "set" if answers else "rule"
     return Guess(stiffness, rule, source), Guess(
@@ -246,30 +264,29 @@ def _damping(stiffness: dict[str, float], inertia: dict[str, float]) -> dict[str
     }
 
 
-def simulated_sag(
-    spec: mujoco.MjSpec,
-    anatomy: Anatomy,
+def settle(
+    model: mujoco.MjModel,
     joint_pos: dict[str, float],
     height: float,
     stiffness: dict[str, float],
     damping: dict[str, float],
-    effort: dict[str, float],
-    armature: dict[str, float],
-    seconds: float = 1.5,
 ) -> dict[str, float]:
-    """Return the deflection of each joint (rad, m) when the robot stands with its trunk kept level.
+    """Return the deflection of each joint (rad, m) after the robot has settled on its legs.
 
-    The trunk slides on a vertical rail, so that falls of bipeds do not hide the sag.
+    Args:
+        model: Robot on a rail; see `rail_model`.
+        joint_pos: Initial position and target of each joint.
+        height: Initial height of the trunk (m).
+        stiffness: Stiffness of each joint.
+        damping: Damping of each joint.
     """
-    model = rail_model(spec, anatomy, effort, armature)
     set_gains(model, stiffness, damping)
     data = mujoco.MjData(model)
     for name, position in joint_pos.items():
         data.qpos[model.jnt_qposadr[model.joint(name).id]] = position
         data.ctrl[model.actuator(name).id] = position
     data.qpos[model.jnt_qposadr[model.joint(RAIL).id]] = height
-    for _ in range(round(seconds / TIMESTEP)):
-        mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, round(SETTLE_TIME / model.opt.timestep))
     return {
         name: abs(float(data.qpos[model.jnt_qposadr[model.joint(name).id]]) - position)
         for name, position in joint_pos.items()
@@ -281,23 +298,40 @@ RAIL = "trunk_rail"
 
 
 def rail_model(
-    spec: mujoco.MjSpec, anatomy: Anatomy, effort: dict[str, float], armature: dict[str, float]
+    spec: mujoco.MjSpec,
+    compiled: mujoco.MjModel,
+    anatomy: Anatomy,
+    effort: dict[str, float],
+    armature: dict[str, float],
 ) -> mujoco.MjModel:
     """Return the robot on level ground, its trunk on a vertical rail, with a position servo per joint."""
     spec = spec.copy()
     for elements in (spec.keys, spec.actuators, spec.sensors, spec.pairs):
         for element in list(elements):
             spec.delete(element)
+    _drop_visuals(spec, compiled, set(anatomy.colliding.value))
     trunk = spec.body(anatomy.trunk.value)
     for joint in list(trunk.joints):
         spec.delete(joint)
     trunk.pos, trunk.quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-    trunk.add_joint(name=RAIL, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=(0.0, 0.0, 1.0))
-    colliding = set(anatomy.colliding.value)
+    # Not what the default class has for the robot's joints.
+    trunk.add_joint(
+        name=RAIL,
+        type=mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=(0.0, 0.0, 1.0),
+        pos=(0.0, 0.0, 0.0),
+        limited=False,
+        range=(0.0, 0.0),
+        actfrclimited=False,
+        actfrcrange=(0.0, 0.0),
+        armature=0.0,
+        damping=0.0,
+        frictionloss=0.0,
+        stiffness=0.0,
+    )
     for geom in spec.geoms:
-        on_robot = geom.name in colliding
         # The ground collides with the robot; the robot, not with itself.
-        geom.contype, geom.conaffinity = 0, int(on_robot)
+        geom.contype, geom.conaffinity = 0, 1
         if geom.name in {name for foot in anatomy.feet.value for name in foot.sole}:
             geom.condim = max(3, geom.condim)
     spec.worldbody.add_geom(
@@ -315,6 +349,9 @@ def rail_model(
         actuator = spec.add_actuator(
             name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
+        # Not what the default class has for the file's actuators.
+        actuator.gear = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        actuator.ctrllimited, actuator.ctrlrange = False, (0.0, 0.0)
         actuator.set_to_position(kp=1.0, kv=1.0)
         limit = effort[joint.name]
         actuator.forcelimited, actuator.forcerange = True, (-limit, limit)
@@ -332,3 +369,20 @@ def set_gains(
         actuator = model.actuator(name).id
         model.actuator_gainprm[actuator, 0] = kp
         model.actuator_biasprm[actuator, 1:3] = -kp, -damping[name]
+
+
+def _drop_visuals(spec: mujoco.MjSpec, compiled: mujoco.MjModel, kept: set[str]) -> None:
+    """Delete all geoms but `kept`, with their meshes: these take seconds to compile."""
+    for body in spec.bodies[1:]:
+        own = compiled.body(body.name)
+        # Masses that came from geoms.
+        body.explicitinertial = True
+        body.mass, body.ipos, body.iquat = float(own.mass[0]), own.ipos, own.iquat
+        body.inertia, body.fullinertia = own.inertia, np.full(6, np.nan)
+    for geom in list(spec.geoms):
+        if geom.name not in kept:
+            spec.delete(geom)
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in list(spec.meshes):
+        if mesh.name not in used:
+            spec.delete(mesh)

@@ -71,11 +71,13 @@ def free_joint(model: mujoco.MjModel) -> int | None:
 def colliding_geoms(model: mujoco.MjModel) -> list[int]:
     """Return the geoms of the robot that collide.
 
-    Geoms with contype or conaffinity; without any, those of contact pairs; without any, those of the
+    With a free joint, those of its tree; without, those of all bodies, the fixed base included. Geoms with contype or conaffinity; without any, those of contact pairs; without any, those of the
     highest group, where files keep the collision geoms that a scene switches on.
     """
-    moving = [g for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] > 0]
-    moving = moving or [g for g in range(model.ngeom) if model.geom_bodyid[g] > 0]
+    free = free_joint(model)
+    root = 0 if free is None else model.body_rootid[model.jnt_bodyid[free]]
+    bodies = {b for b in range(1, model.nbody) if root in (0, model.body_rootid[b])}
+    moving = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies]
     by_itself = [g for g in moving if model.geom_contype[g] or model.geom_conaffinity[g]]
     paired = set(model.pair_geom1[: model.npair]) | set(model.pair_geom2[: model.npair])
     in_pairs = [g for g in moving if g in paired]
@@ -125,6 +127,15 @@ def mesh_vertices(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])]
 
 
+def ground_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
+    """Return the lowest point of a geom, and those when the ground tilts by 0.2 to each side, (5, 3)."""
+    directions = np.array(
+        [(0, 0, -1), (0.2, 0.2, -1), (0.2, -0.2, -1), (-0.2, 0.2, -1), (-0.2, -0.2, -1)]
+    )
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.array([support_point(model, data, geom, direction) for direction in directions])
+
+
 def lowest_height(model: mujoco.MjModel, data: mujoco.MjData, geoms: Iterable[int]) -> float:
     """Return the height of the lowest point of geoms; infinity without geoms."""
     return min((float(lowest_point(model, data, g)[2]) for g in geoms), default=float("inf"))
@@ -144,6 +155,14 @@ def set_pose(
         data.qpos[model.jnt_qposadr[model.joint(name).id]] = angle
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
+    mujoco.mj_tendon(model, data)
+
+
+def tendon_excess(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return the lengths of tendons beyond their ranges, (T,), from the pose of `data`."""
+    low, high = model.tendon_range.T
+    beyond = np.maximum(low - data.ten_length, data.ten_length - high)
+    return np.where(model.tendon_limited, np.maximum(beyond, 0.0), 0.0)
 
 
 def joint_range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:

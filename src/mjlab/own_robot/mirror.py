@@ -1,8 +1,9 @@
 """Mirror image of a robot, left to right, from the geometry of its joints.
 
-Joint j has anchor p and axis a in the trunk's frame at `qpos0`. With the reflection
-M = diag(1, -1, 1), its image has anchor M p and an axis b parallel to M a. A motion q of a hinge is
-that of the axial vector a, so the image moves by s q with
+Joint j turns about the line through anchor p with axis a, in the trunk's frame at `qpos0`. With the
+reflection M = diag(1, -1, 1), its partner turns about a line through M p with an axis b parallel to M a,
+and the links that it moves have their center of mass c at M c. A motion q of a hinge is that of an axial
+vector, so the partner moves by s q with
 
     s = sign(b . (-M a)),    of a slide    s = sign(b . M a).
 """
@@ -16,8 +17,11 @@ import numpy as np
 
 from mjlab.own_robot import geometry as geo
 
-ANCHOR_TOLERANCE = 0.02
-"""Distance of an anchor to the mirror image of its partner's, as a share of the robot's size."""
+LINE_TOLERANCE = 0.02
+"""Distance of a joint's line to the mirror image of its partner's, as a share of the robot's size."""
+MASS_TOLERANCE = 0.06
+"""Distance of the centers of mass of moved links, as a share of the robot's size: identified inertias and
+mounted computers differ left and right."""
 AXIS_TOLERANCE = 0.95
 """Cosine between an axis and the mirror image of its partner's."""
 RANGE_TOLERANCE = 0.25
@@ -38,16 +42,21 @@ def mirror_pairs(model: mujoco.MjModel, trunk: int) -> dict[str, tuple[str, floa
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
     origin, rotation = data.xpos[trunk], data.xmat[trunk].reshape(3, 3)
     anchors = (data.xanchor - origin) @ rotation  # (J, 3)
     axes = data.xaxis @ rotation  # (J, 3)
+    masses = (data.subtree_com[model.jnt_bodyid] - origin) @ rotation  # (J, 3)
     joints = geo.joint_ids(model)
     if trunk:
         joints = [j for j in joints if trunk in _ancestors(model, int(model.jnt_bodyid[j]))]
-    size = float(np.ptp(anchors[joints], axis=0).max()) if joints else 0.0
+    size = max(
+        (float(np.ptp(points[joints], axis=0).max()) for points in (anchors, masses) if joints),
+        default=0.0,
+    )
     costs: list[tuple[float, float, int, int]] = []
     for first, second in itertools.combinations_with_replacement(joints, 2):
-        cost = _mismatch(model, anchors, axes, first, second, size)
+        cost = _mismatch(model, anchors, axes, masses, first, second, size)
         if cost is not None:
             names = model.joint(first).name, model.joint(second).name
             costs.append((round(cost, 3), -_name_likeness(*names), first, second))
@@ -81,26 +90,32 @@ def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
 
 
 def _mismatch(
-    model: mujoco.MjModel, anchors: np.ndarray, axes: np.ndarray, i: int, j: int, size: float
+    model: mujoco.MjModel,
+    anchors: np.ndarray,
+    axes: np.ndarray,
+    masses: np.ndarray,
+    i: int,
+    j: int,
+    size: float,
 ) -> float | None:
     """Return the mismatch of two joints as mirror images; None if they are none."""
     if model.jnt_type[i] != model.jnt_type[j] or _depth(model, i) != _depth(model, j):
         return None
-    distance = float(np.linalg.norm(anchors[i] * _REFLECTION - anchors[j]))
     along = abs(float(np.dot(axes[i] * _REFLECTION, axes[j])))
-    if distance > ANCHOR_TOLERANCE * size + 1e-3 or along < AXIS_TOLERANCE:
+    between = anchors[i] * _REFLECTION - anchors[j]
+    # An anchor may lie anywhere along its axis.
+    line = float(np.linalg.norm(np.cross(between, axes[j]))) / size
+    mass = float(np.linalg.norm(masses[i] * _REFLECTION - masses[j])) / size
+    if along < AXIS_TOLERANCE or line > LINE_TOLERANCE or mass > MASS_TOLERANCE:
         return None
-    if i == j and geo.link_joints(model, int(model.jnt_bodyid[i])) == []:
-        return None
-    sign = _sign(model, axes, i, j)
     ends = np.array(geo.joint_range(model, i)) - model.qpos0[model.jnt_qposadr[i]]
-    image = np.sort(sign * ends)
+    image = np.sort(_sign(model, axes, i, j) * ends)
     other = np.array(geo.joint_range(model, j)) - model.qpos0[model.jnt_qposadr[j]]
     difference = float(np.abs(image - other).max())
-    # A joint in the plane may have an uneven range: a pitch, or a waist.
+    # A joint in the plane may have an uneven range: a waist with a stop on one side.
     if i != j and difference > RANGE_TOLERANCE * max(1.0, float(np.ptp(other))):
         return None
-    return distance / max(size, 1e-9) + (1.0 - along) + 0.01 * difference
+    return line + mass + (1.0 - along) + 0.01 * difference
 
 
 def _sign(model: mujoco.MjModel, axes: np.ndarray, i: int, j: int) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import tempfile
+import warnings
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -65,6 +66,7 @@ def load_model(source: str, *, floating_base: bool = False) -> RobotModel:
         spec = read_urdf(file, floating_base=floating_base)
     else:
         spec = mujoco.MjSpec.from_file(str(file))
+        _drop_dangling_pairs(spec, file)
     generic = {"robot", "model", "scene", "main"}
     name = file.stem if file.stem.lower() not in generic else file.resolve().parent.name
     return RobotModel(spec, identifier(name), source, file, file.resolve().parent)
@@ -182,6 +184,22 @@ def _rank(file: Path, folder: Path) -> tuple:
         stem not in named and named not in stem,
         len(stem),
     )
+
+
+def _drop_dangling_pairs(spec: mujoco.MjSpec, file: Path) -> None:
+    """Delete contact pairs with geoms of a scene that includes the robot, such as its floor."""
+    geoms = {geom.name for geom in spec.geoms}
+    dangling = [pair for pair in spec.pairs if not {pair.geomname1, pair.geomname2} <= geoms]
+    missing = {name for p in dangling for name in (p.geomname1, p.geomname2)} - geoms
+    for pair in dangling:
+        spec.delete(pair)
+    if dangling:
+        warnings.warn(
+            f"{file}: dropped {len(dangling)} contact pairs with geoms {sorted(missing)}, which the "
+            "file does not have.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _from_function(source: str) -> RobotModel:

@@ -103,6 +103,8 @@ def check_pose(
         if not low - 0.01 <= position <= high + 0.01:
             faults.append(f"{name} at {position:.2f} outside [{low:.2f}, {high:.2f}]")
     geo.set_pose(model, data, joint_pos)
+    for tendon in np.flatnonzero(geo.tendon_excess(model, data) > 0.01):
+        faults.append(f"tendon {model.tendon(tendon).name} outside its range")
     trunk = model.body(anatomy.trunk.value).id
     feet = {model.body(foot.link).id for foot in anatomy.feet.value}
     lowest = set(foot_links(model, data, trunk))
@@ -121,13 +123,8 @@ def check_pose(
 
 def sole_points(model: mujoco.MjModel, data: mujoco.MjData, foot: Foot) -> np.ndarray:
     """Return the points of a foot that touch level ground, (P, 3), from the pose of `data`."""
-    points = []
-    for name in foot.sole:
-        for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1), (0, 0)):
-            direction = np.array([0.2 * x, 0.2 * y, -1.0])
-            direction /= np.linalg.norm(direction)
-            points.append(geo.support_point(model, data, model.geom(name).id, direction))
-    return np.array(points)
+    geoms = [model.geom(name).id for name in foot.sole]
+    return np.vstack([geo.ground_points(model, data, geom) for geom in geoms])
 
 
 def straight_height(model: mujoco.MjModel, anatomy: Anatomy) -> float:
@@ -182,7 +179,7 @@ def _searched_pose(
             solved |= set(image)
         if other is not None and angles:
             knee = max(angles, key=lambda name: abs(angles[name] - other[name]))
-            direction = "forward" if _knee_forward(model, anatomy, leg, pose) else "backward"
+            direction = "forward" if knee_forward(model, anatomy, leg, pose) else "backward"
             questions.append(
                 Question(
                     f"pose.{knee}",
@@ -225,7 +222,8 @@ def _bend(
         geo.set_pose(model, data, pose | dict(zip(joints, angles, strict=True)))
         position = _sole_position(model, data, anatomy, foot)[[0, 2]]
         tilt = np.zeros(3) if up is None else data.xmat[link].reshape(3, 3)[2] - up
-        return np.concatenate([(position - target) / length, 0.3 * tilt, 1e-3 * angles])
+        excess = geo.tendon_excess(model, data)
+        return np.concatenate([(position - target) / length, 0.3 * tilt, excess, 1e-3 * angles])
 
     rng, found = np.random.default_rng(0), []
     for _ in range(12):
@@ -236,7 +234,7 @@ def _bend(
     good = [x for cost, x in found if cost < found[0][0] + 1e-4]
 
     def forward(angles: np.ndarray) -> bool:
-        return _knee_forward(model, anatomy, leg, pose | dict(zip(joints, angles, strict=True)))
+        return knee_forward(model, anatomy, leg, pose | dict(zip(joints, angles, strict=True)))
 
     # Two legs bend their knees forward as humans do; four, backward, as nearly all do.
     want = len(anatomy.legs.value) == 2
@@ -246,10 +244,8 @@ def _bend(
     return as_dict, None if other is None else dict(zip(joints, map(float, other), strict=True))
 
 
-def _knee_forward(
-    model: mujoco.MjModel, anatomy: Anatomy, leg: Leg, pose: dict[str, float]
-) -> bool:
-    """Return True if the second pitch joint of a leg is ahead of the line from the first to the foot."""
+def knee_forward(model: mujoco.MjModel, anatomy: Anatomy, leg: Leg, pose: dict[str, float]) -> bool:
+    """Return True if the second pitch joint of a leg is ahead of the line from the first to the last."""
     data = mujoco.MjData(model)
     geo.set_pose(model, data, pose)
     joints = pitch_joints(model, leg)
@@ -260,7 +256,8 @@ def _knee_forward(
     last = joints[2] if len(joints) > 2 else None
     end = data.xanchor[model.joint(last).id] if last else _sole_world(model, data, foot)
     share = (hip[2] - knee[2]) / max(hip[2] - end[2], 1e-6)
-    return bool(knee[0] > hip[0] + share * (end[0] - hip[0]))
+    ahead = knee[0] - hip[0] - share * (end[0] - hip[0])
+    return bool(anatomy.front.value * ahead > 0.0)
 
 
 def _clipped_zero(model: mujoco.MjModel) -> dict[str, float]:

@@ -96,6 +96,9 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         if anatomy.imu_site.source == "asked":
             text = "site of the IMU: no gyro and no site named imu"
             questions.append(Question("imu_site", text, "the trunk's origin"))
+        if anatomy.front.value < 0.0:
+            text = "front of the robot: the toes point along -x, the task's forward is x"
+            questions.append(Question("front", text, "x, so that it walks backward"))
     else:
         joint_pos, asked = arm_home(compiled, anatomy, answers["pose"])
         questions += asked
@@ -103,7 +106,7 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         size = _reach(compiled)
     if "root_height" in settings:
         height = Guess(float(settings["root_height"]), "as set", "set")
-    effort, asked = effort_limits(compiled, size, answers["effort"])
+    effort, asked = effort_limits(compiled, size, _main_joints(anatomy), answers["effort"])
     questions += asked
     is_arm = anatomy.kind.value == "arm"
     armature, asked = rotor_inertias(compiled, effort.value, is_arm, answers["armature"])
@@ -159,6 +162,13 @@ def _answers(name: str, settings: dict[str, str], model: mujoco.MjModel) -> dict
             raise UnknownNameError(f"Setting {key!r}: no such joint; {suggest(pattern, joints)}")
         answers |= dict.fromkeys(matches, float(value))
     return answers
+
+
+def _main_joints(anatomy: Anatomy) -> tuple[str, ...]:
+    """Return the joints of the legs, of an arm those of its first hand."""
+    if anatomy.kind.value == "arm":
+        return anatomy.hands.value[0].joints
+    return anatomy.leg_joints
 
 
 def command_ranges(height: float, feet: int) -> Guess[dict[str, tuple[float, float]]]:
