@@ -196,7 +196,9 @@ def check_legs(report: RobotReport, truth: dict[str, Any], questions: set[str]) 
     right = set(truth["falls"]) <= falls and not set(truth["not_falls"]) & falls
     yield "falls", right, str(sorted(falls))
     yield "on the ground", *_touches(report)
-    model = rail_model(report.spec, report.compiled, anatomy, report.effort.value, report.armature.value)
+    model = rail_model(
+        report.spec, report.compiled, anatomy, report.effort.value, report.armature.value
+    )
     sag = settle(
         model, report.joint_pos.value, height, report.stiffness.value, report.damping.value
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from mjlab.own_robot import geometry as geo
 from mjlab.own_robot.guess import Guess
-from mjlab.own_robot.mirror import mirror_pairs
+from mjlab.utils.mirror import mirror_pairs
 
 Kind = Literal["legged", "arm", "other"]
 Drive = Literal["motor", "position", "other", "none"]
@@ -110,10 +110,13 @@ def find_anatomy(model: mujoco.MjModel, *, kind: Kind | None = None) -> Anatomy:
     free = geo.free_joint(model)
     trunk = int(model.jnt_bodyid[free]) if free is not None else 0
     feet = _feet(model, trunk) if free is not None or kind == "legged" else ()
-    mirror = mirror_pairs(model, trunk)
-    has_sides = any(partner != joint for joint, (partner, _) in mirror.items())
+    mirror = {
+        model.joint(j).name: (model.joint(p.joint).name, p.sign)
+        for j, p in mirror_pairs(model, trunk).items()
+    }
     legs = _legs(model, trunk, feet)
     hands = tuple(_hands(model, trunk, {foot.link for foot in feet}))
+    has_sides = len(feet) >= 2 or len(hands) >= 2
     found = _kind(model, free, feet, hands) if kind is None else Guess(kind, "as set", "set")
     return Anatomy(
         kind=found,
@@ -124,7 +127,7 @@ def find_anatomy(model: mujoco.MjModel, *, kind: Kind | None = None) -> Anatomy:
         upright=_upright(model, trunk, legs),
         hands=Guess(hands, "last link before the finger joints"),
         mirror=Guess(
-            mirror if has_sides else {}, "anchor mirrored, axis parallel, same depth and range"
+            mirror if has_sides else {}, "axis and moved mass mirrored, same depth and range"
         ),
         imu_site=_imu(model, trunk),
         drives=Guess(drives(model), "bias of the actuator: none, a motor; affine, a servo", "file"),
@@ -266,7 +269,9 @@ def _upright(model: mujoco.MjModel, trunk: int, legs: tuple[Leg, ...]) -> Guess[
         for link in geo.links(model)
         if link not in in_legs and model.body_rootid[link] == model.body_rootid[trunk]
     }
-    return Guess(model.body(max(mass, key=lambda b: mass[b])).name, "heaviest link outside the legs")
+    return Guess(
+        model.body(max(mass, key=lambda b: mass[b])).name, "heaviest link outside the legs"
+    )
 
 
 def _fall_bodies(model: mujoco.MjModel, legs: tuple[Leg, ...]) -> Guess[tuple[str, ...]]:

@@ -76,7 +76,8 @@ def effort_limits(
                 )
             )
             limits |= dict.fromkeys(names, stand_in)
-    if same := _same_limits(limits, main_joints, answers):
+    same = _same_limits(limits, main_joints, answers)
+    if same is not None and not questions:
         text = f"effort limit: {same:g} N m for all of {_some(list(main_joints))}, like a stand-in"
         questions.append(Question("effort", text, f"{same:g} N m"))
     source = "asked" if questions else "set" if answers else "file"
@@ -227,32 +228,61 @@ def find_gains(
     stiffness, cap = {}, {}
     for name in joint_pos:
         cap[name] = (STABLE / TIMESTEP) ** 2 * inertia[name]
-        wanted = max(effort[name] / (1.0 if legged else ARM_ERROR), abs(torque[name]) / STATIC_SAG)
+        error = 1.0 if legged else ARM_ERROR
+        wanted = max(effort[name] / error, abs(torque[name]) / STATIC_SAG)
         if own.get(name, 0.0) * 0.2 > abs(torque[name]):
             wanted = own[name]
-        stiffness[name] = answers.get(name, min(wanted, cap[name]))
+        stiffness[name] = min(wanted, cap[name])
+    groups = like_joints(anatomy, list(joint_pos))
+    stiffness = _alike(stiffness, groups) | answers
     rule = (
         "servo of the file, or effort per rad and static torque per 0.14 rad, at most (0.5/dt)^2 I"
     )
     if legged:
         railed = rail_model(spec, model, anatomy, effort, armature)
         for _ in range(MAX_ROUNDS):
-            damping = _damping(stiffness, inertia)
+            damping = _alike(_damping(stiffness, inertia), groups)
             sag = settle(railed, joint_pos, height, stiffness, damping)
-            low = {
-                name: min(sag[name] / STATIC_SAG, 2.0) * stiffness[name]
+            low = [
+                name
                 for name in anatomy.leg_joints
                 if sag[name] > 0.5 * (STATIC_SAG + MAX_SAG) and name not in answers
-            }
+            ]
             if not low:
                 break
-            # Up to w dt = 1 the joint is stable, though not well resolved.
-            stiffness |= {name: min(kp, 4.0 * cap[name]) for name, kp in low.items()}
+            for name in low:
+                raised = stiffness[name] * min(sag[name] / STATIC_SAG, 2.0)
+                # Up to w dt = 1 the joint is stable, though not well resolved.
+                stiffness[name] = min(raised, 4.0 * cap[name])
+            stiffness = _alike(stiffness, groups) | answers
         rule += f"; sag in simulation at most {max(sag[n] for n in anatomy.leg_joints):.2f} rad"
-    source = "set" if answers else "rule"
-    return Guess(stiffness, rule, source), Guess(
-        _damping(stiffness, inertia), "damping ratio 0.7 with the inertia at the joint"
+    damping = _alike(_damping(stiffness, inertia), groups)
+    return Guess(stiffness, rule, "set" if answers else "rule"), Guess(
+        damping, "damping ratio 0.7 with the inertia at the joint"
     )
+
+
+def like_joints(anatomy: Anatomy, joints: list[str]) -> list[tuple[str, ...]]:
+    """Return the groups of joints with the same gains: those of like legs, and mirror images."""
+    groups: dict[tuple[object, ...], list[str]] = {}
+    legs = {
+        name: (len(leg.joints), index)
+        for leg in anatomy.legs.value
+        for index, name in enumerate(leg.joints)
+    }
+    for name in joints:
+        partner, _ = anatomy.mirror.value.get(name, (name, 1.0))
+        groups.setdefault(legs.get(name, tuple(sorted((name, partner)))), []).append(name)
+    return [tuple(group) for group in groups.values()]
+
+
+def _alike(values: dict[str, float], groups: list[tuple[str, ...]]) -> dict[str, float]:
+    """Return the largest value of each group for all its joints, with three digits."""
+    return {
+        name: float(f"{max(values[other] for other in group):.3g}")
+        for group in groups
+        for name in group
+    }
 
 
 def _damping(stiffness: dict[str, float], inertia: dict[str, float]) -> dict[str, float]:

@@ -17,7 +17,6 @@ from scipy.spatial import ConvexHull, QhullError
 from mjlab.own_robot import geometry as geo
 from mjlab.own_robot.anatomy import Anatomy, Foot, Leg, candidate_poses, foot_links
 from mjlab.own_robot.guess import Guess, Question
-from mjlab.own_robot.mirror import mirror_pose
 
 EXTENSION = 0.88
 """Height of the hip above the sole in a searched pose, as a share of the leg's length."""
@@ -69,6 +68,7 @@ def find_posture(
         why = "; ".join(f"{name}: {faults[0]}" for name, faults in rejected[:-1]) or "no keyframe"
         source = "asked" if questions else "rule"
         pose = Guess(joint_pos, f"{why}; feet below the hips at 0.88 of the leg, mirrored", source)
+    pose = dataclasses.replace(pose, value={n: round(q, 4) + 0.0 for n, q in pose.value.items()})
     if answers:
         pose = dataclasses.replace(pose, value=pose.value | answers, source="set")
     height = ground_height(model, data, anatomy, pose.value)
@@ -174,7 +174,7 @@ def _searched_pose(
         pose |= angles
         solved |= set(leg.joints)
         if all(name in mirror for name in leg.joints):
-            image = mirror_pose(mirror, {name: pose[name] for name in leg.joints})
+            image = {mirror[name][0]: mirror[name][1] * pose[name] for name in leg.joints}
             pose |= {name: value for name, value in image.items() if name not in answers}
             solved |= set(image)
         if other is not None and angles:

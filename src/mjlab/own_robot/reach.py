@@ -13,6 +13,12 @@ from mjlab.own_robot.guess import Guess, Question
 
 GOAL_SHARE = 0.8
 """Middle share of each joint's range that goals are drawn from."""
+HANGING = 0.1
+"""Depth of a geom below the base at `qpos0` from which on an arm hangs (m)."""
+STAND_CLEARANCE = 0.1
+"""Distance of a hanging arm to the ground (m)."""
+HOME_DRAWS = 400
+"""Number of poses among which an arm's home is searched."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +44,7 @@ def reachable_hand_poses(
     ground: float | None = None,
     seed: int = 0,
 ) -> HandPoses:
-    """Return hand poses of random joint positions without contact.
+    """Return hand poses of random joint positions in the middle of the ranges, without contact.
 
     Args:
         model: Robot.
@@ -46,59 +52,170 @@ def reachable_hand_poses(
         hand: Hand to place.
         home: Positions of the other joints.
         count: Number of poses.
-        ground: Height of the ground in the frame of the model that all geoms stay above (m); None
+        ground: Height of the ground in the frame of the model that moving geoms stay above (m); None
             without ground.
         seed: Seed of the random draws.
+
+    Raises:
+        ValueError: no pose in 50 draws per pose is free of contact.
     """
     rng, data = np.random.default_rng(seed), mujoco.MjData(model)
-    joints = [model.joint(name).id for name in hand.joints]
-    ranges = np.array([geo.joint_range(model, j) for j in joints])  # (J, 2)
-    middle, half = ranges.mean(axis=1), GOAL_SHARE * np.ptp(ranges, axis=1) / 2.0
-    geoms = [model.geom(name).id for name in anatomy.colliding.value]
+    is_free = _FreeOfContact(model, anatomy, ground)
     link = model.body(hand.link).id
-    moving = [
-        g for g in geoms if set(geo.chain(model, int(model.body_weldid[model.geom_bodyid[g]])))
-    ]
     drawn, positions, quaternions = [], [], []
     for _ in range(50 * count):
         if len(drawn) == count:
             break
-        angles = rng.uniform(middle - half, middle + half)
-        geo.set_pose(model, data, home | dict(zip(hand.joints, map(float, angles), strict=True)))
-        mujoco.mj_collision(model, data)
-        if data.ncon or (ground is not None and geo.lowest_height(model, data, moving) < ground):
+        angles = _draw(model, hand.joints, rng, GOAL_SHARE)
+        geo.set_pose(model, data, home | angles)
+        if not is_free(data):
             continue
         rotation = data.xmat[link].reshape(3, 3)
-        drawn.append(angles)
+        drawn.append(list(angles.values()))
         positions.append(data.xpos[link] + rotation @ np.array(hand.position))
         quaternions.append(data.xquat[link].copy())
+    if not drawn:
+        raise ValueError(f"Hand {hand.link!r}: no pose of {50 * count} is free of contact.")
     return HandPoses(hand.joints, np.array(drawn), np.array(positions), np.array(quaternions))
 
 
 def arm_home(
-    model: mujoco.MjModel, anatomy: Anatomy, answers: dict[str, float] | None = None
+    model: mujoco.MjModel,
+    anatomy: Anatomy,
+    answers: dict[str, float] | None = None,
 ) -> tuple[Guess[dict[str, float]], list[Question]]:
-    """Return the home pose of an arm: a keyframe without contact, else the middle of the ranges."""
+    """Return the home pose of an arm: a keyframe without contact, else a searched one."""
     answers = answers or {}
     data = mujoco.MjData(model)
     joints = geo.joint_ids(model)
+    is_free = _FreeOfContact(model, anatomy, None)
     for name, qpos in candidate_poses(model):
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
         pose = {model.joint(j).name: float(qpos[model.jnt_qposadr[j]]) for j in joints}
+        geo.set_pose(model, data, pose)
         inside = all(
             low - 1e-3 <= pose[model.joint(j).name] <= high + 1e-3
             for j in joints
             for low, high in [geo.joint_range(model, j)]
         )
-        if name != "zero pose" and inside and not data.ncon:
-            if answers:
-                return Guess(pose | answers, f"{name}, with answers", "set"), []
-            return Guess(pose, f"{name}: inside limits, no contact", "file"), []
-    pose = {model.joint(j).name: float(np.mean(geo.joint_range(model, j))) for j in joints}
-    question = Question("pose", "home of the arm: no keyframe", "the middle of the ranges")
+        if name != "zero pose" and inside and is_free(data):
+            source = "set" if answers else "file"
+            return Guess(pose | answers, f"{name}: inside limits, no contact", source), []
+    pose = _searched_home(model, anatomy, is_free, answers)
+    pose = {name: round(position, 3) + 0.0 for name, position in pose.items()}
+    rule = "no keyframe: close to the middle of the ranges, bent for dexterity"
     if answers:
-        return Guess(pose | answers, "as set; else the middle of the ranges", "set"), []
-    return Guess(pose, "no keyframe: the middle of the ranges", "asked"), [question]
+        return Guess(pose, rule, "set"), []
+    used = ", ".join(f"{position:g}" for position in pose.values())
+    return Guess(pose, rule, "asked"), [Question("pose", "home of the arm: no keyframe", used)]
+
+
+def stand_height(model: mujoco.MjModel, anatomy: Anatomy) -> float:
+    """Return the height of the base at which a hanging arm clears the ground, 0 for a standing arm (m)."""
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, {})
+    lowest = geo.lowest_height(model, data, [model.geom(g).id for g in anatomy.colliding.value])
+    return round(STAND_CLEARANCE - lowest, 2) if lowest < -HANGING else 0.0
+
+
+def _searched_home(
+    model: mujoco.MjModel,
+    anatomy: Anatomy,
+    is_free: _FreeOfContact,
+    answers: dict[str, float],
+) -> dict[str, float]:
+    """Return the pose closest to the middle of the ranges among those that are dexterous.
+
+    Dexterity is the smallest singular value of the Jacobian of the hand's position: 0 for a stretched
+    arm. At least 70 % of the largest of all draws is asked for; then joints return to the middle one by one.
+    """
+    rng, data = np.random.default_rng(0), mujoco.MjData(model)
+    hangs = stand_height(model, anatomy) > 0.0
+    middle = {}
+    for joint in geo.joint_ids(model):
+        low, high = geo.joint_range(model, joint)
+        # A hanging arm rests at zero; others at the middle of their ranges.
+        rest = float(model.qpos0[model.jnt_qposadr[joint]]) if hangs else 0.5 * (low + high)
+        slack = 0.5 * (1.0 - GOAL_SHARE) * (high - low)
+        middle[model.joint(joint).name] = float(np.clip(rest, low + slack, high - slack))
+    middle |= answers
+    if not anatomy.hands.value:
+        return middle
+    hand, mirror = anatomy.hands.value[0], anatomy.mirror.value
+    dofs = [int(model.jnt_dofadr[model.joint(name).id]) for name in hand.joints]
+    link, jacobian = model.body(hand.link).id, np.zeros((3, model.nv))
+    geoms = [model.geom(name).id for name in anatomy.colliding.value]
+    # Poses of an arm on the ground stay above it.
+    floor = -np.inf if hangs else -0.01
+
+    def measure(angles: dict[str, float]) -> tuple[dict[str, float], float, bool]:
+        """Return the pose of both arms, its dexterity, and True if it is above the ground."""
+        images = {mirror[n][0]: mirror[n][1] * q for n, q in angles.items() if n in mirror}
+        pose = middle | images | angles | answers
+        geo.set_pose(model, data, pose)
+        if not is_free(data):
+            return pose, 0.0, False
+        point = data.xpos[link] + data.xmat[link].reshape(3, 3) @ np.array(hand.position)
+        mujoco.mj_jac(model, data, jacobian, None, point, link)
+        dexterity = float(np.linalg.svd(jacobian[:, dofs], compute_uv=False)[-1])
+        return pose, dexterity, geo.lowest_height(model, data, geoms) > floor
+
+    def distance(angles: dict[str, float]) -> float:
+        return float(np.linalg.norm([angles[name] - middle[name] for name in hand.joints]))
+
+    drawn = [_draw(model, hand.joints, rng, GOAL_SHARE) for _ in range(HOME_DRAWS)]
+    measured = [(angles, *measure(angles)[1:]) for angles in drawn]
+    above = [item for item in measured if item[2]]
+    kept = above or measured
+    enough = 0.7 * max(dexterity for _, dexterity, _ in kept)
+    good = [angles for angles, dexterity, _ in kept if dexterity >= enough]
+    angles = min(good, key=distance)
+    for name in hand.joints:
+        trial = angles | {name: middle[name]}
+        _, dexterity, is_above = measure(trial)
+        if dexterity >= enough and (is_above or not above):
+            angles = trial
+    return measure(angles)[0]
+
+
+def _draw(
+    model: mujoco.MjModel, joints: tuple[str, ...], rng: np.random.Generator, share: float
+) -> dict[str, float]:
+    """Return positions in the middle `share` of each joint's range, of wide ranges within a turn."""
+    drawn = {}
+    for name in joints:
+        low, high = geo.joint_range(model, model.joint(name).id)
+        half = min(np.pi, 0.5 * (high - low)) * share
+        drawn[name] = float(rng.uniform(0.5 * (low + high) - half, 0.5 * (low + high) + half))
+    return drawn
+
+
+class _FreeOfContact:
+    """Test of poses for contacts, without those that the model has in all poses."""
+
+    def __init__(self, model: mujoco.MjModel, anatomy: Anatomy, ground: float | None) -> None:
+        self._model, self._ground = model, ground
+        geoms = [model.geom(name).id for name in anatomy.colliding.value]
+        # Of a fixed base, only what moves has a height that poses change.
+        self._moving = [g for g in geoms if model.body_weldid[model.geom_bodyid[g]]]
+        self._always: set[tuple[int, int]] = set()
+        rng, data = np.random.default_rng(0), mujoco.MjData(model)
+        names = tuple(model.joint(j).name for j in geo.joint_ids(model))
+        touching = []
+        for _ in range(20):
+            geo.set_pose(model, data, _draw(model, names, rng, GOAL_SHARE))
+            mujoco.mj_collision(model, data)
+            touching.append(self._pairs(data))
+        self._always = set.intersection(*touching)
+
+    def __call__(self, data: mujoco.MjData) -> bool:
+        """Return True if the pose of `data` has no contact, and no geom is below the ground."""
+        mujoco.mj_collision(self._model, data)
+        if self._pairs(data) - self._always:
+            return False
+        if self._ground is None:
+            return True
+        return geo.lowest_height(self._model, data, self._moving) >= self._ground
+
+    @staticmethod
+    def _pairs(data: mujoco.MjData) -> set[tuple[int, int]]:
+        return {(int(a), int(b)) for a, b in data.contact.geom[: data.ncon]}

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from dataclasses import dataclass
+from typing import cast, get_args
 
 import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry as geo
-from mjlab.own_robot.anatomy import Anatomy, find_anatomy
+from mjlab.own_robot.anatomy import Anatomy, Kind, find_anatomy
 from mjlab.own_robot.gains import effort_limits, find_gains, rotor_inertias
+from mjlab.own_robot.gait import command_ranges, pose_tolerance
 from mjlab.own_robot.guess import Guess, Question
 from mjlab.own_robot.model_source import RobotModel, load_model, name_elements
 from mjlab.own_robot.posture import Posture, find_posture
-from mjlab.own_robot.reach import arm_home
-from mjlab.utils.errors import UnknownNameError
+from mjlab.own_robot.reach import arm_home, stand_height
+from mjlab.utils.errors import UnknownNameError, check_one_of
 from mjlab.utils.string import suggest
 
 PER_JOINT = ("pose", "effort", "armature", "stiffness", "damping", "action_scale")
 """Settings of one joint (`effort.FL_knee`), joints by pattern, or all joints (`effort`)."""
-SETTINGS = ("kind", "floating_base", "root_height", *PER_JOINT)
+SETTINGS = ("kind", "floating_base", "front", "imu_site", "root_height", *PER_JOINT)
 """Names of settings."""
 
 
@@ -68,64 +71,49 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
 
     Raises:
         UnknownNameError: unknown setting, or a pattern that matches no joint.
+        ValueError: setting with a value that it does not have.
     """
     settings = settings or {}
     for key in settings:
         if key.partition(".")[0] not in SETTINGS:
             raise UnknownNameError(f"Unknown setting {key!r}; {suggest(key, SETTINGS)}")
-    if isinstance(source, str):
-        floating = settings.get("floating_base", "false").lower() in ("true", "1", "yes")
-        model = load_model(source, floating_base=floating)
-    else:
-        model = source
+    questions: list[Question] = []
+    model = _load(source, settings, questions) if isinstance(source, str) else source
     spec = model.spec.copy()
     name_elements(spec)
     compiled = spec.compile()
-    anatomy = find_anatomy(compiled, kind=settings.get("kind"))  # ty: ignore[invalid-argument-type]
-    questions: list[Question] = []
-    if model.is_urdf and geo.free_joint(compiled) is None and "floating_base" not in settings:
-        text = "a URDF has no free joint: true for a robot with legs or wheels, false for an arm"
-        questions.append(Question("floating_base", text, "false"))
+    anatomy = _find_anatomy(compiled, settings, questions)
     answers = {name: _answers(name, settings, compiled) for name in PER_JOINT}
-    posture = None
-    if anatomy.kind.value == "legged":
-        posture = find_posture(compiled, anatomy, answers["pose"])
-        joint_pos, height = posture.joint_pos, posture.root_height
+    legged, is_arm = anatomy.kind.value == "legged", anatomy.kind.value == "arm"
+    posture = find_posture(compiled, anatomy, answers["pose"]) if legged else None
+    if posture is not None:
+        joint_pos, height, size = posture.joint_pos, posture.root_height, posture.root_height.value
         questions += posture.questions
-        size = height.value
-        if anatomy.imu_site.source == "asked":
-            text = "site of the IMU: no gyro and no site named imu"
-            questions.append(Question("imu_site", text, "the trunk's origin"))
-        if anatomy.front.value < 0.0:
-            text = "front of the robot: the toes point along -x, the task's forward is x"
-            questions.append(Question("front", text, "x, so that it walks backward"))
     else:
         joint_pos, asked = arm_home(compiled, anatomy, answers["pose"])
         questions += asked
-        height = _mount_height(compiled, anatomy, joint_pos.value)
+        stand = stand_height(compiled, anatomy)
+        height = Guess(stand, "on a stand: the arm hangs" if stand else "base on the ground")
         size = _reach(compiled)
     if "root_height" in settings:
         height = Guess(float(settings["root_height"]), "as set", "set")
     effort, asked = effort_limits(compiled, size, _main_joints(anatomy), answers["effort"])
     questions += asked
-    is_arm = anatomy.kind.value == "arm"
     armature, asked = rotor_inertias(compiled, effort.value, is_arm, answers["armature"])
     questions += asked
+    pose = joint_pos.value
     stiffness, damping = find_gains(
         spec,
         compiled,
         anatomy,
-        joint_pos.value,
+        pose,
         height.value,
         effort.value,
         armature.value,
         answers["stiffness"],
     )
-    if answers["damping"]:
-        damping = Guess(damping.value | answers["damping"], "as set", "set")
     scale = _action_scale(compiled, is_arm, effort.value, stiffness.value)
-    if answers["action_scale"]:
-        scale = Guess(scale.value | answers["action_scale"], "as set", "set")
+    commands = command_ranges(height.value, len(anatomy.feet.value))
     return RobotReport(
         model=model,
         spec=spec,
@@ -137,12 +125,64 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         effort=effort,
         armature=armature,
         stiffness=stiffness,
-        damping=damping,
-        action_scale=scale,
-        pose_tolerance=_pose_tolerance(compiled, anatomy),
-        commands=command_ranges(height.value, len(anatomy.feet.value)),
+        damping=_answered(damping, answers["damping"]),
+        action_scale=_answered(scale, answers["action_scale"]),
+        pose_tolerance=pose_tolerance(compiled, anatomy, pose, height.value),
+        commands=commands if legged else Guess({}, "no legs"),
         questions=tuple(questions),
     )
+
+
+def _load(source: str, settings: dict[str, str], questions: list[Question]) -> RobotModel:
+    """Return the model of a source; of a URDF with the free joint that its names of joints suggest."""
+    if "floating_base" in settings:
+        floating = settings["floating_base"].lower() in ("true", "1", "yes")
+        return load_model(source, floating_base=floating)
+    model = load_model(source)
+    if not model.is_urdf or any(joint.type == geo.FREE for joint in model.spec.joints):
+        return model
+    legs = [
+        j.name for j in model.spec.joints if re.search("hip|knee|ankle|calf|thigh", j.name.lower())
+    ]
+    text = "a URDF has no free joint: true for a robot with legs or wheels, false for an arm"
+    reason = (
+        f"true, because of joint {legs[0]!r}" if legs else "false, no joint is named like a leg's"
+    )
+    questions.append(Question("floating_base", text, reason))
+    return load_model(source, floating_base=True) if legs else model
+
+
+def _find_anatomy(
+    compiled: mujoco.MjModel, settings: dict[str, str], questions: list[Question]
+) -> Anatomy:
+    """Return the parts of the robot with answers, and ask what is doubtful."""
+    kind = settings.get("kind")
+    if kind is not None:
+        check_one_of("Setting kind", kind, get_args(Kind))
+    anatomy = find_anatomy(compiled, kind=cast("Kind | None", kind))
+    if "imu_site" in settings:
+        site = settings["imu_site"]
+        sites = [compiled.site(i).name for i in range(compiled.nsite)]
+        check_one_of("Setting imu_site", site, ["trunk", *sites])
+        guess: Guess[str | None] = Guess(None if site == "trunk" else site, "as set", "set")
+        anatomy = dataclasses.replace(anatomy, imu_site=guess)
+    elif anatomy.kind.value == "legged" and anatomy.imu_site.source == "asked":
+        text = "site of the IMU: no gyro and no site named imu"
+        questions.append(Question("imu_site", text, "trunk, its origin"))
+    if "front" in settings:
+        check_one_of("Setting front", settings["front"], ["x", "-x"])
+        front = Guess(1.0 if settings["front"] == "x" else -1.0, "as set", "set")
+        anatomy = dataclasses.replace(anatomy, front=front)
+    elif anatomy.front.source == "asked":
+        text = (
+            "front of the robot: the toes point along -x of the trunk, and forward of the task is x"
+        )
+        questions.append(Question("front", text, "-x"))
+    return anatomy
+
+
+def _answered(guess: Guess[dict[str, float]], answers: dict[str, float]) -> Guess[dict[str, float]]:
+    return Guess(guess.value | answers, "as set", "set") if answers else guess
 
 
 def _answers(name: str, settings: dict[str, str], model: mujoco.MjModel) -> dict[str, float]:
@@ -171,25 +211,6 @@ def _main_joints(anatomy: Anatomy) -> tuple[str, ...]:
     return anatomy.leg_joints
 
 
-def command_ranges(height: float, feet: int) -> Guess[dict[str, tuple[float, float]]]:
-    """Return the ranges of velocity commands: speeds of equal Froude number v^2 / (g h).
-
-    The Go1 (trunk at 0.28 m) is commanded 1 m/s, the G1 (0.76 m) too.
-    """
-    reference = 0.76 if feet == 2 else 0.28
-    speed = float(np.sqrt(max(height, 1e-3) / reference))
-    turn = 0.5 / speed
-    ranges = {
-        "lin_vel_x": (-speed, speed),
-        "lin_vel_y": (-speed, speed),
-        "ang_vel_z": (-turn, turn),
-    }
-    rule = (
-        f"1 m/s x sqrt(height / {reference} m): Froude number of the {'G1' if feet == 2 else 'Go1'}"
-    )
-    return Guess(ranges, rule)
-
-
 def _action_scale(
     model: mujoco.MjModel, is_arm: bool, effort: dict[str, float], stiffness: dict[str, float]
 ) -> Guess[dict[str, float]]:
@@ -199,23 +220,6 @@ def _action_scale(
         return Guess(scale, "a quarter of half the range")
     scale = {n: float(np.clip(0.25 * effort[n] / stiffness[n], 0.2, 0.5)) for n in effort}
     return Guess(scale, "0.25 x effort / stiffness, between 0.2 and 0.5 rad")
-
-
-def _pose_tolerance(model: mujoco.MjModel, anatomy: Anatomy) -> Guess[dict[str, float]]:
-    tolerance = {model.joint(j).name: 0.3 for j in geo.joint_ids(model)}
-    return Guess(tolerance, "0.3 rad")
-
-
-def _mount_height(
-    model: mujoco.MjModel, anatomy: Anatomy, joint_pos: dict[str, float]
-) -> Guess[float]:
-    data = mujoco.MjData(model)
-    geo.set_pose(model, data, joint_pos)
-    geoms = [model.geom(name).id for name in anatomy.colliding.value]
-    lowest = geo.lowest_height(model, data, geoms)
-    if lowest < -0.02:
-        return Guess(-lowest, "on a stand: the arm hangs below its base")
-    return Guess(0.0, "base on the ground")
 
 
 def _reach(model: mujoco.MjModel) -> float:
