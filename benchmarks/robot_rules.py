@@ -89,7 +89,7 @@ def check(report: RobotReport, truth: dict[str, Any]) -> Iterator[Result]:
     yield "kind", anatomy.kind.value == truth["kind"], anatomy.kind.value
     if "trunk" in truth:
         yield "trunk", anatomy.trunk.value == truth["trunk"], anatomy.trunk.value
-    drives = set(anatomy.drives.value[j] for j in _actuated(report))
+    drives = {anatomy.drives.value[j] for j in _actuated(report)}
     yield "drives", drives == {truth["drives"]}, str(drives)
     yield from check_mirror(report, truth["mirror"])
     yield from check_effort(report, truth["effort"], questions)

@@ -155,7 +155,8 @@ def test_arm_of_a_function(tmp_path: Path, imported) -> None:
     assert built.num_joints == 6
     # The servos of the file are replaced, not doubled.
     assert built.compile().nu == 6
-    assert [row[0] for row in questions_table(package.report).rows] == ["pose"]
+    # Its joints have one effort limit.
+    assert [row[0] for row in questions_table(package.report).rows] == ["pose", "effort"]
 
 
 def test_setting_changes_a_value_and_its_reason(tmp_path: Path) -> None:

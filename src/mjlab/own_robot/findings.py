@@ -18,7 +18,8 @@ from mjlab.own_robot.gains import (
     MAX_SAG,
     STABLE,
     joint_inertias,
-    simulated_sag,
+    rail_model,
+    settle,
     static_torques,
 )
 from mjlab.own_robot.posture import find_posture, ground_height, over_soles
@@ -608,16 +609,16 @@ def _sags(subject: Subject) -> dict[str, float]:
     if not all(subject.stiffness.get(name, 0.0) > 0.0 for name in anatomy.leg_joints):
         return {}
     joint_pos = _standing_pose(subject)
-    sags = simulated_sag(
-        subject.spec,
-        anatomy,
+    # Joints without gains are held.
+    stiffness = {name: subject.stiffness.get(name, _HELD) for name in joint_pos}
+    effort = {name: subject.effort.get(name, _HELD) for name in joint_pos}
+    armature = _by_joint(subject, model.dof_armature)
+    sags = settle(
+        rail_model(subject.spec, model, anatomy, effort, armature),
         joint_pos,
         ground_height(model, mujoco.MjData(model), anatomy, joint_pos),
-        # Joints without gains are held.
-        stiffness := {name: subject.stiffness.get(name, _HELD) for name in joint_pos},
+        stiffness,
         {name: kp / _STIFFNESS_OVER_DAMPING for name, kp in stiffness.items()},
-        {name: subject.effort.get(name, _HELD) for name in joint_pos},
-        _by_joint(subject, model.dof_armature),
     )
     return {name: sags[name] for name in anatomy.leg_joints}
 
