@@ -11,7 +11,7 @@ import pytest
 import torch
 from viewer_fakes import FakeEnv, push
 
-from mjlab.viewer.base import BaseViewer, ViewerAction, reset_policy
+from mjlab.viewer.base import BaseViewer, Steering, ViewerAction, reset_policy
 
 
 class ListViewer(BaseViewer):
@@ -113,6 +113,26 @@ def test_single_steps_count_only_while_paused(viewer) -> None:
     viewer.request_single_step()
     viewer._process_actions()
     assert viewer.env.num_steps == 1
+
+
+def test_steering_reaches_the_commands_of_the_env_in_view(viewer) -> None:
+    for direction in (Steering.FORWARD, Steering.TURN_RIGHT, Steering.STOP):
+        viewer.request_action("steer", direction)
+    viewer._process_actions()
+    assert viewer.env.command_manager.steered == [
+        (0, (0.1, 0.0, 0.0)),
+        (0, (0.0, 0.0, -0.1)),
+        (0, None),
+    ]
+
+
+def test_the_right_arrow_steps_a_paused_simulation(viewer) -> None:
+    viewer.request_toggle_pause()
+    viewer.request_action("steer", Steering.TURN_RIGHT)
+    viewer.request_action("steer", Steering.TURN_LEFT)
+    viewer._process_actions()
+    assert viewer.env.num_steps == 1
+    assert viewer.env.command_manager.steered == [(0, (0.0, 0.0, 0.1))]
 
 
 def test_reset_also_resets_a_policy_with_memory(viewer) -> None:

@@ -87,12 +87,18 @@ class FakeTerms:
         self.active_terms = list(values)
         self.paused: list[bool] = []
         self.gui_resets: list[list[int]] = []
+        self.steered: list = []
 
     def get_active_iterable_terms(self, env_idx: int) -> list[tuple[str, list[float]]]:
         return [(name, [value * (env_idx + 1)]) for name, value in self.values.items()]
 
     def get_term_cfg(self, name: str) -> SimpleNamespace:
         return SimpleNamespace(weight=1.0 if name in self.values else 0.0)
+
+    steerable = True
+
+    def steer(self, change, get_env_idx) -> None:
+        self.steered.append((get_env_idx(), change))
 
     def create_gui(self, server, get_env_idx, on_change=None, request_action=None) -> None:
         server.gui.add_slider("lin_vel_x", -1.0, 1.0, 0.05, 0.0)

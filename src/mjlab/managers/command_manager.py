@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 
@@ -59,6 +59,9 @@ class CommandTerm(ManagerTermBase):
 
     Raises `ValueError` if the config's time range has min > max.
     """
+
+    steerable: ClassVar[bool] = False
+    """True if `steer` changes the command, so that viewers bind and list its keys."""
 
     def __init__(self, cfg: CommandTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(env)
@@ -154,6 +157,19 @@ class CommandTerm(ManagerTermBase):
         request_action: Callable[[str, Any], None] | None = None,
     ) -> None:
         """Add the command's controls to the Viser viewer. Does nothing by default."""
+
+    def steer(
+        self, change: tuple[float, float, float] | None, get_env_idx: Callable[[], int]
+    ) -> None:
+        """Change the command of the environment in view by hand. Does nothing by default.
+
+        Terms with `steerable` override it. Viewers call it for keys, between steps.
+
+        Args:
+            change: Changes of the forward and the left velocity and the rate of turning left, in shares
+                of the largest. None: zero; if it is zero already, sampled commands again.
+            get_env_idx: Returns the environment in view, which may change later.
+        """
 
     def on_viewer_pause(self, paused: bool) -> None:
         """Handle a pause or resume of the viewer. Does nothing by default."""
@@ -255,6 +271,18 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         """Add the controls of all commands to the Viser viewer."""
         for name, term in self._terms.items():
             term.create_gui(name, server, get_env_idx, on_change, request_action)
+
+    @property
+    def steerable(self) -> bool:
+        """True if keys of a viewer can change a command."""
+        return any(term.steerable for term in self._terms.values())
+
+    def steer(
+        self, change: tuple[float, float, float] | None, get_env_idx: Callable[[], int]
+    ) -> None:
+        """Call `steer` of all commands."""
+        for term in self._terms.values():
+            term.steer(change, get_env_idx)
 
     def on_viewer_pause(self, paused: bool) -> None:
         """Notify all commands of a pause or resume of the viewer."""

@@ -102,7 +102,22 @@ class ViewerAction(enum.Enum):
     TOGGLE_DEBUG_VIS = "toggle_debug_vis"
     TOGGLE_SHOW_ALL_ENVS = "toggle_show_all_envs"
     FETCH_CHECKPOINT = "fetch_checkpoint"
+    STEER = "steer"
+    """Change the command of the robot in view. Payload: a `Steering`."""
     CUSTOM = "custom"
+
+
+class Steering(enum.Enum):
+    """Directions of steering; values are (forward, left, turn left), in shares of the largest command."""
+
+    FORWARD = (0.1, 0.0, 0.0)
+    BACKWARD = (-0.1, 0.0, 0.0)
+    LEFT = (0.0, 0.1, 0.0)
+    RIGHT = (0.0, -0.1, 0.0)
+    TURN_LEFT = (0.0, 0.0, 0.1)
+    TURN_RIGHT = (0.0, 0.0, -0.1)
+    STOP = None
+    """Stop; a stopped robot gets sampled commands again."""
 
 
 @dataclass
@@ -205,6 +220,10 @@ class BaseViewer(ABC):
     def handle_action(self, action: ViewerAction, payload: Any) -> bool:
         """Handle an action that `BaseViewer` does not; return False if it is unknown."""
         return False
+
+    def env_in_view(self) -> int:
+        """Return the index of the environment in view, the one that keys steer."""
+        return 0
 
     # Loop.
 
@@ -329,8 +348,21 @@ class BaseViewer(ABC):
             with self._pause_on_error(f"performing action {action.value!r}"):
                 if action in handlers:
                     handlers[action]()
+                elif action is ViewerAction.STEER:
+                    self.steer(payload)
                 elif not self.handle_action(action, payload):
                     self.log(f"Unknown viewer action {action.value!r} (payload {payload!r}).")
+
+    def steer(self, direction: Steering) -> None:
+        """Change the command of the robot in view. Does nothing for tasks whose commands cannot be steered.
+
+        While paused, the key of `TURN_RIGHT`, the right arrow, makes a single step.
+        """
+        if self._paused and direction is Steering.TURN_RIGHT:
+            self._single_step()
+        else:
+            manager = self.env.unwrapped.command_manager
+            manager.steer(direction.value, self.env_in_view)
 
     def _single_step(self) -> None:
         if self._paused and self._total_steps < self._step_limit:

@@ -91,3 +91,48 @@ def test_who_lets_go_finds_the_command_as_it_went_on_below(page):
     joystick.restore(command)
     joystick.write_to(command)
     assert torch.equal(command, drawn)
+
+
+# Keys.
+
+
+def command_of(joystick: VelocityJoystick) -> list[float]:
+    command = torch.full((1, 3), 9.0)
+    joystick.write_to(command)
+    return command[0].tolist()
+
+
+@pytest.mark.parametrize("with_page", [True, False])
+def test_keys_change_the_command_in_tenths_of_the_largest(with_page, page):
+    joystick = VelocityJoystick("twist", page if with_page else None, RANGES, lambda: 0)
+    assert command_of(joystick) == [9.0, 9.0, 9.0]
+    for _ in range(3):
+        joystick.steer((0.1, 0.0, 0.0))
+    joystick.steer((0.0, -0.1, 0.0))
+    assert command_of(joystick) == pytest.approx([0.6, -0.1, 0.0])
+    for _ in range(20):
+        joystick.steer((0.1, 0.0, 0.0))
+    assert command_of(joystick)[0] == 2.0
+    for _ in range(10):
+        joystick.steer((-0.1, 0.0, 0.0))
+    assert command_of(joystick)[0] == 0.0
+
+
+def test_keys_move_the_sliders(page):
+    joystick, _ = make(page, env_idx=0)
+    page.widgets["Forward (m/s)"].set_by_person(1.0)
+    joystick.steer((0.1, 0.0, 0.0))
+    assert page.widgets["Forward (m/s)"].value == pytest.approx(1.2)
+    assert page.widgets["Enable"].value
+
+
+def test_stop_halts_the_robot_and_releases_one_that_stands(page):
+    joystick, _ = make(page, env_idx=0)
+    joystick.steer((0.1, 0.0, 0.1))
+    joystick.steer(None)
+    assert command_of(joystick) == [0.0, 0.0, 0.0]
+    joystick.steer(None)
+    assert command_of(joystick) == [9.0, 9.0, 9.0]
+    # A robot on its own is stopped, too.
+    joystick.steer(None)
+    assert command_of(joystick) == [0.0, 0.0, 0.0]

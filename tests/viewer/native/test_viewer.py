@@ -33,6 +33,26 @@ def test_keys_are_none_that_mujocos_window_uses_itself() -> None:
     assert ACTIONS.get(ord("P")) is None
 
 
+def test_keys_steer_the_environment_in_view() -> None:
+    viewer = NativeMujocoViewer(FakeEnv(3), push())
+    viewer.select_env(2)
+    for code in (keys.KEY_UP, keys.KEY_DELETE, keys.KEY_END, ord("P")):
+        viewer._on_key(code)
+    viewer._process_actions()
+    steered = viewer.env.command_manager.steered
+    assert steered == [(2, (0.1, 0.0, 0.0)), (2, (0.0, 0.1, 0.0)), (2, None)]
+
+
+def test_the_help_lists_each_key() -> None:
+    named = {name[4:]: code for name, code in vars(keys).items() if name.startswith("KEY_")}
+    listed = set()
+    for words, _ in (*keys.KEY_HELP, *keys.STEERING_HELP):
+        for word in words.removesuffix(", paused").split(" / "):
+            listed.add(named[word.upper().replace(" ", "_")])
+    # Further keys of the window.
+    assert listed | {keys.KEY_MINUS, keys.KEY_EQUAL, keys.KEY_F9} == set(ACTIONS)
+
+
 def test_without_a_display_the_error_names_the_browser_viewer(monkeypatch) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)

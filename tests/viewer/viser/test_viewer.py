@@ -92,6 +92,60 @@ def test_environment_number_and_groups_come_from_the_config(viser_server) -> Non
     assert viewer.scene.geom_groups_visible == [True, False, False, True, False, False]
 
 
+def commands(server) -> dict:
+    """Return the commands of a page by hotkey."""
+    handles = server.gui._command_handle_from_uuid.values()
+    return {handle.hotkey: handle for handle in handles}
+
+
+def press(server, *hotkeys: str) -> None:
+    for hotkey in hotkeys:
+        for callback in commands(server)[hotkey]._impl.trigger_cb:
+            callback(None)
+
+
+def test_keys_steer_the_environment_in_view(viser_server) -> None:
+    viewer = make(viser_server)
+    press(viser_server, "7", "arrowup", "pagedown", "6", "end")
+    viewer._process_actions()
+    steered = viewer.env.command_manager.steered
+    assert steered == [(1, (0.1, 0.0, 0.0)), (1, (0.0, -0.1, 0.0)), (0, None)]
+
+
+def test_keys_control_the_simulation(viser_server) -> None:
+    viewer = make(viser_server)
+    press(viser_server, "space", "home", "arrowright", "9")
+    viewer._process_actions()
+    status = viewer.get_status()
+    assert (status.paused, status.speed_multiplier, status.step_count) == (True, 2.0, 1)
+    assert not viewer.scene.debug_visualization_enabled
+    press(viser_server, "insert", "enter", "9", "backspace")
+    viewer._process_actions()
+    status = viewer.get_status()
+    assert (status.speed_multiplier, status.step_count) == (1.0, 0)
+    assert viewer.scene.debug_visualization_enabled
+    assert viewer.scene.show_all_envs
+
+
+def test_a_task_without_steering_has_no_keys_for_it(viser_server, monkeypatch) -> None:
+    monkeypatch.setattr("viewer_fakes.FakeTerms.steerable", False)
+    make(viser_server)
+    assert "space" in commands(viser_server)
+    assert "arrowup" not in commands(viser_server)
+
+
+def test_hotkeys_are_those_of_viser() -> None:
+    from typing import get_args
+
+    from viser._messages import HotkeyKey
+
+    from mjlab.viewer.native.keys import BINDINGS
+
+    used = [binding.hotkey for binding in BINDINGS if binding.hotkey is not None]
+    assert set(used) <= set(get_args(HotkeyKey))
+    assert len(used) == len(set(used))
+
+
 def test_plots_get_one_point_a_step(
     viser_server,
 ) -> None:

@@ -1,12 +1,15 @@
-"""Key bindings of the native window.
+"""Keys of both viewers.
 
-MuJoCo's window binds every letter, `,` and the digits 0 to 5, and handles them even if a callback
-does. The bindings here avoid those keys.
+MuJoCo's window binds every letter, `,`, Page Up and the digits 0 to 5, and handles them even if a callback
+does; in the browser, W, A, S, D, Q and E move the camera. The bindings here avoid those keys, and are the
+same in both viewers. Viser's hotkeys have no minus, equal or function keys: these work in the window only.
 """
 
 from __future__ import annotations
 
-from mjlab.viewer.base import ViewerAction
+from typing import Any, NamedTuple
+
+from mjlab.viewer.base import Steering, ViewerAction
 
 # GLFW key codes, written out because importing glfw loads its shared library.
 KEY_UNKNOWN = -1
@@ -33,26 +36,61 @@ KEY_KP_ADD, KEY_KP_ENTER, KEY_KP_EQUAL = range(334, 337)
 KEY_LEFT_SHIFT, KEY_LEFT_CONTROL, KEY_LEFT_ALT, KEY_LEFT_SUPER = range(340, 344)
 KEY_RIGHT_SHIFT, KEY_RIGHT_CONTROL, KEY_RIGHT_ALT, KEY_RIGHT_SUPER = range(344, 348)
 
-ACTIONS = {
-    KEY_ENTER: ViewerAction.RESET,
-    KEY_SPACE: ViewerAction.TOGGLE_PAUSE,
-    KEY_MINUS: ViewerAction.SPEED_DOWN,
-    KEY_EQUAL: ViewerAction.SPEED_UP,
-    KEY_6: ViewerAction.PREV_ENV,
-    KEY_7: ViewerAction.NEXT_ENV,
-    KEY_8: ViewerAction.TOGGLE_PLOTS,
-    KEY_9: ViewerAction.TOGGLE_DEBUG_VIS,
-    KEY_F9: ViewerAction.TOGGLE_SHOW_ALL_ENVS,
-    KEY_RIGHT: ViewerAction.SINGLE_STEP,
-}
+
+class Binding(NamedTuple):
+    """Key of both viewers, or of the window only, and its action."""
+
+    code: int
+    """GLFW key code, for MuJoCo's window."""
+    hotkey: Any
+    """Viser's name of the key, for the browser. None: the window only."""
+    label: str
+    """Label in the browser's command palette (Ctrl+K)."""
+    action: ViewerAction
+    payload: Steering | None = None
+
+
+_STEER = ViewerAction.STEER
+BINDINGS = (
+    Binding(KEY_UP, "arrowup", "Faster forward", _STEER, Steering.FORWARD),
+    Binding(KEY_DOWN, "arrowdown", "Faster backward", _STEER, Steering.BACKWARD),
+    Binding(KEY_LEFT, "arrowleft", "Turn left", _STEER, Steering.TURN_LEFT),
+    Binding(KEY_RIGHT, "arrowright", "Turn right (paused: single step)", _STEER, Steering.TURN_RIGHT),
+    Binding(KEY_DELETE, "delete", "Step left", _STEER, Steering.LEFT),
+    Binding(KEY_PAGE_DOWN, "pagedown", "Step right", _STEER, Steering.RIGHT),
+    Binding(KEY_END, "end", "Stop; twice: sampled commands", _STEER, Steering.STOP),
+    Binding(KEY_SPACE, "space", "Pause", ViewerAction.TOGGLE_PAUSE),
+    Binding(KEY_ENTER, "enter", "Reset", ViewerAction.RESET),
+    Binding(KEY_INSERT, "insert", "Slower simulation", ViewerAction.SPEED_DOWN),
+    Binding(KEY_HOME, "home", "Faster simulation", ViewerAction.SPEED_UP),
+    Binding(KEY_MINUS, None, "Slower simulation", ViewerAction.SPEED_DOWN),
+    Binding(KEY_EQUAL, None, "Faster simulation", ViewerAction.SPEED_UP),
+    Binding(KEY_6, "6", "Previous environment", ViewerAction.PREV_ENV),
+    Binding(KEY_7, "7", "Next environment", ViewerAction.NEXT_ENV),
+    Binding(KEY_8, None, "Reward plots", ViewerAction.TOGGLE_PLOTS),
+    Binding(KEY_9, "9", "Debug drawings", ViewerAction.TOGGLE_DEBUG_VIS),
+    Binding(KEY_BACKSPACE, "backspace", "Debug drawings of all envs", ViewerAction.TOGGLE_SHOW_ALL_ENVS),
+    Binding(KEY_F9, None, "Debug drawings of all envs", ViewerAction.TOGGLE_SHOW_ALL_ENVS),
+)  # fmt: skip
+"""Keys and their actions."""
+
+ACTIONS = {binding.code: binding.action for binding in BINDINGS}
 """Actions by GLFW key code."""
 
 KEY_HELP = (
-    ("Space / Right", "pause / single step"),
-    ("Enter", "reset"),
-    ("- / =", "slower / faster"),
+    ("Space / Enter", "pause / reset"),
+    ("Right, paused", "single step"),
+    ("Insert / Home", "slower / faster"),
     ("6 / 7", "previous / next env"),
-    ("8", "reward plots"),
-    ("9 / F9", "debug drawings / of all envs"),
+    ("8", "reward plots (window)"),
+    ("9 / Backspace", "debug drawings / of all envs"),
 )
-"""Keys and their actions, as shown in the window."""
+"""Keys and their actions, as shown in the viewers."""
+
+STEERING_HELP = (
+    ("Up / Down", "faster forward / backward"),
+    ("Left / Right", "turn left / right"),
+    ("Delete / Page Down", "step left / right"),
+    ("End", "stop; twice: sampled commands"),
+)
+"""Keys that steer the robot, as shown in the viewers of tasks with such commands."""

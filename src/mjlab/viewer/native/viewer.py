@@ -29,7 +29,7 @@ from mjlab.viewer.model_sync import (
     sync_model_fields,
     to_numpy,
 )
-from mjlab.viewer.native.keys import ACTIONS, KEY_HELP
+from mjlab.viewer.native.keys import BINDINGS, KEY_HELP, STEERING_HELP
 from mjlab.viewer.native.visualizer import MujocoNativeDebugVisualizer, add_moving_geoms
 from mjlab.viewer.offscreen_renderer import RenderingUnavailableError, move_sun, prepare_sun
 
@@ -43,6 +43,7 @@ log = logging.getLogger(__name__)
 
 _MARKER_COLOR = (0.9, 0.1, 0.1, 0.9)
 _CLOSING_TIMEOUT_S = 5.0
+_BINDINGS = {binding.code: binding for binding in BINDINGS}
 
 
 @dataclass
@@ -228,6 +229,9 @@ class NativeMujocoViewer(BaseViewer):
             return False
         return True
 
+    def env_in_view(self) -> int:
+        return self.env_idx
+
     def select_env(self, env_idx: int) -> None:
         """Show environment `env_idx` modulo `num_envs`; release a push on the previous one."""
         self._push.release(self.env.unwrapped.sim)
@@ -236,9 +240,9 @@ class NativeMujocoViewer(BaseViewer):
 
     def _on_key(self, key: int) -> None:
         # Called in the window's thread; the main thread performs the action.
-        action = ACTIONS.get(key)
-        if action is not None:
-            self.request_action(action.value)
+        binding = _BINDINGS.get(key)
+        if binding is not None:
+            self.request_action(binding.action.value, binding.payload)
         if self._user_key_callback is not None:
             self._user_key_callback(key)
 
@@ -321,7 +325,8 @@ class NativeMujocoViewer(BaseViewer):
         font = int(mujoco.mjtFontScale.mjFONTSCALE_150)
         top, bottom = mujoco.mjtGridPos.mjGRID_TOPLEFT, mujoco.mjtGridPos.mjGRID_BOTTOMLEFT
         names, values = ("\n".join(column) for column in zip(*rows, strict=True))
-        keys, meanings = ("\n".join(column) for column in zip(*KEY_HELP, strict=True))
+        steering = STEERING_HELP if self.env.unwrapped.command_manager.steerable else ()
+        keys, meanings = ("\n".join(column) for column in zip(*steering, *KEY_HELP, strict=True))
         return [(font, int(top), names, values), (font, int(bottom), keys, meanings)]
 
 

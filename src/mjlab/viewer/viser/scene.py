@@ -93,6 +93,8 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             self._tracked_body_id = view.body_id or self._tracked_body_id
         self.debug_visualization_enabled = True
         self.show_all_envs = False
+        self._env_slider: viser.GuiSliderHandle[int] | None = None
+        self._switches: dict[str, viser.GuiCheckboxHandle] = {}
         self._sim_model = sim_model
         self._expanded_fields = (expanded_fields or set()) if sim_model is not None else set()
         self._variants = GeomVariants(self, sim_model, self._expanded_fields)
@@ -177,6 +179,17 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
             body_xpos, body_xmat, mocap_pos, mocap_quat, env_idx, qpos, qvel, ctrl
         )
 
+    def select_env(self, env_idx: int) -> None:
+        """Show environment `env_idx` modulo `num_envs`, as the slider of the page does."""
+        if self._env_slider is not None:
+            self._env_slider.value = env_idx % self.num_envs
+
+    def toggle(self, attribute: str) -> None:
+        """Toggle the checkbox of an attribute of the scene, if the page has it."""
+        switch = self._switches.get(attribute)
+        if switch is not None:
+            switch.value = not switch.value
+
     def aim(self) -> None:
         """Move the camera of every connected client to the configured view."""
         for client in self.server.get_clients().values():
@@ -213,7 +226,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         gui = self.server.gui
         if self.num_envs > 1:
             with gui.add_folder("Environment"):
-                select = gui.add_slider(
+                select = self._env_slider = gui.add_slider(
                     "Select", 0, self.num_envs - 1, 1, self.env_idx,
                     hint=f"Environment in view, 0 to {self.num_envs - 1}.",
                 )  # fmt: skip
@@ -316,6 +329,7 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
     def _add_switch(self, label: str, attribute: str, **options: Any) -> None:
         """Add a checkbox that sets an attribute of the scene and redraws."""
         switch = self.server.gui.add_checkbox(label, getattr(self, attribute), **options)
+        self._switches[attribute] = switch
 
         @switch.on_update
         def _(_: Any) -> None:

@@ -25,6 +25,7 @@ from mjlab.utils.os import files_in
 from mjlab.utils.string import encodable, escaped
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, reset_policy
 from mjlab.viewer.camera import resolve_camera
+from mjlab.viewer.native.keys import BINDINGS, KEY_HELP, STEERING_HELP, Binding
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
 from mjlab.viewer.page_server import DEFAULT_PORT as DEFAULT_PORT
 from mjlab.viewer.page_server import page_url, serve_page
@@ -247,11 +248,24 @@ class ViserPlayViewer(BaseViewer):
                 self.policy = policy
                 self.reset_environment()
             return True
+        scene = self.scene
+        if action in (ViewerAction.PREV_ENV, ViewerAction.NEXT_ENV):
+            scene.select_env(scene.env_idx + (1 if action is ViewerAction.NEXT_ENV else -1))
+            return True
+        if action is ViewerAction.TOGGLE_DEBUG_VIS:
+            scene.toggle("debug_visualization_enabled")
+            return True
+        if action is ViewerAction.TOGGLE_SHOW_ALL_ENVS:
+            scene.toggle("show_all_envs")
+            return True
         # Command panels send gui_reset to start from the state that they show.
         if isinstance(payload, dict) and payload.get("type") == "gui_reset":
             self._gui_reset(all_envs=bool(payload.get("all_envs", True)))
             return True
         return False
+
+    def env_in_view(self) -> int:
+        return self.scene.env_idx
 
     def _create_gui(self) -> None:
         gui, scene, env = self._server.gui, self.scene, self.env.unwrapped
@@ -272,6 +286,7 @@ class ViserPlayViewer(BaseViewer):
                 )
             if not folder._children:
                 folder.remove()
+            add_keys(self._server, env.command_manager.steerable, self.request_action)
             with gui.add_folder("Scene"):
                 scene.create_scene_gui(debug_viz_extra_gui=add_debug_vis_switches)
             self._camera_overlays.setup_controls()
@@ -315,6 +330,33 @@ class ViserPlayViewer(BaseViewer):
             dones = torch.zeros(env.num_envs, device=env.device).index_fill_(0, ids, 1)
             reset_policy(self.policy, dones)
         self.after_reset()
+
+
+def add_keys(
+    server: viser.ViserServer, steerable: bool, request_action: Callable[..., None]
+) -> None:
+    """Bind the keys of the page, and list them in a folder.
+
+    Args:
+        server: The page's server.
+        steerable: Bind and list the keys that steer the robot.
+        request_action: Queues a viewer action by name, with a payload, for the main thread.
+    """
+    for binding in BINDINGS:
+        if binding.hotkey is None or (binding.action is ViewerAction.STEER and not steerable):
+            continue
+        command = server.gui.add_command(binding.label, hotkey=binding.hotkey)
+
+        @command.on_trigger
+        def _(_event: Any, binding: Binding = binding) -> None:
+            request_action(binding.action.value, binding.payload)
+
+    rows = "".join(
+        f"<div><strong>{keys}:</strong> {meaning}</div>"
+        for keys, meaning in (*(STEERING_HELP if steerable else ()), *KEY_HELP)
+    )
+    with server.gui.add_folder("Keys", expand_by_default=False):
+        server.gui.add_html(f'<div style="padding:0 1em;font-size:0.85em">{rows}</div>')
 
 
 class SimulationControls:

@@ -130,6 +130,7 @@ class UniformVelocityCommand(CommandTerm):
     """
 
     cfg: UniformVelocityCommandCfg
+    steerable = True
 
     def __init__(self, cfg: UniformVelocityCommandCfg, env: ManagerBasedRlEnv) -> None:
         # Copy the ranges, because curricula edit them at run time.
@@ -226,6 +227,14 @@ class UniformVelocityCommand(CommandTerm):
             viz.show_measured = measured.value
             if on_change is not None:
                 on_change()
+
+    def steer(
+        self, change: tuple[float, float, float] | None, get_env_idx: Callable[[], int]
+    ) -> None:
+        """Change the command of the environment in view; it then holds until it is changed again."""
+        if self._joystick is None:
+            self._joystick = VelocityJoystick(self.name, None, self.ranges, get_env_idx)
+        self._joystick.steer(change)
 
     # Sampling.
 

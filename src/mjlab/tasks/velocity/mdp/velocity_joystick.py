@@ -1,8 +1,9 @@
-"""Velocity joystick: sliders in the browser viewer that command the environment in view."""
+"""Velocity joystick: sliders and keys of a viewer that command the environment in view."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -21,21 +22,21 @@ _COMPONENTS = {
 
 
 class VelocityJoystick:
-    """Panel with one slider per command component, and one for the limit of each."""
+    """Velocity set by hand. In the browser: one slider per component, and one for the limit of each."""
 
     def __init__(
         self,
         name: str,
-        server: viser.ViserServer,
+        server: viser.ViserServer | None,
         ranges: Any,
         get_env_idx: Callable[[], int],
         on_change: Callable[[], None] | None = None,
     ) -> None:
-        """Add the panel to the current GUI container.
+        """Start disabled, at zero; add the panel to the current GUI container.
 
         Args:
             name: Title of the panel.
-            server: Viser server.
+            server: Viser server. None: no panel, for keys in MuJoCo's window.
             ranges: `UniformVelocityCommandCfg.Ranges`; slider limits are their largest magnitudes.
             get_env_idx: Returns the environment in view.
             on_change: Called after every change.
@@ -44,13 +45,20 @@ class VelocityJoystick:
         self._on_change = on_change
         self._sliders: list[Any] = []
         self._replaced: tuple[int, torch.Tensor] | None = None
+        limits = [_limit(getattr(ranges, component)) for component in _COMPONENTS]
+        if server is None:
+            self._enabled: Any = SimpleNamespace(value=False)
+            self._sliders = [SimpleNamespace(value=0.0, min=-high, max=high) for high in limits]
+        else:
+            self._create_panel(name, server, limits)
+
+    def _create_panel(self, name: str, server: viser.ViserServer, limits: list[float]) -> None:
         with server.gui.add_folder(name.capitalize()):
             self._enabled = server.gui.add_checkbox(
                 "Enable",
                 False,
                 hint="Command the environment in view by these sliders. Moving one enables them.",
             )
-            limits = [_limit(getattr(ranges, component)) for component in _COMPONENTS]
             for label, limit in zip(_COMPONENTS.values(), limits, strict=True):
                 self._sliders.append(server.gui.add_slider(label, -limit, limit, _STEP, 0.0))
                 self._sliders[-1].on_update(self._moved)
@@ -64,8 +72,7 @@ class VelocityJoystick:
 
         @zero.on_click
         def _(_event: Any) -> None:
-            for slider in self._sliders:
-                slider.value = 0.0
+            self._zero()
 
     def _add_maximum(
         self, server: viser.ViserServer, label: str, slider: Any, limit: float
@@ -78,6 +85,19 @@ class VelocityJoystick:
         def _(_event: Any) -> None:
             slider.value = min(max(slider.value, -maximum.value), maximum.value)
             slider.min, slider.max = -maximum.value, maximum.value
+
+    def steer(self, change: tuple[float, float, float] | None) -> None:
+        """Enable the joystick and move it; see `CommandTerm.steer`."""
+        if change is None:
+            is_stopped = all(slider.value == 0.0 for slider in self._sliders)
+            self._enabled.value = not (self._enabled.value and is_stopped)
+            self._zero()
+            return
+        self._enabled.value = True
+        for slider, share in zip(self._sliders, change, strict=True):
+            moved = slider.value + share * slider.max
+            # Without rounding, ten steps forth and back do not end at zero.
+            slider.value = round(min(max(moved, slider.min), slider.max), 6)
 
     def restore(self, command: torch.Tensor) -> None:
         """Restore the row of `command`, (N, 3), that `write_to` overwrote last, if any."""
@@ -93,6 +113,10 @@ class VelocityJoystick:
             self._replaced = index, command[index].clone()
             values = [float(slider.value) for slider in self._sliders]
             command[index] = torch.tensor(values, dtype=command.dtype, device=command.device)
+
+    def _zero(self) -> None:
+        for slider in self._sliders:
+            slider.value = 0.0
 
     def _moved(self, event: Any) -> None:
         # Enable on user input only; `Zero` and `Max` set sliders without a client.
