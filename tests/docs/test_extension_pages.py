@@ -1,4 +1,4 @@
-"""The worked diffs of *Add a term, a sensor, an actuator, an engine* apply, and their tests pass."""
+"""The worked diffs of *Add a term, a command, a sensor, ...* apply, their code runs, and their tests pass."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_diffs_apply_and_are_short(page: Path) -> None:
 
 
 @pytest.mark.slow
-def test_tests_of_the_diffs_pass(tmp_path: Path) -> None:
+def test_code_runs_and_tests_of_the_diffs_pass(tmp_path: Path) -> None:
     for name in ("src", "tests"):
         shutil.copytree(ROOT / name, tmp_path / name)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
@@ -40,7 +40,10 @@ def test_tests_of_the_diffs_pass(tmp_path: Path) -> None:
         for text in diffs(page):
             apply(text, tmp_path)
             files += re.findall(r"^\+\+\+ b/(tests/\S+)", text, re.MULTILINE)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "src")}
+    for page in PAGES:
+        code = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+        subprocess.run([sys.executable, "-c", "\n".join(code)], env=environment, check=True)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files]
     subprocess.run(command, cwd=tmp_path, env=environment, check=True)
     assert len(files) == len(PAGES)
