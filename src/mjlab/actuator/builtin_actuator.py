@@ -17,6 +17,7 @@ from mjlab.actuator.actuator import (
     TransmissionType,
     constant_within_step,
 )
+from mjlab.compat import suggests_fields
 from mjlab.utils.errors import check_one_of, check_positive
 from mjlab.utils.mujoco import CommandField
 from mjlab.utils.spec import (
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from mjlab.entity.entity import Entity
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class BuiltinPositionActuatorCfg(ActuatorCfg):
     """Position servo, see `BuiltinPositionActuator`."""

@@ -9,6 +9,7 @@ import mujoco
 import torch
 
 from mjlab.actuator.actuator import Actuator, ActuatorCfg, ActuatorCmd
+from mjlab.compat import suggests_fields
 from mjlab.sim.simulation import SharedField
 from mjlab.utils.indexing import EnvIds, as_ids
 from mjlab.utils.spec import create_motor_actuator
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from mjlab.entity.entity import Entity
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class IdealPdActuatorCfg(ActuatorCfg):
     """PD control, see `IdealPdActuator`."""

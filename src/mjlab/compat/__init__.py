@@ -7,6 +7,7 @@ renamed or removed. A module or class where they arrive says so in one line:
 - `@offers_older_attributes` on a class: attributes of its instances;
 - `@accepts_older_fields` on a config class: keyword arguments of its constructor;
 - `accept_older_methods(term)` in the command manager: signatures of a term's methods;
+- `@suggests_attributes` and `@suggests_fields` on a class: names of Isaac Lab, in error messages only;
 - `translate_older(cfg)` in the environment: terms of a config, `@accepts_older_params` on a term: calls.
 
 Each use warns once and names the replacement. Legacy names stay through 1.x and are removed in 2.0.
@@ -160,7 +161,10 @@ def older_names(module_name: str, exports: list[str] | None = None) -> Callable[
     def __getattr__(name: str) -> Any:
         path = table.get(name) or _PASSED_ON.get(name)
         if path is None:
-            raise AttributeError(f"module {module_name!r} has no attribute {name!r}")
+            owner = "mdp" if ".mdp" in module_name else ""
+            raise AttributeError(
+                f"module {module_name!r} has no attribute {name!r}{_counterpart(owner, name)}"
+            )
         value = pkgutil.resolve_name(path)
         # Legacy functions warn when they are called, because `import *` reads them.
         warns_later = path.startswith(_COMPAT) and inspect.isfunction(value)
@@ -335,6 +339,59 @@ def accepts_older_fields(config_class: C) -> C:
             _warn_once(f"{cls.__name__}.{name} is deprecated; use {today}.")
             if translate is not None:
                 translate(value, kwargs)
+        init(self, *args, **kwargs)
+
+    cls.__init__ = __init__
+    return config_class
+
+
+# Names of Isaac Lab.
+
+
+def _counterpart(owner: str, name: str) -> str:
+    """Return "; use X" if Isaac Lab's `name` is X here, else an empty string."""
+    from mjlab.compat.isaac_lab import ATTRIBUTES
+
+    today = ATTRIBUTES.get(owner, {}).get(name)
+    return "" if today is None else f"; use {today}."
+
+
+def suggests_attributes(cls: C) -> C:
+    """Class decorator: name the attribute here in the error for one of Isaac Lab."""
+
+    def __getattr__(self: Any, name: str) -> Any:
+        try:
+            # Raises the error again, which may be of a property's code.
+            return object.__getattribute__(self, name)
+        except AttributeError as error:
+            use = "" if hasattr(type(self), name) else _counterpart(cls.__name__, name)
+            if not use:
+                raise
+            raise AttributeError(f"{error}{use}", name=name, obj=self) from None
+
+    cast("Any", cls).__getattr__ = __getattr__
+    return cls
+
+
+def suggested_field(config_class: type, name: str) -> str | None:
+    """Return the field of a config class that Isaac Lab calls `name`, None if there is none."""
+    from mjlab.compat.isaac_lab import FIELDS
+
+    today = FIELDS.get(name)
+    return today if today in getattr(config_class, "__dataclass_fields__", ()) else None
+
+
+def suggests_fields(config_class: C) -> C:
+    """Class decorator of configs: name the field here in the error for one of Isaac Lab."""
+    cls: Any = config_class
+    init = cls.__init__
+
+    @functools.wraps(init)
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
+        for name in kwargs:
+            today = None if name in cls.__dataclass_fields__ else suggested_field(cls, name)
+            if today is not None:
+                raise TypeError(f"{cls.__name__}: unknown field {name!r}; use {today}.")
         init(self, *args, **kwargs)
 
     cls.__init__ = __init__

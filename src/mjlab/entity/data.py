@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mjlab.compat import offers_older_attributes, older_names
+from mjlab.compat import offers_older_attributes, older_names, suggests_attributes
 from mjlab.entity.indexing import Addresses, EntityIndexing, Ids
 from mjlab.utils.errors import UnsupportedError
 from mjlab.utils.indexing import EnvIds, as_ids, as_index, read_columns
@@ -18,6 +18,7 @@ from mjlab.utils.state import stateful
 
 
 @offers_older_attributes
+@suggests_attributes
 @stateful
 @dataclass(eq=False)
 class EntityData:

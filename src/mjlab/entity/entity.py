@@ -16,6 +16,7 @@ from mjlab.actuator.builtin_group import BuiltinActuatorGroup
 from mjlab.actuator.fused_group import FusedActuatorGroup
 from mjlab.actuator.position_hold import PositionHold
 from mjlab.actuator.xml_actuator import XML_TRANSMISSIONS
+from mjlab.compat import suggests_attributes, suggests_fields
 from mjlab.entity.building import (
     KEY_NAME,
     Found,
@@ -55,6 +56,7 @@ class EntityArticulationInfoCfg:
     """Range of the soft joint limits as a fraction of the joint range, about the same center."""
 
 
+@suggests_fields
 @dataclass
 class EntityCfg:
     """Entity configuration: any MuJoCo spec, with floating or fixed base, with or without joints.
@@ -108,6 +110,7 @@ class EntityCfg:
         return Entity(self)
 
 
+@suggests_attributes
 @stateful
 class Entity:
     """Simulated robot or object. Built from its config; `initialize` binds it to a simulation.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.compat import translate_older
+from mjlab.compat import suggests_attributes, translate_older
 from mjlab.envs import curriculum_state, env_state
 from mjlab.envs.cfg_checks import check_env_cfg, report_odd_times, report_start
 from mjlab.envs.final_observations import final_observations
@@ -111,6 +111,7 @@ class ManagerBasedRlEnvCfg:
     """Multiply rewards by the control timestep (s)."""
 
 
+@suggests_attributes
 class ManagerBasedRlEnv(Tabular):
     """N environments stepped in parallel. All tensors have a leading dimension N.
 

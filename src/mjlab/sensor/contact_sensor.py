@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import mujoco
 import torch
 
-from mjlab.compat import offers_older_attributes
+from mjlab.compat import offers_older_attributes, suggests_attributes, suggests_fields
 from mjlab.sensor.sensor import Sensor, SensorCfg
 from mjlab.utils.errors import WrongStateError, check_one_of
 from mjlab.utils.memory import check_memory
@@ -64,6 +64,7 @@ _FORCE_SCALE = 0.005
 logger = logging.getLogger(__name__)
 
 
+@suggests_fields
 @dataclass
 class ContactSensorCfg(SensorCfg):
     """Contact sensor configuration: contacts of `primary` with `secondary`, or with any geom."""
@@ -119,6 +120,7 @@ class ContactMatch:
         return (self.pattern,) if isinstance(self.pattern, str) else tuple(self.pattern)
 
 
+@suggests_attributes
 @dataclass
 class ContactData:
     """Contact data of N environments. Fields not in `cfg.fields` are None."""

@@ -7,6 +7,8 @@ import warnings
 from collections.abc import Iterator
 from typing import Any
 
+from mjlab.compat import suggested_field
+
 
 def check_fields_exist(owner: str, cfg: Any) -> None:
     """Warn, once, of public attributes that were set on mjlab's configs in `cfg` and are no fields."""
@@ -28,7 +30,8 @@ def _unknown(path: str, value: Any, seen: set[int]) -> Iterator[str]:
             if name in fields:
                 yield from _unknown(f"{path}.{name}", item, seen)
             elif is_ours and not name.startswith("_") and not hasattr(type(value), name):
-                close = difflib.get_close_matches(name, fields, n=1)
+                today = suggested_field(type(value), name)
+                close = [today] if today else difflib.get_close_matches(name, fields, n=1)
                 yield f"{path}.{name}" + "".join(f" (did you mean {c!r}?)" for c in close)
 
 

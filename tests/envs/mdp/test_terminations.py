@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from mjlab.envs.mdp import terminations
+from mjlab.managers.scene_entity_config import SceneEntityCfg
 
 
 def test_tilt_and_height_of_the_root(make_world: Any) -> None:
@@ -36,6 +37,19 @@ def test_a_tilt_beyond_what_acos_takes_is_no_nan() -> None:
     assert terminations.bad_orientation(env, limit_angle=0.5).tolist() == [False, True, True]
     # The observation is not clamped on the way.
     assert torch.equal(data.projected_gravity_b, down)
+
+
+def test_joints_beyond_their_soft_limits(make_world: Any) -> None:
+    world = make_world()
+    # Soft limits: hip +-0.9, knee -1.875 to 0.375; the ankle has none.
+    world.sim.data.qpos[:, 7:] = torch.tensor(
+        [[0.8, 0.3, 9.0], [0.95, 0.0, 0.0], [0.0, -1.9, 0.0], [-0.8, -1.8, -9.0]]
+    )
+    beyond = terminations.joint_pos_out_of_limit(world)
+    assert beyond.tolist() == [False, True, True, False]
+    hip = SceneEntityCfg("robot", joint_names=("hip",))
+    hip.resolve(world.scene)
+    assert terminations.joint_pos_out_of_limit(world, hip).tolist() == [False, True, False, False]
 
 
 def test_time_out_is_reached_at_the_maximum_length(make_world: Any) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from mjlab.compat import suggests_fields
 from mjlab.envs.mdp.frames import Frame, FrameType
 from mjlab.envs.mdp.reachable_poses import draw_reachable_poses
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
@@ -43,6 +44,7 @@ _COUNTED_PART = 0.95
 _GOAL_SIZE, _FRAME_SIZE = 0.12, 0.08
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class UniformPoseCommandCfg(CommandTermCfg):
     """Pose command configuration."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from mjlab.managers.scene_entity_config import SceneEntityCfg
+from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.utils.nan_guard import NanGuard
 
 if TYPE_CHECKING:
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "bad_orientation",
+    "illegal_contact",
+    "joint_pos_out_of_limit",
     "nan_detection",
     "root_height_below_minimum",
     "time_out",
@@ -47,6 +49,17 @@ def root_height_below_minimum(
     """True where the root is below `minimum_height` (m) in world coordinates."""
     asset: Entity = env.scene[asset_cfg.name]
     return asset.data.root_link_pos_w[:, 2] < minimum_height
+
+
+def joint_pos_out_of_limit(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """True where a selected joint is beyond its soft position limits."""
+    asset: Entity = env.scene[asset_cfg.name]
+    joints = columns_of(asset_cfg, "joint", env)
+    position = asset.data.joint_pos[:, joints]
+    low, high = asset.data.soft_joint_pos_limits[:, joints].unbind(-1)
+    return ((position < low) | (position > high)).any(dim=1)
 
 
 def illegal_contact(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.actuator.actuator import TransmissionType, constant_within_step
+from mjlab.compat import suggests_fields
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.managers.manager_base import label_errors
 from mjlab.utils.indexing import as_columns
@@ -182,6 +183,7 @@ class BaseAction(ActionTerm):
         return per_target.repeat(self.num_envs, 1)
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class JointPositionActionCfg(BaseActionCfg):
     """Joint position target configuration."""
@@ -217,6 +219,7 @@ class JointPositionAction(BaseAction):
         )
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class RelativeJointPositionActionCfg(BaseActionCfg):
     """Relative joint position target configuration. `offset` must be 0."""
@@ -244,6 +247,7 @@ class RelativeJointPositionAction(BaseAction):
         self._entity.set_joint_position_target(target, joint_ids=self._columns)
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class JointVelocityActionCfg(BaseActionCfg):
     """Joint velocity target configuration."""
@@ -272,6 +276,7 @@ class JointVelocityAction(BaseAction):
         self._entity.set_joint_velocity_target(self._processed_actions, joint_ids=self._columns)
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class JointEffortActionCfg(BaseActionCfg):
     """Joint effort target configuration."""

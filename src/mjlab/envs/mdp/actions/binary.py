@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.actuator.actuator import constant_within_step
+from mjlab.compat import suggests_fields
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.managers.manager_base import label_errors
 from mjlab.utils.indexing import as_columns
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class BinaryJointPositionActionCfg(ActionTermCfg):
     """Joint positions of an open or a closed gripper. `clip` has no effect."""

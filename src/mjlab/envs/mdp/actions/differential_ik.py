@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, get_args
 
 import torch
 
-from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names
+from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names, suggests_fields
 from mjlab.envs.mdp.frames import Frame, FrameType
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.utils.errors import check_one_of
@@ -34,6 +34,7 @@ _MAX_TARGET = 1.0e6
 _WEIGHTS = ("position_weight", "orientation_weight", "joint_limit_weight", "posture_weight")
 
 
+@suggests_fields
 @accepts_older_fields
 @dataclass(kw_only=True)
 class DifferentialIKActionCfg(ActionTermCfg):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from mjlab.actuator.actuator import DirectActuator
+from mjlab.compat import suggests_fields
 from mjlab.envs.mdp.frames import Frame, FrameType
 from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.utils.errors import check_fields_positive
@@ -26,6 +27,7 @@ _MIN_QUAT_NORM = 1.0e-6
 _RIDGE = 1.0e-3
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class OperationalSpaceControllerActionCfg(ActionTermCfg):
     """Pose target of one frame, tracked by joint efforts. `clip` has no effect.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mjlab.compat import older_names
+from mjlab.compat import older_names, suggests_fields
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.tasks.velocity.mdp.velocity_joystick import VelocityJoystick
 from mjlab.utils.indexing import as_ids, is_empty
@@ -40,6 +40,7 @@ _MIN_FORWARD_SPEED = 0.3
 """Minimum speed of forward commands (m/s)."""
 
 
+@suggests_fields
 @dataclass(kw_only=True)
 class UniformVelocityCommandCfg(CommandTermCfg):
     """Uniform velocity command configuration."""
