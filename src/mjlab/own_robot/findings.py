@@ -49,6 +49,8 @@ _MIN_GYRATION, _MAX_GYRATION = 1 / 30, 1.5
 _MIN_DENSITY, _MAX_DENSITY = 1.2, 20_000.0
 # Stiffness and effort limit of joints without gains (N m/rad, N m), and 1 / s.
 _HELD, _STIFFNESS_OVER_DAMPING = 1e3, 15.0
+# Half the size of a marker (m): virtual links of two-axis joints have one.
+_MARKER = 2e-3
 _LISTED = 4
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 _GROUND = (_PLANE, int(mujoco.mjtGeom.mjGEOM_HFIELD))
@@ -159,7 +161,7 @@ def _zero_armature(subject: Subject) -> Iterator[Finding]:
 
 
 def _soft_gains(subject: Subject) -> Iterator[Finding]:
-    sags = _sags(subject) if _has_gravity(subject) else {}
+    sags = _sags(subject) if _has_gravity(subject) and subject.is_upright else {}
     found = [name for name, sag in sags.items() if sag > MAX_SAG]
     if found:
         worst = max(found, key=lambda name: sags[name])
@@ -176,7 +178,7 @@ def _soft_gains(subject: Subject) -> Iterator[Finding]:
 
 
 def _weak_effort(subject: Subject) -> Iterator[Finding]:
-    if not _has_gravity(subject):
+    if not (_has_gravity(subject) and subject.is_upright):
         return
     torques = _static_torques(subject)
     found = [
@@ -247,7 +249,7 @@ def _absurd_masses(subject: Subject) -> Iterator[Finding]:
 
 
 def _asymmetry(subject: Subject) -> Iterator[Finding]:
-    mirror = subject.anatomy.mirror.value
+    mirror = subject.anatomy.mirror.value if subject.is_upright else {}
     pairs = [(name, partner) for name, (partner, _) in mirror.items() if name < partner]
     for quantity, values in _of_joints(subject).items():
         found = {
@@ -471,13 +473,7 @@ def _static_bodies(subject: Subject) -> Iterator[Finding]:
 
 def _seen_by_rays(subject: Subject) -> Iterator[Finding]:
     model = subject.model
-    if geo.free_joint(model) is None:
-        return
-    found = [
-        g
-        for g in geo.colliding_geoms(model)
-        if model.geom_group[g] in subject.ray_groups and model.body_weldid[model.geom_bodyid[g]]
-    ]
+    found = [g for g in _own_geoms(subject) if model.geom_group[g] in subject.ray_groups]
     if found:
         groups = sorted({int(model.geom_group[g]) for g in found})
         yield Finding(
@@ -527,7 +523,12 @@ def _unnamed_feet(subject: Subject) -> Iterator[Finding]:
 def _undriven(subject: Subject) -> Iterator[Finding]:
     model = subject.model
     is_equality = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
-    coupled = {*model.eq_obj1id[is_equality], *model.eq_obj2id[is_equality]}
+    in_tendon = model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT
+    coupled = {
+        *model.eq_obj1id[is_equality],
+        *model.eq_obj2id[is_equality],
+        *model.wrap_objid[in_tendon],
+    }
     hanging = [
         name
         for name in subject.joint_pos
@@ -656,23 +657,42 @@ def _link_inertia(subject: Subject, link: int) -> tuple[float, np.ndarray, np.nd
 
 
 def _extent(subject: Subject, link: int) -> tuple[np.ndarray, float]:
-    """Return the corners of the boxes of a link's geoms in the world, (P, 3), and their volume (m^3)."""
+    """Return where a link reaches in the world, (P, 3), and the volume of its geoms' boxes (m^3).
+
+    Points are the corners of the boxes, and the links that hang on it. Geoms of millimeters
+    are markers; of a link with these only, both are empty.
+    """
     model, data = subject.model, subject.data
     signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
     corners, volume = [], 0.0
     for g in np.flatnonzero(model.body_weldid[model.geom_bodyid] == link):
         center, half = model.geom_aabb[g, :3], model.geom_aabb[g, 3:]
+        if half.max() <= _MARKER:
+            continue
         local = center + signs * half
         corners.append(data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T)
         volume += float(np.prod(2.0 * half))
-    return np.concatenate(corners) if corners else np.zeros((0, 3)), volume
+    if not corners:
+        return np.zeros((0, 3)), 0.0
+    below = [b for b in geo.links(model) if geo.parent_link(model, b) == link]
+    return np.concatenate([*corners, data.xpos[below]]), volume
+
+
+def _own_geoms(subject: Subject) -> list[int]:
+    """Return the colliding geoms of the tree with the free joint; none without one."""
+    model, free = subject.model, geo.free_joint(subject.model)
+    root = -1 if free is None else int(model.jnt_bodyid[free])
+    colliding = geo.colliding_geoms(model)
+    return [g for g in colliding if model.body_rootid[model.geom_bodyid[g]] == root]
 
 
 def _ground_height(subject: Subject) -> float:
-    """Return the height of the highest static plane; 0 without one."""
-    model = subject.model
+    """Return the height of the highest level static plane; 0 without one."""
+    model, data = subject.model, subject.data
     static = (model.geom_type == _PLANE) & (model.body_weldid[model.geom_bodyid] == 0)
-    return float(subject.data.geom_xpos[static, 2].max(initial=-np.inf)) if static.any() else 0.0
+    # Others are walls.
+    ground = static & (data.geom_xmat[:, 8] > 0.99)
+    return float(data.geom_xpos[ground, 2].max()) if ground.any() else 0.0
 
 
 def _has_steps(subject: Subject) -> bool:

@@ -60,6 +60,16 @@ class Subject:
             for j in geo.joint_ids(self.model)
         }
 
+    @property
+    def is_upright(self) -> bool:
+        """True if the trunk's z axis points up at `qpos0`, as postures and mirror pairs assume."""
+        free = geo.free_joint(self.model)
+        if free is None:
+            return True
+        start = self.model.jnt_qposadr[free] + 3
+        _, x, y, _ = self.model.qpos0[start : start + 4]
+        return bool(x * x + y * y < 0.05)
+
     def place(self, element: Any) -> str:
         """Return file and line of an element of the spec; its path in the model if it has none."""
         line = None if self.lines is None else self.lines.of(element)
