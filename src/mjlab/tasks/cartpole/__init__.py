@@ -25,6 +25,7 @@ register_mjlab_task(
     task_id="Mjlab-Cartpole-Balance",
     env_cfg=f"{_CFG}:cartpole_balance_env_cfg",
     rl_cfg=f"{_CFG}:cartpole_ppo_runner_cfg",
+    profiles={"cpu": f"{_CFG}:cpu"},
 )
 register_mjlab_task(
     task_id="Mjlab-Cartpole-Swingup",
