@@ -11,6 +11,7 @@ class Widget:
     def __init__(self, value=None, low=None, high=None, disabled=False):
         self.value, self.min, self.max, self.disabled = value, low, high, disabled
         self.position, self.content = (0.0, 0.0, 0.0), ""
+        self.wxyz = (1.0, 0.0, 0.0, 0.0)
         self.callbacks = []
 
     def on_update(self, callback):

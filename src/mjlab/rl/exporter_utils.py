@@ -31,6 +31,8 @@ Commands generated on the robot, such as the gait clock, export their parameters
 | clock_frequency, clock_fade_s | stride frequency (Hz), and fade time (s) of the amplitude A from 0 to 1 |
 | clock_standing_threshold | A fades to 0 for commanded motion `|c_xy| + |c_z|` below this; 0: never |
 | clock_starts | initial phases c (strides) of the clock; empty: any |
+| pose_command | command name of the pose command: position, quaternion (w, x, y, z), root frame |
+| pose_frame | type and name of the frame that the command moves |
 
 The policy observes (A sin(2 pi c), A cos(2 pi c)).
 """

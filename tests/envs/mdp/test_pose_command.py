@@ -268,3 +268,11 @@ def test_the_last_goal_of_an_episode_counts(make_world: Any) -> None:
     assert term.metrics["position_error"][0] > 0.4
     assert term.reset(torch.tensor([0, 2]))["goals_reached"] == 0.0
     assert term.num_ended[:2].tolist() == [0.0, 0.0]
+
+
+def test_the_exported_frame(make_world: Any) -> None:
+    term = make_term(make_arm(make_world), ranges=RANGES)
+    assert term.export_metadata("hand") == {
+        "pose_command": "hand",
+        "pose_frame": "site robot/grasp",
+    }

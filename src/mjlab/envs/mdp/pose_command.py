@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from mjlab.compat import suggests_fields
 from mjlab.envs.mdp.frames import Frame, FrameType
+from mjlab.envs.mdp.pose_panel import PosePanel
 from mjlab.envs.mdp.reachable_poses import draw_reachable_poses
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.utils.errors import WrongTypeError, check_count, check_in_range
@@ -24,6 +26,8 @@ from mjlab.utils.lab_api.math import (
 )
 
 if TYPE_CHECKING:
+    import viser
+
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.viewer.debug_visualizer import DebugVisualizer
@@ -115,13 +119,14 @@ class UniformPoseCommand(CommandTerm):
 
     cfg: UniformPoseCommandCfg
 
-    # Views of the simulation.
-    _transient = {"frame", "_entity"}
+    # Views of the simulation, and what the viewer adds.
+    _transient = {"frame", "_entity", "_panel"}
 
     def __init__(self, cfg: UniformPoseCommandCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         self._entity: Entity = env.scene[cfg.entity_name]
         self.frame = Frame(env.sim, self._entity, cfg.entity_name, cfg.frame_type, cfg.frame_name)
+        self._panel: PosePanel | None = None
         self.goals: torch.Tensor | None = None
         if cfg.ranges is None:
             check_in_range(
@@ -164,6 +169,14 @@ class UniformPoseCommand(CommandTerm):
             root.root_link_pos_w, root.root_link_quat_w, self.frame.pos, self.frame.quat
         )
 
+    def export_metadata(self, name: str) -> dict[str, list | str | float]:
+        """Return the commanded frame under the keys of `mjlab.rl.exporter_utils`."""
+        cfg = self.cfg
+        return {
+            "pose_command": name,
+            "pose_frame": f"{cfg.frame_type} {cfg.entity_name}/{cfg.frame_name}",
+        }
+
     def errors(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the distance (m) and the angle (rad) from the frame to its goal, (N,) each."""
         position, quat = self.pose_b
@@ -182,6 +195,19 @@ class UniformPoseCommand(CommandTerm):
         """Update metrics, advance time and resample expired goals; see `CommandTerm.compute`."""
         self.goal_age[slice(None) if env_ids is None else env_ids] += dt
         super().compute(dt, env_ids)
+        if self._panel is not None:
+            self._follow(self._panel)
+
+    def create_gui(
+        self,
+        name: str,
+        server: viser.ViserServer,
+        get_env_idx: Callable[[], int],
+        on_change: Callable[[], None] | None = None,
+        request_action: Callable[[str, Any], None] | None = None,
+    ) -> None:
+        """Add a handle to drag and turn the goal of the displayed environment."""
+        self._panel = PosePanel(name, server, get_env_idx, on_change)
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
         # In a new episode, nothing has ended, and the metrics are those of the old episode.
@@ -193,6 +219,22 @@ class UniformPoseCommand(CommandTerm):
         )
         self.goal_age[env_ids] = 0.0
         self.pose_command_b[env_ids] = self._draw(len(env_ids))
+
+    def _follow(self, panel: PosePanel) -> None:
+        """Move a goal that the user holds to the panel's handle, else the handle to the goal."""
+        held = panel.held(self.num_envs)
+        if held is None:
+            panel.show(torch.cat(self.pose_command_w, dim=1))
+            return
+        index, pose = held
+        pose = pose.to(self.device)
+        root = self._entity.data
+        position, quat = subtract_frame_transforms(
+            root.root_link_pos_w[index], root.root_link_quat_w[index], pose[:3], pose[3:]
+        )
+        self.pose_command_b[index] = torch.cat((position, quat_unique(quat)))
+        # Do not resample the goal.
+        self.time_left[index] = self.cfg.resampling_time_range[1]
 
     def _draw(self, count: int) -> torch.Tensor:
         """Return goals, (count, 7)."""
