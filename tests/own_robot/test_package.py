@@ -159,6 +159,21 @@ def test_arm_of_a_function(tmp_path: Path, imported) -> None:
     assert [row[0] for row in questions_table(package.report).rows] == ["pose", "effort"]
 
 
+def test_reach_task_of_an_arm(tmp_path: Path, imported, registered: list[dict]) -> None:
+    report = describe_robot(RobotModel(arm_spec(), "crane", "cranes:arm_spec", None, None))
+    folder = written(tmp_path, Package("crane", "reach", report))
+    imported(folder, "crane")
+    assert [task["task_id"] for task in registered] == ["Reach-Crane"]
+    cfg = imported(folder, "crane.task").env_cfg()
+    cfg.scene.num_envs = 2
+    cfg.commands["hand_pose"].num_goals = 16
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    assert env.action_manager.total_action_dim == 6
+    env.step(torch.zeros(2, 6))
+    env.close()
+
+
 def test_setting_changes_a_value_and_its_reason(tmp_path: Path) -> None:
     before = quadruped(tmp_path / "a")
     after = quadruped(tmp_path / "b", stiffness="33", **{"pose.FL_calf": "-1.5"})

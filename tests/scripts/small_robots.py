@@ -32,9 +32,9 @@ def write_quadruped(folder: Path) -> Path:
         for leg, (x, y) in _HIPS.items()
     )
     motors = "".join(
-        f'<motor joint="{leg}_{joint}" ctrlrange="-20 20"/>'
+        f'<motor joint="{leg}_{joint}" ctrlrange="-{limit} {limit}"/>'
         for leg in _HIPS
-        for joint in ("hip", "thigh", "calf")
+        for joint, limit in (("hip", 20), ("thigh", 20), ("calf", 25))
     )
     path = folder / "dog.xml"
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,6 +14,12 @@ from small_robots import write_archive, write_quadruped
 from mjlab.scripts import new_robot
 
 
+@pytest.fixture(autouse=True)
+def no_registration(monkeypatch) -> None:
+    """Keep the tasks of this process as they are: the command imports the package that it writes."""
+    monkeypatch.setattr("mjlab.tasks.registry.register_mjlab_task", lambda **task: None)
+
+
 @pytest.fixture
 def model(tmp_path: Path) -> str:
     return str(write_quadruped(tmp_path / "model"))
@@ -42,6 +48,19 @@ def test_archive_is_named_by_its_file(run, tmp_path: Path, folder: Path) -> None
     outcome = run("new_robot", str(write_archive(tmp_path / "model")), "--output", str(folder))
     assert outcome.status == 0, outcome.err
     assert (folder / "src" / "dog" / "model" / "dog.xml").is_file()
+
+
+def test_function_of_a_module(run, folder: Path) -> None:
+    outcome = run(
+        "new_robot", "small_robots:arm_spec", "--output", str(folder), "--name", "crane_arm"
+    )
+    assert outcome.status == 0, outcome.err
+    assert "train Reach-Crane-Arm" in outcome.out
+    assert "mjlab check Reach-Crane-Arm" in outcome.out
+
+
+def test_task_needs_its_parts(run, model: str, folder: Path) -> None:
+    assert "kind=arm" in run("new_robot", model, "--task", "reach", "--output", str(folder)).message
 
 
 def test_answers_add_up(run, model: str, folder: Path) -> None:

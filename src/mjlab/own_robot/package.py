@@ -12,11 +12,11 @@ from mjlab.own_robot.model_files import copy_model
 from mjlab.own_robot.python_text import number
 from mjlab.own_robot.report import RobotReport
 from mjlab.own_robot.robot_source import by_pattern, robot_source, shared
-from mjlab.own_robot.task_source import velocity_source
+from mjlab.own_robot.task_source import reach_source, velocity_source
 from mjlab.own_robot.templates import template
 from mjlab.utils.tables import Table
 
-Task = Literal["velocity", "bare"]
+Task = Literal["velocity", "reach", "bare"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class Package:
         """Names of the registered tasks."""
         if self.task == "bare":
             return ()
+        if self.task == "reach":
+            return (f"Reach-{self.title}",)
         return tuple(f"Velocity-{terrain}-{self.title}" for terrain in ("Flat", "Rough"))
 
     def files(self, command: str, folder: Path) -> dict[str, bytes]:
@@ -51,7 +53,7 @@ class Package:
         """
         module, title, report = f"src/{self.name}", self.title, self.report
         names = {"package": self.name, "title": title, "task_name": title}
-        kind = "legged" if self.task == "velocity" else "bare"
+        kind = "legged" if self.task == "velocity" else self.task
         with tempfile.TemporaryDirectory() as temporary:
             models = Path(temporary) / "model"
             model = copy_model(report.model, models)
@@ -71,11 +73,13 @@ class Package:
         }
         if self.task == "velocity":
             text[f"{module}/task.py"] = velocity_source(report, self.name, title, title)
+        if self.task == "reach":
+            text[f"{module}/task.py"] = reach_source(report, self.name, title)
         return found | {name: content.encode() for name, content in text.items()}
 
     def _test(self, kind: str, names: dict[str, str]) -> str:
-        if kind == "bare":
-            return template("bare_test.py").substitute(names)
+        if kind != "legged":
+            return template(f"{kind}_test.py").substitute(names)
         has_two = len(self.report.anatomy.feet.value) == 2
         reason = (
             "Two legs fall after a second without a policy." if has_two else "Legs yield a little."
@@ -145,6 +149,8 @@ def values_table(report: RobotReport) -> Table:
         parts |= {
             "feet": ([foot.link for foot in anatomy.feet.value], anatomy.feet),
             "soles": (soles, anatomy.feet),
+            "front": ("x" if anatomy.front.value > 0 else "-x", anatomy.front),
+            "kept upright": (anatomy.upright.value, anatomy.upright),
             "IMU": (anatomy.imu_site.value or "(trunk's origin)", anatomy.imu_site),
         }
     if anatomy.hands.value:
@@ -163,6 +169,8 @@ def values_table(report: RobotReport) -> Table:
         values = guess.value if name in ("pose", "armature") else shared(guess.value, report)
         parts[name] = (by_pattern(values, report), guess)
     if anatomy.kind.value == "legged":
+        tolerance = by_pattern(shared(report.pose_tolerance.value, report), report)
+        parts["pose_tolerance"] = (tolerance, report.pose_tolerance)
         speeds = {k: float(number(high)) for k, (_, high) in report.commands.value.items()}
         parts["commands"] = (speeds, report.commands)
     labels = {"file": "found", "rule": "guessed", "set": "set", "asked": "asked"}

@@ -53,7 +53,9 @@ def robot_source(report: RobotReport, title: str, model: Path) -> str:
         motor_reasons="\n".join(motor_reasons),
         motors="\n".join(motors),
         scale="\n".join(reason_lines("Joint target (rad) per unit action", report.action_scale)),
-        action_scale=dict_source(by_pattern(scale, report)),
+        action_scale=dict_source(
+            by_pattern(scale, report) if report.anatomy.kind.value == "legged" else scale
+        ),
         spec="\n".join(f"    {line}" if line else "" for line in _spec(report, is_urdf)),
     )
 
@@ -150,7 +152,8 @@ def _parts(report: RobotReport) -> list[str]:
     anatomy = report.anatomy
     lines = [commented(f'TRUNK = "{anatomy.trunk.value}"', anatomy.trunk.rule)]
     if anatomy.kind.value != "legged":
-        return lines
+        return lines + _arm_parts(report)
+    lines.append(commented(f'UPRIGHT = "{anatomy.upright.value}"', anatomy.upright.rule))
     imu, reason = imu_site(report)
     lines.append(commented(f'IMU = "{imu}"', reason))
     feet, names = feet_in_model_order(report), foot_names(report)
@@ -170,6 +173,35 @@ def _parts(report: RobotReport) -> list[str]:
         f"FOOT_CONTACTS = {tuple_source(contacts, 16)}",
     ]
     return lines
+
+
+def _arm_parts(report: RobotReport) -> list[str]:
+    """Return the first hand, its site and its joints."""
+    if not report.anatomy.hands.value:
+        return []
+    hand, (site, reason) = report.anatomy.hands.value[0], hand_site(report)
+    lines = []
+    if len(report.anatomy.hands.value) > 1:
+        others = ", ".join(other.link for other in report.anatomy.hands.value[1:])
+        lines += comment_lines(f"Of several hands, the first; the others are on {others}.")
+    lines += [
+        commented(f'HAND = "{site}"', f"site: {reason}"),
+        commented(f"ARM = {tuple_source(hand.joints, 6)}", "joints from the base to the hand")
+        if len(hand.joints) < 4
+        else f"ARM = {tuple_source(hand.joints, 6)}",
+    ]
+    if hand.gripper:
+        lines.append(f"GRIPPER = {tuple_source(hand.gripper, 10)}")
+    return lines
+
+
+def hand_site(report: RobotReport) -> tuple[str, str]:
+    """Return the site of the hand, and the reason; `get_spec` adds it if the file has none."""
+    hand = report.anatomy.hands.value[0]
+    if hand.site is not None:
+        return hand.site, "at the grasp"
+    taken = {site.name for site in report.spec.sites}
+    return "hand" if "hand" not in taken else "reaching_hand", f"added to {hand.link}"
 
 
 def imu_site(report: RobotReport) -> tuple[str, str]:
@@ -266,7 +298,14 @@ def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
             "    spec.geom(name).conaffinity = 1",
         ]
     if report.anatomy.kind.value == "legged":
-        lines += _legged_spec(report)
+        return lines + _legged_spec(report)
+    if report.anatomy.hands.value and report.anatomy.hands.value[0].site is None:
+        hand = report.anatomy.hands.value[0]
+        position = tuple(round(x, 4) + 0.0 for x in hand.position)
+        lines += [
+            *comment_lines(f"The grasp: {report.anatomy.hands.rule}."),
+            f'spec.body("{hand.link}").add_site(name=HAND, pos={position})',
+        ]
     return lines
 
 

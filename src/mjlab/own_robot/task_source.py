@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 
+from mjlab.own_robot import geometry
 from mjlab.own_robot.python_text import comment_lines, dict_source, number, tuple_source
 from mjlab.own_robot.report import RobotReport
 from mjlab.own_robot.robot_source import (
@@ -12,6 +14,7 @@ from mjlab.own_robot.robot_source import (
     feet_in_model_order,
     foot_contacts,
     reason_lines,
+    shared,
 )
 from mjlab.own_robot.templates import template
 
@@ -26,25 +29,43 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
     fallen = report.anatomy.fall_bodies
     commands = report.commands.value
     has_gait = len(report.anatomy.feet.value) == 4
-    names = ["ACTION_SCALE", "FEET", "FOOT_CONTACTS", *["HEIGHT"] * has_gait, "SOLES", "TRUNK"]
+    names = [
+        "ACTION_SCALE",
+        "FEET",
+        "FOOT_CONTACTS",
+        *["HEIGHT"] * has_gait,
+        "SOLES",
+        "TRUNK",
+        "UPRIGHT",
+    ]
     return template("legged_task.py").substitute(
         package=package,
         title=title,
         task_name=task_name,
         profile="cpu_with_gait" if has_gait else "cpu as cpu",
-        robot_names=", ".join([*names, "get_robot_cfg"]),
+        robot_names="".join(f"    {name},\n" for name in [*names, "get_robot_cfg"]),
         commands="\n".join(reason_lines("Commands", report.commands)),
         lin_vel=_range(commands["lin_vel_x"]),
         ang_vel=_range(commands["ang_vel_z"]),
         tolerance_reason="\n".join(
             reason_lines("Tolerance of joints around the initial pose (rad)", report.pose_tolerance)
         ),
-        std_walking=dict_source(by_pattern(tolerance, report)),
+        std_walking=dict_source(by_pattern(shared(tolerance, report), report)),
         fallen_reason="\n".join(reason_lines("Bodies that touch the ground after a fall", fallen)),
         fallen=tuple_source(fallen.value, 9),
         contact_mode=f'"{mode}"',
         ray_radius=number(_sole_radius(report)),
         gait=_gait(report),
+    )
+
+
+def reach_source(report: RobotReport, package: str, title: str) -> str:
+    """Return the source of the reach task."""
+    model, data = report.compiled, mujoco.MjData(report.compiled)
+    geometry.set_pose(model, data, report.joint_pos.value)
+    extent = float(np.linalg.norm(np.ptp(data.geom_xpos, axis=0)))
+    return template("reach_task.py").substitute(
+        package=package, title=title, viewer_distance=number(max(0.5, 2.0 * extent), 2)
     )
 
 

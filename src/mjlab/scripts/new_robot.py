@@ -10,7 +10,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -33,8 +33,8 @@ class NewRobotConfig:
 
     name: str | None = None
     """Name of the package, letters, digits and underscores. None: that of the model."""
-    task: Literal["velocity", "bare"] | None = None
-    """Task: `velocity` (legs), `bare` (robot only). None: by the kind of the robot."""
+    task: Task | None = None
+    """Task: `velocity` (legs), `reach` (an arm), `bare` (robot only). None: by the kind of the robot."""
     output: str | None = None
     """Folder of the package. None: the name, in the current folder."""
     set: Annotated[
@@ -78,10 +78,12 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
         settings |= _ask(report.questions)
         report = describe_robot(file, settings)
     package = Package(name, cfg.task or _task(report), report)
+    _check_task(package.task, report)
     files = package.files(_command_line(source, cfg, settings), folder)
     kept = write_files(folder, files, replace(record, model=source, settings=settings))
     tables = [values_table(report), questions_table(report)]
     print(tables_text([table for table in tables if table.rows], WIDTH))
+    print(_findings(package, folder))
     print(_summary(package, folder, kept))
     if cfg.install:
         _install(folder)
@@ -117,7 +119,21 @@ def _check_name(name: str, folder: Path) -> None:
 
 
 def _task(report: RobotReport) -> Task:
-    return "velocity" if report.anatomy.kind.value == "legged" else "bare"
+    kind = report.anatomy.kind.value
+    return "velocity" if kind == "legged" else "reach" if kind == "arm" else "bare"
+
+
+def _check_task(task: Task, report: RobotReport) -> None:
+    """Raise `UserError` for a task that needs parts that were not found."""
+    for needed, parts, kind in (
+        ("velocity", report.anatomy.feet.value, "legged"),
+        ("reach", report.anatomy.hands.value, "arm"),
+    ):
+        if task == needed and not (parts and report.anatomy.kind.value == kind):
+            raise UserError(
+                f"--task {task}: expected a robot of kind {kind}, found {report.anatomy.kind.value} "
+                f"({report.anatomy.kind.rule}); use --set kind={kind} or --task bare."
+            )
 
 
 def on_terminal() -> bool:
@@ -144,6 +160,29 @@ def _command_line(source: str, cfg: NewRobotConfig, settings: dict[str, str]) ->
     for key, value in settings.items():
         words += ["--set", f"{key}={value}"]
     return shlex.join(words)
+
+
+def _findings(package: Package, folder: Path) -> str:
+    """Return what `mjlab check` finds in the robot as written, or as edited by the user."""
+    from mjlab.scripts.check import check_entity, check_task, report
+
+    sys.path.insert(0, str(folder.resolve() / "src"))
+    importlib.invalidate_caches()
+    try:
+        robot = importlib.import_module(f"{package.name}.robot")
+        if package.task == "bare":
+            findings = check_entity("robot", robot.get_robot_cfg())
+        else:
+            task = importlib.import_module(f"{package.name}.task")
+            findings = check_task(
+                task.flat_env_cfg() if package.task == "velocity" else task.env_cfg()
+            )
+    finally:
+        del sys.path[0]
+        # A later run in this process reads the files again.
+        for module in [m for m in sys.modules if m.partition(".")[0] == package.name]:
+            del sys.modules[module]
+    return report(f"\nmjlab check {package.tasks[0] if package.tasks else package.name}", findings)
 
 
 def _summary(package: Package, folder: Path, kept: list[str]) -> str:
