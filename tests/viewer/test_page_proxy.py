@@ -152,6 +152,49 @@ def test_a_rejection_says_the_cure(page):
     )
 
 
+@pytest.fixture
+def sticks(page):
+    """Positions of a gamepad that the page took."""
+    taken: list = []
+    page.on_gamepad = taken.append
+    yield taken
+    page.on_gamepad = None
+
+
+def test_the_page_of_a_gamepad_shows_the_viewer_in_a_frame(page, sticks):
+    got = answer(page, request("/gamepad", Host="localhost"), size=10_000)
+    assert got.startswith(b"HTTP/1.1 200")
+    assert b"\r\nContent-Type: text/html" in got
+    assert b'<iframe src="/"' in got
+    assert sticks == []
+
+
+def test_positions_of_sticks_are_passed_on(page, sticks):
+    fetch = {"Host": "localhost", "Sec-Fetch-Site": "same-origin"}
+    for query in ("forward=1&left=0&turn=-0.25", "forward=0&left=0&turn=0"):
+        assert b" 200 " in answer(page, request(f"/gamepad?{query}", **fetch))
+    assert sticks == [(1.0, 0.0, -0.25), (0.0, 0.0, 0.0)]
+
+
+@pytest.mark.parametrize("query", [
+    "forward=2&left=0&turn=0", "forward=nan&left=0&turn=0", "forward=1&left=0", "forward=&left=0&turn=x",
+])  # fmt: skip
+def test_positions_beyond_the_sticks_are_rejected(page, sticks, query):
+    assert b" 400 " in answer(page, request(f"/gamepad?{query}", Host="localhost"))
+    assert sticks == []
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "none"])
+def test_images_of_other_sites_cannot_steer(page, sticks, site):
+    headers = {"Host": "localhost", "Sec-Fetch-Site": site}
+    assert b" 403 " in answer(page, request("/gamepad?forward=1&left=0&turn=0", **headers))
+    assert sticks == []
+
+
+def test_without_steering_there_is_no_gamepad(page):
+    assert b" 404 " in answer(page, request("/gamepad", Host="localhost"))
+
+
 def test_malformed_clients_are_quiet(page, capfd, caplog):
     for data in (b"", b"\0", os.urandom(3000), b"A" * 200_000, b"GET / HTTP/1.1\r\n", b"\r\n\r\n"):
         with socket.create_connection(("127.0.0.1", page.get_port())) as connection:

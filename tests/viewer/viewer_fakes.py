@@ -97,8 +97,8 @@ class FakeTerms:
 
     steerable = True
 
-    def steer(self, change, get_env_idx) -> None:
-        self.steered.append((get_env_idx(), change))
+    def steer(self, shares, get_env_idx, add=True) -> None:
+        self.steered.append((get_env_idx(), shares) if add else ("sticks", get_env_idx(), shares))
 
     def create_gui(self, server, get_env_idx, on_change=None, request_action=None) -> None:
         server.gui.add_slider("lin_vel_x", -1.0, 1.0, 0.05, 0.0)

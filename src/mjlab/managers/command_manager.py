@@ -159,16 +159,20 @@ class CommandTerm(ManagerTermBase):
         """Add the command's controls to the Viser viewer. Does nothing by default."""
 
     def steer(
-        self, change: tuple[float, float, float] | None, get_env_idx: Callable[[], int]
+        self,
+        shares: tuple[float, float, float] | None,
+        get_env_idx: Callable[[], int],
+        add: bool = True,
     ) -> None:
         """Change the command of the environment in view by hand. Does nothing by default.
 
-        Terms with `steerable` override it. Viewers call it for keys, between steps.
+        Terms with `steerable` override it. Viewers call it for keys and gamepads, between steps.
 
         Args:
-            change: Changes of the forward and the left velocity and the rate of turning left, in shares
-                of the largest. None: zero; if it is zero already, sampled commands again.
+            shares: Forward and left velocity and rate of turning left, in shares of the largest. None:
+                zero; if it is zero already, sampled commands again.
             get_env_idx: Returns the environment in view, which may change later.
+            add: Add `shares` to the command, as keys do. Otherwise they are the command.
         """
 
     def on_viewer_pause(self, paused: bool) -> None:
@@ -278,11 +282,14 @@ class CommandManager(DebugVisSwitches, BuiltTermsManager[CommandTerm]):
         return any(term.steerable for term in self._terms.values())
 
     def steer(
-        self, change: tuple[float, float, float] | None, get_env_idx: Callable[[], int]
+        self,
+        shares: tuple[float, float, float] | None,
+        get_env_idx: Callable[[], int],
+        add: bool = True,
     ) -> None:
         """Call `steer` of all commands."""
         for term in self._terms.values():
-            term.steer(change, get_env_idx)
+            term.steer(shares, get_env_idx, add)
 
     def on_viewer_pause(self, paused: bool) -> None:
         """Notify all commands of a pause or resume of the viewer."""

@@ -103,7 +103,7 @@ class ViewerAction(enum.Enum):
     TOGGLE_SHOW_ALL_ENVS = "toggle_show_all_envs"
     FETCH_CHECKPOINT = "fetch_checkpoint"
     STEER = "steer"
-    """Change the command of the robot in view. Payload: a `Steering`."""
+    """Change the command of the robot in view. Payload: that of `BaseViewer.steer`."""
     CUSTOM = "custom"
 
 
@@ -353,16 +353,22 @@ class BaseViewer(ABC):
                 elif not self.handle_action(action, payload):
                     self.log(f"Unknown viewer action {action.value!r} (payload {payload!r}).")
 
-    def steer(self, direction: Steering) -> None:
+    def steer(self, where: Steering | tuple[float, float, float]) -> None:
         """Change the command of the robot in view. Does nothing for tasks whose commands cannot be steered.
 
         While paused, the key of `TURN_RIGHT`, the right arrow, makes a single step.
+
+        Args:
+            where: Direction of a key, or position of a gamepad's sticks (forward, left, turn left), each
+                in [-1, 1].
         """
-        if self._paused and direction is Steering.TURN_RIGHT:
+        if self._paused and where is Steering.TURN_RIGHT:
             self._single_step()
-        else:
-            manager = self.env.unwrapped.command_manager
-            manager.steer(direction.value, self.env_in_view)
+            return
+        is_key = isinstance(where, Steering)
+        self.env.unwrapped.command_manager.steer(
+            where.value if is_key else where, self.env_in_view, add=is_key
+        )
 
     def _single_step(self) -> None:
         if self._paused and self._total_steps < self._step_limit:

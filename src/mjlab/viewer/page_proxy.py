@@ -11,6 +11,7 @@ import re
 import secrets
 import socket
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 from urllib.parse import parse_qs
@@ -19,6 +20,8 @@ import rich
 import viser
 from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
+
+from mjlab.viewer import gamepad
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +55,9 @@ class PageServer(viser.ViserServer):
         self._page_address = host, port
         own = socket.gethostname().lower()
         self._names = {"localhost", own, f"{own}.local", *names}
+        self.on_gamepad: Callable[[tuple[float, float, float]], Any] | None = None
+        """Called with the position of a gamepad's sticks (forward, left, turn left), each in [-1, 1], in
+        the proxy's thread. None: the page has no gamepad."""
         self._has_warned = False
         self._reported: set[str] = set()
         self._connections: set[asyncio.Task | None] = set()
@@ -165,7 +171,26 @@ class PageServer(viser.ViserServer):
             answer = parser.reject(307, "")
             answer.headers["Location"] = "?"
             return answer
-        return None
+        path, _, query = request.path.partition("?")
+        return self._answer_gamepad(query, request, parser) if path == gamepad.PATH else None
+
+    def _answer_gamepad(self, query: str, request: Request, parser: ServerProtocol) -> Response:
+        """Return the page that reads a gamepad, or pass on the position of its sticks."""
+        if self.on_gamepad is None:
+            return parser.reject(404, "Nothing here can be steered by a gamepad.\n")
+        if not query:
+            answer = parser.reject(200, gamepad.PAGE)
+            del answer.headers["Content-Type"]
+            answer.headers["Content-Type"] = "text/html; charset=utf-8"
+            return answer
+        # An image of another web site is requested without `Origin`, but browsers mark it.
+        if request.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
+            return parser.reject(403, "Expected a request of the page itself.\n")
+        try:
+            self.on_gamepad(gamepad.stick_position(query))
+        except ValueError as error:
+            return parser.reject(400, f"{error}\n")
+        return parser.reject(200, "")
 
 
 def _shorten(record: logging.LogRecord) -> bool:

@@ -118,6 +118,14 @@ def test_keys_change_the_command_in_tenths_of_the_largest(with_page, page):
     assert command_of(joystick)[0] == 0.0
 
 
+def test_sticks_of_a_gamepad_are_the_command(page):
+    joystick, _ = make(page, env_idx=0)
+    joystick.steer((0.1, 0.0, 0.0))
+    for _ in range(2):
+        joystick.steer((-0.5, 1.0, 0.0), add=False)
+        assert command_of(joystick) == pytest.approx([-1.0, 1.0, 0.0])
+
+
 def test_keys_move_the_sliders(page):
     joystick, _ = make(page, env_idx=0)
     page.widgets["Forward (m/s)"].set_by_person(1.0)

@@ -6,6 +6,7 @@ import logging
 import os
 import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -125,6 +126,20 @@ def test_keys_control_the_simulation(viser_server) -> None:
     assert (status.speed_multiplier, status.step_count) == (1.0, 0)
     assert viewer.scene.debug_visualization_enabled
     assert viewer.scene.show_all_envs
+
+
+def test_a_gamepad_steers_through_the_proxy() -> None:
+    viewer = ViserPlayViewer(FakeEnv(2), push(), port=18099)
+    try:
+        assert viewer.server.on_gamepad is None
+        viewer.setup()
+        url = f"http://127.0.0.1:{viewer.server.get_port()}/gamepad"
+        with urlopen(f"{url}?forward=0.5&left=0&turn=-1") as answer:
+            assert answer.status == 200
+        viewer._process_actions()
+        assert viewer.env.command_manager.steered == [("sticks", 0, (0.5, 0.0, -1.0))]
+    finally:
+        viewer.close()
 
 
 def test_a_task_without_steering_has_no_keys_for_it(viser_server, monkeypatch) -> None:

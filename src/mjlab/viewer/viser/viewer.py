@@ -23,9 +23,11 @@ import viser
 from mjlab.utils.errors import WrongStateError
 from mjlab.utils.os import files_in
 from mjlab.utils.string import encodable, escaped
+from mjlab.viewer import gamepad
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, reset_policy
 from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.native.keys import BINDINGS, KEY_HELP, STEERING_HELP, Binding
+from mjlab.viewer.page_proxy import PageServer
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
 from mjlab.viewer.page_server import DEFAULT_PORT as DEFAULT_PORT
 from mjlab.viewer.page_server import page_url, serve_page
@@ -286,7 +288,11 @@ class ViserPlayViewer(BaseViewer):
                 )
             if not folder._children:
                 folder.remove()
-            add_keys(self._server, env.command_manager.steerable, self.request_action)
+            steerable = env.command_manager.steerable
+            has_gamepad = steerable and isinstance(self._server, PageServer)
+            if has_gamepad:
+                self._server.on_gamepad = lambda sticks: self.request_action("steer", sticks)
+            add_keys(self._server, steerable, has_gamepad, self.request_action)
             with gui.add_folder("Scene"):
                 scene.create_scene_gui(debug_viz_extra_gui=add_debug_vis_switches)
             self._camera_overlays.setup_controls()
@@ -333,13 +339,17 @@ class ViserPlayViewer(BaseViewer):
 
 
 def add_keys(
-    server: viser.ViserServer, steerable: bool, request_action: Callable[..., None]
+    server: viser.ViserServer,
+    steerable: bool,
+    has_gamepad: bool,
+    request_action: Callable[..., None],
 ) -> None:
     """Bind the keys of the page, and list them in a folder.
 
     Args:
         server: The page's server.
         steerable: Bind and list the keys that steer the robot.
+        has_gamepad: Link to the page that reads a gamepad.
         request_action: Queues a viewer action by name, with a payload, for the main thread.
     """
     for binding in BINDINGS:
@@ -355,6 +365,8 @@ def add_keys(
         f"<div><strong>{keys}:</strong> {meaning}</div>"
         for keys, meaning in (*(STEERING_HELP if steerable else ()), *KEY_HELP)
     )
+    if has_gamepad:
+        rows += f'<div><a href="{gamepad.PATH}" target="_blank">Page with gamepad</a></div>'
     with server.gui.add_folder("Keys", expand_by_default=False):
         server.gui.add_html(f'<div style="padding:0 1em;font-size:0.85em">{rows}</div>')
 

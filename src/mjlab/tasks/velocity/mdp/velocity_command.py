@@ -230,12 +230,15 @@ class UniformVelocityCommand(CommandTerm):
                 on_change()
 
     def steer(
-        self, change: tuple[float, float, float] | None, get_env_idx: Callable[[], int]
+        self,
+        shares: tuple[float, float, float] | None,
+        get_env_idx: Callable[[], int],
+        add: bool = True,
     ) -> None:
         """Change the command of the environment in view; it then holds until it is changed again."""
         if self._joystick is None:
             self._joystick = VelocityJoystick(self.name, None, self.ranges, get_env_idx)
-        self._joystick.steer(change)
+        self._joystick.steer(shares, add)
 
     # Sampling.
 

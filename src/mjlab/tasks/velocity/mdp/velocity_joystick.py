@@ -86,16 +86,16 @@ class VelocityJoystick:
             slider.value = min(max(slider.value, -maximum.value), maximum.value)
             slider.min, slider.max = -maximum.value, maximum.value
 
-    def steer(self, change: tuple[float, float, float] | None) -> None:
+    def steer(self, shares: tuple[float, float, float] | None, add: bool = True) -> None:
         """Enable the joystick and move it; see `CommandTerm.steer`."""
-        if change is None:
+        if shares is None:
             is_stopped = all(slider.value == 0.0 for slider in self._sliders)
             self._enabled.value = not (self._enabled.value and is_stopped)
             self._zero()
             return
         self._enabled.value = True
-        for slider, share in zip(self._sliders, change, strict=True):
-            moved = slider.value + share * slider.max
+        for slider, share in zip(self._sliders, shares, strict=True):
+            moved = slider.value * add + share * slider.max
             # Without rounding, ten steps forth and back do not end at zero.
             slider.value = round(min(max(moved, slider.min), slider.max), 6)
 
