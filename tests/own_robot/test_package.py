@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 import mujoco
+import numpy as np
 import pytest
 import torch
 from small_robots import arm_spec, write_archive, write_quadruped, write_urdf
@@ -171,6 +172,33 @@ def test_reach_task_of_an_arm(tmp_path: Path, imported, registered: list[dict]) 
     env.reset()
     assert env.action_manager.total_action_dim == 6
     env.step(torch.zeros(2, 6))
+    env.close()
+
+
+def test_tracking_task_of_a_motion(tmp_path: Path, imported) -> None:
+    package = quadruped(tmp_path / "model")
+    model = package.report.compiled
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    poses = np.repeat(data.xpos[None, 1:], 10, axis=0), np.repeat(data.xquat[None, 1:], 10, axis=0)
+    motion = tmp_path / "still.npz"
+    np.savez(
+        motion,
+        fps=[50],
+        joint_pos=np.zeros((10, 12)),
+        joint_vel=np.zeros((10, 12)),
+        body_pos_w=poses[0],
+        body_quat_w=poses[1],
+        body_lin_vel_w=np.zeros_like(poses[0]),
+        body_ang_vel_w=np.zeros_like(poses[0]),
+    )
+    folder = written(tmp_path / "package", Package("dog", "tracking", package.report, motion))
+    cfg = imported(folder, "dog.task").env_cfg(play=True)
+    assert cfg.commands["motion"].body_names[0] == "trunk"
+    cfg.scene.num_envs = 2
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    env.step(torch.zeros(2, 12))
     env.close()
 
 

@@ -115,6 +115,8 @@ def test_questions_on_a_terminal(run, model: str, folder: Path, monkeypatch) -> 
         (["--name", "torch"], "exists"),
         (["--name", "my robot"], "my_robot"),
         (["--nme", "x"], "--name"),
+        (["--task", "tracking"], "--motion"),
+        (["--task", "tracking", "--motion", "none.npz"], "no such file"),
     ],
 )
 def test_mistakes(run, model: str, tmp_path: Path, flags: list[str], message: str) -> None:

@@ -12,11 +12,11 @@ from mjlab.own_robot.model_files import copy_model
 from mjlab.own_robot.python_text import number
 from mjlab.own_robot.report import RobotReport
 from mjlab.own_robot.robot_source import by_pattern, robot_source, shared
-from mjlab.own_robot.task_source import reach_source, velocity_source
+from mjlab.own_robot.task_source import reach_source, tracking_source, velocity_source
 from mjlab.own_robot.templates import template
 from mjlab.utils.tables import Table
 
-Task = Literal["velocity", "reach", "bare"]
+Task = Literal["velocity", "reach", "tracking", "bare"]
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class Package:
     """Task of the robot."""
     report: RobotReport
     """Values of the robot."""
+    motion: Path | None = None
+    """Motion file of the tracking task."""
 
     @property
     def title(self) -> str:
@@ -42,6 +44,8 @@ class Package:
             return ()
         if self.task == "reach":
             return (f"Reach-{self.title}",)
+        if self.task == "tracking":
+            return (f"Tracking-Flat-{self.title}",)
         return tuple(f"Velocity-{terrain}-{self.title}" for terrain in ("Flat", "Rough"))
 
     def files(self, command: str, folder: Path) -> dict[str, bytes]:
@@ -75,6 +79,10 @@ class Package:
             text[f"{module}/task.py"] = velocity_source(report, self.name, title, title)
         if self.task == "reach":
             text[f"{module}/task.py"] = reach_source(report, self.name, title)
+        if self.task == "tracking":
+            assert self.motion is not None
+            text[f"{module}/task.py"] = tracking_source(report, self.name, title, self.motion.name)
+            found[f"{module}/motions/{self.motion.name}"] = self.motion.read_bytes()
         return found | {name: content.encode() for name, content in text.items()}
 
     def _test(self, kind: str, names: dict[str, str]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import mujoco
 import numpy as np
 
@@ -20,6 +22,10 @@ from mjlab.own_robot.templates import template
 
 STANDING_SHARE = 0.65
 """Height of the trunk below which training episodes end, as a share of the standing height."""
+STILL_SPEED, STILL_TURN = 0.66, 0.47
+"""Mean error of a robot that stands still, as a share of the largest commanded velocity, and yaw rate."""
+SOLVED_SPEED, SOLVED_TURN = 0.37, 0.55
+"""Errors below which training stops, as a share of those of a robot that stands still."""
 
 
 def velocity_source(report: RobotReport, package: str, title: str, task_name: str) -> str:
@@ -69,6 +75,37 @@ def reach_source(report: RobotReport, package: str, title: str) -> str:
     )
 
 
+def tracking_source(report: RobotReport, package: str, title: str, motion: str) -> str:
+    """Return the source of the tracking task, of a motion file by its name."""
+    bodies, ends = tracked_bodies(report)
+    return template("tracking_task.py").substitute(
+        package=package,
+        title=title,
+        motion=motion,
+        bodies=tuple_source(bodies, 9),
+        end_effectors=tuple_source(ends, 16),
+    )
+
+
+def tracked_bodies(report: RobotReport) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the bodies that follow a motion, the trunk first, and the ends of the limbs."""
+    anatomy, model = report.anatomy, report.compiled
+    legs = [leg.joints for leg in anatomy.legs.value]
+    limbs = legs + [hand.joints for hand in anatomy.hands.value]
+    # A waist moves several limbs.
+    count = Counter(joint for limb in limbs for joint in limb)
+    trunk, upright = anatomy.trunk.value, anatomy.upright.value
+    bodies, ends = dict.fromkeys((trunk, upright)), []
+    for limb in limbs:
+        own = [joint for joint in limb if count[joint] == 1]
+        if not own:
+            continue
+        links = [model.body(int(model.joint(joint).bodyid[0])).name for joint in own]
+        bodies |= dict.fromkeys(links[n] for n in (len(own) // 4, len(own) // 2, len(own) - 1))
+        ends.append(links[-1])
+    return tuple(bodies), tuple(ends)
+
+
 def _range(bounds: tuple[float, float]) -> str:
     return f"({number(bounds[0])}, {number(bounds[1])})"
 
@@ -89,13 +126,28 @@ def _gait(report: RobotReport) -> str:
             ]
         )
     first, second = diagonals(report)
+    speed, turn = STILL_SPEED * SOLVED_SPEED, STILL_TURN * SOLVED_TURN
+    mirror = (
+        [] if report.anatomy.mirror.value else ["    mirror=None,  # not the same left and right"]
+    )
     return "\n".join(
         [
             *comment_lines(
-                f"A trot: the feet {first} and {second} of FEET, the diagonals, take turns. Episodes end "
-                f"when the trunk sinks below {STANDING_SHARE:.0%} of its height."
+                f"A trot: the feet {first} and {second} of FEET, the diagonals, take turns. Training "
+                f"episodes end when the trunk sinks below {STANDING_SHARE:.0%} of its height. Training "
+                f"stops at errors of {SOLVED_SPEED:.0%} (velocity) and {SOLVED_TURN:.0%} (yaw rate) of "
+                "those of a robot that stands still."
             ),
-            f"cpu = cpu_with_gait(({first}, {second}), minimum_height={STANDING_SHARE} * HEIGHT)",
+            "cpu = cpu_with_gait(",
+            f"    ({first}, {second}),",
+            f"    minimum_height={STANDING_SHARE} * HEIGHT,",
+            "    solved_below={",
+            f'        "lin_vel_error": {number(speed, 2)} * LIN_VEL[1],',
+            f'        "ang_vel_error": {number(turn, 2)} * ANG_VEL[1],',
+            '        "failure_rate": 0.05,',
+            "    },",
+            *mirror,
+            ")",
         ]
     )
 

@@ -34,7 +34,10 @@ class NewRobotConfig:
     name: str | None = None
     """Name of the package, letters, digits and underscores. None: that of the model."""
     task: Task | None = None
-    """Task: `velocity` (legs), `reach` (an arm), `bare` (robot only). None: by the kind of the robot."""
+    """Task: `velocity` or `tracking` (legs), `reach` (an arm), `bare` (robot only). None: `velocity` or
+    `reach`, by the kind of the robot."""
+    motion: Path | None = None
+    """Motion file (.npz) of the task `tracking`."""
     output: str | None = None
     """Folder of the package. None: the name, in the current folder."""
     set: Annotated[
@@ -77,8 +80,14 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
     if report.questions and not answers and on_terminal():
         settings |= _ask(report.questions)
         report = describe_robot(file, settings)
-    package = Package(name, cfg.task or _task(report), report)
+    package = Package(name, cfg.task or _task(report), report, cfg.motion)
     _check_task(package.task, report)
+    if (package.task == "tracking") != (cfg.motion is not None):
+        raise BadCallError(
+            "new-robot: expected --task tracking with --motion FILE, got one of both."
+        )
+    if cfg.motion is not None and not cfg.motion.is_file():
+        raise UserError(f"--motion {cfg.motion}: no such file.")
     files = package.files(_command_line(source, cfg, settings), folder)
     kept = write_files(folder, files, replace(record, model=source, settings=settings))
     tables = [values_table(report), questions_table(report)]
@@ -127,6 +136,7 @@ def _check_task(task: Task, report: RobotReport) -> None:
     """Raise `UserError` for a task that needs parts that were not found."""
     for needed, parts, kind in (
         ("velocity", report.anatomy.feet.value, "legged"),
+        ("tracking", report.anatomy.feet.value, "legged"),
         ("reach", report.anatomy.hands.value, "arm"),
     ):
         if task == needed and not (parts and report.anatomy.kind.value == kind):
@@ -154,9 +164,9 @@ def _ask(questions: tuple[Question, ...]) -> dict[str, str]:
 
 def _command_line(source: str, cfg: NewRobotConfig, settings: dict[str, str]) -> str:
     words = ["uv", "run", "mjlab", "new-robot", source]
-    for flag in ("name", "task", "output"):
+    for flag in ("name", "task", "motion", "output"):
         if value := getattr(cfg, flag):
-            words += [f"--{flag}", value]
+            words += [f"--{flag}", str(value)]
     for key, value in settings.items():
         words += ["--set", f"{key}={value}"]
     return shlex.join(words)
