@@ -171,6 +171,7 @@ ACTING: dict[str, Settings] = {
         "algorithm.policy_delay": 1,
         "algorithm.actor_learning_rate": 1e-5,
         "algorithm.critic_learning_rate": 1e-5,
+        "algorithm.learning_rate_factor": ((0, 0.5),),
         "algorithm.weight_decay": 0.5,
         "algorithm.init_alpha": 0.5,
         "algorithm.alpha_learning_rate": 1e-5,

@@ -308,16 +308,27 @@ def test_a_teacher_that_weighs_nothing_is_not_compared_with():
     runner.learn(2)
 
 
+def test_learning_rates_fall_with_the_steps():
+    runner = make_runner(actor_learning_rate=1e-3, learning_rate_factor=((10, 1.0), (20, 0.2)))
+    rates = []
+    for iterations in range(1, 6):
+        runner.learn(iterations)
+        rates.append(runner.alg.learning_rate)
+    # After 5, 10, 15, 20 and 25 environment steps.
+    assert rates == pytest.approx([1e-3, 1e-3, 6e-4, 2e-4, 2e-4])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"teacher": "actor", "imitation": ((5, 1.0), (2, 0.0))}, "imitation.*increasing steps"),
         ({"teacher": "actor", "imitation": ()}, "imitation.*increasing steps"),
+        ({"learning_rate_factor": ((5, 1.0), (5, 0.3))}, "learning_rate_factor.*increasing steps"),
         ({"teacher_steps": 3}, "without a teacher"),
         ({"imitation": ((0, 1.0),)}, "without a teacher"),
     ],
 )
-def test_an_imitation_that_would_be_silently_another_is_refused(changes, message):
+def test_points_that_would_be_silently_others_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         make_runner(**changes)
 

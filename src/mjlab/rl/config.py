@@ -148,6 +148,11 @@ class RslRlSacAlgorithmCfg:
     """Learning rate of the policy."""
     critic_learning_rate: Positive = 3e-4
     """Learning rate of the critics."""
+    learning_rate_factor: Annotated[tuple[tuple[int, float], ...], Range(0.0, ends="[)")] = (
+        (0, 1.0),
+    )
+    """Factor of both learning rates: points (environment step, factor), interpolated linearly. With
+    smaller rates in the end, policies fall equally often from one evaluation to the next."""
     weight_decay: Weight = 1e-3
     """Weight decay (AdamW)."""
     init_alpha: Positive = 1e-3

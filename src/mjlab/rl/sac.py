@@ -79,15 +79,15 @@ class SAC:
         # usual, because targets move (arXiv 2512.01996).
         self.optimizer = torch.optim.AdamW(
             [
-                {"params": list(self.critic.parameters()), "lr": cfg.critic_learning_rate},
-                {"params": list(self.actor.parameters()), "lr": cfg.actor_learning_rate},
-                {"params": [self._log_alpha], "lr": cfg.alpha_learning_rate, "weight_decay": 0.0},
+                {"params": list(self.critic.parameters())},
+                {"params": list(self.actor.parameters())},
+                {"params": [self._log_alpha], "weight_decay": 0.0},
             ],
             betas=(0.9, 0.95),
             weight_decay=cfg.weight_decay,
             fused=True,
         )
-        self.learning_rate = cfg.actor_learning_rate
+        self._rate_factor = _Schedule(cfg, "learning_rate_factor")
         self._teacher = _Teacher(cfg)
         symmetry, self._env = cfg.symmetry_cfg, env
         self._mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
@@ -108,6 +108,7 @@ class SAC:
         scales = cfg.value_range is None
         self._reward_scale = _ReturnScale(env.num_envs, cfg.gamma, device) if scales else None
         self._num_steps = self._num_updates_made = 0
+        self._set_learning_rates()
         self._actions = torch.zeros(env.num_envs, env.num_actions, device=device)
         self._started = False
         # Metrics of the updates in progress, and of finished ones.
@@ -235,6 +236,7 @@ class SAC:
 
     def _learn(self) -> None:
         """Make the updates of one environment step, from one sample of the replay buffer."""
+        self._set_learning_rates()
         cfg, parts = self.cfg, 1 if self._mirror is None else 2
         size = cfg.num_updates * cfg.batch_size // parts
         batch = self.storage.sample(size, cfg.gamma, cfg.num_steps_return, self._generator)
@@ -268,6 +270,17 @@ class SAC:
             if self._is_ending:
                 break
             self._update({name: value[rows] for name, value in inputs.items()})
+
+    def _set_learning_rates(self) -> None:
+        cfg, factor = self.cfg, self._rate_factor.at(self._num_steps)
+        rates = (
+            factor * cfg.critic_learning_rate,
+            factor * cfg.actor_learning_rate,
+            cfg.alpha_learning_rate,
+        )
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate
+        self.learning_rate = rates[1]
 
     def _update(self, inputs: dict[str, torch.Tensor]) -> None:
         self.optimizer.zero_grad(set_to_none=True)
@@ -430,7 +443,6 @@ class SAC:
                 model.load_state_dict(loaded_dict["critic_state_dict"], strict=strict)
         if cfg.get("optimizer"):
             self.optimizer.load_state_dict(loaded_dict["optimizer_state_dict"])
-            self.learning_rate = self.optimizer.param_groups[1]["lr"]
         if load_cfg is None:
             state = loaded_dict["sac_state_dict"]
             self.actor.load_state_dict(state["actor"])
@@ -444,20 +456,16 @@ class SAC:
             self._noise.load_state_dict(state["noise"])
             if self._reward_scale is not None and state["reward_scale"] is not None:
                 self._reward_scale.load_state_dict(state["reward_scale"])
+        self._set_learning_rates()
         return cfg.get("iteration", False)
 
     def override(self, name: str, value: Any) -> None:
-        """Set a setting that `load` restored: learning rates, weight decay, alpha, or the seed.
+        """Set a setting that `load` restored: weight decay, alpha, or the seed.
 
-        Settings with which the algorithm was built act already.
+        Settings with which the algorithm was built, such as learning rates, act already.
         """
-        rates = ("critic_learning_rate", "actor_learning_rate", "alpha_learning_rate")
-        groups = self.optimizer.param_groups
-        if name in rates:
-            groups[rates.index(name)]["lr"] = float(value)
-            self.learning_rate = groups[1]["lr"]
-        elif name == "weight_decay":
-            for group in groups[:2]:
+        if name == "weight_decay":
+            for group in self.optimizer.param_groups[:2]:
                 group[name] = float(value)
         elif name == "init_alpha":
             with torch.no_grad():
@@ -544,6 +552,21 @@ class _ReturnScale:
                 setattr(self, name, value.to(own.device).clone())
 
 
+class _Schedule:
+    """Setting given by points (environment step, value), interpolated linearly."""
+
+    def __init__(self, cfg: RslRlSacAlgorithmCfg, name: str) -> None:
+        points = getattr(cfg, name)
+        steps = [step for step, _ in points]
+        increases = len(steps) > 0 and steps == sorted(set(steps))
+        check_field(cfg, name, increases, "points with increasing steps")
+        self._steps, self._values = zip(*points, strict=True)
+
+    def at(self, num_steps: int) -> float:
+        """Return the value after `num_steps` environment steps."""
+        return float(np.interp(num_steps, self._steps, self._values))
+
+
 class _Teacher:
     """Controller that acts at first, and is imitated by the policy.
 
@@ -551,9 +574,7 @@ class _Teacher:
     """
 
     def __init__(self, cfg: RslRlSacAlgorithmCfg) -> None:
-        steps = [step for step, _ in cfg.imitation]
-        increases = len(steps) > 0 and steps == sorted(set(steps))
-        check_field(cfg, "imitation", increases, "points with increasing steps")
+        self._weight = _Schedule(cfg, "imitation")
         has_weight = any(weight for _, weight in cfg.imitation)
         if cfg.teacher is None and (cfg.teacher_steps > 0 or has_weight):
             raise ValueError(
@@ -561,7 +582,6 @@ class _Teacher:
                 f"and {cfg.imitation}; set teacher to the observation group with its actions."
             )
         self.group = cfg.teacher
-        self._steps, self._weights = zip(*cfg.imitation, strict=True)
 
     def act(self, obs: TensorDict, noise: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Return the controller's actions with `noise` before tanh, `actions` for free ones."""
@@ -571,7 +591,7 @@ class _Teacher:
 
     def weight(self, num_steps: int) -> float:
         """Return the weight of `distance` after `num_steps` environment steps."""
-        return float(np.interp(num_steps, self._steps, self._weights))
+        return self._weight.at(num_steps)
 
     def distance(self, shown: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
         """Return the mean squared distance of `mean` (B, A) from the controller's `shown` (B, A)."""
