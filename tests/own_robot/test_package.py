@@ -251,6 +251,25 @@ def test_own_ground_goes_and_other_geoms_leave_the_ray_group(tmp_path: Path, imp
     assert all(geom.group != 0 for geom in spec.geoms)
 
 
+def test_other_oddities_of_a_file(tmp_path: Path, imported) -> None:
+    """No geom collides by itself, the file has physics of its own, and a body is fixed to the world."""
+    path = write_quadruped(tmp_path / "model")
+    text = path.read_text().replace("<worldbody>", '<worldbody><body name="dock"/>')
+    text = text.replace(
+        "<asset>", '<option impratio="100" cone="elliptic"/><size nconmax="9"/><asset>'
+    )
+    off = ' contype="0" conaffinity="0"'
+    path.write_text(text.replace(off, "").replace("<geom", f"<geom{off}"))
+    spec = spec_of(Package("dog", "velocity", describe_robot(str(path))), tmp_path / "p", imported)
+    assert spec.body("dock") is None
+    assert (spec.option.impratio, spec.nconmax) == (1.0, -1)
+    model = spec.compile()
+    soles = [geom for geom in range(model.ngeom) if model.geom_priority[geom] == 1]
+    assert len(soles) == 4
+    assert model.geom_conaffinity[soles].all()
+    assert not model.geom_contype.any()
+
+
 def test_rotated_imu_is_replaced(tmp_path: Path, imported) -> None:
     path = write_quadruped(tmp_path / "model")
     path.write_text(

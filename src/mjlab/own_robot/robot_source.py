@@ -151,6 +151,11 @@ def reason_lines(what: str, guess: Guess) -> list[str]:
 def _parts(report: RobotReport) -> list[str]:
     anatomy = report.anatomy
     lines = [commented(f'TRUNK = "{anatomy.trunk.value}"', anatomy.trunk.rule)]
+    if anatomy.colliding.source == "rule":
+        lines += [
+            *reason_lines("Geoms that collide", anatomy.colliding),
+            f"COLLIDING = {tuple_source(anatomy.colliding.value, 12)}",
+        ]
     if anatomy.kind.value != "legged":
         return lines + _arm_parts(report)
     lines.append(commented(f'UPRIGHT = "{anatomy.upright.value}"', anatomy.upright.rule))
@@ -281,7 +286,7 @@ def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
         shown = ", ".join(unnamed[:3]) + (", ..." if len(unnamed) > 3 else "")
         lines += [*comment_lines(f"The file leaves {len(unnamed)} elements unnamed: {shown}."),
                   "name_elements(spec)"]  # fmt: skip
-    lines += _removals(report, spec)
+    lines += _removals(report, spec) + _physics(spec)
     if any(g.group == _RAY_GROUP for b in spec.bodies[1:] for g in b.geoms):
         has_visuals = any(not (g.contype or g.conaffinity) for g in spec.geoms)
         group = f"{_COLLISION_GROUP} if geom.contype or geom.conaffinity else {_VISUAL_GROUP}"
@@ -293,8 +298,8 @@ def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
         ]
     if report.anatomy.colliding.source == "rule":
         lines += [
-            *comment_lines(f"{report.anatomy.colliding.rule}. They collide with the ground."),
-            f"for name in {tuple_source(report.anatomy.colliding.value, 30)}:",
+            "# With the ground, not with each other.",
+            "for name in COLLIDING:",
             "    spec.geom(name).conaffinity = 1",
         ]
     if report.anatomy.kind.value == "legged":
@@ -336,6 +341,41 @@ def _removals(report: RobotReport, spec: mujoco.MjSpec) -> list[str]:
     return lines
 
 
+def _physics(spec: mujoco.MjSpec) -> list[str]:
+    """Return lines that leave the physics to the task, without a notice at each start."""
+    option, lines = spec.option, []
+    if option.impratio != 1.0 or option.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        lines += [
+            f"spec.option.impratio = 1.0  # {number(option.impratio)} in the file",
+            "spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL",
+        ]
+    if spec.nconmax != -1 or spec.njmax != -1:
+        lines.append("spec.nconmax = spec.njmax = -1")
+    if lines:
+        lines.insert(
+            0, "# The task sets the physics: `cfg.sim`. Elliptic cones cost twice the time."
+        )
+    return lines
+
+
+def _shared_bodies(report: RobotReport) -> list[str]:
+    """Return the bodies beside a floating base that can be left out: without joints, not referred to."""
+    spec = report.model.spec.copy()
+    root = report.compiled.body_rootid[report.compiled.body(report.anatomy.trunk.value).id]
+    found = []
+    for body in list(spec.worldbody.bodies):
+        if not body.name or body.name == report.compiled.body(root).name or body.joints:
+            continue
+        trial = spec.copy()
+        trial.delete(trial.body(body.name))
+        try:
+            trial.compile()
+        except ValueError:
+            continue
+        found.append(body.name)
+    return found
+
+
 def _legged_spec(report: RobotReport) -> list[str]:
     lines = [
         "for name in SOLES:",
@@ -354,6 +394,11 @@ def _legged_spec(report: RobotReport) -> list[str]:
         "imu_ang_vel": ("GYRO", "SITE", "IMU"),
         "root_angmom": ("SUBTREEANGMOM", "BODY", "TRUNK"),
     }
+    for name in _shared_bodies(report):
+        lines += [
+            "# Fixed to the world: all environments would share it.",
+            f'spec.delete(spec.body("{name}"))',
+        ]
     lines.append("# Sensors that the task reads.")
     for name, (kind, object_type, owner) in sensors.items():
         if name in taken:
