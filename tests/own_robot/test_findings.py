@@ -254,6 +254,13 @@ def tangled(robot: Robot) -> None:
     robot.add(robot.thigh, lump)
 
 
+def immaterial(robot: Robot) -> None:
+    for name, text in robot.files.items():
+        text = re.sub(r' (contype|conaffinity)="[^"]*"', "", text)
+        robot.files[name] = re.sub(r"<geom ", '<geom contype="0" conaffinity="0" ', text)
+    robot.set(robot.trunk)
+
+
 def slippery(robot: Robot) -> None:
     robot.set(robot.foot, priority="0")
 
@@ -295,6 +302,7 @@ FAULTS = {
     "initial pose above the ground": lifted(0.2),
     "initial pose falls": leaning,
     "self-penetration in the initial pose": tangled,
+    "nothing collides": immaterial,
     "soles whose friction cannot be randomized": slippery,
     "frictionless soles": frictionless,
     "unnamed feet": unnamed,

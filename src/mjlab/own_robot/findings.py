@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry as geo
+from mjlab.own_robot.anatomy import finger_joints
 from mjlab.own_robot.gains import (
     MAX_SAG,
     STABLE,
@@ -250,7 +251,13 @@ def _absurd_masses(subject: Subject) -> Iterator[Finding]:
 
 def _asymmetry(subject: Subject) -> Iterator[Finding]:
     mirror = subject.anatomy.mirror.value if subject.is_upright else {}
-    pairs = [(name, partner) for name, (partner, _) in mirror.items() if name < partner]
+    # Fingers of one gripper are alike, and have partners of many kinds.
+    fingers = {subject.model.joint(j).name for j in finger_joints(subject.model)}
+    pairs = [
+        (name, partner)
+        for name, (partner, _) in mirror.items()
+        if name < partner and not {name, partner} & fingers
+    ]
     for quantity, values in _of_joints(subject).items():
         found = {
             (a, b): (values[a], values[b])
@@ -279,7 +286,9 @@ def _asymmetry(subject: Subject) -> Iterator[Finding]:
             [name for pair in uneven for name in pair],
         )
     alone = [
-        name for name in subject.joint_pos if name not in mirror and _is_lateral(subject, name)
+        name
+        for name in subject.joint_pos
+        if name not in mirror and name not in fingers and _is_lateral(subject, name)
     ]
     if alone and len(alone) < len(mirror) / 2:
         yield _asymmetric(subject, f"{_joints(alone)} without a partner on the other side", alone)
@@ -485,23 +494,48 @@ def _seen_by_rays(subject: Subject) -> Iterator[Finding]:
         )
 
 
+def _no_contacts(subject: Subject) -> Iterator[Finding]:
+    free = geo.free_joint(subject.model)
+    if free is not None and not _own_geoms(subject):
+        body = int(subject.model.jnt_bodyid[free])
+        yield Finding(
+            "nothing collides",
+            f"no geom of {_body(subject, body)} has contype, conaffinity or a contact pair",
+            (subject.body_place(body),),
+            "The robot falls through the ground.",
+            'Give the collision geoms contype="1" and conaffinity="1", or use CollisionCfg.',
+        )
+
+
 def _soles(subject: Subject) -> Iterator[Finding]:
+    if not _own_geoms(subject):
+        return
     model = subject.model
     soles = [model.geom(name).id for foot in subject.anatomy.feet.value for name in foot.sole]
     found = [g for g in soles if model.geom_priority[g] == 0 or model.geom_condim[g] == 1]
-    if found:
-        facts = [
-            f"priority {sorted({int(model.geom_priority[g]) for g in found})}",
-            f"condim {sorted({int(model.geom_condim[g]) for g in found})}",
-        ]
-        yield Finding(
-            "soles whose friction cannot be randomized",
-            f"{counted(len(found), 'geom')} of the feet: {', '.join(facts)}",
-            subject.geom_places(found),
-            "With equal priority, MuJoCo takes the larger friction of foot and ground: a foot of 0.3 on ground "
-            "of 1.0 has 1.0. With priority and condim 1, feet have no friction at all.",
-            'Give the soles priority="1" and condim="3", in the file or by CollisionCfg.',
+    paired = {*model.pair_geom1[: model.npair], *model.pair_geom2[: model.npair]}
+    if not found:
+        return
+    if paired & set(found):
+        what = "in contact pairs"
+        why = "A contact pair has a friction and condim of its own, and ignores those of its geoms."
+        cure = 'Delete the pairs, and give the soles priority="1" and condim="3".'
+    else:
+        priorities = sorted({int(model.geom_priority[g]) for g in found})
+        condims = sorted({int(model.geom_condim[g]) for g in found})
+        what = f"priority {_listed(priorities)} and condim {_listed(condims)}"
+        why = (
+            "With equal priority, MuJoCo takes the larger friction of foot and ground: a foot of 0.3 on "
+            "ground of 1.0 has 1.0. With priority and condim 1, feet have no friction at all."
         )
+        cure = 'Give the soles priority="1" and condim="3", in the file or by CollisionCfg.'
+    yield Finding(
+        "soles whose friction cannot be randomized",
+        f"{counted(len(found), 'geom')} of the feet, {what}",
+        subject.geom_places(found),
+        why,
+        cure,
+    )
 
 
 def _unnamed_feet(subject: Subject) -> Iterator[Finding]:
@@ -679,11 +713,15 @@ def _extent(subject: Subject, link: int) -> tuple[np.ndarray, float]:
 
 
 def _own_geoms(subject: Subject) -> list[int]:
-    """Return the colliding geoms of the tree with the free joint; none without one."""
+    """Return the geoms in the tree of the free joint that collide, by themselves or in pairs."""
     model, free = subject.model, geo.free_joint(subject.model)
     root = -1 if free is None else int(model.jnt_bodyid[free])
-    colliding = geo.colliding_geoms(model)
-    return [g for g in colliding if model.body_rootid[model.geom_bodyid[g]] == root]
+    paired = {*model.pair_geom1[: model.npair], *model.pair_geom2[: model.npair]}
+    return [
+        g
+        for g in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root).tolist()
+        if model.geom_contype[g] or model.geom_conaffinity[g] or g in paired
+    ]
 
 
 def _ground_height(subject: Subject) -> float:
@@ -728,9 +766,9 @@ def _places(places: Sequence[str]) -> str:
     return ", ".join(f"{file}:{_listed(own)}" if own else file for file, own in lines.items())
 
 
-def _listed(names: Sequence[str]) -> str:
+def _listed(names: Sequence[object]) -> str:
     rest = len(names) - _LISTED
-    return ", ".join([*names[:_LISTED], f"{rest} more"] if rest > 1 else names)
+    return ", ".join(map(str, [*names[:_LISTED], f"{rest} more"] if rest > 1 else names))
 
 
 RULES: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
@@ -748,6 +786,7 @@ RULES: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
     _absurd_masses,
     _absurd_inertias,
     _asymmetry,
+    _no_contacts,
     _soles,
     _unnamed_feet,
     _seen_by_rays,
