@@ -6,27 +6,24 @@ finding says what, where in the file, why it matters, and the cure. Nothing is r
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry as geo
+from mjlab.own_robot import measures
 from mjlab.own_robot.anatomy import finger_joints
+from mjlab.own_robot.finding import Finding as Finding
+from mjlab.own_robot.finding import listed
 from mjlab.own_robot.gains import (
     MAX_SAG,
     STABLE,
     joint_inertias,
-    rail_model,
-    settle,
-    static_torques,
 )
-from mjlab.own_robot.posture import find_posture, ground_height, over_soles
+from mjlab.own_robot.posture import over_soles
 from mjlab.own_robot.subject import Subject
 from mjlab.utils.string import counted
-from mjlab.utils.tables import WIDTH
 
 MAX_DEPTH = 0.001
 """Largest depth of contacts of the robot with itself (m)."""
@@ -48,46 +45,7 @@ _TINY_RANGE = np.radians(2.0 * np.pi)
 _MIN_GYRATION, _MAX_GYRATION = 1 / 30, 1.5
 # Mass over the volume of the geoms' boxes (kg/m^3): air, and more than tungsten.
 _MIN_DENSITY, _MAX_DENSITY = 1.2, 20_000.0
-# Stiffness and effort limit of joints without gains (N m/rad, N m), and 1 / s.
-_HELD, _STIFFNESS_OVER_DAMPING = 1e3, 15.0
-# Half the size of a marker (m): virtual links of two-axis joints have one.
-_MARKER = 2e-3
-_LISTED = 4
-_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
-_GROUND = (_PLANE, int(mujoco.mjtGeom.mjGEOM_HFIELD))
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Fault of a model."""
-
-    fault: str
-    """Name of the fault, a few words."""
-    what: str
-    """Elements and values."""
-    where: tuple[str, ...]
-    """`file:line` of each element, or its path in the model, or its setting in a config."""
-    why: str
-    """Consequence."""
-    cure: str
-    """Edit that helps."""
-
-    def __str__(self) -> str:
-        parts = {"at": _places(self.where), "why": self.why, "cure": self.cure}
-        lines = [
-            f"{self.fault}: {self.what}",
-            *(f"    {key:<4} {text}" for key, text in parts.items()),
-        ]
-        return "\n".join(
-            textwrap.fill(
-                line,
-                WIDTH,
-                subsequent_indent=9 * " ",
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-            for line in lines
-        )
+_GROUND = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 
 
 def find_faults(subject: Subject) -> list[Finding]:
@@ -99,7 +57,7 @@ def find_faults(subject: Subject) -> list[Finding]:
 
 
 def _zero_gravity(subject: Subject) -> Iterator[Finding]:
-    if not _has_gravity(subject):
+    if not measures.has_gravity(subject):
         option = subject.model.opt
         is_off = bool(option.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
         vector = " ".join(f"{value:g}" for value in option.gravity)
@@ -114,7 +72,7 @@ def _zero_gravity(subject: Subject) -> Iterator[Finding]:
 
 def _stiff_gains(subject: Subject) -> Iterator[Finding]:
     step = float(subject.model.opt.timestep)
-    armature = _by_joint(subject, subject.model.dof_armature)
+    armature = measures.by_joint(subject, subject.model.dof_armature)
     inertia = joint_inertias(subject.model, subject.joint_pos, armature)
     products = {
         name: step * np.sqrt(kp / max(inertia[name], 1e-12))
@@ -143,12 +101,12 @@ def _stiff_gains(subject: Subject) -> Iterator[Finding]:
 
 def _zero_armature(subject: Subject) -> Iterator[Finding]:
     model = subject.model
-    armature = _by_joint(subject, model.dof_armature)
+    armature = measures.by_joint(subject, model.dof_armature)
     candidates = armature if subject.is_urdf and not model.nu else subject.driven
     found = [
         name
         for name in armature
-        if name in candidates and armature[name] == 0.0 and _is_hinge(model, name)
+        if name in candidates and armature[name] == 0.0 and measures.is_hinge(model, name)
     ]
     if found:
         yield Finding(
@@ -162,7 +120,7 @@ def _zero_armature(subject: Subject) -> Iterator[Finding]:
 
 
 def _soft_gains(subject: Subject) -> Iterator[Finding]:
-    sags = _sags(subject) if _has_gravity(subject) and subject.is_upright else {}
+    sags = measures.sags(subject) if measures.has_gravity(subject) and subject.is_upright else {}
     found = [name for name, sag in sags.items() if sag > MAX_SAG]
     if found:
         worst = max(found, key=lambda name: sags[name])
@@ -179,9 +137,9 @@ def _soft_gains(subject: Subject) -> Iterator[Finding]:
 
 
 def _weak_effort(subject: Subject) -> Iterator[Finding]:
-    if not (_has_gravity(subject) and subject.is_upright):
+    if not (measures.has_gravity(subject) and subject.is_upright):
         return
-    torques = _static_torques(subject)
+    torques = measures.holding_torques(subject)
     found = [
         name
         for name, limit in subject.effort.items()
@@ -205,8 +163,8 @@ def _weak_effort(subject: Subject) -> Iterator[Finding]:
 def _absurd_inertias(subject: Subject) -> Iterator[Finding]:
     found: dict[int, tuple[float, float]] = {}
     for link in geo.links(subject.model):
-        mass, center, inertia = _link_inertia(subject, link)
-        points, _ = _extent(subject, link)
+        mass, center, inertia = measures.link_inertia(subject, link)
+        points, _ = measures.extent(subject, link)
         if mass > 0.0 and len(points):
             reach = float(np.linalg.norm(points - center, axis=1).max())
             gyration = float(np.sqrt(np.linalg.eigvalsh(inertia)[-1] / mass))
@@ -229,8 +187,8 @@ def _absurd_inertias(subject: Subject) -> Iterator[Finding]:
 def _absurd_masses(subject: Subject) -> Iterator[Finding]:
     found: dict[int, tuple[float, float]] = {}
     for link in geo.links(subject.model):
-        mass, _, _ = _link_inertia(subject, link)
-        _, volume = _extent(subject, link)
+        mass, _, _ = measures.link_inertia(subject, link)
+        _, volume = measures.extent(subject, link)
         if volume > 0.0 and not _MIN_DENSITY < mass / volume < _MAX_DENSITY:
             found[link] = mass, volume
     if found:
@@ -308,16 +266,17 @@ def _of_joints(subject: Subject) -> dict[str, dict[str, float]]:
     """Return quantities of joints, and of the links that they move, by joint."""
     model = subject.model
     links = {
-        name: _link_inertia(subject, int(model.joint(name).bodyid[0])) for name in subject.joint_pos
+        name: measures.link_inertia(subject, int(model.joint(name).bodyid[0]))
+        for name in subject.joint_pos
     }
     return {
         "mass": {name: mass for name, (mass, _, _) in links.items()},
         "inertia": {name: float(np.trace(inertia)) for name, (_, _, inertia) in links.items()},
-        "armature": _by_joint(subject, model.dof_armature),
-        "damping": _by_joint(
+        "armature": measures.by_joint(subject, model.dof_armature),
+        "damping": measures.by_joint(
             subject, model.dof_damping[:, 0] if model.dof_damping.ndim > 1 else model.dof_damping
         ),
-        "friction loss": _by_joint(subject, model.dof_frictionloss),
+        "friction loss": measures.by_joint(subject, model.dof_frictionloss),
         "kp": {name: subject.stiffness.get(name, 0.0) for name in subject.joint_pos},
         "effort limit": {name: subject.effort.get(name, 0.0) for name in subject.joint_pos},
     }
@@ -400,12 +359,13 @@ def _ground(subject: Subject) -> Iterator[Finding]:
     if free is None:
         return
     root = int(model.jnt_bodyid[free])
-    own = [g for g in geo.colliding_geoms(model) if model.body_rootid[model.geom_bodyid[g]] == root]
-    gap = geo.lowest_height(model, data, own) - _ground_height(subject)
+    gap = geo.lowest_height(model, data, measures.own_geoms(subject)) - measures.level_of_ground(
+        subject
+    )
     height = float(data.xpos[root, 2])
     is_sunk = gap < -MAX_SUNK
     # Boxes and height fields may carry the robot above the plane.
-    if not np.isfinite(gap) or not (is_sunk or (gap > MAX_GAP and not _has_steps(subject))):
+    if not np.isfinite(gap) or not (is_sunk or (gap > MAX_GAP and not measures.has_steps(subject))):
         return
     yield Finding(
         "initial pose in the ground" if is_sunk else "initial pose above the ground",
@@ -482,7 +442,7 @@ def _static_bodies(subject: Subject) -> Iterator[Finding]:
 
 def _seen_by_rays(subject: Subject) -> Iterator[Finding]:
     model = subject.model
-    found = [g for g in _own_geoms(subject) if model.geom_group[g] in subject.ray_groups]
+    found = [g for g in measures.own_geoms(subject) if model.geom_group[g] in subject.ray_groups]
     if found:
         groups = sorted({int(model.geom_group[g]) for g in found})
         yield Finding(
@@ -496,7 +456,7 @@ def _seen_by_rays(subject: Subject) -> Iterator[Finding]:
 
 def _no_contacts(subject: Subject) -> Iterator[Finding]:
     free = geo.free_joint(subject.model)
-    if free is not None and not _own_geoms(subject):
+    if free is not None and not measures.own_geoms(subject):
         body = int(subject.model.jnt_bodyid[free])
         yield Finding(
             "nothing collides",
@@ -508,7 +468,7 @@ def _no_contacts(subject: Subject) -> Iterator[Finding]:
 
 
 def _soles(subject: Subject) -> Iterator[Finding]:
-    if not _own_geoms(subject):
+    if not measures.own_geoms(subject):
         return
     model = subject.model
     soles = [model.geom(name).id for foot in subject.anatomy.feet.value for name in foot.sole]
@@ -523,7 +483,7 @@ def _soles(subject: Subject) -> Iterator[Finding]:
     else:
         priorities = sorted({int(model.geom_priority[g]) for g in found})
         condims = sorted({int(model.geom_condim[g]) for g in found})
-        what = f"priority {_listed(priorities)} and condim {_listed(condims)}"
+        what = f"priority {listed(priorities)} and condim {listed(condims)}"
         why = (
             "With equal priority, MuJoCo takes the larger friction of foot and ground: a foot of 0.3 on "
             "ground of 1.0 has 1.0. With priority and condim 1, feet have no friction at all."
@@ -547,7 +507,7 @@ def _unnamed_feet(subject: Subject) -> Iterator[Finding]:
     if found:
         yield Finding(
             "unnamed feet",
-            f"{counted(len(found), 'part')} of the feet ({_listed([e.name for e in found])} here)",
+            f"{counted(len(found), 'part')} of the feet ({listed([e.name for e in found])} here)",
             tuple(subject.place(element) for element in found),
             "Contact sensors, friction and rewards find feet by name patterns.",
             'Name them, such as name="FL_foot_collision".',
@@ -607,139 +567,6 @@ def missed_joints(
         )
 
 
-# Quantities.
-
-
-def _by_joint(subject: Subject, values: np.ndarray) -> dict[str, float]:
-    """Return the values of degrees of freedom, (nv,), by joint."""
-    model = subject.model
-    return {
-        name: float(values[model.jnt_dofadr[model.joint(name).id]]) for name in subject.joint_pos
-    }
-
-
-def _has_gravity(subject: Subject) -> bool:
-    option = subject.model.opt
-    is_off = option.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    return not is_off and option.gravity[2] < 0.0
-
-
-def _is_hinge(model: mujoco.MjModel, joint: str) -> bool:
-    return int(model.joint(joint).type[0]) == geo.HINGE
-
-
-def _sags(subject: Subject) -> dict[str, float]:
-    """Return the deflection of hinges with gains under the robot's weight (rad), of legs if it has some.
-
-    Legs in simulation, with the trunk kept level. Arms: torque less dry friction, over stiffness.
-    """
-    model, anatomy = subject.model, subject.anatomy
-    if anatomy.kind.value != "legged":
-        torques, friction = _static_torques(subject), _by_joint(subject, model.dof_frictionloss)
-        return {
-            name: max(abs(torques[name]) - friction[name], 0.0) / kp
-            for name, kp in subject.stiffness.items()
-            if kp > 0.0 and _is_hinge(model, name)
-        }
-    if not all(subject.stiffness.get(name, 0.0) > 0.0 for name in anatomy.leg_joints):
-        return {}
-    joint_pos = _standing_pose(subject)
-    # Joints without gains are held.
-    stiffness = {name: subject.stiffness.get(name, _HELD) for name in joint_pos}
-    effort = {name: subject.effort.get(name, _HELD) for name in joint_pos}
-    armature = _by_joint(subject, model.dof_armature)
-    sags = settle(
-        rail_model(subject.spec, model, anatomy, effort, armature),
-        joint_pos,
-        ground_height(model, mujoco.MjData(model), anatomy, joint_pos),
-        stiffness,
-        {name: kp / _STIFFNESS_OVER_DAMPING for name, kp in stiffness.items()},
-    )
-    return {name: sags[name] for name in anatomy.leg_joints}
-
-
-def _standing_pose(subject: Subject) -> dict[str, float]:
-    """Return the initial joint positions; those of a standing pose if the file has none."""
-    if subject.anatomy.kind.value == "legged" and subject.pose == "qpos0":
-        return find_posture(subject.model, subject.anatomy).joint_pos.value
-    return subject.joint_pos
-
-
-def _static_torques(subject: Subject) -> dict[str, float]:
-    """Return the torque that holds each joint still (N m, N)."""
-    joint_pos = _standing_pose(subject)
-    torques = static_torques(subject.model, subject.anatomy, joint_pos)
-    # Bodies with `gravcomp` carry themselves.
-    carried = _by_joint(subject, subject.data.qfrc_gravcomp)
-    return {name: torque - carried[name] for name, torque in torques.items()}
-
-
-def _link_inertia(subject: Subject, link: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass (kg), center of mass, (3,), and inertia about it, (3, 3), of a link in the world."""
-    model, data = subject.model, subject.data
-    own = np.flatnonzero(model.body_weldid == link)
-    mass = float(model.body_mass[own].sum())
-    inertia = np.zeros((3, 3))
-    if mass == 0.0:
-        return mass, data.xpos[link].copy(), inertia
-    center = model.body_mass[own] @ data.xipos[own] / mass
-    for body in own:
-        rotation, offset = data.ximat[body].reshape(3, 3), data.xipos[body] - center
-        inertia += rotation @ np.diag(model.body_inertia[body]) @ rotation.T
-        inertia += model.body_mass[body] * (offset @ offset * np.eye(3) - np.outer(offset, offset))
-    return mass, center, inertia
-
-
-def _extent(subject: Subject, link: int) -> tuple[np.ndarray, float]:
-    """Return where a link reaches in the world, (P, 3), and the volume of its geoms' boxes (m^3).
-
-    Points are the corners of the boxes, and the links that hang on it. Geoms of millimeters
-    are markers; of a link with these only, both are empty.
-    """
-    model, data = subject.model, subject.data
-    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
-    corners, volume = [], 0.0
-    for g in np.flatnonzero(model.body_weldid[model.geom_bodyid] == link):
-        center, half = model.geom_aabb[g, :3], model.geom_aabb[g, 3:]
-        if half.max() <= _MARKER:
-            continue
-        local = center + signs * half
-        corners.append(data.geom_xpos[g] + local @ data.geom_xmat[g].reshape(3, 3).T)
-        volume += float(np.prod(2.0 * half))
-    if not corners:
-        return np.zeros((0, 3)), 0.0
-    below = [b for b in geo.links(model) if geo.parent_link(model, b) == link]
-    return np.concatenate([*corners, data.xpos[below]]), volume
-
-
-def _own_geoms(subject: Subject) -> list[int]:
-    """Return the geoms in the tree of the free joint that collide, by themselves or in pairs."""
-    model, free = subject.model, geo.free_joint(subject.model)
-    root = -1 if free is None else int(model.jnt_bodyid[free])
-    paired = {*model.pair_geom1[: model.npair], *model.pair_geom2[: model.npair]}
-    return [
-        g
-        for g in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root).tolist()
-        if model.geom_contype[g] or model.geom_conaffinity[g] or g in paired
-    ]
-
-
-def _ground_height(subject: Subject) -> float:
-    """Return the height of the highest level static plane; 0 without one."""
-    model, data = subject.model, subject.data
-    static = (model.geom_type == _PLANE) & (model.body_weldid[model.geom_bodyid] == 0)
-    # Others are walls.
-    ground = static & (data.geom_xmat[:, 8] > 0.99)
-    return float(data.geom_xpos[ground, 2].max()) if ground.any() else 0.0
-
-
-def _has_steps(subject: Subject) -> bool:
-    """Return True if static geoms other than planes may carry the robot."""
-    model = subject.model
-    static = (model.geom_type != _PLANE) & (model.body_weldid[model.geom_bodyid] == 0)
-    return bool((static & ((model.geom_contype > 0) | (model.geom_conaffinity > 0))).any())
-
-
 # Text.
 
 
@@ -749,26 +576,11 @@ def _body(subject: Subject, body: int) -> str:
 
 def _bodies(subject: Subject, bodies: Iterable[int]) -> str:
     names = [subject.model.body(b).name for b in bodies]
-    return f"{counted(len(names), 'link')} ({_listed(names)})"
+    return f"{counted(len(names), 'link')} ({listed(names)})"
 
 
 def _joints(names: Sequence[str]) -> str:
-    return f"{counted(len(names), 'joint')} ({_listed(names)})"
-
-
-def _places(places: Sequence[str]) -> str:
-    """Return places, of those in one file its name once: `robot.xml:12, 20, 31`."""
-    lines: dict[str, list[str]] = {}
-    for place in dict.fromkeys(places):
-        file, colon, line = place.rpartition(":")
-        is_line = bool(colon) and line.isdigit()
-        lines.setdefault(file if is_line else place, []).extend([line] if is_line else [])
-    return ", ".join(f"{file}:{_listed(own)}" if own else file for file, own in lines.items())
-
-
-def _listed(names: Sequence[object]) -> str:
-    rest = len(names) - _LISTED
-    return ", ".join(map(str, [*names[:_LISTED], f"{rest} more"] if rest > 1 else names))
+    return f"{counted(len(names), 'joint')} ({listed(names)})"
 
 
 RULES: tuple[Callable[[Subject], Iterator[Finding]], ...] = (
