@@ -23,8 +23,8 @@ import yaml
 
 import mjlab
 from mjlab.own_robot import geometry as geo
-from mjlab.own_robot.gains import MAX_SAG, rail_model, settle
-from mjlab.own_robot.posture import knee_forward
+from mjlab.own_robot.gains import MAX_SAG, rail_model, set_gains, settle
+from mjlab.own_robot.posture import check_pose, knee_forward
 from mjlab.own_robot.report import RobotReport, describe_robot
 
 PACKAGES = (
@@ -196,14 +196,32 @@ def check_legs(report: RobotReport, truth: dict[str, Any], questions: set[str]) 
     right = set(truth["falls"]) <= falls and not set(truth["not_falls"]) & falls
     yield "falls", right, str(sorted(falls))
     yield "on the ground", *_touches(report)
-    model = rail_model(
-        report.spec, report.compiled, anatomy, report.effort.value, report.armature.value
-    )
-    sag = settle(
-        model, report.joint_pos.value, height, report.stiffness.value, report.damping.value
-    )
+    faults = check_pose(model, anatomy, report.joint_pos.value, report.posture.leg_length)
+    yield "pose stands", not faults, str(faults)
+    model = rail_model(report.spec, model, anatomy, report.effort.value, report.armature.value)
+    pose, gains = report.joint_pos.value, (report.stiffness.value, report.damping.value)
+    sag = settle(model, pose, height, *gains)
     worst = max(anatomy.leg_joints, key=lambda j: sag[j])
     yield "sag", sag[worst] <= MAX_SAG, f"{worst} {sag[worst]:.3f} rad"
+    if len(links) >= 4:
+        # Two legs fall without a policy.
+        yield "stands free", *_stands_free(report)
+
+
+def _stands_free(report: RobotReport) -> tuple[bool, str]:
+    """Return True if the trunk keeps three quarters of its height for 2 s."""
+    anatomy, pose = report.anatomy, report.joint_pos.value
+    model = rail_model(
+        report.spec, report.compiled, anatomy, report.effort.value, report.armature.value, free=True
+    )
+    set_gains(model, report.stiffness.value, report.damping.value)
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, pose, report.root_height.value)
+    for name, position in pose.items():
+        data.ctrl[model.actuator(name).id] = position
+    mujoco.mj_step(model, data, round(2.0 / model.opt.timestep))
+    share = data.xpos[model.body(anatomy.trunk.value).id][2] / report.root_height.value
+    return bool(share > 0.75), f"trunk at {share:.0%} of its height after 2 s"
 
 
 def _touches(report: RobotReport) -> tuple[bool, str]:

@@ -39,6 +39,8 @@ class Foot:
     """Site on the foot; None if there is none."""
     position: tuple[float, float, float]
     """Middle of the sole in the frame of the body (m)."""
+    normal: tuple[float, float, float]
+    """Direction away from the ground, in the frame of the body, when the sole is level."""
     size: tuple[float, float]
     """Length and width of the sole (m)."""
 
@@ -200,11 +202,21 @@ def _feet(model: mujoco.MjModel, trunk: int) -> tuple[Foot, ...]:
             best, links, pose = height, found, qpos
     if not links:
         return ()
+    feet = {link: [] for link in links}
+    # At zero, legs are straight; in a keyframe, soles are level.
+    for qpos in (pose, model.qpos0):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        for link in links:
+            feet[link].append(_foot(model, data, link))
+    level = [max(found, key=lambda foot: foot.size[0] * foot.size[1]) for found in feet.values()]
     data.qpos[:] = pose
     mujoco.mj_kinematics(model, data)
     frame, origin = data.xmat[trunk].reshape(3, 3), data.xpos[trunk].copy()
-    feet = [(_foot(model, data, link), (data.xpos[link] - origin) @ frame) for link in links]
-    return tuple(foot for foot, _ in sorted(feet, key=lambda item: _row_order(item[1], feet)))
+    placed = [
+        (foot, (data.xpos[link] - origin) @ frame) for foot, link in zip(level, links, strict=True)
+    ]
+    return tuple(foot for foot, _ in sorted(placed, key=lambda item: _row_order(item[1], placed)))
 
 
 def _row_order(position: np.ndarray, feet: list) -> tuple[float, float]:
@@ -230,6 +242,7 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
         sole=tuple(model.geom(g).name for g in sole),
         site=model.site(sites[0]).name or None if sites else None,
         position=(float(local[0]), float(local[1]), float(local[2])),
+        normal=tuple(float(x) for x in data.xmat[link].reshape(3, 3)[2]),
         size=(float(high[0] - low[0]), float(high[1] - low[1])),
     )
 

@@ -27,6 +27,9 @@ TIMESTEP = 0.005
 """Time step of the velocity tasks (s)."""
 ARM_ERROR = 0.1
 """Position error at which the joint of an arm has its effort limit (rad)."""
+SWAY_MARGIN = 2.5
+"""Stiffness of hips against swaying, as a multiple of the smallest stable one, m g h over the legs: the
+Aliengo sinks by 24 % at 2, by 18 % at 3."""
 MAX_EFFORT = 3.0
 """Effort limit that is plausible, as a multiple of weight x height."""
 DAMPING_RATIO = 0.7
@@ -226,10 +229,11 @@ def find_gains(
     inertia = joint_inertias(model, joint_pos, armature)
     own = servo_stiffness(model)
     stiffness, cap = {}, {}
+    sway = _sway_stiffness(model, anatomy, height)
     for name in joint_pos:
         cap[name] = (STABLE / TIMESTEP) ** 2 * inertia[name]
         error = 1.0 if legged else ARM_ERROR
-        wanted = max(effort[name] / error, abs(torque[name]) / STATIC_SAG)
+        wanted = max(effort[name] / error, abs(torque[name]) / STATIC_SAG, sway.get(name, 0.0))
         if own.get(name, 0.0) * 0.2 > abs(torque[name]):
             wanted = own[name]
         stiffness[name] = min(wanted, cap[name])
@@ -260,6 +264,21 @@ def find_gains(
     return Guess(stiffness, rule, "set" if answers else "rule"), Guess(
         damping, "damping ratio 0.7 with the inertia at the joint"
     )
+
+
+def _sway_stiffness(model: mujoco.MjModel, anatomy: Anatomy, height: float) -> dict[str, float]:
+    """Return the stiffness with which the hips keep four and more legs from swaying over (N m/rad).
+
+    Legs that turn by q about point feet lower the trunk's weight m g by h q^2 / 2, against the work
+    k q^2 / 2 in each hip: stable if the sum of k is above m g h. Two legs balance by stepping.
+    """
+    legs = anatomy.legs.value
+    if len(legs) < 4:
+        return {}
+    weight = 9.81 * float(model.body_subtreemass[model.body(anatomy.trunk.value).id])
+    smallest = SWAY_MARGIN * weight * height / len(legs)
+    # All joints above the knee, the last but the ankle's.
+    return {name: smallest for leg in legs for name in leg.joints[:2]}
 
 
 def like_joints(anatomy: Anatomy, joints: list[str]) -> list[tuple[str, ...]]:
@@ -312,10 +331,11 @@ def settle(
     """
     set_gains(model, stiffness, damping)
     data = mujoco.MjData(model)
+    geo.set_pose(model, data, joint_pos, height)
     for name, position in joint_pos.items():
-        data.qpos[model.jnt_qposadr[model.joint(name).id]] = position
         data.ctrl[model.actuator(name).id] = position
-    data.qpos[model.jnt_qposadr[model.joint(RAIL).id]] = height
+    if geo.free_joint(model) is None:
+        data.qpos[model.jnt_qposadr[model.joint(RAIL).id]] = height
     mujoco.mj_step(model, data, round(SETTLE_TIME / model.opt.timestep))
     return {
         name: abs(float(data.qpos[model.jnt_qposadr[model.joint(name).id]]) - position)
@@ -333,32 +353,26 @@ def rail_model(
     anatomy: Anatomy,
     effort: dict[str, float],
     armature: dict[str, float],
+    *,
+    free: bool = False,
 ) -> mujoco.MjModel:
-    """Return the robot on level ground, its trunk on a vertical rail, with a position servo per joint."""
+    """Return the robot on level ground with a position servo per joint.
+
+    Args:
+        spec: Robot.
+        compiled: `spec`, compiled.
+        anatomy: Parts of the robot.
+        effort: Effort limit of each joint.
+        armature: Armature of each joint.
+        free: Keep the free joint; else the trunk slides on a vertical rail.
+    """
     spec = spec.copy()
     for elements in (spec.keys, spec.actuators, spec.sensors, spec.pairs):
         for element in list(elements):
             spec.delete(element)
     _drop_visuals(spec, compiled, set(anatomy.colliding.value))
-    trunk = spec.body(anatomy.trunk.value)
-    for joint in list(trunk.joints):
-        spec.delete(joint)
-    trunk.pos, trunk.quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-    # Not what the default class has for the robot's joints.
-    trunk.add_joint(
-        name=RAIL,
-        type=mujoco.mjtJoint.mjJNT_SLIDE,
-        axis=(0.0, 0.0, 1.0),
-        pos=(0.0, 0.0, 0.0),
-        limited=False,
-        range=(0.0, 0.0),
-        actfrclimited=False,
-        actfrcrange=(0.0, 0.0),
-        armature=0.0,
-        damping=0.0,
-        frictionloss=0.0,
-        stiffness=0.0,
-    )
+    if not free:
+        _put_on_rail(spec.body(anatomy.trunk.value), spec)
     for geom in spec.geoms:
         # The ground collides with the robot; the robot, not with itself.
         geom.contype, geom.conaffinity = 0, 1
@@ -389,6 +403,28 @@ def rail_model(
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.gravity = (0.0, 0.0, -9.81)
     return spec.compile()
+
+
+def _put_on_rail(trunk: mujoco.MjsBody, spec: mujoco.MjSpec) -> None:
+    """Replace the free joint of the trunk by a vertical slide."""
+    for joint in list(trunk.joints):
+        spec.delete(joint)
+    trunk.pos, trunk.quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    # Not what the default class has for the robot's joints.
+    trunk.add_joint(
+        name=RAIL,
+        type=mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=(0.0, 0.0, 1.0),
+        pos=(0.0, 0.0, 0.0),
+        limited=False,
+        range=(0.0, 0.0),
+        actfrclimited=False,
+        actfrcrange=(0.0, 0.0),
+        armature=0.0,
+        damping=0.0,
+        frictionloss=0.0,
+        stiffness=0.0,
+    )
 
 
 def set_gains(

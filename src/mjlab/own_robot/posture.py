@@ -22,6 +22,9 @@ EXTENSION = 0.88
 """Height of the hip above the sole in a searched pose, as a share of the leg's length."""
 MIN_TRUNK_HEIGHT = 0.55
 """Height of the trunk in a standing pose, as a share of that with straight legs."""
+OVER_SOLES = 0.02
+"""Distance of the center of mass from the soles, seen from above, as a share of its height: two feet with
+spheres for soles have a hull of millimeters."""
 MARGIN = 0.05
 """Share of a joint's range kept free at both ends in a searched pose."""
 
@@ -207,23 +210,28 @@ def _bend(
     data = mujoco.MjData(model)
     geo.set_pose(model, data, pose)
     hip = data.xanchor[model.joint(joints[0]).id].copy()
-    drop = float(hip[2])
-    length = straight + drop
-    # Two legs carry the center of mass above the soles; four and more stand below their hips.
-    x = float(data.subtree_com[model.body(anatomy.trunk.value).id][0])
-    target = np.array([x if len(anatomy.legs.value) == 2 else hip[0], drop - EXTENSION * length])
-    link = model.body(foot.link).id
-    up = data.xmat[link].reshape(3, 3)[2].copy() if len(joints) > 2 else None
+    length = straight + float(hip[2])
+    depth = float(hip[2]) - EXTENSION * length
+    link, trunk = model.body(foot.link).id, model.body(anatomy.trunk.value).id
+    # A leg without an ankle cannot keep its sole level.
+    level = 0.3 if len(joints) > 2 else 0.0
     ranges = np.array([geo.joint_range(model, model.joint(j).id) for j in joints])
     slack = MARGIN * np.ptp(ranges, axis=1)
     low, high = ranges[:, 0] + slack, ranges[:, 1] - slack
+    mirror, two_legs = anatomy.mirror.value, len(anatomy.legs.value) == 2
 
     def residual(angles: np.ndarray) -> np.ndarray:
-        geo.set_pose(model, data, pose | dict(zip(joints, angles, strict=True)))
-        position = _sole_position(model, data, anatomy, foot)[[0, 2]]
-        tilt = np.zeros(3) if up is None else data.xmat[link].reshape(3, 3)[2] - up
+        moved = dict(zip(joints, angles, strict=True))
+        if two_legs:
+            moved |= {mirror[n][0]: mirror[n][1] * q for n, q in moved.items() if n in mirror}
+        geo.set_pose(model, data, pose | moved)
+        # Two legs carry the center of mass above the soles; four and more stand below their hips.
+        x = float(data.subtree_com[trunk][0]) if two_legs else float(hip[0])
+        sole = _sole_position(model, data, anatomy, foot)
+        place = np.array([sole[0] - x, sole[2] - depth]) / length
+        tilt = data.xmat[link].reshape(3, 3) @ np.array(foot.normal) - np.array([0.0, 0.0, 1.0])
         excess = geo.tendon_excess(model, data)
-        return np.concatenate([(position - target) / length, 0.3 * tilt, excess, 1e-3 * angles])
+        return np.concatenate([place, level * tilt, excess, 1e-3 * angles])
 
     rng, found = np.random.default_rng(0), []
     for _ in range(12):
@@ -284,14 +292,17 @@ def _sole_position(
 
 
 def over_soles(model: mujoco.MjModel, data: mujoco.MjData, anatomy: Anatomy) -> bool:
-    """Return True if the center of mass is above the convex hull of the soles."""
-    points = np.vstack([sole_points(model, data, foot) for foot in anatomy.feet.value])[:, :2]
-    com = data.subtree_com[model.body(anatomy.trunk.value).id][:2]
+    """Return True if the center of mass is above the convex hull of the soles, or nearly so."""
+    points = np.vstack([sole_points(model, data, foot) for foot in anatomy.feet.value])
+    com = data.subtree_com[model.body(anatomy.trunk.value).id]
+    slack = OVER_SOLES * float(com[2] - points[:, 2].min())
+    points, com = points[:, :2], com[:2]
     try:
         hull = ConvexHull(points)
     except QhullError:
-        return bool((points.min(axis=0) <= com).all() and (com <= points.max(axis=0)).all())
-    return bool((hull.equations[:, :2] @ com + hull.equations[:, 2] < 0.005).all())
+        inside = (points.min(axis=0) - slack <= com) & (com <= points.max(axis=0) + slack)
+        return bool(inside.all())
+    return bool((hull.equations[:, :2] @ com + hull.equations[:, 2] < slack).all())
 
 
 def _feet_mirrored(data: mujoco.MjData, model: mujoco.MjModel, anatomy: Anatomy) -> bool:
