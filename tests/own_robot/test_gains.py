@@ -67,7 +67,7 @@ def test_stands_free(reports, robot):
         data.ctrl[model.actuator(name).id] = position
     mujoco.mj_step(model, data, 400)
     trunk = model.body(report.anatomy.trunk.value).id
-    assert data.xpos[trunk][2] > 0.8 * report.root_height.value
+    assert data.xpos[trunk][2] > 0.75 * report.root_height.value
     assert data.xmat[trunk].reshape(3, 3)[2, 2] > 0.98
 
 
@@ -113,12 +113,12 @@ def test_static_torques_are_those_of_stiff_servos(reports):
     model = rail_of(report)
     # Friction would carry part of the load.
     model.geom_friction[:] = 1e-4
-    stiff = dict.fromkeys(torques, 2000.0)
+    stiff = dict.fromkeys(torques, 300.0)
     sag = settle(
-        model, report.joint_pos.value, report.root_height.value, stiff, dict.fromkeys(torques, 20.0)
+        model, report.joint_pos.value, report.root_height.value, stiff, dict.fromkeys(torques, 10.0)
     )
     for joint in report.anatomy.leg_joints:
-        assert 2000.0 * sag[joint] == pytest.approx(abs(torques[joint]), rel=0.25, abs=1.0)
+        assert 300.0 * sag[joint] == pytest.approx(abs(torques[joint]), rel=0.25, abs=0.2)
 
 
 def test_tightest_effort_limit():

@@ -209,7 +209,10 @@ def _feet(model: mujoco.MjModel, trunk: int) -> tuple[Foot, ...]:
         mujoco.mj_kinematics(model, data)
         for link in links:
             feet[link].append(_foot(model, data, link))
-    level = [max(found, key=lambda foot: foot.size[0] * foot.size[1]) for found in feet.values()]
+    level = [
+        straight if np.prod(straight.size) > 1.5 * np.prod(posed.size) else posed
+        for posed, straight in feet.values()
+    ]
     data.qpos[:] = pose
     mujoco.mj_kinematics(model, data)
     frame, origin = data.xmat[trunk].reshape(3, 3), data.xpos[trunk].copy()
@@ -235,6 +238,7 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
     low, high = (f([f(points[g], axis=0) for g in sole], axis=0) for f in (np.min, np.max))
     middle = np.array([*(0.5 * (low + high))[:2], lowest])
     local = data.xmat[link].reshape(3, 3).T @ (middle - data.xpos[link])
+    normal = data.xmat[link].reshape(3, 3)[2]
     sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == link]
     sites.sort(key=lambda s: float(np.linalg.norm(data.site_xpos[s] - middle)))
     return Foot(
@@ -242,7 +246,7 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
         sole=tuple(model.geom(g).name for g in sole),
         site=model.site(sites[0]).name or None if sites else None,
         position=(float(local[0]), float(local[1]), float(local[2])),
-        normal=tuple(float(x) for x in data.xmat[link].reshape(3, 3)[2]),
+        normal=(float(normal[0]), float(normal[1]), float(normal[2])),
         size=(float(high[0] - low[0]), float(high[1] - low[1])),
     )
 

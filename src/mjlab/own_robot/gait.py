@@ -63,25 +63,25 @@ def pose_tolerance(
             (0, 0, 0, -TURN),
         ]
     )
+    mirror = anatomy.mirror.value
+    done: set[str] = set()
     for leg, foot in zip(anatomy.legs.value, anatomy.feet.value, strict=True):
+        if done.issuperset(leg.joints):
+            continue
         home = np.array([joint_pos[name] for name in leg.joints])
         excursions = np.array(
             [step(model, leg, foot, joint_pos, move[:3], move[3]) - home for move in moves]
         )
         spread = SPREAD * np.abs(excursions).max(axis=0)
         largest = np.clip(spread, MIN_TOLERANCE, MAX_TOLERANCE)
-        tolerance |= {name: float(t) for name, t in zip(leg.joints, largest, strict=True)}
-    tolerance = {name: round(_of_pair(anatomy, tolerance, name), 2) for name in tolerance}
+        for name, value in zip(leg.joints, largest, strict=True):
+            partner, _ = mirror.get(name, (name, 1.0))
+            done |= {name, partner}
+            tolerance[name] = tolerance[partner] = round(float(value), 2)
     return Guess(
         tolerance,
         f"0.8 of what strides of {stride:.2f} m and lifts of {lift:.2f} m need; 0.15 rad elsewhere",
     )
-
-
-def _of_pair(anatomy: Anatomy, values: dict[str, float], joint: str) -> float:
-    """Return the larger value of a joint and its mirror image."""
-    partner, _ = anatomy.mirror.value.get(joint, (joint, 1.0))
-    return max(values[joint], values[partner])
 
 
 def step(
@@ -118,8 +118,11 @@ def step(
     # A leg of three joints cannot keep its foot level.
     level = 0.3 if len(leg.joints) > 3 else 0.0
 
+    addresses = geo.qpos_addresses(model, leg.joints)
+
     def residual(angles: np.ndarray) -> np.ndarray:
-        geo.set_pose(model, data, joint_pos | dict(zip(leg.joints, angles, strict=True)))
+        data.qpos[addresses] = angles
+        mujoco.mj_kinematics(model, data)
         actual = data.xmat[link].reshape(3, 3)
         error = (data.xpos[link] + actual @ local - target) / length
         return np.concatenate([error, level * (actual - wanted).ravel(), 0.02 * (angles - home)])

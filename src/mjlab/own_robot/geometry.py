@@ -151,8 +151,17 @@ def set_pose(
     if free is not None:
         start = model.jnt_qposadr[free]
         data.qpos[start : start + 7] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
-    for name, angle in joint_pos.items():
-        data.qpos[model.jnt_qposadr[model.joint(name).id]] = angle
+    data.qpos[qpos_addresses(model, joint_pos)] = list(joint_pos.values())
+    update(model, data)
+
+
+def qpos_addresses(model: mujoco.MjModel, joints: Iterable[str]) -> list[int]:
+    """Return the index in `qpos` of each hinge or slide."""
+    return [int(model.jnt_qposadr[model.joint(name).id]) for name in joints]
+
+
+def update(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Compute poses, centers of mass and lengths of tendons from `qpos`."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     mujoco.mj_tendon(model, data)

@@ -1,7 +1,7 @@
 """Standing pose of a legged robot: the keyframe that passes the checks, else a searched one.
 
 Poses are joint positions by name, with the trunk level. The search bends the pitch joints of one leg
-until the sole is level and below the center of mass at `EXTENSION` of the leg's length, and mirrors it.
+until the sole is level and below the center of mass at `EXTENSION` of its length, and mirrors it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from mjlab.own_robot import geometry as geo
 from mjlab.own_robot.anatomy import Anatomy, Foot, Leg, candidate_poses, foot_links
 from mjlab.own_robot.guess import Guess, Question
 
-EXTENSION = 0.88
-"""Height of the hip above the sole in a searched pose, as a share of the leg's length."""
+EXTENSION = {2: 0.92, 4: 0.75}
+"""Height of the hips above the soles in a searched pose, as a share of the leg's length, by number of legs:
+0.87 to 0.95 in the keyframes of Berkeley Humanoid, Apollo, T1, H1 and G1; 0.67 to 0.70 in those of Go1,
+Aliengo, B2 and HyQReal, 0.8 of Spot."""
 MIN_TRUNK_HEIGHT = 0.55
 """Height of the trunk in a standing pose, as a share of that with straight legs."""
 OVER_SOLES = 0.02
@@ -70,7 +72,10 @@ def find_posture(
         joint_pos, questions = _searched_pose(model, anatomy, straight, answers)
         why = "; ".join(f"{name}: {faults[0]}" for name, faults in rejected[:-1]) or "no keyframe"
         source = "asked" if questions else "rule"
-        pose = Guess(joint_pos, f"{why}; feet below the hips at 0.88 of the leg, mirrored", source)
+        share = EXTENSION[2 if len(anatomy.legs.value) == 2 else 4]
+        pose = Guess(
+            joint_pos, f"{why}; soles level, legs at {share} of their length, mirrored", source
+        )
     pose = dataclasses.replace(pose, value={n: round(q, 4) + 0.0 for n, q in pose.value.items()})
     if answers:
         pose = dataclasses.replace(pose, value=pose.value | answers, source="set")
@@ -139,8 +144,12 @@ def straight_height(model: mujoco.MjModel, anatomy: Anatomy) -> float:
         joints = pitch_joints(model, leg)
         ranges = np.array([geo.joint_range(model, model.joint(j).id) for j in joints])
 
-        def depth(angles: np.ndarray, joints=joints, foot=foot) -> float:
-            geo.set_pose(model, data, clipped | dict(zip(joints, angles, strict=True)))
+        geo.set_pose(model, data, clipped)
+        addresses = geo.qpos_addresses(model, joints)
+
+        def depth(angles: np.ndarray, addresses=addresses, foot=foot) -> float:
+            data.qpos[addresses] = angles
+            mujoco.mj_kinematics(model, data)
             return -float(_sole_position(model, data, anatomy, foot)[2])
 
         if not joints:
@@ -151,8 +160,7 @@ def straight_height(model: mujoco.MjModel, anatomy: Anatomy) -> float:
         for width in (0.2, 0.05, 0.02):
             for _ in range(40):
                 trial = np.clip(start + width * rng.normal(size=len(joints)), *ranges.T)
-                if depth(trial) > depth(start):
-                    start = trial
+                start = max(start, trial, key=depth)
         best = max(best, depth(start))
     return best
 
@@ -211,20 +219,25 @@ def _bend(
     geo.set_pose(model, data, pose)
     hip = data.xanchor[model.joint(joints[0]).id].copy()
     length = straight + float(hip[2])
-    depth = float(hip[2]) - EXTENSION * length
+    depth = float(hip[2]) - EXTENSION[2 if len(anatomy.legs.value) == 2 else 4] * length
     link, trunk = model.body(foot.link).id, model.body(anatomy.trunk.value).id
     # A leg without an ankle cannot keep its sole level.
     level = 0.3 if len(joints) > 2 else 0.0
     ranges = np.array([geo.joint_range(model, model.joint(j).id) for j in joints])
     slack = MARGIN * np.ptp(ranges, axis=1)
     low, high = ranges[:, 0] + slack, ranges[:, 1] - slack
-    mirror, two_legs = anatomy.mirror.value, len(anatomy.legs.value) == 2
+    two_legs = len(anatomy.legs.value) == 2
+    addresses = geo.qpos_addresses(model, joints)
+    # Both legs of two move alike; of more, the others stay.
+    mirror = anatomy.mirror.value if two_legs else {}
+    partners = [mirror.get(name, (name, 1.0)) for name in joints]
+    images = geo.qpos_addresses(model, [name for name, _ in partners])
+    signs = np.array([sign for _, sign in partners])
 
     def residual(angles: np.ndarray) -> np.ndarray:
-        moved = dict(zip(joints, angles, strict=True))
-        if two_legs:
-            moved |= {mirror[n][0]: mirror[n][1] * q for n, q in moved.items() if n in mirror}
-        geo.set_pose(model, data, pose | moved)
+        data.qpos[addresses] = angles
+        data.qpos[images] = signs * angles
+        geo.update(model, data)
         # Two legs carry the center of mass above the soles; four and more stand below their hips.
         x = float(data.subtree_com[trunk][0]) if two_legs else float(hip[0])
         sole = _sole_position(model, data, anatomy, foot)
