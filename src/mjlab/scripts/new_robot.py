@@ -215,9 +215,11 @@ def _install(folder: Path) -> None:
         if uv
         else [sys.executable, "-m", "pip", "install"]
     )
-    outcome = subprocess.run([*pip, "-e", str(folder)], capture_output=True, text=True, check=False)
+    # Its only requirement, mjlab, is running.
+    words = [*pip, "--no-deps", "-e", str(folder)]
+    outcome = subprocess.run(words, capture_output=True, text=True, check=False)
     if outcome.returncode:
-        raise UserError(f"--install: {' '.join(pip)} -e {folder} failed:\n{outcome.stderr.strip()}")
+        raise UserError(f"--install: {shlex.join(words)} failed:\n{outcome.stderr.strip()}")
     print(f"Installed {folder}.")
 
 
