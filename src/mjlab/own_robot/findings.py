@@ -523,6 +523,7 @@ def _undriven(subject: Subject) -> Iterator[Finding]:
         *model.eq_obj2id[is_equality],
         *model.wrap_objid[in_tendon],
     }
+    roots = {int(model.body_rootid[model.joint(name).bodyid[0]]) for name in subject.driven}
     hanging = [
         name
         for name in subject.joint_pos
@@ -530,8 +531,9 @@ def _undriven(subject: Subject) -> Iterator[Finding]:
         if name not in subject.driven
         and joint.id not in coupled
         and not joint.stiffness.any()
-        # Joints of a planar base, and of objects.
+        # Joints of a planar base, and of objects such as a door.
         and model.body_parentid[joint.bodyid[0]] != 0
+        and model.body_rootid[joint.bodyid[0]] in roots
     ]
     is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     # Most joints have an actuator, so that the others were not meant to be passive.

@@ -63,8 +63,13 @@ def joint_ids(model: mujoco.MjModel) -> list[int]:
 
 
 def free_joint(model: mujoco.MjModel) -> int | None:
-    """Return the free joint of the heaviest tree; None without one."""
-    found = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
+    """Return the free joint of the heaviest tree with other joints; None without one, as for objects."""
+    roots = {int(model.body_rootid[model.jnt_bodyid[j]]) for j in joint_ids(model)}
+    found = [
+        j
+        for j in range(model.njnt)
+        if model.jnt_type[j] == FREE and int(model.body_rootid[model.jnt_bodyid[j]]) in roots
+    ]
     return max(found, key=lambda j: model.body_subtreemass[model.jnt_bodyid[j]], default=None)
 
 
