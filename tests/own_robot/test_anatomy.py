@@ -124,3 +124,11 @@ def test_imu_of_the_gyro_before_that_of_a_name():
         objname="sensor",
     )
     assert anatomy_of(spec).imu_site.value == "sensor"
+
+
+def test_planar_walker_is_no_arm():
+    spec = arm_spec()
+    for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1))):
+        spec.body("base").add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    assert anatomy_of(arm_spec()).kind.value == "arm"
+    assert anatomy_of(spec).kind.value == "other"

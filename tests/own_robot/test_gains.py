@@ -137,7 +137,7 @@ def test_tightest_effort_limit():
 @pytest.mark.parametrize(
     ("ranges", "asked"),
     [
-        ({"a0_1": 5000.0}, "implausible"),
+        ({"a0_1": 5000.0}, "above 3 x weight"),
         ({f"{s}{r}_{n}": 30.0 for s in "ab" for r in (0, 1) for n in (1, 2, 3)}, "for all"),
     ],
 )

@@ -143,9 +143,17 @@ def _kind(
 ) -> Guess[Kind]:
     if free is not None and len(feet) >= 2:
         return Guess("legged", f"a free joint and {len(feet)} feet")
+    if any(_slides_freely(model, base) for base in geo.links(model)):
+        return Guess("other", "a base that slides in a plane")
     if free is None and any(len(hand.joints) >= 4 for hand in hands):
         return Guess("arm", "no free joint, at least four joints in a row")
     return Guess("other", "neither feet below a free joint, nor four joints in a row")
+
+
+def _slides_freely(model: mujoco.MjModel, link: int) -> bool:
+    """Return True for a link that two slides of its own move against the world, as of planar walkers."""
+    slides = [j for j in geo.link_joints(model, link) if model.jnt_type[j] == geo.SLIDE]
+    return geo.parent_link(model, link) == 0 and len(slides) >= 2
 
 
 def _trunk(model: mujoco.MjModel, free: int | None, trunk: int) -> Guess[str]:

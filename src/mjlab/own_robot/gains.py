@@ -33,6 +33,7 @@ Aliengo sinks by 24 % at 2, by 18 % at 3."""
 MAX_EFFORT = 3.0
 """Effort limit that is plausible, as a multiple of weight x height."""
 DAMPING_RATIO = 0.7
+"""Damping ratio with the inertia at the joint."""
 SETTLE_TIME = 1.5
 """Time in which a robot settles on its legs (s)."""
 MAX_ROUNDS = 8
@@ -69,16 +70,20 @@ def effort_limits(
         limits[name] = limit
     stand_in = 0.25 * weight * size
     questions = []
-    for names, reason in ((missing, "no effort limit in the file"), (implausible, "implausible")):
-        if names:
-            questions.append(
-                Question(
-                    f"effort.{names[0]}" if len(names) == 1 else "effort",
-                    f"effort limit of {_some(names)}: {reason}",
-                    f"{stand_in:.3g} N m",
-                )
+    doubtful = missing + implausible
+    if doubtful:
+        reasons = [
+            f"{_some(names)}: {reason}"
+            for names, reason in (
+                (missing, "no limit in the file"),
+                (implausible, f"above {MAX_EFFORT:g} x weight x height"),
             )
-            limits |= dict.fromkeys(names, stand_in)
+            if names
+        ]
+        key = "effort" if len(doubtful) > 1 else f"effort.{doubtful[0]}"
+        text = f"effort limit of {'; '.join(reasons)}"
+        questions.append(Question(key, text, f"{stand_in:.3g} N m"))
+        limits |= dict.fromkeys(doubtful, stand_in)
     same = _same_limits(limits, main_joints, answers)
     if same is not None and not questions:
         text = f"effort limit: {same:g} N m for all of {_some(list(main_joints))}, like a stand-in"
@@ -245,7 +250,7 @@ def find_gains(
     if legged:
         railed = rail_model(spec, model, anatomy, effort, armature)
         for _ in range(MAX_ROUNDS):
-            damping = _alike(_damping(stiffness, inertia), groups)
+            damping = _alike(_damping(stiffness, inertia, legged), groups)
             sag = settle(railed, joint_pos, height, stiffness, damping)
             low = [
                 name
@@ -260,9 +265,11 @@ def find_gains(
                 stiffness[name] = min(raised, 4.0 * cap[name])
             stiffness = _alike(stiffness, groups) | answers
         rule += f"; sag in simulation at most {max(sag[n] for n in anatomy.leg_joints):.2f} rad"
-    damping = _alike(_damping(stiffness, inertia), groups)
+    damping = _alike(_damping(stiffness, inertia, legged), groups)
     return Guess(stiffness, rule, "set" if answers else "rule"), Guess(
-        damping, "damping ratio 0.7 with the inertia at the joint"
+        damping,
+        "damping ratio 0.7 with the inertia at the joint, stiffness / 40 s to "
+        + ("/ 20 s" if legged else "/ 5 s"),
     )
 
 
@@ -304,10 +311,18 @@ def _alike(values: dict[str, float], groups: list[tuple[str, ...]]) -> dict[str,
     }
 
 
-def _damping(stiffness: dict[str, float], inertia: dict[str, float]) -> dict[str, float]:
+def _damping(
+    stiffness: dict[str, float], inertia: dict[str, float], legged: bool
+) -> dict[str, float]:
+    """Return 2 z sqrt(k I) with the damping ratio z, within the published range of damping over k.
+
+    Published for legs: 1/40 s of Spot and H1, 1/32 of the B2, 1/20 of the Aliengo, 1/16 of the Go1 and G1;
+    for arms up to 1/5 s of the UR5e.
+    """
+    longest = 1.0 / 20.0 if legged else 1.0 / 5.0
     return {
         name: float(
-            np.clip(2.0 * DAMPING_RATIO * np.sqrt(kp * inertia[name]), kp / 40.0, kp / 10.0)
+            np.clip(2.0 * DAMPING_RATIO * np.sqrt(kp * inertia[name]), kp / 40.0, kp * longest)
         )
         for name, kp in stiffness.items()
     }

@@ -70,6 +70,9 @@ def find_posture(
         rejected.append((name, faults))
     else:
         joint_pos, questions = _searched_pose(model, anatomy, straight, answers)
+        if faults := check_pose(model, anatomy, joint_pos, straight):
+            text = f"standing pose: the best found does not stand, {'; '.join(faults)}"
+            questions += (Question("pose", text, "the best found"),)
         why = "; ".join(f"{name}: {faults[0]}" for name, faults in rejected[:-1]) or "no keyframe"
         source = "asked" if questions else "rule"
         share = EXTENSION[2 if len(anatomy.legs.value) == 2 else 4]
