@@ -318,3 +318,16 @@ def test_a_planted_fault_is_found_with_its_line(robot: Robot, fault: str, tmp_pa
     found = [finding for finding in robot.findings(tmp_path) if finding.fault == name]
     places = {str(Path(place).relative_to(tmp_path)) for one in found for place in one.where}
     assert robot.line in places
+
+
+def test_a_loose_object_is_not_the_robot(tmp_path: Path) -> None:
+    path = tmp_path / "table.xml"
+    path.write_text(
+        """<mujoco><worldbody>
+        <body name="table"><geom type="box" size="1 1 0.1"/></body>
+        <body name="goal" pos="0 0 2"><freejoint/>
+          <geom type="box" size="0.1 0.1 0.1" contype="0" conaffinity="0"/></body>
+        </worldbody></mujoco>""",
+        encoding="utf-8",
+    )
+    assert find_faults(subject_of(mujoco.MjSpec.from_file(str(path)), SourceLines(path))) == []
