@@ -10,7 +10,8 @@ import torch
 
 from mjlab.actuator import BuiltinMotorActuatorCfg, BuiltinPositionActuatorCfg, IdealPdActuatorCfg
 from mjlab.entity import EntityCfg
-from mjlab.envs.mdp import OperationalSpaceControllerActionCfg
+from mjlab.envs.mdp import DifferentialIKActionCfg, OperationalSpaceControllerActionCfg
+from mjlab.rl import exporter_utils
 from mjlab.utils.lab_api.math import quat_box_plus, quat_error_magnitude
 
 # An arm of six hinges with a heavy forearm, and a finger that the action does not control.
@@ -200,6 +201,25 @@ def test_relative_actions_are_scaled(make_world: Any) -> None:
     torch.testing.assert_close(
         quat_error_magnitude(moved[1], quat), torch.full((3,), 0.5), atol=0.02, rtol=0.0
     )
+
+
+@pytest.mark.parametrize("kind", [OperationalSpaceControllerActionCfg, DifferentialIKActionCfg])
+@pytest.mark.parametrize(
+    ("relative", "scales"), [(True, [0.1] * 3 + [0.5] * 3), (False, [1.0] * 7)]
+)
+def test_the_exported_scale_is_that_of_relative_actions(
+    make_world: Any, kind: Any, relative: bool, scales: list[float]
+) -> None:
+    cfg = kind(
+        entity_name="robot",
+        actuator_names=("j.*",),
+        frame_name="hand",
+        use_relative_mode=relative,
+        delta_pos_scale=0.1,
+        delta_ori_scale=0.5,
+    )
+    metadata = exporter_utils._action_metadata({"hand": cfg.build(make_arm(make_world))})
+    assert metadata["action_scale"] == pytest.approx(scales)
 
 
 @pytest.mark.parametrize("engine", ["native", "warp"])

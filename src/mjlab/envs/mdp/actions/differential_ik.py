@@ -138,10 +138,10 @@ class DifferentialIKAction(ActionTerm):
         self._raw_actions = torch.zeros(
             self.num_envs, self.action_dim, dtype=torch.float32, device=self.device
         )
+        # Absolute poses are not scaled.
         scales = (cfg.delta_pos_scale,) * 3 + (cfg.delta_ori_scale,) * 3
-        self._scale = torch.tensor(
-            scales[: self.action_dim], dtype=torch.float32, device=self.device
-        )
+        scales = scales[: self.action_dim] if cfg.use_relative_mode else (1.0,) * self.action_dim
+        self._scale = torch.tensor(scales, dtype=torch.float32, device=self.device)
         self._desired_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
         self._desired_quat = torch.zeros(self.num_envs, 4, dtype=torch.float32, device=self.device)
         self.reset()

@@ -107,10 +107,10 @@ class OperationalSpaceControllerAction(ActionTerm):
         # Fields that are read are computed from their first use on.
         for field in ("M", "cdof", "cvel", "qfrc_bias", "qfrc_gravcomp"):
             getattr(env.sim.data, field)
+        # Poses of absolute actions are not scaled.
         scales = (cfg.delta_pos_scale,) * 3 + (cfg.delta_ori_scale,) * 3
-        self._scale = torch.tensor(
-            scales[: 6 if cfg.controls_orientation else 3], device=self.device
-        )
+        scales = scales[: self.action_dim] if cfg.use_relative_mode else (1.0,) * self.action_dim
+        self._scale = torch.tensor(scales, dtype=torch.float32, device=self.device)
         shape = (self.num_envs, self.action_dim)
         self._raw_actions = torch.zeros(shape, dtype=torch.float32, device=self.device)
         self._desired_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
