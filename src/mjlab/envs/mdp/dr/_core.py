@@ -16,8 +16,8 @@ import torch
 
 from mjlab.envs.mdp.dr._types import (
     Distribution,
+    FieldRanges,
     Operation,
-    Ranges,
     draw,
     read_bounds,
     resolve_distribution,
@@ -95,7 +95,7 @@ def field_term(
     def term(
         env: ManagerBasedRlEnv,
         env_ids: torch.Tensor | None,
-        ranges: Ranges,
+        ranges: FieldRanges,
         asset_cfg: SceneEntityCfg = ROBOT,
         distribution: Distribution | str = "uniform",
         operation: Operation | str = row.operation,
@@ -150,7 +150,7 @@ class FieldTerm(Protocol):
         self,
         env: ManagerBasedRlEnv,
         env_ids: torch.Tensor | None,
-        ranges: Ranges,
+        ranges: FieldRanges,
         asset_cfg: SceneEntityCfg = ...,
         distribution: Distribution | str = ...,
         operation: Operation | str = ...,

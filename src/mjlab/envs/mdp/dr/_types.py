@@ -18,7 +18,7 @@ from mjlab.utils.lab_api.math import sample_log_uniform, sample_uniform
 Bounds = tuple[float, float] | list[float]
 """Two numbers: lower and upper bound, or mean and standard deviation for "gaussian"."""
 
-Ranges = Bounds | dict[int, Bounds] | dict[str, "Bounds | dict[int, Bounds]"]
+FieldRanges = Bounds | dict[int, Bounds] | dict[str, "Bounds | dict[int, Bounds]"]
 """Bounds for all target axes, by axis, or by a pattern of object names (with either inside)."""
 
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import torch
 
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.envs.mdp.dr._types import Distribution, Operation, Ranges
+    from mjlab.envs.mdp.dr._types import Distribution, FieldRanges, Operation
     from mjlab.managers.scene_entity_config import SceneEntityCfg
 
 __all__ = ["pair_friction"]
@@ -22,7 +22,7 @@ _ROW = FieldRow("pair_friction", "pair_friction", PAIR, default_axes=(0,))
 def pair_friction(
     env: ManagerBasedRlEnv,
     env_ids: torch.Tensor | None,
-    ranges: Ranges,
+    ranges: FieldRanges,
     asset_cfg: SceneEntityCfg = ROBOT,
     distribution: Distribution | str = "uniform",
     operation: Operation | str = "abs",
