@@ -23,7 +23,7 @@ from mjlab.tasks import registry
 from mjlab.tasks.cpu_profile import cpu_profile
 
 PROFILED = "Test-Profiled"
-PLAIN = "Mjlab-Cartpole-Balance"
+PLAIN = "Test-Plain"
 """A task without profiles."""
 
 
@@ -48,6 +48,8 @@ def _profiled_task(monkeypatch):
         rl_cfg=registry._tasks[TASK].rl_cfg,
         profiles={"cpu": cpu, "big": lambda env_cfg, rl_cfg: None},
     )
+    own = registry._tasks[TASK]
+    registry.register_mjlab_task(PLAIN, own.env_cfg, rl_cfg=own.rl_cfg)
 
 
 @pytest.fixture
