@@ -54,6 +54,7 @@ _OTHERS = {
     "keep-going",
     "headless",
     "task",
+    "aside",
 }
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 

@@ -26,7 +26,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     robots.get_my_robot_cfg = get_go1_robot_cfg
     monkeypatch.setitem(sys.modules, "my_robots", robots)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     namespace: dict[str, Any] = {}
     for block in blocks:
         exec(block, namespace)
