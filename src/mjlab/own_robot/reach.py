@@ -1,82 +1,22 @@
-"""Home pose and reachable goals of an arm."""
+"""Home pose and stand of an arm."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry as geo
-from mjlab.own_robot.anatomy import Anatomy, Hand, candidate_poses
+from mjlab.own_robot.anatomy import Anatomy, candidate_poses
 from mjlab.own_robot.guess import Guess, Question
 
-GOAL_SHARE = 0.8
-"""Middle share of each joint's range that goals are drawn from."""
+MIDDLE_SHARE = 0.8
+"""Middle share of each joint's range that poses are drawn from, as the goals of pose commands are."""
 HANGING = 0.1
 """Depth of a geom below the base at `qpos0` from which on an arm hangs (m)."""
 STAND_CLEARANCE = 0.1
 """Distance of a hanging arm to the ground (m)."""
 HOME_DRAWS = 400
 """Number of poses among which an arm's home is searched."""
-
-
-@dataclass(frozen=True)
-class HandPoses:
-    """Poses of a hand, N of them."""
-
-    joints: tuple[str, ...]
-    """Joints of the arm."""
-    joint_pos: np.ndarray
-    """Joint positions, (N, J)."""
-    positions: np.ndarray
-    """Positions of the grasp in the frame of the base, (N, 3) (m)."""
-    quaternions: np.ndarray
-    """Orientations of the hand in the frame of the base, (N, 4), w first."""
-
-
-def reachable_hand_poses(
-    model: mujoco.MjModel,
-    anatomy: Anatomy,
-    hand: Hand,
-    home: dict[str, float],
-    count: int = 1000,
-    ground: float | None = None,
-    seed: int = 0,
-) -> HandPoses:
-    """Return hand poses of random joint positions in the middle of the ranges, without contact.
-
-    Args:
-        model: Robot.
-        anatomy: Parts of the robot.
-        hand: Hand to place.
-        home: Positions of the other joints.
-        count: Number of poses.
-        ground: Height of the ground in the frame of the model that moving geoms stay above (m); None
-            without ground.
-        seed: Seed of the random draws.
-
-    Raises:
-        ValueError: no pose in 50 draws per pose is free of contact.
-    """
-    rng, data = np.random.default_rng(seed), mujoco.MjData(model)
-    is_free = _FreeOfContact(model, anatomy, ground)
-    link = model.body(hand.link).id
-    drawn, positions, quaternions = [], [], []
-    for _ in range(50 * count):
-        if len(drawn) == count:
-            break
-        angles = _draw(model, hand.joints, rng, GOAL_SHARE)
-        geo.set_pose(model, data, home | angles)
-        if not is_free(data):
-            continue
-        rotation = data.xmat[link].reshape(3, 3)
-        drawn.append(list(angles.values()))
-        positions.append(data.xpos[link] + rotation @ np.array(hand.position))
-        quaternions.append(data.xquat[link].copy())
-    if not drawn:
-        raise ValueError(f"Hand {hand.link!r}: no pose of {50 * count} is free of contact.")
-    return HandPoses(hand.joints, np.array(drawn), np.array(positions), np.array(quaternions))
 
 
 def arm_home(
@@ -88,7 +28,7 @@ def arm_home(
     answers = answers or {}
     data = mujoco.MjData(model)
     joints = geo.joint_ids(model)
-    is_free = _FreeOfContact(model, anatomy, None)
+    is_free = _FreeOfContact(model)
     for name, qpos in candidate_poses(model):
         pose = {model.joint(j).name: float(qpos[model.jnt_qposadr[j]]) for j in joints}
         geo.set_pose(model, data, pose)
@@ -135,7 +75,7 @@ def _searched_home(
         low, high = geo.joint_range(model, joint)
         # A hanging arm rests at zero; others at the middle of their ranges.
         rest = float(model.qpos0[model.jnt_qposadr[joint]]) if hangs else 0.5 * (low + high)
-        slack = 0.5 * (1.0 - GOAL_SHARE) * (high - low)
+        slack = 0.5 * (1.0 - MIDDLE_SHARE) * (high - low)
         middle[model.joint(joint).name] = float(np.clip(rest, low + slack, high - slack))
     middle |= answers
     if not anatomy.hands.value:
@@ -162,7 +102,7 @@ def _searched_home(
     def distance(angles: dict[str, float]) -> float:
         return float(np.linalg.norm([angles[name] - middle[name] for name in hand.joints]))
 
-    drawn = [_draw(model, hand.joints, rng, GOAL_SHARE) for _ in range(HOME_DRAWS)]
+    drawn = [_draw(model, hand.joints, rng) for _ in range(HOME_DRAWS)]
     measured = [(angles, *measure(angles)[1:]) for angles in drawn]
     above = [item for item in measured if item[2]]
     kept = above or measured
@@ -178,13 +118,13 @@ def _searched_home(
 
 
 def _draw(
-    model: mujoco.MjModel, joints: tuple[str, ...], rng: np.random.Generator, share: float
+    model: mujoco.MjModel, joints: tuple[str, ...], rng: np.random.Generator
 ) -> dict[str, float]:
-    """Return positions in the middle `share` of each joint's range, of wide ranges within a turn."""
+    """Return positions in the middle of each joint's range, of wide ranges within a turn."""
     drawn = {}
     for name in joints:
         low, high = geo.joint_range(model, model.joint(name).id)
-        half = min(np.pi, 0.5 * (high - low)) * share
+        half = min(np.pi, 0.5 * (high - low)) * MIDDLE_SHARE
         drawn[name] = float(rng.uniform(0.5 * (low + high) - half, 0.5 * (low + high) + half))
     return drawn
 
@@ -192,29 +132,21 @@ def _draw(
 class _FreeOfContact:
     """Test of poses for contacts, without those that the model has in all poses."""
 
-    def __init__(self, model: mujoco.MjModel, anatomy: Anatomy, ground: float | None) -> None:
-        self._model, self._ground = model, ground
-        geoms = [model.geom(name).id for name in anatomy.colliding.value]
-        # Of a fixed base, only what moves has a height that poses change.
-        self._moving = [g for g in geoms if model.body_weldid[model.geom_bodyid[g]]]
-        self._always: set[tuple[int, int]] = set()
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._model = model
         rng, data = np.random.default_rng(0), mujoco.MjData(model)
         names = tuple(model.joint(j).name for j in geo.joint_ids(model))
         touching = []
         for _ in range(20):
-            geo.set_pose(model, data, _draw(model, names, rng, GOAL_SHARE))
+            geo.set_pose(model, data, _draw(model, names, rng))
             mujoco.mj_collision(model, data)
             touching.append(self._pairs(data))
         self._always = set.intersection(*touching)
 
     def __call__(self, data: mujoco.MjData) -> bool:
-        """Return True if the pose of `data` has no contact, and no geom is below the ground."""
+        """Return True if the pose of `data` has no contact."""
         mujoco.mj_collision(self._model, data)
-        if self._pairs(data) - self._always:
-            return False
-        if self._ground is None:
-            return True
-        return geo.lowest_height(self._model, data, self._moving) >= self._ground
+        return self._pairs(data) <= self._always
 
     @staticmethod
     def _pairs(data: mujoco.MjData) -> set[tuple[int, int]]:
