@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, get_args
 import torch
 
 from mjlab.compat import accepts_older_fields, offers_older_attributes, older_names, suggests_fields
+from mjlab.envs.mdp.actions.pose_target import PoseTargetAction, PoseTargetActionCfg
 from mjlab.envs.mdp.frames import Frame, FrameType
-from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.utils.errors import check_one_of
 from mjlab.utils.indexing import as_columns
-from mjlab.utils.lab_api.math import compute_pose_error, normalize, quat_box_plus, quat_from_matrix
+from mjlab.utils.lab_api.math import compute_pose_error, quat_from_matrix
 from mjlab.utils.string import resolve_expr
 
 if TYPE_CHECKING:
@@ -26,18 +26,13 @@ logger = logging.getLogger(__name__)
 # Minimum damping: with less, a singular arm has no solution.
 _MIN_DAMPING = 1.0e-6
 
-# Minimum norm of a quaternion that defines an orientation.
-_MIN_QUAT_NORM = 1.0e-6
-
-# Maximum magnitude of targets (m, rad); larger numbers would overflow.
-_MAX_TARGET = 1.0e6
 _WEIGHTS = ("position_weight", "orientation_weight", "joint_limit_weight", "posture_weight")
 
 
 @suggests_fields
 @accepts_older_fields
 @dataclass(kw_only=True)
-class DifferentialIKActionCfg(ActionTermCfg):
+class DifferentialIKActionCfg(PoseTargetActionCfg):
     """Pose target of one frame, tracked by damped least squares. `clip` has no effect.
 
     Action dimension: 3 without orientation (`orientation_weight` 0); else 6 in relative mode
@@ -46,24 +41,6 @@ class DifferentialIKActionCfg(ActionTermCfg):
     Joint targets start from the current joint positions, so that soft position servos sag under
     the arm's weight; compensate with `gravcomp` of the bodies, as many arm controllers do.
     """
-
-    actuator_names: tuple[str, ...] | list[str]
-    """Patterns of the actuated joints that may move, matched in full."""
-
-    frame_type: FrameType = "body"
-    """Element type of the frame: `body`, `site` or `geom` of the entity."""
-
-    frame_name: str
-    """Pattern of the frame's name. Must match exactly one element."""
-
-    use_relative_mode: bool = True
-    """Interpret actions as displacements from the current frame pose instead of absolute poses."""
-
-    delta_pos_scale: float = 1.0
-    """Translation per unit action in relative mode (m)."""
-
-    delta_ori_scale: float = 1.0
-    """Rotation per unit action in relative mode (rad)."""
 
     damping: float = 0.05
     """Damping of joint motion. Larger values are smoother near singularities, and slower."""
@@ -93,7 +70,7 @@ class DifferentialIKActionCfg(ActionTermCfg):
 
 
 @offers_older_attributes
-class DifferentialIKAction(ActionTerm):
+class DifferentialIKAction(PoseTargetAction):
     """Commands the pose of a frame; joint position targets are updated every physics substep.
 
     See `compute_dq` for the formula. Targets never leave the soft joint limits, even if the pose is
@@ -113,8 +90,6 @@ class DifferentialIKAction(ActionTerm):
         "_frame_pos",
         "_frame_rotation",
         "_posture_target",
-        "_scale",
-        "_entity",
     }
 
     def __init__(self, cfg: DifferentialIKActionCfg, env: ManagerBasedRlEnv) -> None:
@@ -135,47 +110,11 @@ class DifferentialIKAction(ActionTerm):
             dtype=torch.float32,
             device=self.device,
         )
-        self._raw_actions = torch.zeros(
-            self.num_envs, self.action_dim, dtype=torch.float32, device=self.device
-        )
-        # Absolute poses are not scaled.
-        scales = (cfg.delta_pos_scale,) * 3 + (cfg.delta_ori_scale,) * 3
-        scales = scales[: self.action_dim] if cfg.use_relative_mode else (1.0,) * self.action_dim
-        self._scale = torch.tensor(scales, dtype=torch.float32, device=self.device)
-        self._desired_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
-        self._desired_quat = torch.zeros(self.num_envs, 4, dtype=torch.float32, device=self.device)
-        self.reset()
 
     @property
-    def action_dim(self) -> int:
-        """Action dimension: 3 without orientation, 6 for relative poses, 7 for absolute poses."""
-        if self.cfg.orientation_weight == 0.0:
-            return 3
-        return 6 if self.cfg.use_relative_mode else 7
-
-    @property
-    def raw_action(self) -> torch.Tensor:
-        """Last unprocessed action, (N, action_dim). Zero after a reset."""
-        return self._raw_actions
-
-    def process_actions(self, actions: torch.Tensor) -> None:
-        """Set the target pose from `actions`, (N, action_dim), and the current frame pose."""
-        self._raw_actions.copy_(actions)
-        cfg, (position, quat) = self.cfg, self._get_frame_pose()
-        if cfg.use_relative_mode:
-            delta = (self._raw_actions * self._scale).clamp_(-_MAX_TARGET, _MAX_TARGET)
-            position = position + delta[:, :3]
-            if self.action_dim == 6:
-                quat = quat_box_plus(quat, delta[:, 3:])
-        else:
-            position = self._raw_actions[:, :3].clamp(-_MAX_TARGET, _MAX_TARGET)
-            if self.action_dim == 7:
-                target = self._raw_actions[:, 3:]
-                is_valid = torch.linalg.vector_norm(target, dim=1, keepdim=True) > _MIN_QUAT_NORM
-                # A zero quaternion defines no orientation: keep the current one.
-                quat = torch.where(is_valid, normalize(target), quat)
-        self._desired_pos.copy_(position)
-        self._desired_quat.copy_(quat)
+    def controls_orientation(self) -> bool:
+        """True if the orientation has a weight."""
+        return self.cfg.orientation_weight != 0.0
 
     def apply_actions(self) -> None:
         """Write joint position targets q + dq."""
@@ -220,14 +159,6 @@ class DifferentialIKAction(ActionTerm):
             pull,
         )
         return torch.where(blocked, bounded, torch.clamp(dq, low, high))
-
-    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Zero the raw action and clear the target pose of `env_ids` (None: all)."""
-        index = slice(None) if env_ids is None else env_ids
-        self._raw_actions[index] = 0.0
-        self._desired_pos[index] = 0.0
-        self._desired_quat[index] = 0.0
-        self._desired_quat[index, 0] = 1.0
 
     def _least_squares(
         self, q: torch.Tensor, low: torch.Tensor, high: torch.Tensor

@@ -10,18 +10,16 @@ import torch
 
 from mjlab.actuator.actuator import DirectActuator
 from mjlab.compat import suggests_fields
-from mjlab.envs.mdp.frames import Frame, FrameType
-from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
+from mjlab.envs.mdp.actions.pose_target import PoseTargetAction, PoseTargetActionCfg
+from mjlab.envs.mdp.frames import Frame
 from mjlab.utils.errors import check_fields_positive
 from mjlab.utils.indexing import as_columns
-from mjlab.utils.lab_api.math import compute_pose_error, normalize, quat_box_plus
+from mjlab.utils.lab_api.math import compute_pose_error
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
 
-# Minimum norm of a quaternion that defines an orientation.
-_MIN_QUAT_NORM = 1.0e-6
 # Part of the mean inverse inertia that is added in all directions. Bounds the inertia of directions
 # in which a singular arm cannot move; changes that of others by less than 0.1 %.
 _RIDGE = 1.0e-3
@@ -29,7 +27,7 @@ _RIDGE = 1.0e-3
 
 @suggests_fields
 @dataclass(kw_only=True)
-class OperationalSpaceControllerActionCfg(ActionTermCfg):
+class OperationalSpaceControllerActionCfg(PoseTargetActionCfg):
     """Pose target of one frame, tracked by joint efforts. `clip` has no effect.
 
     Action dimension: 3 without orientation; else 6 in relative mode (translation, rotation vector)
@@ -39,26 +37,8 @@ class OperationalSpaceControllerActionCfg(ActionTermCfg):
     whose own gains then have no effect.
     """
 
-    actuator_names: tuple[str, ...] | list[str]
-    """Patterns of the actuated joints that move the frame, matched in full."""
-
-    frame_type: FrameType = "body"
-    """Element type of the frame: `body`, `site` or `geom` of the entity."""
-
-    frame_name: str
-    """Pattern of the frame's name. Must match exactly one element."""
-
     controls_orientation: bool = True
     """Control the orientation too. False leaves it to the posture."""
-
-    use_relative_mode: bool = True
-    """Interpret actions as displacements from the current frame pose instead of absolute poses."""
-
-    delta_pos_scale: float = 1.0
-    """Translation per unit action in relative mode (m)."""
-
-    delta_ori_scale: float = 1.0
-    """Rotation per unit action in relative mode (rad)."""
 
     stiffness: float = 150.0
     """Acceleration of the frame per unit of pose error (1/s^2): the square of the natural frequency."""
@@ -77,7 +57,7 @@ class OperationalSpaceControllerActionCfg(ActionTermCfg):
         return OperationalSpaceControllerAction(self, env)
 
 
-class OperationalSpaceControllerAction(ActionTerm):
+class OperationalSpaceControllerAction(PoseTargetAction):
     """Commands the pose of a frame; joint efforts are updated every physics substep.
 
     See `compute_efforts` for the formula. Actuators limit the efforts. Poses are in the world frame:
@@ -90,7 +70,7 @@ class OperationalSpaceControllerAction(ActionTerm):
     cfg: OperationalSpaceControllerActionCfg
 
     # Derived from the config; not checkpointed.
-    _transient = {"_entity", "_columns", "_dofs", "_frame", "_body_ids", "_scale"}
+    _transient = {"_columns", "_dofs", "_frame", "_body_ids"}
 
     def __init__(self, cfg: OperationalSpaceControllerActionCfg, env: ManagerBasedRlEnv) -> None:
         check_fields_positive(cfg, "stiffness", "damping_ratio")
@@ -107,46 +87,14 @@ class OperationalSpaceControllerAction(ActionTerm):
         # Fields that are read are computed from their first use on.
         for field in ("M", "cdof", "cvel", "qfrc_bias", "qfrc_gravcomp"):
             getattr(env.sim.data, field)
-        # Poses of absolute actions are not scaled.
-        scales = (cfg.delta_pos_scale,) * 3 + (cfg.delta_ori_scale,) * 3
-        scales = scales[: self.action_dim] if cfg.use_relative_mode else (1.0,) * self.action_dim
-        self._scale = torch.tensor(scales, dtype=torch.float32, device=self.device)
-        shape = (self.num_envs, self.action_dim)
-        self._raw_actions = torch.zeros(shape, dtype=torch.float32, device=self.device)
-        self._desired_pos = torch.zeros(self.num_envs, 3, dtype=torch.float32, device=self.device)
-        self._desired_quat = torch.zeros(self.num_envs, 4, dtype=torch.float32, device=self.device)
-        self.reset()
 
     @property
-    def action_dim(self) -> int:
-        """Action dimension: 3 without orientation, 6 for relative poses, 7 for absolute poses."""
-        if not self.cfg.controls_orientation:
-            return 3
-        return 6 if self.cfg.use_relative_mode else 7
+    def controls_orientation(self) -> bool:
+        """As the config says."""
+        return self.cfg.controls_orientation
 
-    @property
-    def raw_action(self) -> torch.Tensor:
-        """Last unprocessed action, (N, action_dim). Zero after a reset."""
-        return self._raw_actions
-
-    def process_actions(self, actions: torch.Tensor) -> None:
-        """Set the target pose from `actions`, (N, action_dim), and the current frame pose."""
-        self._raw_actions.copy_(actions)
-        position, quat = self._frame.pos, self._frame.quat
-        if self.cfg.use_relative_mode:
-            delta = self._raw_actions * self._scale
-            position = position + delta[:, :3]
-            if self.action_dim == 6:
-                quat = quat_box_plus(quat, delta[:, 3:])
-        else:
-            position = self._raw_actions[:, :3]
-            if self.action_dim == 7:
-                target = self._raw_actions[:, 3:]
-                is_valid = torch.linalg.vector_norm(target, dim=1, keepdim=True) > _MIN_QUAT_NORM
-                # A zero quaternion defines no orientation: keep the current one.
-                quat = torch.where(is_valid, normalize(target), quat)
-        self._desired_pos.copy_(position)
-        self._desired_quat.copy_(quat)
+    def _get_frame_pose(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self._frame.pos, self._frame.quat
 
     def apply_actions(self) -> None:
         """Write joint effort targets."""
@@ -203,14 +151,6 @@ class OperationalSpaceControllerAction(ActionTerm):
             # Gravity that the bodies' `gravcomp` cancels is not compensated twice.
             efforts += (sim.data.qfrc_bias - sim.data.qfrc_gravcomp)[:, self._dofs]
         return efforts
-
-    def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
-        """Zero the raw action and clear the target pose of `env_ids` (None: all)."""
-        index = slice(None) if env_ids is None else env_ids
-        self._raw_actions[index] = 0.0
-        self._desired_pos[index] = 0.0
-        self._desired_quat[index] = 0.0
-        self._desired_quat[index, 0] = 1.0
 
 
 def _check_actuators(entity: Entity, joints: list[str], env: ManagerBasedRlEnv) -> None:
