@@ -7,7 +7,7 @@ States are written to `qpos` and `qvel`: derived quantities are stale until the 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -150,16 +150,7 @@ def reset_joints_by_offset(
         position_range: Bounds of the position offset (rad or m).
         velocity_range: Bounds of the velocity offset (rad/s or m/s).
     """
-    ids = resolve_env_ids(env, env_ids)
-    asset: Entity = env.scene[asset_cfg.name]
-    data, joints = asset.data, columns_of(asset_cfg, "joint", env)
-    position = data.default_joint_pos[ids][:, joints]
-    position += sample_uniform(*position_range, position.shape, env.device)
-    limits = data.soft_joint_pos_limits[ids][:, joints]
-    position.clamp_(min=limits[..., 0], max=limits[..., 1])
-    velocity = data.default_joint_vel[ids][:, joints]
-    velocity += sample_uniform(*velocity_range, velocity.shape, env.device)
-    asset.write_joint_state_to_sim(position, velocity, joint_ids=joints, env_ids=ids)
+    _reset_joints(env, env_ids, position_range, velocity_range, asset_cfg, torch.add)
 
 
 def reset_joints_by_scale(
@@ -177,15 +168,27 @@ def reset_joints_by_scale(
         position_range: Bounds of the factor of the default positions.
         velocity_range: Bounds of the factor of the default velocities.
     """
+    _reset_joints(env, env_ids, position_range, velocity_range, asset_cfg, torch.mul)
+
+
+def _reset_joints(
+    env: ManagerBasedRlEnv,
+    env_ids: torch.Tensor | None,
+    position_range: tuple[float, float],
+    velocity_range: tuple[float, float],
+    asset_cfg: SceneEntityCfg,
+    combine: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+) -> None:
+    """Reset joints to `combine(defaults, uniform samples)`, clamped to the soft position limits."""
     ids = resolve_env_ids(env, env_ids)
     asset: Entity = env.scene[asset_cfg.name]
     data, joints = asset.data, columns_of(asset_cfg, "joint", env)
     position = data.default_joint_pos[ids][:, joints]
-    position *= sample_uniform(*position_range, position.shape, env.device)
+    position = combine(position, sample_uniform(*position_range, position.shape, env.device))
     limits = data.soft_joint_pos_limits[ids][:, joints]
     position.clamp_(min=limits[..., 0], max=limits[..., 1])
     velocity = data.default_joint_vel[ids][:, joints]
-    velocity *= sample_uniform(*velocity_range, velocity.shape, env.device)
+    velocity = combine(velocity, sample_uniform(*velocity_range, velocity.shape, env.device))
     asset.write_joint_state_to_sim(position, velocity, joint_ids=joints, env_ids=ids)
 
 
