@@ -33,6 +33,7 @@ from mjlab.envs.mdp.actions.operational_space import (
     OperationalSpaceControllerAction,
     OperationalSpaceControllerActionCfg,
 )
+from mjlab.envs.mdp.actions.pose_target import PoseTargetAction, PoseTargetActionCfg
 
 __all__ = [
     "BaseActionCfg",
@@ -48,6 +49,8 @@ __all__ = [
     "JointVelocityActionCfg",
     "OperationalSpaceControllerAction",
     "OperationalSpaceControllerActionCfg",
+    "PoseTargetAction",
+    "PoseTargetActionCfg",
     "RelativeJointPositionAction",
     "RelativeJointPositionActionCfg",
     "SiteEffortAction",
