@@ -14,7 +14,16 @@ from mjlab.scripts.describe import DescribeConfig, TaskDescription, describe
 from mjlab.tasks.registry import list_tasks, load_env_cfg
 
 STOCK = [name for name in list_tasks() if name.startswith("Mjlab-")]
-KINDS = ["observations", "actions", "commands", "rewards", "terminations", "events", "curriculum"]
+KINDS = [
+    "observations",
+    "unmeasured",
+    "actions",
+    "commands",
+    "rewards",
+    "terminations",
+    "events",
+    "curriculum",
+]
 KINDS += ["metrics", "recorders", "entities", "sensors"]
 
 

@@ -202,8 +202,9 @@ last evaluation, size on disk, and settings that differ from the task.""",
         "what a task observes, rewards and ends",
         argument="TASK",
         details="""\
-Print tables of a task: observations, actions, commands, rewards, terminations, events,
-curriculum, metrics, entities and sensors. Builds one environment on the CPU.""",
+Print tables of a task: observations (and those that a robot cannot measure), actions, commands,
+rewards, terminations, events, curriculum, metrics, entities and sensors. Builds one environment on
+the CPU.""",
         examples=(
             "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1",
             "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu --json",

@@ -14,6 +14,7 @@ from mjlab.cli.flags import (
     previewed,
     with_task_options,
 )
+from mjlab.deploy.measurable import unmeasured_table
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
@@ -123,7 +124,8 @@ class TaskDescription:
         self, task: str, cfg: DescribeConfig, num_envs: int, env: ManagerBasedRlEnv
     ) -> None:
         self.task = task
-        self.tables = env.tables()
+        observations, *others = env.tables()
+        self.tables = [observations, unmeasured_table(env), *others]
         self._facts = {
             "task": task,
             "profile": cfg.profile,
