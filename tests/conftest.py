@@ -36,6 +36,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU"))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def discovered_tasks() -> None:
+    """Discover the tasks once: tests that replace the registry by a copy take them along."""
+    from mjlab.tasks.registry import list_tasks
+
+    list_tasks()
+
+
 @pytest.fixture(scope="session")
 def cuda_device() -> str:
     """Device of tests marked `cuda`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from dataclasses import replace
 from typing import Any
@@ -299,6 +300,17 @@ def test_the_package_that_registers_a_task_is_its_source():
     source = task_source("Mjlab-Cartpole-Swingup")
     assert source is not None
     assert source.endswith("mjlab/tasks/cartpole/__init__.py")
+
+
+def test_source_of_a_task_that_was_imported_before_discovery():
+    code = (
+        "import mjlab.tasks.cartpole; from mjlab.tasks.registry import task_source; "
+        "print(task_source('Mjlab-Cartpole-Swingup'))"
+    )
+    outcome = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert outcome.stdout.strip().endswith("cartpole/__init__.py")
 
 
 def test_a_task_without_a_learner_has_the_default():

@@ -400,8 +400,9 @@ def _register_all(source: str, module: str, load: Callable[[], object]) -> None:
     before = dict(_tasks)
     try:
         load()
-        for name in _tasks.keys() - before.keys():
-            _tasks[name] = dataclasses.replace(_tasks[name], package=module)
+        for name, task in list(_tasks.items()):
+            if name not in before or _names_config_in(task, module):
+                _tasks[name] = dataclasses.replace(task, package=module)
     # A broken package, even one that exits, must not affect the others.
     except (Exception, SystemExit) as error:
         # Roll back: tasks registered before the error may depend on code that did not run.
@@ -414,6 +415,11 @@ def _register_all(source: str, module: str, load: Callable[[], object]) -> None:
             "".join(traceback.format_exception_only(error)).rstrip(),
             _missing_extra(error),
         )
+
+
+def _names_config_in(task: _Task, module: str) -> bool:
+    """Return True for a task of `module` that a script registered by importing it before discovery."""
+    return isinstance(task.env_cfg, str) and task.env_cfg.startswith(f"{module}.")
 
 
 def _missing_extra(error: BaseException) -> str:
