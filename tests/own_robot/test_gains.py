@@ -71,6 +71,22 @@ def test_stands_free(reports, robot):
     assert data.xmat[trunk].reshape(3, 3)[2, 2] > 0.98
 
 
+def test_low_belly_stays_off_the_ground():
+    spec = legged_spec(4)
+    spec.body("trunk").add_geom(
+        name="belly", type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.05, 0.05, 0.01), pos=(0, 0, -0.28)
+    )
+    report = describe_robot(RobotModel(spec, "robot", "low", None, None))
+    model = free_model(report)
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, report.joint_pos.value, report.root_height.value)
+    for name, position in report.joint_pos.value.items():
+        data.ctrl[model.actuator(name).id] = position
+    for _ in range(400):
+        mujoco.mj_step(model, data)
+        assert model.geom("belly").id not in data.contact.geom
+
+
 def free_model(report: RobotReport) -> mujoco.MjModel:
     """Return the robot with position servos on a plane."""
     spec = report.spec.copy()

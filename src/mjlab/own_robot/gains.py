@@ -36,6 +36,8 @@ DAMPING_RATIO = 0.7
 """Damping ratio with the inertia at the joint."""
 SETTLE_TIME = 1.5
 """Time in which a robot settles on its legs (s)."""
+DROP = 0.05
+"""Height from which a robot is dropped on its feet, the largest of the velocity tasks' resets (m)."""
 MAX_ROUNDS = 8
 """Rounds of raising the stiffness of joints that sag."""
 
@@ -265,12 +267,59 @@ def find_gains(
                 stiffness[name] = min(raised, 4.0 * cap[name])
             stiffness = _alike(stiffness, groups) | answers
         rule += f"; sag in simulation at most {max(sag[n] for n in anatomy.leg_joints):.2f} rad"
+        if len(anatomy.legs.value) >= 4:
+            free = rail_model(spec, model, anatomy, effort, armature, free=True)
+            factor = _standing_factor(free, anatomy, joint_pos, height, stiffness, inertia)
+            if factor > 1.0:
+                rule += f"; x {factor:.2f} to keep all but the feet off the ground"
+                legs = set(anatomy.leg_joints) - answers.keys()
+                stiffness |= {name: float(f"{factor * stiffness[name]:.3g}") for name in legs}
     damping = _alike(_damping(stiffness, inertia, legged), groups)
     return Guess(stiffness, rule, "set" if answers else "rule"), Guess(
         damping,
         "damping ratio 0.7 with the inertia at the joint, stiffness / 40 s to "
         + ("/ 20 s" if legged else "/ 5 s"),
     )
+
+
+def _standing_factor(
+    model: mujoco.MjModel,
+    anatomy: Anatomy,
+    joint_pos: dict[str, float],
+    height: float,
+    stiffness: dict[str, float],
+    inertia: dict[str, float],
+) -> float:
+    """Return the factor of the legs' stiffness at which the robot stands on its feet alone; 1 if none does.
+
+    Without a rail, the trunk pitches and sways too: knees of the HyQReal2 that sag by 0.14 rad on the rail
+    give way by 0.22 rad, so that its thighs touch the ground.
+    """
+    fallen = {model.body(name).id for name in anatomy.fall_bodies.value}
+    groups = like_joints(anatomy, list(joint_pos))
+    for step in range(MAX_ROUNDS):
+        factor = 1.15**step
+        trial = dict(stiffness)
+        trial |= {name: factor * stiffness[name] for name in anatomy.leg_joints}
+        set_gains(model, trial, _alike(_damping(trial, inertia, legged=True), groups))
+        if not _touches(model, fallen, joint_pos, height + DROP):
+            return factor
+    return 1.0
+
+
+def _touches(
+    model: mujoco.MjModel, bodies: set[int], joint_pos: dict[str, float], height: float
+) -> bool:
+    """Return True if one of `bodies` touches the ground within `SETTLE_TIME` of standing."""
+    data = mujoco.MjData(model)
+    geo.set_pose(model, data, joint_pos, height)
+    for name, position in joint_pos.items():
+        data.ctrl[model.actuator(name).id] = position
+    for _ in range(round(SETTLE_TIME / (4 * model.opt.timestep))):
+        mujoco.mj_step(model, data, 4)
+        if bodies & {int(model.geom_bodyid[g]) for g in data.contact.geom.ravel()}:
+            return True
+    return False
 
 
 def _sway_stiffness(model: mujoco.MjModel, anatomy: Anatomy, height: float) -> dict[str, float]:
