@@ -78,12 +78,40 @@ def test_menagerie_without_its_package(monkeypatch):
         load_model("menagerie:unitree_go2")
 
 
+class MenagerieError(Exception):
+    """Base of the package's errors."""
+
+
 def test_menagerie(monkeypatch, tmp_path):
     file = write_quadruped(tmp_path / "dog")
-    robot = types.SimpleNamespace(default_model="dog", xml=lambda entry: file)
-    module = types.SimpleNamespace(get=lambda name: robot)
+
+    def get(name: str) -> types.SimpleNamespace:
+        if name != "dog":
+            raise MenagerieError("Did you mean 'dog'?")
+        return types.SimpleNamespace(default_model="dog", xml=lambda entry: file)
+
+    module = types.SimpleNamespace(get=get, MenagerieError=MenagerieError)
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", module)
     assert load_model("menagerie:dog").file == file
+    with pytest.raises(ValueError, match="'menagerie:dgo': Did you mean 'dog'"):
+        load_model("menagerie:dgo")
+
+
+def test_menagerie_with_a_filled_cache(monkeypatch, tmp_path):
+    menagerie = pytest.importorskip("mujoco_menagerie", reason="needs mjlab[menagerie]")
+    cache = menagerie.Cache(tmp_path)
+    monkeypatch.setenv("MENAGERIE_CACHE_DIR", str(tmp_path))
+    monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
+    robot = menagerie.get("unitree_go2")
+    # Published: the model, and the file that says that it is complete.
+    folder = cache.model_path(robot)
+    write_quadruped(folder).rename(folder / robot.entry(robot.default_model).file)
+    (folder / ".complete").write_text("{}")
+    model = load_model("menagerie:unitree_go2")
+    assert (model.name, model.assets) == ("go2", folder)
+    assert model.spec.compile().njnt == 13
+    with pytest.raises(ValueError, match="unitree_go2"):
+        load_model("menagerie:unitree_go3")
 
 
 def test_missing_file():

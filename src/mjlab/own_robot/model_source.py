@@ -47,7 +47,8 @@ def load_model(source: str, *, floating_base: bool = False) -> RobotModel:
         floating_base: Add a free joint to the root link of a URDF, which cannot have one.
 
     Raises:
-        ValueError: not a robot's model, or several candidates; the message lists them.
+        ValueError: not a robot's model, or several candidates, which the message lists; a name that
+            MuJoCo Menagerie does not have, or a failed download.
         ModuleNotFoundError: the package of a function, or `mujoco-menagerie`, is missing.
     """
     path = Path(source).expanduser()
@@ -223,6 +224,9 @@ def _menagerie_file(name: str) -> Path:
         raise ModuleNotFoundError(
             f"Model 'menagerie:{name}': package mujoco-menagerie not found; install mjlab[menagerie]."
         ) from error
-    robot = menagerie.get(name)
-    # The robot alone: the default entry is its scene.
-    return Path(robot.xml(robot.default_model))
+    try:
+        robot = menagerie.get(name)
+        # The robot alone: the default entry is its scene.
+        return Path(robot.xml(robot.default_model))
+    except menagerie.MenagerieError as error:
+        raise ValueError(f"Model 'menagerie:{name}': {error}") from error
