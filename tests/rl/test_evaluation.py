@@ -18,6 +18,7 @@ from mjlab.rl.evaluation import (
     evaluate_policy,
     make_evaluation_env,
     mean_and_interval,
+    ratio_and_interval,
     summarize,
     wilson_interval,
 )
@@ -176,6 +177,7 @@ def rates(failures: int, episodes: int) -> EvaluationResult:
         succeeded=~failed,
         terminations={},
         metrics={},
+        standing_still={},
     )
     return summarize(played, played.succeeded, 0.0)
 
@@ -227,6 +229,29 @@ def test_metrics_average_steps_then_episodes():
     half = T95_OF_FOUR * torch.tensor([0.0, 0.5, 1.0, 1.5]).std().item() / 2
     assert steps.interval == pytest.approx((0.75 - half, 0.75 + half))
     assert result.to_dict()["metrics"]["steps"]["mean"] == 0.75
+
+
+def test_metrics_are_given_as_shares_of_those_of_standing_still():
+    error = {"error": lambda env: torch.where(env.episode_length_buf == 0, 1.0, 2.0)}
+    still_error = {"error": lambda env: torch.full((4,), 4.0)}
+    result = evaluate_policy(counting(), still, metrics=error, standing_still=still_error)
+    share = result.metrics["error_share"]
+    assert share.mean == pytest.approx(result.metrics["error"].mean / 4.0)
+    assert share.interval == pytest.approx([x / 4.0 for x in result.metrics["error"].interval])
+    assert result.value("error_share") == share.mean
+    assert result.to_dict()["standing_still"] == {"error": 4.0}
+    with pytest.raises(ValueError, match="standing_still"):
+        evaluate_policy(counting(), still, standing_still=still_error)
+
+
+def test_share_is_a_ratio_of_means():
+    errors, references = torch.tensor([1.0, 0.0, 5.0]), torch.tensor([0.0, 2.0, 10.0])
+    found = ratio_and_interval(errors, references)
+    assert found.mean == pytest.approx(0.5)
+    # Errors that are that share of their references in each episode leave no doubt.
+    exact = ratio_and_interval(0.3 * references, references)
+    assert exact.interval == pytest.approx((0.3, 0.3))
+    assert found.interval[1] - found.interval[0] > 0.1
 
 
 def test_a_metric_that_is_infinite_after_the_episode_does_not_reach_it():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import signal
 import statistics
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -189,6 +189,19 @@ def test_evaluations_wait_for_an_exploring_metric(tmp_path: Path):
     below = [int(it) + 1 for it, value in zip(iterations, values, strict=True) if value <= 0.1]
     assert 0 < len(below) < len(iterations)
     assert [iteration for _, iteration, _, _ in told.told] == below
+
+
+def test_exploring_metrics_and_bounds_may_be_shares():
+    cfg = evaluation(
+        metrics={"rate": lambda env: torch.full((env.num_envs,), 0.1)},
+        standing_still={"rate": lambda env: torch.full((env.num_envs,), 0.5)},
+        trigger_below={"rate_share": 0.4},
+        solved_below={"rate_share": 0.4},
+    )
+    exploring = SolvedCheck(failing_env(1), Still(), cfg, 1).exploring_metrics()
+    assert exploring == {"rate_share": pytest.approx(0.2)}
+    with pytest.raises(ValueError, match="rate_share"):
+        SolvedCheck(failing_env(1), Still(), replace(cfg, standing_still={}), 1)
 
 
 def test_an_unknown_exploring_metric_suggests_names():

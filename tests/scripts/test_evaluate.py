@@ -24,6 +24,7 @@ METRICS = {
     "success_rate": None,
     "failure_interval": (0.0, 0.5),
     "metrics": {},
+    "standing_still": {},
     "units": {},
     "curricula": {},
     "notes": [],
@@ -52,6 +53,22 @@ def test_metrics_have_their_units():
     lines = evaluate._table({**metrics, "units": {"speed": "m/s"}}, []).splitlines()
     assert "speed        0.25 m/s   no interval" in lines
     assert "share        0.25   no interval" in lines
+
+
+def test_errors_of_standing_still_are_beside_the_measured_ones():
+    measured = {
+        "error": {"mean": 0.1, "interval": None},
+        "error_share": {"mean": 0.25, "interval": None},
+    }
+    metrics = {
+        **METRICS,
+        "failure_rate": None,
+        "metrics": measured,
+        "standing_still": {"error": 0.4},
+    }
+    lines = evaluate._table({**metrics, "units": {"error": "m/s"}}, []).splitlines()
+    assert "error        0.1 m/s   no interval   (25% of standing still, 0.4 m/s)" in lines
+    assert not any(line.startswith("error_share") for line in lines)
 
 
 def test_elsewhere_lines_are_rare_and_go_to_stderr(capsys):

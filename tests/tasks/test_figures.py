@@ -23,7 +23,14 @@ DEVIATIONS: dict[str, set[str]] = {
 _TRACKING_ERRORS = {
     name: f"tasks.velocity.rl.ppo:{name}" for name in ("lin_vel_error", "ang_vel_error")
 }
-_UNITS = {"lin_vel_error": "m/s", "ang_vel_error": "rad/s"}
+_STANDING_ERRORS = {
+    name: f"tasks.velocity.rl.ppo:standing_{name}" for name in ("lin_vel_error", "ang_vel_error")
+}
+_EVALUATION = {
+    "metrics": _TRACKING_ERRORS,
+    "standing_still": _STANDING_ERRORS,
+    "units": {"lin_vel_error": "m/s", "ang_vel_error": "rad/s"},
+}
 for task, positions in {
     "Mjlab-Velocity-Flat-Unitree-Go1": [],
     "Mjlab-Velocity-Flat-Unitree-G1": [2],
@@ -35,7 +42,7 @@ for task, positions in {
         for position in positions
     } | {
         "rl.evaluation is default in the table, and "
-        f"{ {'_': 'EvaluationCfg', 'metrics': _TRACKING_ERRORS, 'units': _UNITS}!r} here"
+        f"{ {'_': 'EvaluationCfg', **_EVALUATION}!r} here"
     }
 
 _PLACEMENT = {

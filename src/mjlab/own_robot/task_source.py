@@ -22,10 +22,12 @@ from mjlab.own_robot.templates import template
 
 STANDING_SHARE = 0.65
 """Height of the trunk below which training episodes end, as a share of the standing height."""
-STILL_SPEED, STILL_TURN = 0.66, 0.47
-"""Mean error of a robot that stands still, as a share of the largest commanded velocity, and yaw rate."""
-SOLVED_SPEED, SOLVED_TURN = 0.37, 0.55
-"""Errors below which training stops, as a share of those of a robot that stands still."""
+SOLVED = {
+    2: {"lin_vel_error_share": 0.6, "ang_vel_error_share": 0.9, "failure_rate": 0.2},
+    4: {"lin_vel_error_share": 0.4, "ang_vel_error_share": 0.6, "failure_rate": 0.1},
+}
+"""Errors, as shares of those of a robot that stands still, and failure rate below which training stops, by
+number of feet."""
 
 
 def velocity_source(report: RobotReport, package: str, title: str, task_name: str) -> str:
@@ -126,7 +128,6 @@ def _gait(report: RobotReport) -> str:
             ]
         )
     first, second = diagonals(report)
-    speed, turn = STILL_SPEED * SOLVED_SPEED, STILL_TURN * SOLVED_TURN
     mirror = (
         [] if report.anatomy.mirror.value else ["    mirror=None,  # not the same left and right"]
     )
@@ -135,16 +136,13 @@ def _gait(report: RobotReport) -> str:
             *comment_lines(
                 f"A trot: the feet {first} and {second} of FEET, the diagonals, take turns. Training "
                 f"episodes end when the trunk sinks below {STANDING_SHARE:.0%} of its height. Training "
-                f"stops at errors of {SOLVED_SPEED:.0%} (velocity) and {SOLVED_TURN:.0%} (yaw rate) of "
-                "those of a robot that stands still."
+                "stops at these shares of the errors of a robot that stands still, and this rate of falls."
             ),
             "cpu = cpu_with_gait(",
             f"    ({first}, {second}),",
             f"    minimum_height={STANDING_SHARE} * HEIGHT,",
             "    solved_below={",
-            f'        "lin_vel_error": {number(speed, 2)} * LIN_VEL[1],',
-            f'        "ang_vel_error": {number(turn, 2)} * ANG_VEL[1],',
-            '        "failure_rate": 0.05,',
+            *(f'        "{name}": {limit},' for name, limit in SOLVED[4].items()),
             "    },",
             *mirror,
             ")",

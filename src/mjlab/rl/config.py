@@ -266,6 +266,9 @@ class EvaluationCfg:
     metrics: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
     """Metrics besides the return: `func(env) -> (num_envs,)` by name, averaged over the steps of an
     episode."""
+    standing_still: dict[str, Callable[[Any], Any]] = field(default_factory=dict)
+    """Values of `metrics` for a robot that stands still, by the metric's name and in the same form.
+    Evaluations give the metric's share of it, `NAME_share`, which bounds may name."""
     units: dict[str, str] = field(default_factory=dict)
     """Units of `metrics` by name, shown beside their values."""
 

@@ -24,7 +24,7 @@ import torch
 
 from mjlab.envs.curriculum_state import config_as_built
 from mjlab.rl.config import resolve_success
-from mjlab.utils.errors import check_positive
+from mjlab.utils.errors import check_one_of, check_positive
 from mjlab.utils.random import evaluation_seed, preserved_rng
 from mjlab.utils.string import suggest
 from mjlab.utils.torch import threads_for_policy
@@ -48,6 +48,9 @@ Progress = Callable[[int, float], None]
 RESULT_FIELDS = ("mean_return", "mean_length", "success_rate", "failure_rate")
 """Fields of `EvaluationResult` that `EvaluationResult.value` accepts, besides metrics."""
 
+SHARE = "_share"
+"""End of the name of a metric's share of its value for a robot that stands still."""
+
 # Steps between checks for the end of all episodes: each check synchronizes with the GPU.
 _STEPS_BETWEEN_CHECKS = 16
 _LONGEST_EPISODE = 1_000_000
@@ -67,6 +70,7 @@ def evaluate_policy(
     max_steps: int | None = None,
     success: Success = None,
     metrics: Mapping[str, PerEnv] | None = None,
+    standing_still: Mapping[str, PerEnv] | None = None,
     seed: int | None = None,
     progress: Progress | None = None,
     is_stopped: Callable[[], bool] | None = None,
@@ -94,6 +98,8 @@ def evaluate_policy(
             before the end. None: not defined.
         metrics: Functions by name, `func(env) -> (num_envs,)`, read before every step and averaged
             over the steps of an episode.
+        standing_still: Functions like those of `metrics`, by the metric's name: its value for a robot that
+            stands still. The result has the metric's share of it, `NAME_share`.
         seed: Seed of the evaluation; None: generators are not seeded. With the same seed,
             environments in the same state give the same episodes.
         progress: Function called every few steps with the number of finished episodes, and with the
@@ -102,8 +108,12 @@ def evaluate_policy(
 
     Raises:
         EvaluationStopped: `is_stopped` returned True.
-        ValueError: `num_episodes` is not positive, or episodes are too long.
+        ValueError: `num_episodes` is not positive, episodes are too long, or `standing_still` names
+            no metric.
     """
+    metrics, standing_still = metrics or {}, standing_still or {}
+    for name in standing_still:
+        check_one_of("evaluate_policy standing_still", name, metrics)
     num_episodes = env.num_envs if num_episodes is None else num_episodes
     check_positive("num_episodes", num_episodes)
     if max_steps is None:
@@ -144,7 +154,15 @@ def evaluate_policy(
 
             rounds.append(
                 _play_round(
-                    env, policy, count, max_steps, success_func, metrics or {}, report, is_stopped
+                    env,
+                    policy,
+                    count,
+                    max_steps,
+                    success_func,
+                    metrics,
+                    standing_still,
+                    report,
+                    is_stopped,
                 )
             )
     episodes = functools.reduce(operator.add, rounds)
@@ -199,7 +217,10 @@ class EvaluationResult:
     terminations: dict[str, float] = dataclasses.field(default_factory=dict)
     """Fraction of episodes with the termination true in the last step, by name."""
     metrics: dict[str, MeanAndInterval] = dataclasses.field(default_factory=dict)
-    """Metrics of the task, averaged over the steps of an episode and then over episodes."""
+    """Metrics of the task, averaged over the steps of an episode and then over episodes; and of those in
+    `standing_still`, the share of it, `NAME_share`."""
+    standing_still: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Metrics of a robot that stands still, with the same commands."""
     curricula: dict[str, Any] = dataclasses.field(default_factory=dict)
     """State of the curricula, which stands still in an evaluation: numbers that differ from the task's
     config, by path (`commands.twist.ranges.lin_vel_x`), and lowest and highest terrain level. Episodes
@@ -347,16 +368,17 @@ class SolvedCheck:
         self._algorithm = algorithm
         self._seed = seed
         self._bounds = Bound.all_of(cfg)
-        known = {*cfg.metrics, *RESULT_FIELDS}
+        measured = [*cfg.metrics, *(f"{name}{SHARE}" for name in cfg.standing_still)]
+        known = {*measured, *RESULT_FIELDS}
         if cfg.criterion is None:
             known.discard("success_rate")
         for bound in self._bounds:
             check_measured(bound, cfg, known)
         for name in cfg.trigger_below:
-            if name not in cfg.metrics:
+            if name not in measured:
                 raise ValueError(
                     f"EvaluationCfg trigger_below: {name!r} is not in `metrics`; "
-                    f"{suggest(name, sorted(cfg.metrics))}"
+                    f"{suggest(name, sorted(measured))}"
                 )
         self._eval_env: Any = None
         self.env_cfg: ManagerBasedRlEnvCfg | None = None
@@ -364,8 +386,15 @@ class SolvedCheck:
 
     def exploring_metrics(self) -> dict[str, float]:
         """Return the metrics in `trigger_below` of the environments of the run, now."""
-        metrics, env = self.cfg.metrics, self._env.unwrapped
-        return {name: metrics[name](env).mean().item() for name in self.cfg.trigger_below}
+        cfg, env = self.cfg, self._env.unwrapped
+
+        def value(name: str) -> float:
+            if name in cfg.metrics:
+                return cfg.metrics[name](env).mean().item()
+            name = name.removesuffix(SHARE)
+            return (cfg.metrics[name](env).mean() / cfg.standing_still[name](env).mean()).item()
+
+        return {name: value(name) for name in cfg.trigger_below}
 
     def should_evaluate(self, stats: IterationStats) -> bool:
         """Return True if the data of the last iteration suggest that the policy may be good enough."""
@@ -429,6 +458,7 @@ class SolvedCheck:
                     policy,
                     success=self.cfg.criterion,
                     metrics=self.cfg.metrics,
+                    standing_still=self.cfg.standing_still,
                     seed=seed,
                     is_stopped=is_stopped,
                 )
@@ -580,6 +610,7 @@ def _play_round(
     max_steps: int,
     success_func: PerEnv | None,
     metrics: Mapping[str, PerEnv],
+    standing_still: Mapping[str, PerEnv],
     report: Callable[[int, int], None],
     is_stopped: Callable[[], bool] | None,
 ) -> Episodes:
@@ -597,6 +628,9 @@ def _play_round(
     returns, lengths = zeros(torch.float64), zeros(torch.long)
     failed, succeeded = zeros(torch.bool), zeros(torch.bool)
     sums = {name: zeros(torch.float64) for name in metrics}
+    still = {name: zeros(torch.float64) for name in standing_still}
+    measured = [*zip(sums.values(), metrics.values(), strict=True)]
+    measured += [*zip(still.values(), standing_still.values(), strict=True)]
     manager = unwrapped.termination_manager
     terminations = {name: zeros(torch.bool) for name in manager.active_terms}
     reset_policy = getattr(policy, "reset", None)
@@ -608,9 +642,9 @@ def _play_round(
             raise EvaluationStopped
         if success_func is not None:
             succeeded = torch.where(running, success_func(unwrapped).bool(), succeeded)
-        for name, func in metrics.items():
+        for total, func in measured:
             # `where` instead of a product: zero times infinity is NaN.
-            sums[name] += torch.where(running, func(unwrapped), 0.0)
+            total += torch.where(running, func(unwrapped), 0.0)
         observations, rewards, dones, _ = env.step(policy(observations).to(env.device))
         returns += rewards * running
         lengths += running
@@ -635,6 +669,7 @@ def _play_round(
         succeeded=succeeded[first],
         terminations={name: ended_by[first] for name, ended_by in terminations.items()},
         metrics={name: total[first] / lengths[first] for name, total in sums.items()},
+        standing_still={name: total[first] / lengths[first] for name, total in still.items()},
     )
 
 
@@ -656,6 +691,8 @@ class Episodes:
     """True if the termination was true in the last step, (E,) bool, by name."""
     metrics: dict[str, torch.Tensor]
     """Mean of the metric over the steps of the episode, (E,), by name."""
+    standing_still: dict[str, torch.Tensor]
+    """The same for a robot that stands still."""
 
     def __add__(self, other: Episodes) -> Episodes:
         joined: dict[str, Any] = {}
@@ -680,6 +717,9 @@ def summarize(
     mean_return = mean_and_interval(returns)
     rate = None if successes is None else successes.double().mean().item()
     failures = episodes.failed.double().mean().item()
+    metrics = {name: mean_and_interval(v) for name, v in episodes.metrics.items()}
+    for name, still in episodes.standing_still.items():
+        metrics[f"{name}{SHARE}"] = ratio_and_interval(episodes.metrics[name], still)
     return EvaluationResult(
         num_episodes=count,
         mean_return=mean_return.mean,
@@ -693,7 +733,10 @@ def summarize(
         failure_rate=failures,
         failure_interval=wilson_interval(failures, count),
         terminations={k: v.double().mean().item() for k, v in episodes.terminations.items()},
-        metrics={name: mean_and_interval(v) for name, v in episodes.metrics.items()},
+        metrics=metrics,
+        standing_still={
+            name: v.double().mean().item() for name, v in episodes.standing_still.items()
+        },
         num_unfinished=int((~episodes.finished).sum().item()),
         duration=duration,
         returns=tuple(returns.tolist()),
@@ -710,6 +753,21 @@ def mean_and_interval(values: torch.Tensor) -> MeanAndInterval:
 
     half = float(stdtrit(count - 1, 0.975)) * values.double().std().item() / math.sqrt(count)
     return MeanAndInterval(mean, (mean - half, mean + half))
+
+
+def ratio_and_interval(values: torch.Tensor, references: torch.Tensor) -> MeanAndInterval:
+    """Return the ratio R of the means of `values` and `references`, (E,), and its 95 % confidence interval.
+
+    That of the mean of (x - R y) / mean(y): Cochran, Sampling Techniques, 1977, chapter 6.
+    """
+    mean = references.double().mean()
+    ratio = values.double().mean() / mean
+    found = mean_and_interval((values - ratio * references) / mean)
+    ratio = ratio.item()
+    if found.interval is None:
+        return MeanAndInterval(ratio, None)
+    low, high = found.interval
+    return MeanAndInterval(ratio, (ratio + low, ratio + high))
 
 
 def wilson_interval(rate: float, count: int) -> tuple[float, float]:

@@ -92,6 +92,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
                 max_steps=cfg.max_steps,
                 success=solved.criterion,
                 metrics=solved.metrics,
+                standing_still=solved.standing_still,
                 seed=cfg.seed,
                 progress=progress.update,
             )
@@ -184,7 +185,7 @@ def _failure_terms(env: Any) -> list[str]:
 
 def _table(metrics: dict[str, Any], failures: list[str]) -> str:
     """Format the metrics; `failures` are the terminations that count as failures."""
-    from mjlab.rl.evaluation import curricula_text
+    from mjlab.rl.evaluation import SHARE, curricula_text
 
     lines = [
         f"Task         {metrics['task']}",
@@ -213,9 +214,17 @@ def _table(metrics: dict[str, Any], failures: list[str]) -> str:
             f"{_interval(metrics['failure_interval'], '.1%')}"
             + (f"   (ended by: {ended})" if ended else "")
         )
-    for name, value in metrics["metrics"].items():
-        mean = f"{value['mean']:.4g} {metrics['units'].get(name, '')}".rstrip()
-        lines.append(f"{name:<12} {mean}   {_interval(value['interval'], '.4g')}")
+    measured, still = metrics["metrics"], metrics["standing_still"]
+    for name, value in measured.items():
+        if name.removesuffix(SHARE) in still and name not in still:
+            continue
+        unit = metrics["units"].get(name, "")
+        line = f"{name:<12} {value['mean']:.4g} {unit}".rstrip()
+        line += f"   {_interval(value['interval'], '.4g')}"
+        if name in still:
+            share = measured[f"{name}{SHARE}"]["mean"]
+            line += f"   ({share:.0%} of standing still, {still[name]:.4g} {unit})"
+        lines.append(line)
     if state := curricula_text(metrics["curricula"]):
         lines.append(f"Curricula    {state}")
     lines += [f"Note         {note}" for note in metrics["notes"]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -110,3 +111,18 @@ def test_the_humanoid_keeps_its_penalties(terrain):
         assert ranges[-1] == pytest.approx(table.commands["twist"].ranges.lin_vel_x)
     finally:
         env.close()
+
+
+def test_errors_of_standing_still(go1):
+    robot = go1.scene["robot"]
+    robot.write_root_link_velocity_to_sim(torch.zeros(4, 6))
+    go1.sim.forward()
+    torch.testing.assert_close(ppo.standing_lin_vel_error(go1), ppo.lin_vel_error(go1))
+    term = go1.command_manager.get_term("twist")
+    term.is_heading_env[:] = torch.tensor([True, True, False, False])
+    term.is_standing_env[:] = torch.tensor([False, True, False, True])
+    error = ppo.standing_ang_vel_error(go1)
+    torch.testing.assert_close(error[2:], ppo.ang_vel_error(go1)[2:])
+    torch.testing.assert_close(error[1], ppo.ang_vel_error(go1)[1])
+    # k a up to 0.5 rad/s, which errors of 1 to pi rad exceed: (0.25 + 0.5 (pi - 1)) / pi.
+    assert error[0] == pytest.approx((0.25 + 0.5 * (math.pi - 1.0)) / math.pi, rel=1e-3)
