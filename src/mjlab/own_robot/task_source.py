@@ -28,6 +28,8 @@ SOLVED = {
 }
 """Errors, as shares of those of a robot that stands still, and failure rate below which training stops, by
 number of feet."""
+GEAR_FRICTION = 0.02
+"""Dry friction of a drive as a share of its effort limit; 0.017 to 0.024 for the motors of the G1."""
 
 
 def velocity_source(report: RobotReport, package: str, title: str, task_name: str) -> str:
@@ -37,6 +39,7 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
     fallen = report.anatomy.fall_bodies
     commands = report.commands.value
     has_gait = len(report.anatomy.feet.value) == 4
+    friction_reason, friction = _joint_friction(report)
     names = [
         "ACTION_SCALE",
         "FEET",
@@ -59,6 +62,8 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
             reason_lines("Tolerance of joints around the initial pose (rad)", report.pose_tolerance)
         ),
         std_walking=dict_source(by_pattern(shared(tolerance, report), report)),
+        friction_reason="\n".join(comment_lines(friction_reason)),
+        joint_friction=friction,
         fallen_reason="\n".join(reason_lines("Bodies that touch the ground after a fall", fallen)),
         fallen=tuple_source(fallen.value, 9),
         contact_mode=f'"{mode}"',
@@ -110,6 +115,20 @@ def tracked_bodies(report: RobotReport) -> tuple[tuple[str, ...], tuple[str, ...
 
 def _range(bounds: tuple[float, float]) -> str:
     return f"({number(bounds[0])}, {number(bounds[1])})"
+
+
+def _joint_friction(report: RobotReport) -> tuple[str, str]:
+    """Return the reason and the source of the ranges of dry friction."""
+    names, model = driven_joints(report), report.compiled
+    if any(model.dof_frictionloss[model.joint(name).dofadr[0]] > 0.0 for name in names):
+        return "Dry friction of joints. None: 0.75 to 1.25 times that of the file.", "None"
+    limits = by_pattern(shared({name: report.effort.value[name] for name in names}, report), report)
+    ranges = {name: (0.0, GEAR_FRICTION * limit) for name, limit in limits.items()}
+    reason = (
+        f"Dry friction of joints (N m): not in the file. Up to {GEAR_FRICTION:.0%} of the effort limit, as "
+        "the motors of the Unitree G1 have it."
+    )
+    return reason, dict_source(ranges)
 
 
 def _sole_radius(report: RobotReport) -> float:

@@ -1,14 +1,15 @@
 """Base config of the velocity task: track commanded linear velocity and yaw rate.
 
 `make_legged_env_cfg` returns the task of a robot, from the names of its parts; see `config/go1` and
-`config/g1`. `make_flat`, `remove_state_estimation` and `make_playable` adapt it to flat ground, to
-the sensors of a robot and to play mode. `make_velocity_env_cfg` returns the template, whose names
+`config/g1`. `make_flat`, `remove_state_estimation`, `randomize_drives` and `make_playable` adapt it to
+flat ground, to the sensors and drives of a robot and to play mode. `make_velocity_env_cfg` returns the template, whose names
 are left to fill in.
 """
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from typing import Any
 
@@ -235,6 +236,48 @@ def remove_state_estimation(cfg: ManagerBasedRlEnvCfg) -> None:
     del actor.terms["base_lin_vel"]
     if actor.terms.pop("height_scan", None) is not None:
         actor.history_length = BLIND_HISTORY
+
+
+def randomize_drives(
+    cfg: ManagerBasedRlEnvCfg, joint_friction: dict[str, tuple[float, float]] | None = None
+) -> None:
+    """Randomize what a model file does not say of a robot's drives, in place.
+
+    Events of mode `startup` vary friction, armature, gains and peak torque of each joint; the latency
+    of the commands is drawn at each reset. `mjlab fit-actuators` measures a robot's own values, and
+    prints events of the same names with narrower ranges.
+
+    Args:
+        cfg: Task with position-controlled joints.
+        joint_friction: Dry friction (N m or N) by joint name pattern. None: 0.75 to 1.25 times that of
+            the model.
+    """
+    friction: dict[str, Any] = {"operation": "scale", "ranges": (0.75, 1.25)}
+    if joint_friction is not None:
+        friction = {"operation": "abs", "ranges": joint_friction}
+    joints = SceneEntityCfg("robot", joint_names=(".*",))
+    for name, func, params in (
+        ("joint_friction", mdp.dr.joint_friction, friction),
+        # Rotor inertias come from data sheets, or from rules.
+        ("armature", mdp.dr.joint_armature, {"operation": "scale", "ranges": (0.8, 1.2)}),
+        # Torque constants vary from motor to motor, and with temperature.
+        ("gains", mdp.dr.pd_gains, {"kp_range": (0.9, 1.1), "kd_range": (0.9, 1.1)}),
+        # Peak torque depends on the charge of the battery.
+        ("motor_strength", mdp.dr.effort_limits, {"effort_limit_range": (0.9, 1.1)}),
+    ):
+        cfg.events[name] = EventTermCfg(
+            func=func, mode="startup", params={"asset_cfg": copy.deepcopy(joints), **params}
+        )
+    # From measurement to torque, robots of this size need 5 to 15 ms. One lag per episode.
+    robot, substeps = cfg.scene.entities["robot"], round(0.015 / cfg.sim.mujoco.timestep)
+    assert robot.articulation is not None
+    robot.articulation = dataclasses.replace(
+        robot.articulation,
+        actuators=tuple(
+            dataclasses.replace(actuator, delay_max_lag=substeps, delay_hold_prob=1.0)
+            for actuator in robot.articulation.actuators
+        ),
+    )
 
 
 def get_sensor(cfg: ManagerBasedRlEnvCfg, name: str) -> Any:
