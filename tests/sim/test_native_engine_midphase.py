@@ -135,6 +135,31 @@ def test_a_moved_geom_or_centre_of_mass_loses_no_contact(field: str, value: obje
     assert supported[other] == (field == "body_ipos")
 
 
+def test_fine_meshes_need_no_copies() -> None:
+    """Volumes of bodies share an array with those of the triangles of meshes."""
+
+    def fine(*disabled: str) -> Simulation:
+        spec = mujoco.MjSpec.from_string(SCENE)
+        for name in ("shell", "eye", "ear"):
+            spec.add_mesh(name=name).make_sphere(subdivision=4)
+            spec.body("walker").add_geom(
+                type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, contype=0, conaffinity=0, mass=0
+            )
+        cfg = SimulationCfg(mujoco=MujocoCfg(timestep=0.004, disableflags=disabled), num_threads=1)
+        sim = Simulation(NUM_ENVS, cfg, spec=spec, device="cpu")
+        sim.expand_model_fields(FIELDS)
+        return sim
+
+    found, all_pairs = fine(), fine("midphase")
+    for sim in (found, all_pairs):
+        generator = torch.Generator().manual_seed(1)
+        randomize(sim, generator, 0.2)
+        place(sim, generator)
+        sim.step(20)
+    assert torch.equal(found.data.qpos, all_pairs.data.qpos)
+    assert found.mj_model.bvh_aabb.nbytes > 10 * found._engine.bytes_each
+
+
 def test_restored_fields_are_searched_with_their_own_boxes() -> None:
     sim = build(fields=("body_ipos",))
     trunk = sim.mj_model.body("walker").id

@@ -83,6 +83,9 @@ _BOUNDED = (
     *("body_ipos", "body_iquat"),
 )
 _BOUNDING_VOLUMES = ("bvh_aabb", "body_margin")
+# Memory of the volumes per environment above which the midphase is off instead (bytes). Those of
+# meshes are in the same array, though they never change: 41 MB of a Unitree B2.
+_MOST_BOUNDS = 2**20
 
 # Position and velocity stages do not need contacts. Collision detection is half of the cost of
 # these stages on Go1 and G1.
@@ -458,6 +461,11 @@ class NativeEngine(Engine):
         """
         written = self._model_copies.keys() & _BOUNDED
         volumes = {*_BOUNDING_VOLUMES, "geom_rbound"} - self.model_fields.keys()
+        if self._model.bvh_aabb.nbytes > _MOST_BOUNDS:
+            volumes.remove("bvh_aabb")
+            without = int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+            self._model.opt.disableflags |= without
+            self._disabled[:] |= without
         if self._bounds is None:
             # States and written fields of the second batch, volumes of both.
             sizes = [getattr(self._model, name).nbytes for name in (*written, *volumes, *volumes)]
