@@ -295,6 +295,22 @@ function without arguments that returns an EntityCfg.""",
         ),
     ),
     Command(
+        "deploy",
+        "deploy",
+        "a policy as a folder for a robot",
+        argument="POLICY",
+        details="""\
+Write a folder that runs a policy without this package and without torch: network (ONNX), contract
+(JSON), scene, golden trace, and programs to read.
+
+POLICY is the folder of a run, a checkpoint (.pt), an exported policy (.onnx) of a run, or a bundled
+policy (go1, g1).""",
+        examples=(
+            "mjlab deploy go1 --output go1_bundle",
+            "mjlab deploy logs/rsl_rl/go1_velocity/2026-01-02_03-04-05",
+        ),
+    ),
+    Command(
         "profile-env",
         "find out",
         "where the time of a step goes",

@@ -232,8 +232,8 @@ def get_base_metadata(
             metadata.update(term.export_metadata(name))
     metadata.update(_observation_metadata(env, observation_groups))
     metadata.update(_action_metadata(terms))
-    metadata["step_dt"] = _shortest(env.step_dt)
-    metadata["physics_dt"] = _shortest(env.physics_dt)
+    metadata["step_dt"] = shortest(env.step_dt)
+    metadata["physics_dt"] = shortest(env.physics_dt)
     metadata["decimation"] = env.cfg.decimation
     if entities:
         cfgs = [actuator.cfg for actuator in entity.actuators]
@@ -241,11 +241,15 @@ def get_base_metadata(
     return metadata
 
 
-def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:
-    """Return names, PD gains as configured (not as randomized) and default positions of joints."""
+def joint_gains(entity: Entity, model: Any) -> dict[str, tuple[float, float]]:
+    """Return the PD gains kp and kd of each actuated joint, as configured (not as randomized).
+
+    Args:
+        entity: Entity with the joints.
+        model: Compiled `MjModel` of the scene.
+    """
     gains: dict[str, tuple[float, float]] = {}
     affine = 1  # mujoco.mjtBias.mjBIAS_AFFINE
-    model = env.sim.mj_model
     for actuator in entity.actuators:
         if str(getattr(actuator.transmission_type, "value", "joint")) != "joint":
             continue
@@ -260,13 +264,19 @@ def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:
             kp = getattr(actuator.cfg, "stiffness", 0.0 - bias[1])
             kd = getattr(actuator.cfg, "damping", 0.0 - bias[2])
             gains[name] = float(kp), float(kd)
+    return gains
+
+
+def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:
+    """Return names, PD gains as configured (not as randomized) and default positions of joints."""
+    gains = joint_gains(entity, env.sim.mj_model)
     actuated = [name for name in entity.joint_names if name in gains]
     default = entity.data.default_joint_pos
     return {
         "joint_names": list(entity.joint_names),
         "joint_stiffness": [gains[name][0] for name in actuated],
         "joint_damping": [gains[name][1] for name in actuated],
-        "default_joint_pos": _shortest(default[0]) if default is not None else [],
+        "default_joint_pos": shortest(default[0]) if default is not None else [],
     }
 
 
@@ -283,7 +293,7 @@ def _observation_metadata(env: ManagerBasedRlEnv, groups: Sequence[str] | None) 
     return {
         "observation_names": [name for _, name in terms],
         "observation_terms_scale": [
-            _shortest(scale.flatten() if scale.ndim > 0 else scale) for scale in scales
+            shortest(scale.flatten() if scale.ndim > 0 else scale) for scale in scales
         ],
         "observation_terms_flatten_history_dim": [cfg.flatten_history_dim for cfg in cfgs],
         "observation_terms_history_length": [cfg.history_length for cfg in cfgs],
@@ -311,7 +321,7 @@ def _action_metadata(terms: Mapping[str, Any]) -> Metadata:
         components["scale"] += _per_component(term, "_scale", 1.0)
         components["offset"] += _per_component(term, "_offset", 0.0)
         components["clip"] += (
-            _shortest(clip[0])
+            shortest(clip[0])
             if isinstance(clip, torch.Tensor)
             else [[-np.inf, np.inf]] * term.action_dim
         )
@@ -333,15 +343,18 @@ def _per_component(term: Any, attribute: str, default: float) -> list[float]:
     value = getattr(term, attribute, default)
     if isinstance(value, torch.Tensor):
         row = value[0] if value.ndim > 1 else value
-        return _shortest(row.expand(term.action_dim))
+        return shortest(row.expand(term.action_dim))
     return [float(value)] * term.action_dim
 
 
-def _shortest(value: Any) -> Any:
-    """Return the shortest decimals that equal `value` in float32: 0.1, not 0.100000001."""
+def shortest(value: Any) -> Any:
+    """Return the shortest decimals that equal `value`, a number or a tensor, in float32.
+
+    0.1 instead of 0.100000001.
+    """
     if isinstance(value, torch.Tensor):
         value = value.tolist()
-    return [*map(_shortest, value)] if isinstance(value, list) else float(str(np.float32(value)))
+    return [*map(shortest, value)] if isinstance(value, list) else float(str(np.float32(value)))
 
 
 def attach_metadata_to_onnx(onnx_path: str, metadata: Mapping[str, list | str | float]) -> None:

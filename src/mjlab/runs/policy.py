@@ -79,6 +79,16 @@ def load_policy(
         # The profile may ease the physics of training.
         trained = load_env_cfg(task, profile=profile)
         return load_onnx_policy(checkpoint.path, env, device, trained)
+    return load_runner(task, env, checkpoint, device, profile).get_inference_policy(device=device)
+
+
+def load_runner(
+    task: str, env: Any, checkpoint: Checkpoint, device: str, profile: str | None = None
+) -> Any:
+    """Return a runner with the acting network of `checkpoint`.
+
+    Arguments and errors are those of `load_policy`, without exported policies.
+    """
     from mjlab.rl import MjlabOnPolicyRunner
 
     agent_cfg = agent_cfg_of(task, checkpoint, profile)
@@ -92,7 +102,7 @@ def load_policy(
         ) from error
     network = "student" if isinstance(agent_cfg, RslRlDistillationRunnerCfg) else "actor"
     checkpoint.load_into(runner, {network: True}, device)
-    return runner.get_inference_policy(device=device)
+    return runner
 
 
 def has_foreign_runner(task: str) -> bool:

@@ -1,0 +1,201 @@
+"""The folder of a deployed policy: network, contract, scene, golden trace and programs to read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from mjlab.deploy.contract import Contract
+from mjlab.deploy.golden import record, write_csv
+from mjlab.rl.exporter_utils import OnnxPolicy, attach_metadata_to_onnx, get_base_metadata
+from mjlab.scene import Scene, SceneCfg
+
+if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
+
+FILES = Path(__file__).parent / "files"
+"""Folder of the programs that every bundle contains."""
+PROGRAMS = ("runtime.py", "simulate.py")
+"""Programs copied into every bundle."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A written bundle."""
+
+    folder: Path
+    """Folder."""
+    contract: dict[str, Any]
+    """Content of `contract.json`."""
+    notes: list[str]
+    """What a user should know, one sentence each."""
+
+
+def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], steps: int) -> Bundle:
+    """Write everything but the network into `folder`, which holds `policy.onnx`.
+
+    Args:
+        contract: Contract of the policy in `folder`, in a nominal environment.
+        folder: Folder of the bundle.
+        source: Origin of the policy, for the contract.
+        steps: Number of control steps of the golden trace.
+    """
+    env = contract.subject.env
+    policy = folder / "policy.onnx"
+    _update_metadata(env, policy)
+    write_scene(env, folder / "scene")
+    _write_robot(contract, folder / "robot")
+    arrays, episodes = record(contract, OnnxPolicy(policy), steps)
+    golden = {
+        "file": "golden.npz",
+        "table": "golden.csv",
+        "steps": steps,
+        "episodes": episodes,
+    }
+    content = contract.as_dict(source, golden)
+    text = json.dumps(content, indent=1, allow_nan=False)
+    (folder / "contract.json").write_text(text + "\n", encoding="utf-8")
+    arrays_of: Any = arrays
+    np.savez_compressed(folder / "golden.npz", **arrays_of)
+    write_csv(folder / "golden.csv", content, arrays)
+    _write_motion(contract, folder)
+    for name in PROGRAMS:
+        if (FILES / name).exists():
+            shutil.copyfile(FILES / name, folder / name)
+    return Bundle(folder, content, _notes(content))
+
+
+def origin(
+    task: str, profile: str | None, checkpoint: Path, seed: int | None, **known: Any
+) -> dict:
+    """Return the origin of a policy for the contract."""
+    return {
+        "task": task,
+        "profile": profile,
+        "run": checkpoint.resolve().parent.name,
+        "checkpoint": checkpoint.name,
+        "seed": seed,
+        **known,
+        "commit": _commit(),
+        "package": f"mjlab {version('mjlab')}",
+        "mujoco": mujoco.__version__,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _commit() -> str | None:
+    """Return the commit of the package's source; None if it is not a checkout."""
+    try:
+        return subprocess.run(
+            ["git", "rev-parse", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=10,
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _update_metadata(env: ManagerBasedRlEnv, policy: Path) -> None:
+    """Write the settings of the evaluated task into the file; training may have eased them."""
+    model_groups = OnnxPolicy(policy).metadata.get("observation_group")
+    groups = model_groups.split(",") if model_groups else None
+    metadata = dict(get_base_metadata(env, "", groups))
+    del metadata["run_path"]
+    attach_metadata_to_onnx(str(policy), metadata)
+
+
+# Models.
+
+
+def write_scene(env: ManagerBasedRlEnv, folder: Path) -> None:
+    """Write the scene of `env` with its physics options, and the numbers that XML rounds."""
+    options: Any = SimpleNamespace(opt=env.scene.spec.option)
+    env.cfg.sim.mujoco.apply(options)
+    env.scene.write(folder)
+    written = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    exact: Any = rounded_fields(env.sim.mj_model, written)
+    np.savez_compressed(folder / "exact.npz", **exact)
+
+
+def rounded_fields(model: mujoco.MjModel, written: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Return the numbers of `model` that differ in `written`, by field; `opt.` before options."""
+    fields = {}
+    for prefix, one, other in (("", model, written), ("opt.", model.opt, written.opt)):
+        for name in dir(one):
+            if name.startswith("_"):
+                continue
+            value, there = getattr(one, name), getattr(other, name)
+            if isinstance(value, float):
+                value, there = np.array(value), np.array(there)
+            if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+                continue
+            if value.shape == there.shape and not np.array_equal(value, there):
+                fields[prefix + name] = value.copy()
+    return fields
+
+
+def _write_robot(contract: Contract, folder: Path) -> None:
+    env, robot = contract.subject.env, contract.subject.robot
+    scene = Scene(SceneCfg(entities={robot: env.cfg.scene.entities[robot]}), "cpu")
+    scene.write(folder)
+    (folder / "scene.xml").replace(folder / "robot.xml")
+
+
+# Motions.
+
+
+def _write_motion(contract: Contract, folder: Path) -> None:
+    """Write the frames of all motions of a motion command, in the fields of other controllers."""
+    env = contract.subject.env
+    for name in env.command_manager.active_terms:
+        term: Any = env.command_manager.get_term(name)
+        if not hasattr(term, "motion"):
+            continue
+        motion = term.motion
+        fields = ("joint_pos", "joint_vel", "body_pos_w", "body_quat_w")
+        arrays = {
+            key: getattr(motion, key).cpu().numpy()
+            for key in (*fields, "body_lin_vel_w", "body_ang_vel_w")
+        }
+        np.savez_compressed(
+            folder / "motion.npz",
+            fps=np.array([1.0 / env.step_dt]),
+            joint_names=np.array(term.robot.joint_names),
+            body_names=np.array(term.body_names),
+            **arrays,
+        )
+
+
+def _notes(content: Mapping[str, Any]) -> list[str]:
+    """Return what the user should know about a contract."""
+    notes = [
+        f"Robots do not measure {one['measurement']}, which {one['term']} needs ({one['why']})."
+        for one in content["unmeasured"]
+    ]
+    notes += [
+        f"The runtime does not know {term['function']} of the term {term['name']}: add its formula to "
+        "TERMS in runtime.py."
+        for observation in content["observations"]
+        for term in observation["terms"]
+        if term["kind"] == "custom"
+    ]
+    notes += [
+        f"The runtime does not know the action {action['name']} ({action['class']})."
+        for action in content["actions"]
+        if action["kind"] == "custom"
+    ]
+    return notes

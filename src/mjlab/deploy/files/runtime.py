@@ -1,0 +1,299 @@
+"""Run the policy of this folder on a robot. Needs numpy and onnxruntime; read it, and rewrite it.
+
+    policy = Policy.load(".")
+    while not policy.is_ready:             # from a standing pose to the first pose of the policy
+        send(policy.hand_over(measure()))  # then wait until the period is over
+    policy.reset()
+    while True:
+        send(policy.step(measure(), command))
+
+`measure()` returns a dict of `time` (s, monotonic) and of all measurements that `contract.json` lists.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+
+@dataclass
+class Targets:
+    """Motor commands of a period: torque = kp (position - q) + kd (velocity - q') + effort."""
+
+    names: list
+    position: np.ndarray
+    velocity: np.ndarray
+    effort: np.ndarray
+    kp: np.ndarray
+    kd: np.ndarray
+    period: float
+    is_damping: bool = False
+    reason: str = ""
+
+
+def arrayed(value):
+    """Return lists as arrays, and other values unchanged."""
+    return np.array(value) if isinstance(value, list) else value
+
+
+# Formulas of the observation terms: f(values of the inputs, term) -> value.
+
+
+def rotation(q):
+    """Return the matrix of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q
+    first = (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w))
+    second = (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w))
+    third = (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
+    return np.array((first, second, third))
+
+
+def reading(inputs, term):
+    """Return factor * x - offset of the chosen components."""
+    x = inputs[0] if term["columns"] is None else inputs[0][term["columns"]]
+    x = x if term["factor"] is None else term["factor"] * x
+    return x if term["offset"] is None else x - term["offset"]
+
+
+def pose_error(inputs, term):
+    """Return translation and rotation vector from a pose to the commanded pose."""
+    place, (w, x, y, z), goal = inputs
+    # Matrix of the product with the conjugate quaternion from the right.
+    right = np.array(((w, x, y, z), (-x, w, -z, y), (-y, z, w, -x), (-z, -y, x, w)))
+    turn = right @ goal[3:]
+    turn = -turn if turn[0] < 0 else turn
+    sine = np.linalg.norm(turn[1:])
+    ratio = 2 * np.arctan2(sine, turn[0]) / sine if sine > 1e-9 else 2.0
+    return np.concatenate((goal[:3] - place, ratio * turn[1:]))
+
+
+TERMS = {
+    **dict.fromkeys(("reading", "command", "last_action"), reading),
+    "cos_sin": lambda i, term: np.array((np.cos(x := reading(i, term)), np.sin(x))).ravel(),
+    "gravity": lambda i, term: -rotation(i[0])[2],
+    "position_in_frame": lambda i, term: rotation(i[2]).T @ (i[0] - i[1]),
+    "vector_in_frame": lambda i, term: rotation(i[1]).T @ i[0],
+    # Two columns of the relative rotation matrix, row by row.
+    "orientation_in_frame": lambda i, term: (rotation(i[1]).T @ rotation(i[0]))[:, :2].ravel(),
+    "pose_error": pose_error,
+    # A term of your own: "my_package.mdp:wheel_speed": lambda inputs, term: ...
+}
+
+
+class Policy:
+    """Policy with its contract, memory, clocks and limits."""
+
+    @classmethod
+    def load(cls, folder, limits=True):
+        """Read `contract.json` and `policy.onnx`. Without limits, targets are those of the policy."""
+        folder, options = Path(folder), onnxruntime.SessionOptions()
+        # More threads than one make the slowest steps a hundred times slower.
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        contract = json.loads((folder / "contract.json").read_text(encoding="utf-8"))
+        session = onnxruntime.InferenceSession(str(folder / contract["policy"]["file"]), options)
+        return cls(contract, session.run, folder, limits)
+
+    def __init__(self, contract, run, folder=".", limits=True):
+        """Prepare the terms; `run(names of outputs, inputs)` is that of an onnxruntime session."""
+        if (contract["schema"], contract["version"]) != ("mjlab-contract", 1):
+            raise ValueError("contract.json: expected schema mjlab-contract, version 1.")
+        self.contract, self._run, self._has_limits = contract, run, limits
+        self.period, joints = contract["rates"]["step_dt"], contract["joints"]
+        self.names = [joint["name"] for joint in joints]
+        keys = ("kp", "kd", "default_pos")
+        self.kp, self.kd, self.default = (np.array([j[key] for j in joints]) for key in keys)
+        self._limits = {k: arrayed(v) for k, v in contract["limits"].items()}
+        self._clip, inputs = contract["policy"]["clip"], contract["policy"]["inputs"]
+        self.inputs = {entry["name"]: np.zeros(entry["shape"], np.float32) for entry in inputs}
+        self._memory = {e["output"]: e["name"] for e in inputs if e["kind"] == "memory"}
+        self._outputs = [contract["policy"]["output"], *self._memory]
+        self._terms = [self._term(o, dict(t)) for o in contract["observations"] for t in o["terms"]]
+        self._actions = [self._action(dict(action)) for action in contract["actions"]]
+        self._commands = {command["name"]: command for command in contract["commands"]}
+        self._given = [n for n, command in self._commands.items() if command["kind"] == "given"]
+        for command in self._commands.values():
+            if command["kind"] == "motion":
+                self.motion = dict(np.load(Path(folder) / command["file"]))
+                frame = command["motions"][0]["start"] + command["start_frame"] - 1
+                self.default = self.motion["joint_pos"][frame].astype(float)
+        self.values, self.action = {}, np.zeros(contract["policy"]["size"], np.float32)
+        self.is_ready, self._start = False, None
+        self.reset()
+
+    def _term(self, observation, term):
+        """Return key, formula, settings, place in the input, and size in a history of one term."""
+        function = TERMS.get(term["kind"]) or TERMS.get(term["function"])
+        if function is None:
+            raise ValueError(
+                f"Term {term['name']!r}: unknown function {term['function']!r}. Add its formula to TERMS "
+                "under this name; its inputs are the measurements that contract.json lists for it."
+            )
+        term |= {key: arrayed(term[key]) for key in ("offset", "scale")}
+        term["clip"] = None if term["clip"] in (None, [None, None]) else term["clip"]
+        if term["kind"] == "last_action":
+            term["inputs"] = ["last_action"]
+        place = (0, *(slice(None),) * observation["axis"], slice(term["start"], term["stop"]))
+        slot = self.inputs[observation["input"]][place]
+        history = term["size"] if term["history"]["length"] else 0
+        return (observation["input"], term["name"]), function, term, slot, history
+
+    def _action(self, action):
+        """Return an action term with arrays and the places of its joints."""
+        if action["kind"] == "custom":
+            raise ValueError(f"Action {action['name']!r} is a {action['class']}: compute it here.")
+        action |= {k: arrayed(action.get(k)) for k in ("scale", "offset", "open", "closed")}
+        clip = action.get("clip") or [[None, None]] * len(action["joints"])
+        action["low"], action["high"] = np.array(clip, float).T  # None: NaN, which fmin ignores.
+        action["index"] = [self.names.index(name) for name in action["joints"]]
+        return action
+
+    def reset(self, motion=0):
+        """Start an episode, of one of the motions in motion tracking: clear memory, clocks, faults."""
+        self.reason, self._time, self._repeated, self._is_first = "", None, 0, True
+        self.action, self._sent = np.zeros_like(self.action), None
+        self._motion, self.frame = motion, None
+        for name in self._memory.values():
+            self.inputs[name][:] = 0.0
+        # Phase and amplitude of gait clocks.
+        start = {n: np.float32(command.get("start", 0)) for n, command in self._commands.items()}
+        self._clocks = {name: [phase, np.float32(0)] for name, phase in start.items()}
+
+    def step(self, measurements, command=None):
+        """Return the motor commands of one period.
+
+        `command` is that of the only given command, or a dict by name. After non-finite or stale
+        measurements, a tilt or joint speed beyond the limits, all steps damp until `reset`.
+        """
+        values = self._checked(measurements)
+        self._add_commands(values, command)
+        values["last_action"] = self.action
+        for key, function, term, slot, history in self._terms:
+            value = function([values[name] for name in term["inputs"]], term)
+            self.values[key] = value
+            if term["clip"] is not None:
+                value = np.clip(value, *term["clip"])
+            if term["scale"] is not None:
+                value = value * term["scale"]
+            if not history:
+                slot[:] = value
+            elif self._is_first:
+                slot.reshape(-1, history)[:] = value
+            else:
+                slot[:-history], slot[-history:] = slot[history:].copy(), value
+        self._is_first = False
+        action, *memory = self._run(self._outputs, self.inputs)
+        if not all(np.isfinite(x.sum()) for x in (action, *self.inputs.values())):
+            self.reason = self.reason or "a command or the answer of the policy is not finite"
+        if self.reason and self._has_limits:
+            return self.damp(values["joint_pos"])
+        for name, value in zip(self._memory.values(), memory, strict=True):
+            self.inputs[name][:] = value
+        self.action = action[0] if self._clip is None else action[0].clip(-self._clip, self._clip)
+        return self._targets()
+
+    def hand_over(self, measurements, seconds=2.0, tolerance=0.2):
+        """Move from the measured pose to the first pose of the policy, in `seconds`.
+
+        `is_ready` becomes True when time is over and each joint within `tolerance` (rad, m).
+        """
+        values = self._checked(measurements)
+        q, now = values["joint_pos"], float(measurements["time"])
+        if self.reason:
+            return self.damp(q)
+        begin, pose = self._start = self._start or (now, q)
+        share = min((now - begin) / seconds, 1.0)
+        self.is_ready = share == 1.0 and bool(np.abs(q - self.default).max() < tolerance)
+        return self._commanded(pose + share * (self.default - pose))
+
+    def damp(self, q):
+        """Return commands that only brake: no stiffness, targets at the measured positions."""
+        q, zero = np.where(np.isfinite(q), q, self.default), np.zeros(len(self.names))
+        return Targets(self.names, q, zero, zero, zero, self.kd, self.period, True, self.reason)
+
+    def _commanded(self, position):
+        zero = np.zeros(len(self.names))
+        return Targets(self.names, position, zero, zero.copy(), self.kp, self.kd, self.period)
+
+    def _checked(self, measurements):
+        """Return the values; set `reason` if they are stale, not finite, or beyond the limits."""
+        values = {k: np.asarray(v, float) for k, v in measurements.items() if k != "time"}
+        limits, last, self._time = self._limits, self._time, float(measurements["time"])
+        if self.reason or not self._has_limits:
+            return values
+        gap = self.period if last is None else self._time - last
+        self._repeated = self._repeated + 1 if gap <= 0 else 0
+        age = max(gap, self._repeated * self.period)
+        if not age <= limits["max_age"]:
+            self.reason = f"no new measurement for {age:.3f} s"
+        elif not all(np.isfinite(value.sum()) for value in values.values()):
+            self.reason = "a measurement is not finite"
+        elif (np.abs(values["joint_vel"]) > limits["joint_speed"]).any():
+            self.reason = "a joint is faster than limits.joint_speed"
+        elif limits["tilt"] is not None and limits["tilt_from"] in values:
+            _, x, y, _ = values[limits["tilt_from"]]
+            if 1 - 2 * (x * x + y * y) < np.cos(limits["tilt"]):
+                self.reason = "the robot is tilted by more than limits.tilt"
+        return values
+
+    def _add_commands(self, values, command):
+        """Add given commands, gait clocks and motions to `values`."""
+        if not isinstance(command, dict):
+            command = dict.fromkeys(self._given, command)
+        for name in self._given:
+            values[f"command/{name}"] = np.asarray(command[name], float)
+        for name, entry in self._commands.items():
+            if entry["kind"] == "gait_clock":
+                values[f"command/{name}"] = self._clock(entry, values)
+            elif entry["kind"] == "motion":
+                self._play(f"command/{name}", entry, values)
+
+    def _clock(self, entry, values):
+        """Return (A sin, A cos) of a gait clock, after advancing it; float32, as in training."""
+        clock, fade, stands, f32 = self._clocks[entry["name"]], entry["fade_s"], False, np.float32
+        if entry["velocity_command"] is not None:
+            x, y, yaw = values[f"command/{entry['velocity_command']}"]
+            stands = np.hypot(x, y) + abs(yaw) < entry["standing_threshold"]
+        if not self._is_first:
+            clock[0] = np.fmod(clock[0] + f32(entry["frequency"] * self.period), f32(1))
+            change = f32(-self.period if stands else self.period) / f32(fade or 1.0)
+            clock[1] = np.clip(clock[1] + change, f32(0), f32(1))
+        amplitude = clock[1] if fade > 0 else f32(not stands)
+        phase = clock[0] * f32(2 * np.pi)
+        return np.array((amplitude * np.sin(phase), amplitude * np.cos(phase)))
+
+    def _play(self, key, entry, values):
+        """Add the next frame of the motion; its last frame is held."""
+        motion, data, anchor = entry["motions"][self._motion], self.motion, entry["anchor_index"]
+        ahead = motion["start"] + entry["start_frame"] if self.frame is None else self.frame + 1
+        self.frame = t = min(ahead, motion["start"] + motion["length"] - 1)
+        values[key] = np.concatenate((data["joint_pos"][t], data["joint_vel"][t]))
+        values[f"{key}/anchor_pos"] = data["body_pos_w"][t, anchor]
+        values[f"{key}/anchor_quat"] = data["body_quat_w"][t, anchor]
+        if "time_step" in self.inputs:
+            self.inputs["time_step"][:] = t
+
+    def _targets(self):
+        """Return the motor commands of the last action, within the limits."""
+        parts = []
+        for action in self._actions:
+            raw = self.action[action["start"] : action["stop"]]
+            if action["kind"] == "binary_joint_position":
+                target = np.where(raw < 0, action["closed"], action["open"])
+            else:
+                target = raw * action["scale"] + action["offset"]
+            parts.append(np.fmax(np.fmin(target, action["high"]), action["low"]))
+        self.target = sent = np.concatenate(parts)
+        if self._has_limits:
+            limits = self._limits
+            sent = sent.clip(limits["target_low"], limits["target_high"])
+            if self._sent is not None:
+                step = limits["target_step"]
+                sent = sent.clip(self._sent - step, self._sent + step)
+        self._sent, commands = sent, self._commanded(self.default.copy())
+        fields = {"joint_velocity": commands.velocity, "joint_effort": commands.effort}
+        for action in self._actions:
+            part = sent[action["target_start"] : action["target_stop"]]
+            fields.get(action["kind"], commands.position)[action["index"]] = part
+        return commands

@@ -1,0 +1,421 @@
+"""Measurements: raw sensor values that the observations of a policy are computed from.
+
+A measurement says what a robot must supply (shape, unit, frame, and if robots can measure it), how plain
+MuJoCo gives it (`source`), and how the environment gives it (`read`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import mujoco
+import torch
+
+from mjlab.utils.lab_api.math import subtract_frame_transforms
+
+if TYPE_CHECKING:
+    from mjlab.entity import Entity
+    from mjlab.envs import ManagerBasedRlEnv
+    from mjlab.envs.mdp.frames import Frame
+    from mjlab.managers import ObservationTermCfg
+
+Availability = Literal["measured", "computed", "estimated", "external", "none"]
+"""Origin on a robot: encoders and IMU; kinematics from these; a state estimator; perception, such as
+cameras; none."""
+
+_ESTIMATED = "robots do not measure it; it needs a state estimator"
+_EXTERNAL = "it needs perception, such as a camera or motion capture"
+_ROOTED = "kinematics of the joint positions"
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Raw value that a robot must supply."""
+
+    name: str
+    """Name in the contract."""
+    shape: tuple[int, ...]
+    """Shape of one value."""
+    unit: str
+    """Unit."""
+    frame: str
+    """Frame that the value is expressed in; empty for joints and images."""
+    availability: Availability
+    """Origin on a robot."""
+    why: str
+    """Reason of the availability, in words."""
+    source: dict[str, Any]
+    """Origin in plain MuJoCo; the page of the contract has the kinds."""
+    read: Callable[[ManagerBasedRlEnv], torch.Tensor]
+    """Return the value in all environments, (N, *shape)."""
+
+    def entry(self) -> dict[str, Any]:
+        """Return the entry of the contract."""
+        size = 1
+        for count in self.shape:
+            size *= count
+        return {
+            "name": self.name,
+            "size": size,
+            "shape": list(self.shape),
+            "unit": self.unit,
+            "frame": self.frame,
+            "availability": self.availability,
+            "why": self.why,
+            "source": self.source,
+        }
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Environment, and the entity that the contract calls the robot."""
+
+    env: ManagerBasedRlEnv
+    """Environment."""
+    robot: str
+    """Name of the entity."""
+
+    @property
+    def entity(self) -> Entity:
+        """Entity of the robot."""
+        return self.env.scene[self.robot]
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """Compiled model of the scene."""
+        return self.env.sim.mj_model
+
+    def name(self, entity: str, text: str) -> str:
+        """Return the name of a measurement: those of other entities begin with the entity's name."""
+        return text if entity == self.robot else f"{entity}_{text}"
+
+
+# Joints.
+
+
+def joint_unit(entity: Entity) -> str:
+    """Return the unit of the joint positions of an entity."""
+    slides = {joint.type == mujoco.mjtJoint.mjJNT_SLIDE for joint in entity.joints}
+    return {(True,): "m", (False,): "rad"}.get(tuple(slides), "rad or m")
+
+
+def joint_pos(subject: Subject, entity_name: str) -> Measurement:
+    """Positions of all joints, in the entity's order, as the encoders read them."""
+    return _of_joints(subject, entity_name, "joint_pos", "")
+
+
+def joint_vel(subject: Subject, entity_name: str) -> Measurement:
+    """Velocities of all joints, in the entity's order."""
+    return _of_joints(subject, entity_name, "joint_vel", "/s")
+
+
+def _of_joints(subject: Subject, entity_name: str, kind: str, per: str) -> Measurement:
+    entity: Entity = subject.env.scene[entity_name]
+    is_robot = entity_name == subject.robot
+    return Measurement(
+        subject.name(entity_name, kind),
+        (entity.num_joints,),
+        joint_unit(entity) + per,
+        "",
+        "measured" if is_robot else "external",
+        "encoders" if is_robot else _EXTERNAL,
+        {"kind": kind, "joints": scene_joints(subject, entity)},
+        lambda env: getattr(env.scene[entity_name].data, kind),
+    )
+
+
+def scene_joints(subject: Subject, entity: Entity) -> list[str]:
+    """Return the names of an entity's joints in the scene."""
+    return [subject.model.joint(i).name for i in entity.indexing.joint_ids.tolist()]
+
+
+# Root and bodies.
+
+
+def root_quat(subject: Subject, entity_name: str) -> Measurement:
+    """Orientation of the root, quaternion (w, x, y, z)."""
+    return Measurement(
+        subject.name(entity_name, "root_quat"),
+        (4,),
+        "",
+        "world",
+        *_of_root_orientation(subject, entity_name),
+        {"kind": "body_quat", "body": _root(subject, entity_name)},
+        lambda env: env.scene[entity_name].data.root_link_quat_w,
+    )
+
+
+def root_pos(subject: Subject, entity_name: str) -> Measurement:
+    """Position of the root."""
+    fixed = entity_name == subject.robot and subject.entity.is_fixed_base
+    why = _ESTIMATED if entity_name == subject.robot else _EXTERNAL
+    return Measurement(
+        subject.name(entity_name, "root_pos"),
+        (3,),
+        "m",
+        "world",
+        "computed" if fixed else "estimated" if entity_name == subject.robot else "external",
+        "fixed base" if fixed else why,
+        {"kind": "body_pos", "body": _root(subject, entity_name)},
+        lambda env: env.scene[entity_name].data.root_link_pos_w,
+    )
+
+
+def root_lin_vel_b(subject: Subject, entity_name: str) -> Measurement:
+    """Linear velocity of the root's origin, in the root frame."""
+    return Measurement(
+        subject.name(entity_name, "root_lin_vel_b"),
+        (3,),
+        "m/s",
+        "root",
+        "estimated" if entity_name == subject.robot else "external",
+        _ESTIMATED if entity_name == subject.robot else _EXTERNAL,
+        {"kind": "body_lin_vel_b", "body": _root(subject, entity_name)},
+        lambda env: env.scene[entity_name].data.root_link_lin_vel_b,
+    )
+
+
+def root_ang_vel_b(subject: Subject, entity_name: str) -> Measurement:
+    """Angular velocity of the root, in the root frame."""
+    is_robot = entity_name == subject.robot
+    return Measurement(
+        subject.name(entity_name, "root_ang_vel_b"),
+        (3,),
+        "rad/s",
+        "root",
+        "measured" if is_robot else "external",
+        "gyroscope, turned to the axes of the root" if is_robot else _EXTERNAL,
+        {"kind": "body_ang_vel_b", "body": _root(subject, entity_name)},
+        lambda env: env.scene[entity_name].data.root_link_ang_vel_b,
+    )
+
+
+def body_quat(subject: Subject, entity_name: str, body: str) -> Measurement:
+    """Orientation of a body, quaternion (w, x, y, z)."""
+    if body == _root(subject, entity_name).rpartition("/")[2]:
+        return root_quat(subject, entity_name)
+    index = subject.env.scene[entity_name].body_names.index(body)
+    return Measurement(
+        subject.name(entity_name, f"{body}_quat"),
+        (4,),
+        "",
+        "world",
+        "computed",
+        f"an IMU on the body, or that of the root and the {_ROOTED} between",
+        {"kind": "body_quat", "body": _full(subject, entity_name, body)},
+        lambda env: env.scene[entity_name].data.body_link_quat_w[:, index],
+    )
+
+
+def body_pos(subject: Subject, entity_name: str, body: str) -> Measurement:
+    """Position of a body's origin in the world."""
+    if body == _root(subject, entity_name).rpartition("/")[2]:
+        return root_pos(subject, entity_name)
+    entity: Entity = subject.env.scene[entity_name]
+    index = entity.body_names.index(body)
+    return Measurement(
+        subject.name(entity_name, f"{body}_pos"),
+        (3,),
+        "m",
+        "world",
+        *_of_position(subject, entity_name),
+        {"kind": "body_pos", "body": _full(subject, entity_name, body)},
+        lambda env: env.scene[entity_name].data.body_link_pos_w[:, index],
+    )
+
+
+# Sites and other frames.
+
+
+def site_pos(subject: Subject, entity_name: str, site: str) -> Measurement:
+    """Position of a site in the world."""
+    index = subject.env.scene[entity_name].site_names.index(site)
+    return Measurement(
+        subject.name(entity_name, f"{site}_pos"),
+        (3,),
+        "m",
+        "world",
+        *_of_position(subject, entity_name),
+        {"kind": "site_pos", "site": _full(subject, entity_name, site)},
+        lambda env: env.scene[entity_name].data.site_pos_w[:, index],
+    )
+
+
+def site_quat(subject: Subject, entity_name: str, site: str) -> Measurement:
+    """Orientation of a site, quaternion (w, x, y, z)."""
+    index = subject.env.scene[entity_name].site_names.index(site)
+    return Measurement(
+        subject.name(entity_name, f"{site}_quat"),
+        (4,),
+        "",
+        "world",
+        "computed",
+        _ROOTED,
+        {"kind": "site_quat", "site": _full(subject, entity_name, site)},
+        lambda env: env.scene[entity_name].data.site_quat_w[:, index],
+    )
+
+
+def site_lin_vel_w(subject: Subject, entity_name: str, site: str) -> Measurement:
+    """Linear velocity of a site, world axes."""
+    index = subject.env.scene[entity_name].site_names.index(site)
+    return Measurement(
+        subject.name(entity_name, f"{site}_lin_vel_w"),
+        (3,),
+        "m/s",
+        "world",
+        *_of_position(subject, entity_name),
+        {"kind": "site_lin_vel_w", "site": _full(subject, entity_name, site)},
+        lambda env: env.scene[entity_name].data.site_lin_vel_w[:, index],
+    )
+
+
+def frame_pose_b(
+    subject: Subject, entity_name: str, frame: Frame
+) -> tuple[Measurement, Measurement]:
+    """Position and orientation of a frame of an entity, in the entity's root frame."""
+    full = getattr(subject.model, frame.frame_type)(frame.element).name
+    source = {"type": frame.frame_type, "name": full, "root": _root(subject, entity_name)}
+
+    def pose(env: ManagerBasedRlEnv) -> tuple[torch.Tensor, torch.Tensor]:
+        root = env.scene[entity_name].data
+        return subtract_frame_transforms(
+            root.root_link_pos_w, root.root_link_quat_w, frame.pos, frame.quat
+        )
+
+    name = subject.name(entity_name, full.rpartition("/")[2])
+    return (
+        Measurement(
+            f"{name}_pos_b",
+            (3,),
+            "m",
+            "root",
+            "computed",
+            _ROOTED,
+            {"kind": "frame_pos_b", **source},
+            lambda env: pose(env)[0],
+        ),
+        Measurement(
+            f"{name}_quat_b",
+            (4,),
+            "",
+            "root",
+            "computed",
+            _ROOTED,
+            {"kind": "frame_quat_b", **source},
+            lambda env: pose(env)[1],
+        ),
+    )
+
+
+# Sensors.
+
+_UNITS = {
+    "gyro": "rad/s",
+    "velocimeter": "m/s",
+    "accelerometer": "m/s^2",
+    "force": "N",
+    "torque": "N m",
+    "framequat": "",
+    "framepos": "m",
+    "framelinvel": "m/s",
+    "frameangvel": "rad/s",
+    "jointpos": "rad or m",
+    "jointvel": "rad/s or m/s",
+    "touch": "N",
+}
+_MEASURED = {
+    "gyro": "gyroscope",
+    "accelerometer": "accelerometer",
+    "framequat": "IMU",
+    "framexaxis": "orientation of the IMU",
+    "frameyaxis": "orientation of the IMU",
+    "framezaxis": "orientation of the IMU",
+    "frameangvel": "gyroscope, turned to these axes",
+    "magnetometer": "magnetometer",
+    "force": "force sensor",
+    "torque": "torque sensor",
+    "touch": "touch sensor",
+    "jointpos": "encoders",
+    "jointvel": "encoders",
+    "actuatorpos": "encoders",
+    "actuatorvel": "encoders",
+    "jointactuatorfrc": "motor currents",
+    "actuatorfrc": "motor currents",
+}
+
+
+def sensor(subject: Subject, sensor_name: str) -> Measurement:
+    """Value of a MuJoCo sensor, in MuJoCo's unit and frame."""
+    model = subject.model
+    element = model.sensor(sensor_name)
+    kind = mujoco.mjtSensor(int(element.type[0])).name.removeprefix("mjSENS_").lower()
+    source: dict[str, Any] = {"kind": "sensor", "sensor": sensor_name, "type": kind}
+    frame = "world"
+    if int(element.objtype[0]) == int(mujoco.mjtObj.mjOBJ_SITE):
+        site = int(element.objid[0])
+        source |= {
+            "site": model.site(site).name,
+            "body": model.body(int(model.site_bodyid[site])).name,
+            "site_pos": model.site_pos[site].tolist(),
+            "site_quat": model.site_quat[site].tolist(),
+        }
+        if not kind.startswith("frame"):
+            frame = f"site {model.site(site).name}"
+    entity, _, short = sensor_name.rpartition("/")
+    reason = _MEASURED.get(kind)
+    return Measurement(
+        subject.name(entity or subject.robot, short),
+        (int(element.dim[0]),),
+        _UNITS.get(kind, ""),
+        frame,
+        "measured" if reason else "estimated",
+        reason or f"{kind}: {_ESTIMATED}",
+        source,
+        lambda env: env.scene[sensor_name].data,
+    )
+
+
+def traced(
+    subject: Subject,
+    name: str,
+    unit: str,
+    why: str,
+    availability: Availability,
+    cfg: ObservationTermCfg,
+) -> Measurement:
+    """Value of a term that no kinematics gives, such as scans, images and contacts."""
+
+    def read(env: ManagerBasedRlEnv) -> torch.Tensor:
+        return cfg.func(env, **cfg.params)
+
+    shape = tuple(read(subject.env).shape[1:])
+    return Measurement(name, shape, unit, "", availability, why, {"kind": "trace"}, read)
+
+
+# Shared.
+
+
+def _root(subject: Subject, entity_name: str) -> str:
+    entity: Entity = subject.env.scene[entity_name]
+    return subject.model.body(int(entity.indexing.root_body_id)).name
+
+
+def _full(subject: Subject, entity_name: str, name: str) -> str:
+    return f"{entity_name}/{name}"
+
+
+def _of_root_orientation(subject: Subject, entity_name: str) -> tuple[Availability, str]:
+    if entity_name != subject.robot:
+        return "external", _EXTERNAL
+    return ("computed", "fixed base") if subject.entity.is_fixed_base else ("measured", "IMU")
+
+
+def _of_position(subject: Subject, entity_name: str) -> tuple[Availability, str]:
+    if entity_name != subject.robot:
+        return "external", _EXTERNAL
+    if subject.entity.is_fixed_base:
+        return "computed", _ROOTED
+    return "estimated", _ESTIMATED

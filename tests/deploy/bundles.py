@@ -1,0 +1,74 @@
+"""Bundles for tests: of the bundled policies, and of untrained ones."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+STEPS = 45
+"""Control steps of the traces: an episode of each bundle, and one that begins within."""
+
+
+def load_program(folder: Path, name: str) -> ModuleType:
+    """Import a program of a bundle, as its user does: with the folder on the path."""
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def write_demo(name: str, folder: Path) -> Path:
+    """Write the bundle of the bundled policy `name`."""
+    from mjlab.cli.policy_flags import parse_policy_flags
+    from mjlab.scripts.demo import DEMOS
+    from mjlab.scripts.deploy import DeployConfig, run_deploy
+
+    demo = DEMOS[name]
+    flags = ["--checkpoint-file", str(demo.policy), "--output", str(folder), "--steps", str(STEPS)]
+    flags += [] if demo.profile is None else ["--profile", demo.profile]
+    cfg = parse_policy_flags(DeployConfig, flags, demo.task, "deploy", purpose="evaluate")
+    run_deploy(demo.task, cfg)
+    return folder
+
+
+def write_random(task: str, folder: Path) -> Path:
+    """Write the bundle of an untrained policy of `task`."""
+    from mjlab.deploy.bundle import write_bundle
+    from mjlab.deploy.contract import Contract
+    from mjlab.deploy.nominal import nominal_cfg
+    from mjlab.rl import MjlabOnPolicyRunner
+    from mjlab.rl.learners import acting_cfg
+    from mjlab.runs.policy import make_env
+    from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+
+    cfg, lacks = nominal_cfg(load_env_cfg(task, evaluate=True))
+    cfg.seed = 1
+    agent = load_rl_cfg(task)
+    env = make_env(task, cfg, "cpu", agent=agent)
+    runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
+    folder.mkdir()
+    runner_cls(env, acting_cfg(agent), device="cpu").export_policy(str(folder / "policy.onnx"))
+    contract = Contract(env.unwrapped, folder / "policy.onnx", lacks)
+    write_bundle(contract, folder, {"task": task}, STEPS)
+    env.close()
+    return folder
+
+
+def row_of(policy: Any, trace: dict[str, np.ndarray], k: int) -> tuple[dict, dict]:
+    """Return measurements and commands of step `k`."""
+    contract = policy.contract
+    measured: dict[str, Any] = {
+        entry["name"]: trace[f"measurement/{entry['name']}"][k]
+        for entry in contract["measurements"]
+    }
+    measured["time"] = float(trace["time"][k])
+    given = [entry["name"] for entry in contract["commands"] if entry["kind"] == "given"]
+    return measured, {name: trace[f"command/{name}"][k] for name in given}
