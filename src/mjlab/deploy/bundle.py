@@ -18,6 +18,7 @@ import numpy as np
 
 from mjlab.deploy.contract import Contract
 from mjlab.deploy.golden import record, write_csv
+from mjlab.deploy.unitree import write_unitree
 from mjlab.rl.exporter_utils import OnnxPolicy, attach_metadata_to_onnx, get_base_metadata
 from mjlab.scene import Scene, SceneCfg
 
@@ -73,7 +74,12 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
     for name in PROGRAMS:
         if (FILES / name).exists():
             shutil.copyfile(FILES / name, folder / name)
-    return Bundle(folder, content, _notes(content))
+    notes = _notes(content)
+    if (why := write_unitree(content, folder)) is not None:
+        notes.append(why)
+    elif _is_go1(env):
+        notes.append("A Go1 speaks unitree_legged_sdk (UDP), which Unitree's programs do not.")
+    return Bundle(folder, content, notes)
 
 
 def origin(
@@ -92,6 +98,11 @@ def origin(
         "mujoco": mujoco.__version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def _is_go1(env: ManagerBasedRlEnv) -> bool:
+    """Return True if the robot is the bundled Go1, which has the joint names of a Go2."""
+    return any("go1" in Path(entity.spec.modelname).stem for entity in env.scene.entities.values())
 
 
 def _commit() -> str | None:

@@ -1,0 +1,173 @@
+"""`params/deploy.yaml`: the file that Unitree's deployment programs read beside the network.
+
+The programs register a fixed set of terms. A policy with another one cannot run there, and the file is then
+not written. Gains are in the order of the motors, everything else in that of the policy.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+_LEGS = ("FR", "FL", "RR", "RL")
+_SIDES = ("left", "right")
+_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+_ARM = (
+    *("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow"),
+    *("wrist_roll", "wrist_pitch", "wrist_yaw"),
+)
+MOTORS: dict[str, tuple[str, ...]] = {
+    "Go1, Go2": tuple(f"{leg}_{joint}" for leg in _LEGS for joint in ("hip", "thigh", "calf")),
+    "G1": (
+        *(f"{side}_{joint}" for side in _SIDES for joint in _LEG),
+        *("waist_yaw", "waist_roll", "waist_pitch"),
+        *(f"{side}_{joint}" for side in _SIDES for joint in _ARM),
+    ),
+}
+"""Joint of each motor, without `_joint`, in the order of the motor commands."""
+
+
+class UnknownToUnitreeError(ValueError):
+    """Term, action or robot that Unitree's programs do not know."""
+
+
+def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
+    """Write `params/deploy.yaml` and `exported/policy.onnx`; return why not, or None if written."""
+    try:
+        content = deploy_settings(contract)
+    except UnknownToUnitreeError as error:
+        return f"No deploy.yaml for Unitree's programs: {error}"
+    for name in ("params", "exported"):
+        (folder / name).mkdir(exist_ok=True)
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
+    head = f"# {contract['source'].get('task')}, written by training; do not edit.\n"
+    (folder / "params" / "deploy.yaml").write_text(head + text, encoding="utf-8")
+    shutil.copyfile(folder / contract["policy"]["file"], folder / "exported" / "policy.onnx")
+    return None
+
+
+def deploy_settings(contract: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of `deploy.yaml`.
+
+    Raises:
+        UnknownToUnitreeError: a term, action, command or robot that the programs do not know.
+    """
+    joints = contract["joints"]
+    motors = motor_map([joint["name"] for joint in joints])
+    by_motor = sorted(range(len(joints)), key=lambda k: motors[k])
+    (observation, *others) = contract["observations"]
+    if others:
+        raise UnknownToUnitreeError(f"they have no input {others[0]['input']!r}.")
+    return {
+        "joint_ids_map": motors,
+        "step_dt": contract["rates"]["step_dt"],
+        "stiffness": [joints[k]["kp"] for k in by_motor],
+        "damping": [joints[k]["kd"] for k in by_motor],
+        "default_joint_pos": [joint["default_pos"] for joint in joints],
+        "commands": _commands(contract),
+        "actions": {"JointPositionAction": _action(contract)},
+        "observations": dict(_observation(contract, term) for term in observation["terms"]),
+    }
+
+
+def motor_map(names: Sequence[str]) -> list[int]:
+    """Return the motor of each joint.
+
+    Raises:
+        UnknownToUnitreeError: the joints are not those of a robot in `MOTORS`.
+    """
+    short = [name.removesuffix("_joint") for name in names]
+    for motors in MOTORS.values():
+        if sorted(short) == sorted(motors):
+            return [motors.index(name) for name in short]
+    raise UnknownToUnitreeError(f"no motor map for these joints; known: {'; '.join(MOTORS)}.")
+
+
+# Terms.
+
+
+def _observation(contract: Mapping[str, Any], term: Mapping[str, Any]) -> tuple[str, dict]:
+    """Return the programs' name of a term, and its settings."""
+    name, params = _registered(contract, term)
+    low, high = term["clip"] or (None, None)
+    return name, {
+        "params": params,
+        "clip": None if low is None or high is None else [low, high],
+        "scale": np.broadcast_to(term["scale"] or [1.0], term["size"]).tolist(),
+        "history_length": max(1, term["history"]["length"]),
+    }
+
+
+def _registered(contract: Mapping[str, Any], term: Mapping[str, Any]) -> tuple[str, dict]:
+    kind, inputs = term["kind"], term["inputs"]
+    sources = {one["name"]: one["source"] for one in contract["measurements"]}
+    commands = {one["name"]: one for one in contract["commands"]}
+    if kind == "last_action" and term["columns"] is None:
+        return "last_action", {}
+    if kind == "gravity" and inputs == ["root_quat"]:
+        return "projected_gravity", {}
+    if kind == "reading" and term["columns"] is None and term["factor"] is None:
+        source = sources[inputs[0]]
+        if source["kind"] == "joint_pos":
+            return ("joint_pos" if term["offset"] is None else "joint_pos_rel"), {}
+        if source["kind"] == "joint_vel":
+            return "joint_vel_rel", {}
+        if _is_gyro_of_root(contract, source):
+            return "base_ang_vel", {}
+    if kind == "command":
+        command = commands[inputs[0].removeprefix("command/")]
+        if command["kind"] == "motion":
+            return "motion_command", {}
+        if _is_velocity(command):
+            return "velocity_commands", {}
+        always = command["kind"] == "gait_clock" and command["velocity_command"] is None
+        if always and command["fade_s"] == 0.0 and command["start"] == 0.0:
+            return "gait_phase", {"period": 1.0 / command["frequency"]}
+    if kind == "orientation_in_frame" and inputs[0].startswith("command/"):
+        return "motion_anchor_ori_b", {}
+    raise UnknownToUnitreeError(f"they do not register the term {term['name']!r}.")
+
+
+def _is_gyro_of_root(contract: Mapping[str, Any], source: Mapping[str, Any]) -> bool:
+    """Return True for the angular velocity of the root in its own axes, which the IMU measures."""
+    root = contract["robot"]["root_body"]
+    if source["kind"] == "body_ang_vel_b":
+        return source["body"] == root
+    has_axes_of_root = source.get("body") == root and source["site_quat"] == [1.0, 0.0, 0.0, 0.0]
+    return source.get("type") == "gyro" and has_axes_of_root
+
+
+def _is_velocity(command: Mapping[str, Any]) -> bool:
+    names = [component["name"] for component in command["components"]]
+    return names == ["lin_vel_x", "lin_vel_y", "ang_vel_z"]
+
+
+def _commands(contract: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the ranges that the programs clamp the stick to."""
+    for command in contract["commands"]:
+        if _is_velocity(command):
+            ranges = {one["name"]: one["range"] for one in command["components"]}
+            return {"base_velocity": {"ranges": {**ranges, "heading": None}}}
+    return {}
+
+
+def _action(contract: Mapping[str, Any]) -> dict[str, Any]:
+    (action, *others), joints = contract["actions"], contract["joints"]
+    names = [joint["name"] for joint in joints]
+    if others or action["kind"] != "joint_position" or action["joints"] != names:
+        raise UnknownToUnitreeError(
+            "they expect one joint position action of all joints, in order."
+        )
+    if action["clip"] is not None:
+        raise UnknownToUnitreeError("they do not clip joint targets.")
+    return {
+        "clip": None,
+        "scale": action["scale"],
+        "offset": action["offset"],
+        "joint_ids": None,
+    }

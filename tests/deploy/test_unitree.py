@@ -1,0 +1,149 @@
+"""`deploy.yaml`, read by the rules of Unitree's programs."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import yaml
+
+from mjlab.deploy.unitree import MOTORS, UnknownToUnitreeError, deploy_settings, motor_map
+
+
+class Reader:
+    """Unitree's reading: motor states in motor order in, motor targets in motor order out."""
+
+    def __init__(self, folder: Path) -> None:
+        text = (folder / "params" / "deploy.yaml").read_text()
+        self.cfg = yaml.safe_load(text)
+        self.motors = np.array(self.cfg["joint_ids_map"])
+        session = onnxruntime.InferenceSession(str(folder / "exported" / "policy.onnx"))
+        (self.input,) = session.get_inputs()
+        # The programs multiply the dimensions: a dynamic one, -1, would throw.
+        self.size = int(np.prod(self.input.shape))
+        self.session = session
+        self.action = np.zeros(len(self.motors), np.float32)
+        self.history: dict[str, list] = {}
+        self.phase = 0.0
+
+    def observe(self, state: dict[str, np.ndarray], stick: np.ndarray) -> np.ndarray:
+        """Return the network input of low-level states in the order of the motors."""
+        parts = []
+        for name, term in self.cfg["observations"].items():
+            value = getattr(self, name)(state, stick, **term["params"])
+            if term["clip"] is not None:
+                value = np.clip(value, *term["clip"])
+            assert isinstance(term["scale"], list)
+            value = value * np.array(term["scale"])
+            frames = self.history.setdefault(name, [value] * term["history_length"])
+            frames[:] = [*frames[1:], value]
+            parts += frames
+        return np.concatenate(parts).astype(np.float32)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return motor positions in the order of the motors."""
+        first_output = self.session.run(None, {"obs": observation[None]})[0]
+        self.action = first_output[0]
+        (action,) = self.cfg["actions"].values()
+        assert action["clip"] is None
+        assert action["joint_ids"] is None
+        targets = np.empty(len(self.motors))
+        targets[self.motors] = self.action * action["scale"] + action["offset"]
+        return targets
+
+    # Registered terms.
+
+    def base_ang_vel(self, state, stick):
+        return state["gyroscope"]
+
+    def projected_gravity(self, state, stick):
+        w, x, y, z = state["quaternion"]
+        return np.array([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1])
+
+    def joint_pos_rel(self, state, stick):
+        return state["q"][self.motors] - self.cfg["default_joint_pos"]
+
+    def joint_vel_rel(self, state, stick):
+        return state["dq"][self.motors]
+
+    def last_action(self, state, stick):
+        return self.action
+
+    def velocity_commands(self, state, stick):
+        ranges = self.cfg["commands"]["base_velocity"]["ranges"]
+        bounds = [ranges[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")]
+        return np.clip(stick, *np.array(bounds).T)
+
+    def gait_phase(self, state, stick, period):
+        angle = 2 * np.pi * self.phase
+        self.phase = (self.phase + self.cfg["step_dt"] / period) % 1.0
+        return np.array([np.sin(angle), np.cos(angle)])
+
+
+@pytest.mark.parametrize("name", ["go1", "g1"])
+def test_the_programs_act_as_in_training(bundle, name):
+    folder = bundle(name)
+    reader, trace = Reader(folder), dict(np.load(folder / "golden.npz"))
+    assert reader.input.name == "obs"
+    motors = reader.motors
+    for k in range(len(trace["time"])):
+        assert bool(trace["first"][k]) == (k == 0)
+        q, dq = np.empty(len(motors)), np.empty(len(motors))
+        q[motors] = trace["measurement/joint_pos"][k]
+        dq[motors] = trace["measurement/joint_vel"][k]
+        state = {
+            "q": q,
+            "dq": dq,
+            "gyroscope": trace["measurement/imu_ang_vel"][k],
+            "quaternion": trace["measurement/root_quat"][k],
+        }
+        observation = reader.observe(state, trace["command/twist"][k])
+        assert observation.size == reader.size
+        np.testing.assert_allclose(observation, trace["input/obs"][k], atol=2e-5)
+        targets = reader.act(observation)
+        np.testing.assert_allclose(targets[motors], trace["target"][k], atol=2e-5)
+
+
+def test_gains_are_in_the_order_of_the_motors(bundle):
+    contract = json.loads((bundle("go1") / "contract.json").read_text())
+    # As in Unitree's model of the Go2: left legs first.
+    order = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
+    contract["joints"] = [contract["joints"][k] for k in order]
+    contract["actions"][0]["joints"] = [joint["name"] for joint in contract["joints"]]
+    for k, joint in enumerate(contract["joints"]):
+        joint["kp"] = float(k)
+    settings = deploy_settings(contract)
+    assert settings["joint_ids_map"] == order
+    assert settings["stiffness"] == [3.0, 4.0, 5.0, 0.0, 1.0, 2.0, 9.0, 10.0, 11.0, 6.0, 7.0, 8.0]
+
+
+def test_breadth_first_joints_of_the_g1():
+    motors = MOTORS["G1"]
+    order = [0, 6, 12, 1, 7, 13, 2, 8, 14, 3, 9, 15, 22, 4, 10, 16, 23, 5, 11, 17, 24, 18, 25, 19]
+    order += [26, 20, 27, 21, 28]
+    assert motor_map([f"{motors[k]}_joint" for k in order]) == order
+
+
+def _with_term(contract: dict, **changes: Any) -> dict:
+    changed = copy.deepcopy(contract)
+    changed["observations"][0]["terms"][0].update(changes)
+    return changed
+
+
+def test_unregistered_terms_are_named(bundle):
+    contract = json.loads((bundle("go1") / "contract.json").read_text())
+    with pytest.raises(UnknownToUnitreeError, match="base_ang_vel"):
+        deploy_settings(_with_term(contract, kind="custom"))
+    with pytest.raises(UnknownToUnitreeError, match="base_ang_vel"):
+        deploy_settings(_with_term(contract, columns=[0, 1]))
+
+
+def test_no_file_for_a_policy_that_cannot_run_there(bundle):
+    folder = bundle("Mjlab-Velocity-Rough-Unitree-Go1")
+    assert not (folder / "params").exists()
+    assert not (folder / "exported").exists()
