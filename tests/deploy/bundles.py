@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -39,8 +40,10 @@ def write_demo(name: str, folder: Path) -> Path:
     return folder
 
 
-def write_random(task: str, folder: Path) -> Path:
-    """Write the bundle of an untrained policy of `task`."""
+def write_random(
+    task: str, folder: Path, edit: Callable[[Any, Any], None] = lambda env, agent: None
+) -> Path:
+    """Write the bundle of an untrained policy of `task`; `edit` changes both configs in place."""
     from mjlab.deploy.bundle import write_bundle
     from mjlab.deploy.contract import Contract
     from mjlab.deploy.nominal import nominal_cfg
@@ -49,9 +52,10 @@ def write_random(task: str, folder: Path) -> Path:
     from mjlab.runs.policy import make_env
     from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
-    cfg, lacks = nominal_cfg(load_env_cfg(task, evaluate=True))
+    evaluated, agent = load_env_cfg(task, evaluate=True), load_rl_cfg(task)
+    edit(evaluated, agent)
+    cfg, lacks = nominal_cfg(evaluated, agent.clip_actions)
     cfg.seed = 1
-    agent = load_rl_cfg(task)
     env = make_env(task, cfg, "cpu", agent=agent)
     runner_cls: Any = load_runner_cls(task) or MjlabOnPolicyRunner
     folder.mkdir()

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bundles import load_program, row_of
+from bundles import load_program, row_of, write_random
+
+from mjlab.envs.mdp import last_action
+from mjlab.managers import ObservationTermCfg
+from mjlab.utils.noise import UniformNoiseCfg
 
 # Observations of all kinds: sensors, gravity, history and clock, motions, objects, poses, scans, images.
 BUNDLES = (
@@ -36,9 +42,8 @@ def differences(got: Any, expected: np.ndarray, spans: np.ndarray) -> float:
     return float(np.abs(np.asarray(got) - expected).max(initial=0.0) / max(np.ptp(spans), 1e-3))
 
 
-@pytest.mark.parametrize("name", BUNDLES)
-def test_answers_are_those_of_training(bundle, name):
-    folder = bundle(name)
+def worst_differences(folder: Path) -> dict[str, float]:
+    """Return the largest difference of each array that the runtime computes, over the whole trace."""
     policy = load_program(folder, "runtime").Policy.load(folder, limits=False)
     trace = arrays_of(folder)
     motions = {one["row"]: one["motion"] for one in policy.contract["golden"]["episodes"]}
@@ -54,8 +59,43 @@ def test_answers_are_those_of_training(bundle, name):
             if key in trace:
                 found = differences(value, trace[key][k], trace[key])
                 worst[key] = max(worst.get(key, 0.0), found)
+    return worst
+
+
+@pytest.mark.parametrize("name", BUNDLES)
+def test_answers_are_those_of_training(bundle, name):
+    worst = worst_differences(bundle(name))
     assert worst.keys() >= {"action", "target"}
     assert max(worst.values()) < TOLERANCE, worst
+
+
+def test_pipeline_of_terms_memory_and_clips(tmp_path):
+    def edit(env: Any, agent: Any) -> None:
+        terms = env.observations["actor"].terms
+        terms["cart_pos"].scale, terms["cart_pos"].history_length = 3.0, 4
+        terms["cart_vel"].clip, terms["cart_vel"].scale = (-0.2, 0.1), 0.5
+        terms["pole_angle"].history_length = 2
+        terms["pole_vel"].noise, terms["pole_vel"].delay_max_lag = UniformNoiseCfg(-1.0, 1.0), 2
+        terms["last"] = ObservationTermCfg(func=last_action, params={"action_name": "effort"})
+        action = env.actions["effort"]
+        action.scale, action.offset, action.clip = 2.0, 0.1, {"slider": (-0.02, 0.15)}
+        agent.clip_actions = 0.03
+        agent.actor.class_name, agent.actor.rnn_type = "RNNModel", "lstm"
+        agent.actor.rnn_hidden_dim = 8
+        env.episode_length_s = 1.0
+
+    folder = write_random("Mjlab-Cartpole-Swingup", tmp_path / "bundle", edit)
+    worst = worst_differences(folder)
+    assert max(worst.values()) < TOLERANCE, worst
+    trace = arrays_of(folder)
+    assert np.abs(trace["action"]).max() == pytest.approx(0.03)
+    # Episodes of 20 steps: memory and histories restart.
+    assert trace["first"].nonzero()[0].tolist() == [0, 20, 40]
+    contract = json.loads((folder / "contract.json").read_text())
+    by_name = {term["name"]: term for term in contract["observations"][0]["terms"]}
+    assert by_name["pole_vel"]["noise"]["n_max"] == 1.0
+    assert by_name["pole_vel"]["delay"] == [0, 2]
+    assert by_name["cart_vel"]["clip"] == [-0.2, 0.1]
 
 
 @pytest.mark.parametrize("name", ["go1", "g1", "Mjlab-Lift-Cube-Yam", "Mjlab-Reach-Yam"])
@@ -92,6 +132,21 @@ def test_one_step_is_fast(bundle):
             durations.append(time.perf_counter() - start)
     # The target is 0.1 ms on an idle core; tests run on busy ones.
     assert np.median(durations) < 1e-3
+
+
+def test_programs_need_neither_mjlab_nor_torch(bundle):
+    folder = bundle("go1")
+    program = (
+        "import sys, runpy\n"
+        "sys.modules['mjlab'] = sys.modules['torch'] = None\n"
+        f"sys.path.insert(0, {str(folder)!r})\n"
+        "sys.argv = ['simulate.py', '--seconds', '1', '--command', '0.8', '0', '0']\n"
+        f"runpy.run_path({str(folder / 'simulate.py')!r}, run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    forward = float(done.stdout.partition("[")[2].split()[0])
+    assert forward > 0.2
 
 
 # Limits.

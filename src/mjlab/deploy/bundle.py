@@ -18,6 +18,7 @@ import numpy as np
 
 from mjlab.deploy.contract import Contract
 from mjlab.deploy.golden import record, write_csv
+from mjlab.deploy.readme import readme
 from mjlab.deploy.unitree import write_unitree
 from mjlab.rl.exporter_utils import OnnxPolicy, attach_metadata_to_onnx, get_base_metadata
 from mjlab.scene import Scene, SceneCfg
@@ -79,6 +80,7 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
         notes.append(why)
     elif _is_go1(env):
         notes.append("A Go1 speaks unitree_legged_sdk (UDP), which Unitree's programs do not.")
+    (folder / "README.md").write_text(readme(content, notes), encoding="utf-8")
     return Bundle(folder, content, notes)
 
 
