@@ -50,6 +50,14 @@ def test_archive_is_named_by_its_file(run, tmp_path: Path, folder: Path) -> None
     assert (folder / "src" / "dog" / "model" / "dog.xml").is_file()
 
 
+def test_folder_of_the_model_may_have_its_name(run, tmp_path: Path, folder: Path, monkeypatch) -> None:
+    write_quadruped(tmp_path / "dog")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    outcome = run("new_robot", "dog/dog.xml", "--output", str(folder))
+    assert outcome.status == 0, outcome.err
+
+
 def test_function_of_a_module(run, folder: Path) -> None:
     outcome = run(
         "new_robot", "small_robots:arm_spec", "--output", str(folder), "--name", "crane_arm"

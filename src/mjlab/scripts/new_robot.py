@@ -123,7 +123,9 @@ def _check_name(name: str, folder: Path) -> None:
             f"--name {name!r}: expected a Python name; use e.g. --name {identifier(name)}."
         )
     found = importlib.util.find_spec(name)
-    if found is not None and folder.resolve() not in Path(found.origin or "/").resolve().parents:
+    # A folder without `__init__.py`, such as that of the model, has no origin; the package hides it.
+    origin = found.origin if found is not None else None
+    if origin is not None and folder.resolve() not in Path(origin).resolve().parents:
         raise UserError(f"--name {name!r}: a module of this name exists; use another.")
 
 
