@@ -19,6 +19,7 @@ from make_clips import light_studio
 from matplotlib.figure import Figure
 from PIL import Image
 
+from mjlab.actuator import BuiltinPositionActuatorCfg
 from mjlab.entity import EntityCfg
 from mjlab.own_robot.package import Package
 from mjlab.own_robot.report import describe_robot
@@ -64,6 +65,7 @@ def softer(cfg: EntityCfg, stiffness: float) -> EntityCfg:
     assert cfg.articulation is not None
     cfg.articulation.actuators = copy.deepcopy(cfg.articulation.actuators)
     for actuator in cfg.articulation.actuators:
+        assert isinstance(actuator, BuiltinPositionActuatorCfg)
         actuator.stiffness = stiffness
     return cfg
 

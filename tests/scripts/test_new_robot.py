@@ -50,7 +50,9 @@ def test_archive_is_named_by_its_file(run, tmp_path: Path, folder: Path) -> None
     assert (folder / "src" / "dog" / "model" / "dog.xml").is_file()
 
 
-def test_folder_of_the_model_may_have_its_name(run, tmp_path: Path, folder: Path, monkeypatch) -> None:
+def test_folder_of_the_model_may_have_its_name(
+    run, tmp_path: Path, folder: Path, monkeypatch
+) -> None:
     write_quadruped(tmp_path / "dog")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
