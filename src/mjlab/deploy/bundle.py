@@ -172,25 +172,12 @@ def _write_robot(contract: Contract, folder: Path) -> None:
 
 
 def _write_motion(contract: Contract, folder: Path) -> None:
-    """Write the frames of all motions of a motion command, in the fields of other controllers."""
+    """Write the reference of a motion command, in the fields that controllers of motions read."""
     env = contract.subject.env
     for name in env.command_manager.active_terms:
         term: Any = env.command_manager.get_term(name)
-        if not hasattr(term, "motion"):
-            continue
-        motion = term.motion
-        fields = ("joint_pos", "joint_vel", "body_pos_w", "body_quat_w")
-        arrays = {
-            key: getattr(motion, key).cpu().numpy()
-            for key in (*fields, "body_lin_vel_w", "body_ang_vel_w")
-        }
-        np.savez_compressed(
-            folder / "motion.npz",
-            fps=np.array([1.0 / env.step_dt]),
-            joint_names=np.array(term.robot.joint_names),
-            body_names=np.array(term.body_names),
-            **arrays,
-        )
+        if hasattr(term, "motion_arrays"):
+            np.savez_compressed(folder / "motion.npz", **term.motion_arrays())
 
 
 def _notes(content: Mapping[str, Any]) -> list[str]:

@@ -90,9 +90,9 @@ def _motion(subject: Subject, term: Any) -> dict[str, Any]:
                 motion.names, motion.starts.tolist(), motion.lengths.tolist(), strict=True
             )
         ],
-        "bodies": list(cfg.body_names),
+        "bodies": list(entity.body_names),
         "anchor": cfg.anchor_body_name,
-        "anchor_index": list(cfg.body_names).index(cfg.anchor_body_name),
+        "anchor_index": list(entity.body_names).index(cfg.anchor_body_name),
     }
 
 

@@ -42,7 +42,8 @@ def record(contract: Contract, policy: Any, steps: int) -> tuple[dict[str, np.nd
     with env.curricula_held(), torch.no_grad():
         for k in range(steps):
             if not episodes or k - episodes[-1]["row"] == EPISODE_STEPS or is_over:
-                observations, _ = env.reset()
+                # Seeded, because building the policy may have drawn random numbers.
+                observations, _ = env.reset(seed=None if episodes else env.cfg.seed)
                 policy.reset()
                 episodes.append({"row": k, "motion": _motion(env)})
             recorder.before(k, observations, is_first=episodes[-1]["row"] == k)

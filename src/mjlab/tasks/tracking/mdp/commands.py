@@ -28,7 +28,7 @@ from mjlab.tasks.tracking.mdp.motion_sampling import (
     draw_uniform,
     perturbed_start,
 )
-from mjlab.tasks.tracking.motion_file import check_rate, read_motion
+from mjlab.tasks.tracking.motion_file import PER_BODY, PER_JOINT, check_rate, read_motion
 from mjlab.tasks.tracking.motion_order import Skeleton, arranged
 from mjlab.tasks.tracking.motion_sources import find_motions
 from mjlab.utils.errors import check_one_of
@@ -265,6 +265,21 @@ class MotionCommand(MotionReader, CommandTerm):
         """
         # The first frame of a motion has no predecessor.
         return MotionFrame(self, self.frame_indexes - self.time_steps.clamp(max=1))
+
+    def motion_arrays(self) -> dict[str, np.ndarray]:
+        """Return all motions in sequence as the arrays of a motion file, with all bodies of the robot."""
+        skeleton = Skeleton.of_entity(self.robot, self._env.sim.mj_model)
+        motions = [arranged(path, read_motion(path), skeleton) for path in self.motion_files]
+        arrays = {
+            name: np.concatenate([getattr(motion, name) for motion in motions])
+            for name in (*PER_JOINT, *PER_BODY)
+        }
+        return {
+            "fps": np.array([1.0 / self._env.step_dt]),
+            "joint_names": np.array(skeleton.joint_names),
+            "body_names": np.array(skeleton.body_names),
+            **arrays,
+        }
 
     def update_relative_body_poses(self) -> None:
         """Update the relative poses from the current reference and robot state."""

@@ -1,0 +1,68 @@
+"""`mjlab deploy`: the policy that it finds, and the folder that it writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+QUICK = ("--steps", "4")
+
+
+def contract_of(folder: Path) -> dict:
+    """Return the contract of a bundle."""
+    return json.loads((folder / "contract.json").read_text())
+
+
+def test_a_run_is_deployed_from_its_last_checkpoint(run, trained, tmp_path):
+    folder = tmp_path / "bundle"
+    outcome = run("deploy", str(trained), "--output", str(folder), *QUICK)
+    assert outcome.status == 0, outcome.err
+    source = contract_of(folder)["source"]
+    assert source["task"] == "Mjlab-Cartpole-Swingup"
+    assert source["run"] == trained.name
+    assert source["checkpoint"] == "model_1.pt"
+    assert source["seed"] == 7
+    names = {path.name for path in folder.iterdir()}
+    assert names >= {"contract.json", "policy.onnx", "golden.npz", "golden.csv", "README.md"}
+    assert names >= {"runtime.py", "simulate.py", "scene", "robot"}
+    # Nothing else is left beside it.
+    assert [path.name for path in tmp_path.iterdir()] == ["bundle"]
+
+
+def test_a_checkpoint_and_its_export_are_the_same_policy(run, trained, tmp_path):
+    (exported,) = trained.glob("*.onnx")
+    actions = []
+    for name, policy in (("pt", trained / "model_1.pt"), ("onnx", exported)):
+        outcome = run("deploy", str(policy), "--output", str(tmp_path / name), *QUICK)
+        assert outcome.status == 0, outcome.err
+        actions.append(np.load(tmp_path / name / "golden.npz")["action"])
+    np.testing.assert_allclose(*actions, atol=1e-6)
+
+
+def test_settings_of_the_run_are_in_the_contract(run, train, tmp_path):
+    trained = train(tmp_path / "logs", 1, "--env.decimation", "4", "--agent.clip-actions", "2.5")
+    outcome = run("deploy", str(trained), "--output", str(tmp_path / "bundle"), *QUICK)
+    assert outcome.status == 0, outcome.err
+    contract = contract_of(tmp_path / "bundle")
+    assert contract["rates"]["decimation"] == 4
+    assert contract["policy"]["clip"] == 2.5
+
+
+def test_a_folder_in_use_is_not_replaced(run, trained, tmp_path):
+    (tmp_path / "bundle").mkdir()
+    (tmp_path / "bundle" / "mine.txt").write_text("mine")
+    outcome = run("deploy", str(trained), "--output", str(tmp_path / "bundle"))
+    assert outcome.status == 1
+    assert "not empty" in outcome.message
+    assert (tmp_path / "bundle" / "mine.txt").exists()
+
+
+@pytest.mark.parametrize("policy", ["nowhere", "."])
+def test_a_policy_that_is_not_found(run, tmp_path, monkeypatch, policy):
+    monkeypatch.chdir(tmp_path)
+    outcome = run("deploy", policy)
+    assert outcome.status == 1
+    assert policy in outcome.message
