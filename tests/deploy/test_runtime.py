@@ -42,9 +42,14 @@ def differences(got: Any, expected: np.ndarray, spans: np.ndarray) -> float:
     return float(np.abs(np.asarray(got) - expected).max(initial=0.0) / max(np.ptp(spans), 1e-3))
 
 
-def worst_differences(folder: Path) -> dict[str, float]:
-    """Return the largest difference of each array that the runtime computes, over the whole trace."""
-    policy = load_program(folder, "runtime").Policy.load(folder, limits=False)
+def worst_differences(folder: Path, **terms: Any) -> dict[str, float]:
+    """Return the largest difference of each array that the runtime computes, over the whole trace.
+
+    `terms` are formulas to add, by function of this module.
+    """
+    runtime = load_program(folder, "runtime")
+    runtime.TERMS.update({f"{__name__}:{name}": formula for name, formula in terms.items()})
+    policy = runtime.Policy.load(folder, limits=False)
     trace = arrays_of(folder)
     motions = {one["row"]: one["motion"] for one in policy.contract["golden"]["episodes"]}
     worst: dict[str, float] = {}
@@ -69,6 +74,11 @@ def test_answers_are_those_of_training(bundle, name):
     assert max(worst.values()) < TOLERANCE, worst
 
 
+def kinetic_energy(env: Any) -> Any:
+    """Observation term that the runtime does not know, (N, 1)."""
+    return 0.5 * env.scene["cartpole"].data.joint_vel.square().sum(dim=1, keepdim=True)
+
+
 def test_pipeline_of_terms_memory_and_clips(tmp_path):
     def edit(env: Any, agent: Any) -> None:
         terms = env.observations["actor"].terms
@@ -77,6 +87,7 @@ def test_pipeline_of_terms_memory_and_clips(tmp_path):
         terms["pole_angle"].history_length = 2
         terms["pole_vel"].noise, terms["pole_vel"].delay_max_lag = UniformNoiseCfg(-1.0, 1.0), 2
         terms["last"] = ObservationTermCfg(func=last_action, params={"action_name": "effort"})
+        terms["energy"] = ObservationTermCfg(func=kinetic_energy)
         action = env.actions["effort"]
         action.scale, action.offset, action.clip = 2.0, 0.1, {"slider": (-0.02, 0.15)}
         agent.clip_actions = 0.03
@@ -85,7 +96,10 @@ def test_pipeline_of_terms_memory_and_clips(tmp_path):
         env.episode_length_s = 1.0
 
     folder = write_random("Mjlab-Cartpole-Swingup", tmp_path / "bundle", edit)
-    worst = worst_differences(folder)
+    with pytest.raises(ValueError, match="kinetic_energy"):
+        load_program(folder, "runtime").Policy.load(folder)
+    # The value of an unknown term is a measurement.
+    worst = worst_differences(folder, kinetic_energy=lambda inputs, term: inputs[0])
     assert max(worst.values()) < TOLERANCE, worst
     trace = arrays_of(folder)
     assert np.abs(trace["action"]).max() == pytest.approx(0.03)

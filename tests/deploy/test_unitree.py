@@ -147,3 +147,9 @@ def test_no_file_for_a_policy_that_cannot_run_there(bundle):
     folder = bundle("Mjlab-Velocity-Rough-Unitree-Go1")
     assert not (folder / "params").exists()
     assert not (folder / "exported").exists()
+
+
+def test_robots_of_others_are_not_mentioned(bundle):
+    folder = bundle("Mjlab-Reach-Yam")
+    assert not (folder / "params").exists()
+    assert "Unitree's programs" not in (folder / "README.md").read_text()

@@ -139,7 +139,7 @@ class Contract:
             ],
             "measurements": [one.entry() for one in self.measurements.values()],
             "actions": actions,
-            "limits": _limits(self.subject, actions, joints),
+            "limits": {**_limits(self.subject, actions, joints), "tilt_from": self._tilt_from()},
             "terminations": _terminations(env),
             "episode_length_s": env.max_episode_length_s,
             "unmeasured": self._unmeasured(),
@@ -192,6 +192,17 @@ class Contract:
                 "start": "first_value",
             },
         }
+
+    def _tilt_from(self) -> str | None:
+        """Return the orientation of the robot that its program measures: of the root if possible."""
+        root = root_quat(self.subject, self.subject.robot).name
+        bodies = f"{self.subject.robot}/"
+        quats = [
+            name
+            for name, one in self.measurements.items()
+            if one.source["kind"] == "body_quat" and one.source["body"].startswith(bodies)
+        ]
+        return root if root in quats else next(iter(quats), None)
 
     def _unmeasured(self) -> list[dict[str, str]]:
         entries = []
@@ -427,7 +438,6 @@ def _limits(
             _SLIDE_SPEED if joint["type"] == "slide" else _HINGE_SPEED for joint in joints
         ],
         "tilt": min([_TILT, *fell]) if has_tilt else None,
-        "tilt_from": root_quat(subject, subject.robot).name if has_tilt else None,
         "max_age": shortest(_MAX_AGE_STEPS * subject.env.step_dt),
     }
 

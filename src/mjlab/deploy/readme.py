@@ -10,6 +10,14 @@ from typing import Any
 _TEMPLATE = Path(__file__).parent / "files" / "README.md.txt"
 
 
+_HEADING = """
+
+The reference motion has a heading in the world, and an IMU starts with any. When `hand_over` is done, turn
+all further orientations by the difference of yaw, once computed: left-multiply them by (cos d/2, 0, 0,
+sin d/2), with d = yaw(`body_quat_w[0, anchor_index]` of `motion.npz`) - yaw(measured), and
+yaw(w, x, y, z) = atan2(2 (w z + x y), 1 - 2 (y y + z z))."""
+
+
 def readme(contract: Mapping[str, Any], notes: Sequence[str]) -> str:
     """Return the README, in Markdown.
 
@@ -41,6 +49,7 @@ def readme(contract: Mapping[str, Any], notes: Sequence[str]) -> str:
             ],
         ),
         joints=", ".join(joint["name"] for joint in contract["joints"]),
+        heading=_HEADING if any(c["kind"] == "motion" for c in contract["commands"]) else "",
         commands=_commands(contract["commands"]),
         notes=f"\n## Notes\n\n{listed}\n" if listed else "\n",
     )

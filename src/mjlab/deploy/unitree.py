@@ -37,7 +37,12 @@ class UnknownToUnitreeError(ValueError):
 
 
 def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
-    """Write `params/deploy.yaml` and `exported/policy.onnx`; return why not, or None if written."""
+    """Write `params/deploy.yaml` and `exported/policy.onnx` for a robot in `MOTORS`.
+
+    Returns the reason if the robot is one, and the files are not written; else None.
+    """
+    if not has_motors(contract):
+        return None
     try:
         content = deploy_settings(contract)
     except UnknownToUnitreeError as error:
@@ -49,6 +54,12 @@ def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
     (folder / "params" / "deploy.yaml").write_text(head + text, encoding="utf-8")
     shutil.copyfile(folder / contract["policy"]["file"], folder / "exported" / "policy.onnx")
     return None
+
+
+def has_motors(contract: Mapping[str, Any]) -> bool:
+    """Return True if the joints are those of a robot in `MOTORS`."""
+    names = sorted(joint["name"].removesuffix("_joint") for joint in contract["joints"])
+    return any(names == sorted(motors) for motors in MOTORS.values())
 
 
 def deploy_settings(contract: Mapping[str, Any]) -> dict[str, Any]:
