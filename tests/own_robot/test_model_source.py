@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import types
 import zipfile
+from pathlib import Path
 
 import mujoco
 import pytest
@@ -61,6 +63,17 @@ def test_archive_without_a_model(tmp_path):
         archive.writestr("notes.txt", "no robot")
     with pytest.raises(ValueError, match="no MJCF or URDF"):
         load_model(str(path))
+
+
+def test_archive_leaves_no_folder(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from mjlab.own_robot.model_source import model_file; "
+        "print(model_file(Path(sys.argv[1])))"
+    )
+    words = [sys.executable, "-c", code, str(write_archive(tmp_path))]
+    outcome = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert outcome.stdout.strip().endswith("dog.xml")
+    assert not Path(outcome.stdout.strip()).exists()
 
 
 def test_function(monkeypatch):

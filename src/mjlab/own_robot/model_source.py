@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import re
+import shutil
 import tempfile
 import warnings
 import zipfile
@@ -91,6 +93,8 @@ def model_file(path: Path) -> Path:
         return path
     if path.is_file():
         folder = Path(tempfile.mkdtemp(prefix="mjlab_robot_"))
+        # Specs read their meshes when they are compiled.
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
         with zipfile.ZipFile(path) as archive:
             archive.extractall(folder)
     else:
