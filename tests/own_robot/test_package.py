@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from legged import legged_spec
 from small_robots import arm_spec, write_archive, write_quadruped, write_urdf
 from tensordict import TensorDict
 
@@ -137,6 +138,18 @@ def test_trot_pairs_diagonal_feet(tmp_path: Path, imported) -> None:
     assert feet == ("FL_calf_foot", "FR_calf_foot", "RL_calf_foot", "RR_calf_foot")
     task = (folder / "src" / "dog" / "task.py").read_text()
     assert "((0, 3), (1, 2))" in task
+
+
+@pytest.mark.parametrize(("legs", "share"), [(2, 0.6), (4, 0.4)])
+def test_training_stops_at_shares_of_standing_still(tmp_path: Path, imported, legs, share) -> None:
+    report = describe_robot(RobotModel(legged_spec(legs), "robot", "robots:legged", None, None))
+    folder = written(tmp_path, Package(f"robot{legs}", "velocity", report))
+    task = imported(folder, f"robot{legs}.task")
+    env_cfg, rl_cfg = task.flat_env_cfg(), task.rl_cfg()
+    task.cpu.easing(env_cfg, rl_cfg)
+    assert rl_cfg.evaluation.solved_below["lin_vel_error_share"] == share
+    # Errors are measured, and compared with those of standing still.
+    assert {"lin_vel_error", "ang_vel_error"} <= rl_cfg.evaluation.standing_still.keys()
 
 
 def test_own_tests_pass(tmp_path: Path, imported) -> None:

@@ -53,7 +53,7 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
         package=package,
         title=title,
         task_name=task_name,
-        profile="cpu_with_gait" if has_gait else "cpu as cpu",
+        profile="cpu_with_gait" if has_gait else "cpu_without_gait",
         robot_names="".join(f"    {name},\n" for name in [*names, "get_robot_cfg"]),
         commands="\n".join(reason_lines("Commands", report.commands)),
         lin_vel=_range(commands["lin_vel_x"]),
@@ -137,33 +137,34 @@ def _sole_radius(report: RobotReport) -> float:
 
 
 def _gait(report: RobotReport) -> str:
-    if len(report.anatomy.feet.value) != 4:
-        return "\n".join(
-            [
-                *comment_lines(
-                    "`cpu`, imported above, is the profile of robots of unknown gait: it rewards air time of "
-                    "the feet. It has taught four legs to walk, not yet two."
-                ),
-            ]
+    legs = len(report.anatomy.feet.value)
+    solved = SOLVED[2 if legs == 2 else 4]
+    arguments = [
+        "    solved_below={",
+        *(f'        "{name}": {limit},' for name, limit in solved.items()),
+        "    },",
+    ]
+    if not report.anatomy.mirror.value:
+        arguments.append("    mirror=None,  # not the same left and right")
+    stops = "Training stops at these shares of the errors of a robot that stands still, and this rate of falls."
+    if legs != 4:
+        reason = (
+            f"The gait is unknown: the profile rewards air time of the feet, and has taught four legs to "
+            f"walk, not yet two. {stops}"
         )
+        return "\n".join([*comment_lines(reason), "cpu = cpu_without_gait(", *arguments, ")"])
     first, second = diagonals(report)
-    mirror = (
-        [] if report.anatomy.mirror.value else ["    mirror=None,  # not the same left and right"]
+    reason = (
+        f"A trot: the feet {first} and {second} of FEET, the diagonals, take turns. Training episodes end "
+        f"when the trunk sinks below {STANDING_SHARE:.0%} of its height. {stops}"
     )
     return "\n".join(
         [
-            *comment_lines(
-                f"A trot: the feet {first} and {second} of FEET, the diagonals, take turns. Training "
-                f"episodes end when the trunk sinks below {STANDING_SHARE:.0%} of its height. Training "
-                "stops at these shares of the errors of a robot that stands still, and this rate of falls."
-            ),
+            *comment_lines(reason),
             "cpu = cpu_with_gait(",
             f"    ({first}, {second}),",
             f"    minimum_height={STANDING_SHARE} * HEIGHT,",
-            "    solved_below={",
-            *(f'        "{name}": {limit},' for name, limit in SOLVED[4].items()),
-            "    },",
-            *mirror,
+            *arguments,
             ")",
         ]
     )

@@ -138,29 +138,37 @@ def _ease_penalties(env_cfg: ManagerBasedRlEnvCfg) -> None:
             ease_weight(env_cfg, name, _PENALTY_AT_FIRST * term.weight, samples // _NUM_ENVS)
 
 
-def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
-    _ease_penalties(env_cfg)
-    if env_cfg.rewards.get(_AIR_TIME) is not None:
-        ease_weight(env_cfg, _AIR_TIME, _AIR_TIME_AT_FIRST, _EASED_SAMPLES // _NUM_ENVS)
-    evaluation = rl_cfg.evaluation
-    evaluation.num_episodes = 200
-    evaluation.min_interval = 40
-    evaluation.trigger_return = 3600.0
-    if _is_flat(env_cfg):
-        # On a plane, robots may walk long before they reach this training return.
-        evaluation.first_iteration, evaluation.trigger_return = 80, -math.inf
-    evaluation.solved_below = dict(_SOLVED)
+def cpu_without_gait(
+    *, solved_below: dict[str, float] | None = None, mirror: str | None = _MIRROR
+) -> Profile:
+    """Return the `cpu` profile of a legged robot of unknown gait.
 
+    Args:
+        solved_below: As of `cpu_with_gait`.
+        mirror: As of `cpu_with_gait`.
+    """
 
-cpu = cpu_profile(
-    _ease,
-    num_envs=_NUM_ENVS,
-    init_std=0.8,
-    simple_contacts=True,
-    unpushed_samples=2_000_000,
-    mirror=_MIRROR,
-)
-"""The `cpu` profile of robots of unknown gait."""
+    def ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
+        _ease_penalties(env_cfg)
+        if env_cfg.rewards.get(_AIR_TIME) is not None:
+            ease_weight(env_cfg, _AIR_TIME, _AIR_TIME_AT_FIRST, _EASED_SAMPLES // _NUM_ENVS)
+        evaluation = rl_cfg.evaluation
+        evaluation.num_episodes = 200
+        evaluation.min_interval = 40
+        evaluation.trigger_return = 3600.0
+        if _is_flat(env_cfg):
+            # On a plane, robots may walk long before they reach this training return.
+            evaluation.first_iteration, evaluation.trigger_return = 80, -math.inf
+        evaluation.solved_below = dict(solved_below or _SOLVED)
+
+    return cpu_profile(
+        ease,
+        num_envs=_NUM_ENVS,
+        init_std=0.8,
+        simple_contacts=True,
+        unpushed_samples=2_000_000,
+        mirror=mirror,
+    )
 
 
 def cpu_with_gait(
@@ -227,6 +235,10 @@ def cpu_with_gait(
         unpushed_samples=500_000,
         mirror=mirror,
     )
+
+
+cpu = cpu_without_gait()
+"""The `cpu` profile of robots of unknown gait."""
 
 
 def _is_flat(env_cfg: ManagerBasedRlEnvCfg) -> bool:
