@@ -254,6 +254,16 @@ def test_hand_over_from_a_standing_pose(robot):
     assert policy.is_ready
 
 
+def test_hand_over_after_a_fault_begins_at_the_measured_pose(robot):
+    policy, measured, _ = robot
+    policy.hand_over({**measured, "time": 0.0}, seconds=0.1)
+    policy.hand_over({**measured, "joint_pos": policy.default, "time": 0.12}, seconds=0.1)
+    policy.reset()
+    assert not policy.is_ready
+    pose = policy.default + 0.4
+    np.testing.assert_allclose(policy.hand_over({**measured, "joint_pos": pose}).position, pose)
+
+
 def test_hand_over_of_a_fallen_robot_damps(robot):
     policy, measured, _ = robot
     targets = policy.hand_over({**measured, "root_quat": [0.0, 1.0, 0.0, 0.0]})

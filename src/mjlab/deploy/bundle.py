@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 FILES = Path(__file__).parent / "files"
 """Folder of the programs that every bundle contains."""
-PROGRAMS = ("runtime.py", "simulate.py")
+PROGRAMS = ("runtime.py", "runtime.hpp", "simulate.py")
 """Programs copied into every bundle."""
 
 
@@ -177,7 +177,8 @@ def _write_motion(contract: Contract, folder: Path) -> None:
     for name in env.command_manager.active_terms:
         term: Any = env.command_manager.get_term(name)
         if hasattr(term, "motion_arrays"):
-            np.savez_compressed(folder / "motion.npz", **term.motion_arrays())
+            # Without compression: runtime.hpp reads it without a library.
+            np.savez(folder / "motion.npz", **term.motion_arrays())
 
 
 def _notes(content: Mapping[str, Any]) -> list[str]:

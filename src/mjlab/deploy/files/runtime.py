@@ -119,7 +119,6 @@ class Policy:
                 frame = command["motions"][0]["start"] + command["start_frame"] - 1
                 self.default = self.motion["joint_pos"][frame].astype(float)
         self.values, self.action = {}, np.zeros(contract["policy"]["size"], np.float32)
-        self.is_ready, self._start = False, None
         self.reset()
 
     def _term(self, observation, term):
@@ -152,6 +151,7 @@ class Policy:
     def reset(self, motion=0):
         """Start an episode, of one of the motions in motion tracking: clear memory, clocks, faults."""
         self.reason, self._time, self._repeated, self._is_first = "", None, 0, True
+        self.is_ready, self._start = False, None
         self.action, self._sent = np.zeros_like(self.action), None
         self._motion, self.frame = motion, None
         for name in self._memory.values():

@@ -1,0 +1,274 @@
+"""The runtime of a bundle in C++: compiled, and run on tables of measurements."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+
+DRIVER = Path(__file__).with_name("replay.cpp")
+FILES = Path(__file__).parents[2] / "src" / "mjlab" / "deploy" / "files"
+TOLERANCE = 1e-5
+"""Largest difference, as a fraction of the range of a term."""
+
+Row = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory) -> Path:
+    """Compile the driver; skip where this machine has no compiler or library, unless required."""
+    program = tmp_path_factory.mktemp("replay") / "replay"
+    library = Path("/usr/include/nlohmann/json.hpp")
+    if os.environ.get("MJLAB_TEST_CPP") != "required" and not (
+        shutil.which("g++") and library.exists()
+    ):
+        pytest.skip("needs g++ and nlohmann-json3-dev")
+    command = ["g++", "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{FILES}"]
+    subprocess.run([*command, str(DRIVER), "-o", str(program)], check=True)
+    return program
+
+
+def layers_of(path: Path) -> list[dict[str, Any]]:
+    """Return the layers from the network input to the actions."""
+    graph = onnx.load(str(path)).graph
+    weights = {one.name: onnx.numpy_helper.to_array(one) for one in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Constant":
+            weights[node.output[0]] = onnx.helper.get_attribute_value(node.attribute[0])
+    layers, value = [], "obs"
+    while value != graph.output[0].name:
+        node = next(n for n in graph.node if value in n.input)
+        arrays = [weights[name] for name in node.input if name in weights]
+        kind = {
+            "Sub": "normalize",
+            "Gemm": "linear",
+            "LayerNormalization": "layer_norm",
+            "Elu": "elu",
+            "Sigmoid": "silu",
+            "Slice": "first",
+            "Tanh": "tanh",
+        }[node.op_type]
+        if kind == "normalize":
+            # The quotient follows the difference.
+            node = next(n for n in graph.node if node.output[0] in n.input)
+            arrays = [weights[node.input[1]], arrays[0]]
+        if kind == "silu":
+            # The product with its argument follows the sigmoid.
+            node = next(n for n in graph.node if node.output[0] in n.input)
+        if kind == "first":
+            size = onnx.numpy_helper.to_array(arrays[1])[0]
+            arrays = [np.zeros(0), np.zeros(size)]
+        weight, bias = (np.ravel(x).tolist() for x in (*arrays, (), ())[:2])
+        layers.append({"kind": kind, "weight": weight, "bias": bias})
+        value = node.output[0]
+    return layers
+
+
+@pytest.fixture
+def replay(program, tmp_path) -> Callable[..., list[Row]]:
+    """Return a function that runs the policy of a bundle on a table."""
+
+    def run(folder: Path, table: Path, mode: str = "", layers: Any = None) -> list[Row]:
+        layers = layers_of(folder / "policy.onnx") if layers is None else layers
+        (tmp_path / "layers.json").write_text(json.dumps(layers))
+        command = [program, folder, tmp_path / "layers.json", table, mode]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(done.stderr)
+        return [json.loads(line) for line in done.stdout.splitlines()]
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "go1",
+        "g1",
+        "Mjlab-Cartpole-Swingup",
+        "Mjlab-Lift-Cube-Yam",
+        "Mjlab-Reach-Yam",
+        "Mjlab-Tracking-Flat-Unitree-G1",
+    ],
+)
+def test_answers_are_those_of_training(bundle, replay, name):
+    folder = bundle(name)
+    trace = dict(np.load(folder / "golden.npz"))
+    rows = replay(folder, folder / "golden.csv")
+    assert len(rows) == len(trace["time"])
+    keys = {key for key in trace if key.startswith("raw/")} | {"input/obs", "action", "target"}
+    assert len(keys) > 3
+    for key in keys:
+        kind, _, term = key.partition("/")
+        group = {"raw": "values", "input": "inputs"}.get(kind)
+        got = [row[kind] if group is None else row[group][term] for row in rows]
+        expected = trace[key].reshape(len(rows), -1)
+        scale = max(np.ptp(expected), 1e-3)
+        assert np.abs(got - expected).max(initial=0.0) / scale < TOLERANCE, key
+
+
+def test_motor_commands_are_those_of_the_contract(bundle, replay):
+    folder = bundle("go1")
+    joints = json.loads((folder / "contract.json").read_text())["joints"]
+    row = replay(folder, folder / "golden.csv", "limits")[0]
+    assert row["names"] == [joint["name"] for joint in joints]
+    assert row["kp"] == [joint["kp"] for joint in joints]
+    assert row["kd"] == [joint["kd"] for joint in joints]
+    assert row["position"] == row["target"]
+    assert not row["is_damping"]
+
+
+# Limits.
+
+
+class Robot:
+    """Policy with limits whose network answers a constant, and measurements of a robot at rest."""
+
+    def __init__(self, folder: Path, copy: Path, replay: Callable[..., list[Row]]) -> None:
+        self.folder, self._replay = copy, replay
+        shutil.copytree(folder, copy, ignore=shutil.ignore_patterns("scene", "robot"))
+        self.contract = json.loads((copy / "contract.json").read_text())
+        with (copy / "golden.csv").open() as table:
+            self.first = next(csv.DictReader(table))
+
+    def run(self, rows: list[Row], mode: str = "limits", action: float = 0.0) -> list[Row]:
+        """Return the answers to measurements that differ from those of the first row."""
+        (self.folder / "contract.json").write_text(json.dumps(self.contract))
+        with (self.folder / "table.csv").open("w") as table:
+            writer = csv.DictWriter(table, self.first)
+            writer.writeheader()
+            for k, row in enumerate(rows):
+                writer.writerow({**self.first, "time": 0.02 * k, "first": int(k == 0), **row})
+        size = len(self.contract["joints"])
+        inputs = self.contract["observations"][0]["shape"][0]
+        layer = {"kind": "linear", "weight": [0.0] * size * inputs, "bias": [action] * size}
+        return self._replay(self.folder, self.folder / "table.csv", mode, [layer])
+
+
+@pytest.fixture
+def robot(bundle, replay, tmp_path) -> Robot:
+    return Robot(bundle("go1"), tmp_path / "bundle", replay)
+
+
+@pytest.mark.parametrize(("action", "end"), [(1000.0, "high"), (-1000.0, "low")])
+def test_targets_keep_within_limits(robot, action, end):
+    (row,) = robot.run([{}], action=action)
+    np.testing.assert_allclose(row["position"], robot.contract["limits"][f"target_{end}"])
+    assert np.abs(row["target"]).min() > 100.0
+
+
+def test_target_jumps_are_limited(robot):
+    robot.contract["limits"]["target_step"] = [0.1] * 12
+    # Memory of one number that counts the steps, and is added to the actions.
+    robot.contract["policy"]["inputs"].append(
+        {"name": "h", "shape": [1, 1], "kind": "memory", "output": "h_out"}
+    )
+    before, after, restarted = robot.run([{}, {}, {"first": 1}])
+    scale = np.array(robot.contract["actions"][0]["scale"])
+    np.testing.assert_allclose(after["target"] - np.array(before["target"]), scale)
+    assert np.abs(np.subtract(after["position"], before["position"])).max() == pytest.approx(0.1)
+    assert restarted["position"] == before["position"]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"measurement.joint_vel.FR_calf_joint": "40"}, "faster"),
+        ({f"measurement.root_quat.{k}": q for k, q in enumerate((0.76, 0.64, 0, 0))}, "tilted"),
+        ({"measurement.imu_ang_vel.1": "nan"}, "finite"),
+        ({"measurement.joint_pos.FR_calf_joint": "inf"}, "finite"),
+        ({"command.twist.0": "nan"}, "finite"),
+        ({"time": "0.5"}, "no new measurement"),
+        ({"time": "nan"}, "no new measurement"),
+    ],
+)
+def test_odd_measurements_damp_until_reset(robot, change, reason):
+    good, odd, later, restarted = robot.run([{}, change, {}, {"first": 1}])
+    assert [row["is_damping"] for row in (good, odd, later, restarted)] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert reason in odd["reason"]
+    assert later["reason"] == odd["reason"]
+    assert not any(odd["kp"])
+    assert all(np.array(odd["kd"]) > 0.0)
+    assert np.isfinite(np.array(odd["position"], float)).all()
+
+
+def test_repeated_measurements_damp(robot):
+    steps = round(robot.contract["limits"]["max_age"] / robot.contract["rates"]["step_dt"]) + 2
+    damping = [row["is_damping"] for row in robot.run([{"time": 0.0}] * steps)]
+    assert damping[-1]
+    assert not damping[-3]
+
+
+def test_answer_that_is_not_finite_damps(robot):
+    (row,) = robot.run([{}], action=1e39)
+    assert row["is_damping"]
+
+
+def test_without_limits_nothing_damps(robot):
+    (row,) = robot.run([{"measurement.joint_vel.FR_calf_joint": "40"}], mode="", action=1000.0)
+    assert not row["is_damping"]
+    assert row["position"] == row["target"]
+
+
+# Hand-over.
+
+
+def test_hand_over_from_a_standing_pose(robot):
+    default = {joint["name"]: joint["default_pos"] for joint in robot.contract["joints"]}
+    pose = {f"measurement.joint_pos.{name}": x + 0.3 for name, x in default.items()}
+    there = {f"measurement.joint_pos.{name}": x for name, x in default.items()}
+    rest = {f"measurement.joint_vel.{name}": 0.0 for name in default}
+    times = (0.0, 0.05, 0.1, 0.12)
+    rows = [{**rest, **(there if time > 0.1 else pose), "time": time} for time in times]
+    first, half, late, last = robot.run(rows, mode="hand-over")
+    q = np.array(list(default.values()))
+    np.testing.assert_allclose(first["position"], q + 0.3)
+    np.testing.assert_allclose(half["position"], q + 0.15)
+    # The joints did not follow: not ready.
+    assert [row["is_ready"] for row in (first, half, late, last)] == [False, False, False, True]
+    np.testing.assert_allclose(last["position"], q)
+    # Again after a fault: from the measured pose.
+    (*_, last) = robot.run([*rows, {**rest, **pose, "time": 0.2, "first": 1}], mode="hand-over")
+    np.testing.assert_allclose(last["position"], q + 0.3)
+
+
+def test_hand_over_of_a_fallen_robot_damps(robot):
+    fallen = {f"measurement.root_quat.{k}": q for k, q in enumerate((0, 1, 0, 0))}
+    (row,) = robot.run([fallen], mode="hand-over")
+    assert row["is_damping"]
+    assert not row["is_ready"]
+
+
+# Terms of packages, and errors.
+
+
+def test_unknown_term_is_named_and_can_be_added(robot):
+    term = robot.contract["observations"][0]["terms"][0]
+    term["kind"], term["function"] = "custom", "my_package.mdp:half"
+    (row,) = robot.run([{}])
+    measured = [float(robot.first[f"measurement.imu_ang_vel.{k}"]) for k in range(3)]
+    np.testing.assert_allclose(row["values"][f"obs/{term['name']}"], np.multiply(measured, 0.5))
+    term["function"] = "my_package.mdp:third"
+    with pytest.raises(RuntimeError, match="my_package.mdp:third"):
+        robot.run([{}])
+
+
+def test_measurements_of_wrong_size_are_named(robot):
+    robot.contract["measurements"][0]["size"] = 17
+    name = robot.contract["measurements"][0]["name"]
+    with pytest.raises(RuntimeError, match=f"'{name}': expected 17"):
+        robot.run([{}])
