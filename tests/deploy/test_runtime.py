@@ -287,3 +287,9 @@ def test_unknown_term_is_named_and_can_be_added(bundle):
     measured, command = row_of(policy, arrays_of(folder), 0)
     policy.step(measured, command)
     np.testing.assert_allclose(policy.values["obs", term["name"]], 0.5 * measured["imu_ang_vel"])
+
+
+def test_runtime_is_short():
+    from mjlab.deploy.bundle import FILES
+
+    assert len((FILES / "runtime.py").read_text().splitlines()) < 300

@@ -25,6 +25,7 @@ def test_a_run_is_deployed_from_its_last_checkpoint(run, trained, tmp_path):
     assert source["run"] == trained.name
     assert source["checkpoint"] == "model_1.pt"
     assert source["seed"] == 7
+    assert source["iteration"] == 2
     names = {path.name for path in folder.iterdir()}
     assert names >= {"contract.json", "policy.onnx", "golden.npz", "golden.csv", "README.md"}
     assert names >= {"runtime.py", "simulate.py", "scene", "robot"}
@@ -58,6 +59,13 @@ def test_a_folder_in_use_is_not_replaced(run, trained, tmp_path):
     assert outcome.status == 1
     assert "not empty" in outcome.message
     assert (tmp_path / "bundle" / "mine.txt").exists()
+
+
+def test_only_trained_policies_are_deployed(run, trained, tmp_path):
+    output = ("--output", str(tmp_path / "bundle"))
+    outcome = run("deploy", str(trained), "--agent", "zero", *output)
+    assert outcome.status == 1
+    assert "--agent" in outcome.message
 
 
 @pytest.mark.parametrize("policy", ["nowhere", "."])

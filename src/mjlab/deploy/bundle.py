@@ -109,17 +109,17 @@ def _is_go1(env: ManagerBasedRlEnv) -> bool:
 
 def _commit() -> str | None:
     """Return the commit of the package's source; None if it is not a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    command = ["git", "rev-parse", "--show-toplevel", "HEAD"]
     try:
-        return subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=10,
-        ).stdout.strip()
+        done = subprocess.run(
+            command, cwd=package, capture_output=True, text=True, check=True, timeout=10
+        )
     except (OSError, subprocess.SubprocessError):
         return None
+    top, commit = done.stdout.split("\n")[:2]
+    # An installed package may lie within the checkout of something else.
+    return commit if Path(top) / "src" / "mjlab" == package else None
 
 
 def _update_metadata(env: ManagerBasedRlEnv, policy: Path) -> None:

@@ -91,7 +91,8 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
             f"--output: folder {folder} is not empty; use another folder, or --overwrite."
         )
     checkpoint = find_checkpoint(task, cfg)
-    assert checkpoint is not None
+    if checkpoint is None:
+        raise UserError(f"--agent: expected 'trained', got {cfg.agent!r}; a bundle needs a policy.")
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
     report_policy(task, checkpoint, cfg, env_cfg, "evaluate")
     agent = agent_cfg_of(task, checkpoint, cfg.profile)
@@ -106,7 +107,14 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
             made.mkdir()
             _export(task, env, checkpoint, made, cfg.profile)
             contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
-            source = origin(task, cfg.profile, checkpoint.path, _seed_of(checkpoint))
+            is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
+            source = origin(
+                task,
+                cfg.profile,
+                checkpoint.path,
+                seed=Run(checkpoint.path.parent).seed,
+                iteration=checkpoint.iteration if is_ours else None,
+            )
             bundle = write_bundle(contract, made, source, cfg.steps)
             if folder.exists():
                 shutil.rmtree(folder)
@@ -134,10 +142,6 @@ def _export(task: str, env: Any, checkpoint: Checkpoint, folder: Path, profile: 
 
         if (state := curricula_of(checkpoint.content)) is not None:
             load_curricula(env, state)
-
-
-def _seed_of(checkpoint: Checkpoint) -> int | None:
-    return Run(checkpoint.path.parent).seed
 
 
 def main() -> None:

@@ -149,7 +149,7 @@ class Policy:
         return action
 
     def reset(self, motion=0):
-        """Start an episode, of one of the motions in motion tracking: clear memory, clocks, faults."""
+        """Start an episode, in motion tracking of a motion: clear memory, clocks and faults."""
         self.reason, self._time, self._repeated, self._is_first = "", None, 0, True
         self.is_ready, self._start = False, None
         self.action, self._sent = np.zeros_like(self.action), None
@@ -193,10 +193,10 @@ class Policy:
         self.action = action[0] if self._clip is None else action[0].clip(-self._clip, self._clip)
         return self._targets()
 
-    def hand_over(self, measurements, seconds=2.0, tolerance=0.2):
+    def hand_over(self, measurements, seconds=2.0, tolerance=0.3):
         """Move from the measured pose to the first pose of the policy, in `seconds`.
 
-        `is_ready` becomes True when time is over and each joint within `tolerance` (rad, m).
+        `is_ready` becomes True then, with all joints within `tolerance`: the Go1 sags by 0.23 rad.
         """
         values = self._checked(measurements)
         q, now = values["joint_pos"], float(measurements["time"])

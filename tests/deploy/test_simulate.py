@@ -1,0 +1,62 @@
+"""The simulation of a bundle: keys, damping, and a policy that ends in it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bundles import load_program
+
+UP, LEFT, BACKSPACE = 265, 263, 259
+
+
+@pytest.fixture
+def simulate(bundle):
+    """Return the program of the Go1's bundle, its policy and a simulation."""
+    folder = bundle("go1")
+    load_program(folder, "runtime")
+    program = load_program(folder, "simulate")
+    policy = program.Policy.load(folder)
+    return program, policy, program.Simulation(policy.contract, program.load_model(folder))
+
+
+def test_keys_command_within_the_ranges_of_training(simulate):
+    program, policy, _ = simulate
+    (command,) = policy.contract["commands"]
+    keys = program.Keys(command)
+    assert not keys.value.any()
+    for _ in range(30):
+        keys.press(UP)
+    assert keys.value.tolist() == [command["components"][0]["range"][1], 0.0, 0.0]
+    keys.press(LEFT)
+    assert keys.value[1] > 0.0
+    keys.press(BACKSPACE)
+    assert not keys.value.any()
+
+
+def test_a_robot_hands_over_walks_and_is_damped(simulate):
+    program, policy, simulation = simulate
+    simulation.reset()
+    for _ in range(100):
+        targets = policy.hand_over(simulation.measure(), seconds=1.0)
+        simulation.apply(targets)
+        if policy.is_ready:
+            break
+    assert policy.is_ready
+    policy.reset()
+    for _ in range(50):
+        simulation.apply(policy.step(simulation.measure(), [0.8, 0.0, 0.0]))
+    assert simulation.data.body("robot/trunk").xpos[0] > 0.2
+    # On its back, it is damped: the motors only brake.
+    upside_down = np.array([0.0, 1.0, 0.0, 0.0])
+    simulation.set_state(
+        qpos=np.r_[simulation.data.qpos[:3], upside_down, simulation.data.qpos[7:]]
+    )
+    assert not program.play(policy, simulation, lambda: [0.8, 0.0, 0.0], 1.0)
+    assert "tilted" in policy.reason
+    speeds = []
+    for _ in range(50):
+        targets = policy.step(simulation.measure(), [0.8, 0.0, 0.0])
+        assert targets.is_damping
+        simulation.apply(targets)
+        speeds.append(np.abs(simulation.data.qvel[6:]).max())
+    assert speeds[-1] < 1.0
