@@ -26,14 +26,14 @@ def load_program(folder: Path, name: str) -> ModuleType:
     return module
 
 
-def write_demo(name: str, folder: Path) -> Path:
+def write_demo(name: str, folder: Path, steps: int = STEPS) -> Path:
     """Write the bundle of the bundled policy `name`."""
     from mjlab.cli.policy_flags import parse_policy_flags
     from mjlab.scripts.demo import DEMOS
     from mjlab.scripts.deploy import DeployConfig, run_deploy
 
     demo = DEMOS[name]
-    flags = ["--checkpoint-file", str(demo.policy), "--output", str(folder), "--steps", str(STEPS)]
+    flags = ["--checkpoint-file", str(demo.policy), "--output", str(folder), "--steps", str(steps)]
     flags += [] if demo.profile is None else ["--profile", demo.profile]
     cfg = parse_policy_flags(DeployConfig, flags, demo.task, "deploy", purpose="evaluate")
     run_deploy(demo.task, cfg)
@@ -41,7 +41,10 @@ def write_demo(name: str, folder: Path) -> Path:
 
 
 def write_random(
-    task: str, folder: Path, edit: Callable[[Any, Any], None] = lambda env, agent: None
+    task: str,
+    folder: Path,
+    edit: Callable[[Any, Any], None] = lambda env, agent: None,
+    steps: int = STEPS,
 ) -> Path:
     """Write the bundle of an untrained policy of `task`; `edit` changes both configs in place."""
     from mjlab.deploy.bundle import write_bundle
@@ -61,7 +64,7 @@ def write_random(
     folder.mkdir()
     runner_cls(env, acting_cfg(agent), device="cpu").export_policy(str(folder / "policy.onnx"))
     contract = Contract(env.unwrapped, folder / "policy.onnx", lacks)
-    write_bundle(contract, folder, {"task": task}, STEPS)
+    write_bundle(contract, folder, {"task": task}, steps)
     env.close()
     return folder
 

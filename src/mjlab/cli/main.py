@@ -311,6 +311,19 @@ policy (go1, g1).""",
         ),
     ),
     Command(
+        "check-deploy",
+        "find out",
+        "where a deployed policy differs from training",
+        argument="BUNDLE",
+        details="""\
+Run the programs of a bundle in plain MuJoCo, and compare with its golden trace: sensors, terms,
+history, vector, action, target, torque, and the state after one control step.
+
+At a difference: first step, stage, component, and the likely cause if one explains it; exit status 1.
+BUNDLE is a folder that `mjlab deploy` wrote; its programs may have been edited.""",
+        examples=("mjlab check-deploy bundle", "mjlab check-deploy bundle --json"),
+    ),
+    Command(
         "profile-env",
         "find out",
         "where the time of a step goes",

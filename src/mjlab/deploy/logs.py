@@ -1,0 +1,301 @@
+"""Logs of a robot, and answers of a program in another language, against the contract of a bundle.
+
+Both are tables (CSV) with the columns of `golden.csv`:
+
+    time                                   s, monotonic
+    first                                  1 where an episode begins; without it, the first row
+    measurement.<name>.<k or joint>        raw measurements; also `quaternion.<w, x, y, z>`,
+                                           `gyroscope.<x, y, z>`, `position.<joint>`, `velocity.<joint>`
+    command.<name>.<k>                     commands
+    obs.<k>, action.<k>, target.<joint>    what the program computed, as far as it is known
+
+`golden.csv` is such a log.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjlab.deploy.check import Comparison, Report, compare, find_causes
+from mjlab.deploy.evidence import Evidence
+from mjlab.utils.errors import UserError
+
+_ANSWERS = {"obs": "input/obs", "action": "action", "target": "target"}
+_STAGES = {"input/obs": "vector", "action": "action", "target": "target"}
+# Gaps above this multiple of the period are counted as missed steps.
+_MISSED = 1.5
+# Relative difference of another control rate.
+_OTHER_PERIOD = 0.02
+# Longest lag searched for (steps).
+_LONGEST_LAG = 10
+_ENOUGH = 20
+
+
+class CsvTable:
+    """Columns of a CSV file.
+
+    Attributes:
+        path: File.
+        columns: Values by name, (K,). NaN: empty.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read a file.
+
+        Raises:
+            UserError: the file cannot be read as a table of numbers.
+        """
+        self.path = path
+        try:
+            with path.open(newline="", encoding="utf-8") as file:
+                header, *rows = csv.reader(file)
+            values = np.array([[float(cell or "nan") for cell in row] for row in rows])
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path}: expected a CSV table of numbers ({error}).") from error
+        if not len(values):
+            raise UserError(f"{path}: expected rows below the header, got none.")
+        self.columns = dict(zip((name.strip() for name in header), values.T, strict=True))
+
+    def group(self, name: str, labels: list[str]) -> np.ndarray | None:
+        """Return the columns `name.<label>`, (K, n); None if one is missing."""
+        keys = [f"{name}.{label}" for label in labels]
+        if not keys or any(key not in self.columns for key in keys):
+            return None
+        return np.stack([self.columns[key] for key in keys], axis=1)
+
+
+# Answers.
+
+
+def check_answers(folder: Path, path: Path) -> Report:
+    """Return the report of a program's answers to `golden.csv`, with its `step` if rows are missing.
+
+    Raises:
+        UserError: the table has no answers, or more rows than the trace.
+    """
+    evidence, table = Evidence(folder), CsvTable(path)
+    count = len(evidence.first)
+    rows = table.columns.get("step", np.arange(len(next(iter(table.columns.values())))))
+    rows = rows.astype(int)
+    if rows.min() < 0 or rows.max() >= count:
+        raise UserError(f"{path} step: expected 0 to {count - 1}, got up to {rows.max()}.")
+    values = {}
+    for name, answers in _answers(evidence, table).items():
+        got = np.full((count, answers.shape[1]), np.nan)
+        got[rows] = answers
+        values[_STAGES[name], name] = got
+    if not values:
+        raise UserError(
+            f"{path}: expected columns obs.<k>, action.<k> or target.<joint>, got none."
+        )
+    return _report(evidence, values, [])
+
+
+def _answers(evidence: Evidence, table: CsvTable) -> dict[str, np.ndarray]:
+    """Return the answers in a table, by name in the trace."""
+    sizes = {one["input"]: one["shape"] for one in evidence.contract["observations"]}
+    numbers = {
+        "obs": sizes["obs"][-1] if len(sizes.get("obs", ())) == 1 else 0,
+        "action": evidence.contract["policy"]["size"],
+    }
+    labels = {name: [str(k) for k in range(size)] for name, size in numbers.items()}
+    labels["target"] = evidence.target_joints
+    found = {_ANSWERS[name]: table.group(name, labels[name]) for name in _ANSWERS}
+    return {name: values for name, values in found.items() if values is not None}
+
+
+def _report(
+    evidence: Evidence, values: dict[tuple[str, str], np.ndarray], notes: list[str]
+) -> Report:
+    """Return the report on answers; those that are NaN are not compared."""
+    observed = values.get(("vector", "input/obs"))
+    if observed is not None:
+        for (place, term), entry in evidence.terms.items():
+            if place == "obs":
+                part = observed[:, entry["start"] : entry["stop"]]
+                values["history", f"term/obs/{term}"] = part
+    comparisons = [_where_known(one) for one in compare(evidence, values)]
+    report = Report(comparisons, undecided=notes)
+    if not report.is_passed:
+        report.findings = find_causes(evidence, comparisons, {})
+    return report
+
+
+def _where_known(one: Comparison) -> Comparison:
+    """Leave out what the table does not say."""
+    if one.got.shape != one.expected.shape:
+        return one
+    known = np.isfinite(one.got) & np.isfinite(one.expected)
+    return replace(
+        one, expected=np.where(known, one.expected, np.nan), got=np.where(known, one.got, 0.0)
+    )
+
+
+# Logs.
+
+
+def check_log(folder: Path, path: Path) -> Report:
+    """Return the report of a log: terms, vector, action and target recomputed from its raw columns.
+
+    Raises:
+        UserError: the log lacks time, or all measurements.
+    """
+    bundle, table = Evidence(folder), CsvTable(path)
+    if "time" not in table.columns:
+        raise UserError(f"{path}: expected a column time (s).")
+    raw, missing = _raw(bundle, table)
+    answers = _answers(bundle, table)
+    trace = _recomputed(bundle, table, raw, answers)
+    evidence = Evidence(folder, trace)
+    values = {(_STAGES[name], name): value for name, value in answers.items()}
+    timing = _timing(bundle, table.columns["time"], trace["first"])
+    timing += _lags(bundle, raw, answers)
+    notes = [
+        f"{name}: not in the log; what is computed from it is not compared." for name in missing
+    ]
+    absent = [name for name in _ANSWERS if _ANSWERS[name] not in answers]
+    notes += [f"{name}: not in the log." for name in absent]
+    notes.append(
+        "sensors, torque, state and what is read when: raw columns are taken as they are, and a log has "
+        "no true state."
+    )
+    return replace(_report(evidence, values, notes), notes=timing)
+
+
+def _raw(evidence: Evidence, table: CsvTable) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return measurements and commands of a log by name in the trace, and the missing ones."""
+    found, missing = {}, []
+    for entry in evidence.contract["measurements"]:
+        name, source = entry["name"], entry["source"]
+        joints = evidence.joint_names if name in ("joint_pos", "joint_vel") else None
+        labels = joints or [str(k) for k in range(entry["size"])]
+        values = table.group(f"measurement.{name}", labels)
+        if values is None:
+            values = table.group(*_plain_name(name, source, labels))
+        if values is None:
+            missing.append(f"measurement {name}")
+            values = np.full((len(table.columns["time"]), entry["size"]), np.nan)
+        found[f"measurement/{name}"] = values.reshape(-1, *entry["shape"])
+    for entry in evidence.contract["commands"]:
+        name = entry["name"]
+        values = table.group(f"command.{name}", [str(k) for k in range(entry["size"])])
+        if values is None and entry["kind"] == "given":
+            missing.append(f"command {name}")
+            values = np.full((len(table.columns["time"]), entry["size"]), np.nan)
+        if values is not None:
+            found[f"command/{name}"] = values
+    return found, missing
+
+
+def _plain_name(name: str, source: Mapping[str, Any], labels: list[str]) -> tuple[str, list[str]]:
+    """Return the shorter name of a measurement, and the labels of its columns."""
+    if source["kind"] == "sensor" and source["type"] == "gyro":
+        return "gyroscope", list("xyz")
+    if name == "root_quat":
+        return "quaternion", list("wxyz")
+    return {"joint_pos": "position", "joint_vel": "velocity"}.get(name, name), labels
+
+
+def _recomputed(
+    evidence: Evidence,
+    table: CsvTable,
+    raw: Mapping[str, np.ndarray],
+    answers: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Return the trace that the original runtime gives for the raw columns of a log.
+
+    Each stage starts from the log where it has the stage before: the last action from its actions, the action
+    from its observations, the target from its actions.
+    """
+    policy = evidence.originals.runtime.Policy.load(evidence.folder, limits=False)
+    count = len(table.columns["time"])
+    first = table.columns.get("first", np.arange(count) == 0).astype(bool)
+    rows: dict[str, list] = {}
+
+    def add(name: str, value: Any) -> None:
+        rows.setdefault(name, []).append(np.array(value))
+
+    given = [one["name"] for one in evidence.contract["commands"] if one["kind"] == "given"]
+    names = [one["name"] for one in evidence.contract["measurements"]]
+    for k in range(count):
+        if first[k]:
+            policy.reset()
+        measured: dict[str, Any] = {name: raw[f"measurement/{name}"][k] for name in names}
+        measured["time"] = float(table.columns["time"][k])
+        policy.step(measured, {name: raw[f"command/{name}"][k] for name in given})
+        for (place, term), value in policy.values.items():
+            add(f"raw/{place}/{term}", np.ravel(value))
+        for place, value in policy.inputs.items():
+            add(f"input/{place}", value[0])
+        for (place, term), entry in evidence.terms.items():
+            if place == "obs":
+                add(f"term/obs/{term}", policy.inputs[place][0, entry["start"] : entry["stop"]])
+        if "input/obs" in answers and len(policy.inputs) == 1:
+            x = answers["input/obs"][k : k + 1].astype(np.float32)
+            (action,) = policy._run(policy._outputs, {"obs": x})
+            clip = evidence.contract["policy"]["clip"] or np.inf
+            policy.action = action[0].clip(-clip, clip)
+        add("action", policy.action.copy())
+        if "action" in answers:
+            policy.action = answers["action"][k].astype(np.float32)
+        policy._targets()
+        add("target", policy.target.copy())
+    trace = {name: np.array(values) for name, values in rows.items()}
+    return {**trace, **raw, "first": first, "time": table.columns["time"]}
+
+
+def _timing(evidence: Evidence, time: np.ndarray, first: np.ndarray) -> list[str]:
+    """Return sentences on the period of a log."""
+    gaps = np.diff(time)[~first[1:].astype(bool)]
+    if not len(gaps):
+        return []
+    period, wanted = float(np.median(gaps)), evidence.contract["rates"]["step_dt"]
+    missed = int((gaps > _MISSED * wanted).sum())
+    text = (
+        f"period: median {1e3 * period:.2f} ms, contract {1e3 * wanted:.2f} ms; jitter (standard deviation) "
+        f"{1e3 * gaps.std():.2f} ms, longest {1e3 * gaps.max():.2f} ms; {missed} gaps above "
+        f"{_MISSED} periods."
+    )
+    other = abs(period / wanted - 1) > _OTHER_PERIOD
+    return [text, "Likely cause: other control rate."] if other else [text]
+
+
+def _lags(
+    evidence: Evidence, raw: Mapping[str, np.ndarray], answers: Mapping[str, np.ndarray]
+) -> list[str]:
+    """Return a sentence on the lag of joint positions behind their targets, and that of the trace."""
+    if "target" not in answers:
+        return []
+    joints, dt = evidence.joint_names, evidence.contract["rates"]["step_dt"]
+    index = [joints.index(name) for name in evidence.target_joints if name in joints]
+    texts = []
+    for target, position in (
+        (answers["target"], raw["measurement/joint_pos"]),
+        (evidence.trace["target"], evidence.trace["measurement/joint_pos"]),
+    ):
+        lag = _lag(target, position[:, index]) if target.shape[1] == len(index) else None
+        texts.append("unknown" if lag is None else f"{1e3 * lag * dt:.0f} ms")
+    return [f"lag of joint positions behind targets: {texts[0]}; in the golden trace {texts[1]}."]
+
+
+def _lag(target: np.ndarray, position: np.ndarray) -> float | None:
+    """Return the lag with the largest correlation of the changes, in steps, between samples too."""
+    a, b = np.diff(target, axis=0), np.diff(position, axis=0)
+    if len(a) < _ENOUGH + _LONGEST_LAG or not np.isfinite(a).all() or not np.isfinite(b).all():
+        return None
+    products = [
+        float((a[: len(a) - lag] * b[lag:]).sum(axis=0).mean()) for lag in range(_LONGEST_LAG + 1)
+    ]
+    peak = int(np.argmax(products))
+    if peak in (0, _LONGEST_LAG):
+        return float(peak)
+    # Peak of the parabola through three samples.
+    before, here, after = products[peak - 1 : peak + 2]
+    curvature = before - 2 * here + after
+    return peak + 0.5 * (before - after) / curvature if curvature < 0 else float(peak)

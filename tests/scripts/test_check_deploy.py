@@ -1,0 +1,37 @@
+"""The command `check-deploy`."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from mjlab.scripts.check_deploy import command
+from mjlab.scripts.deploy import command as deploy
+from mjlab.utils.errors import UserError
+
+
+def test_command_prints_and_exits(tmp_path, capsys):
+    folder = tmp_path / "bundle"
+    deploy(["go1", "--output", str(folder), "--steps", "20"], "deploy")
+    command([str(folder)], "check-deploy")
+    assert "PASSED" in capsys.readouterr().out
+    text = (folder / "contract.json").read_text()
+    content = json.loads(text)
+    content["actions"][0]["scale"] = [1.0] * 12
+    (folder / "contract.json").write_text(json.dumps(content))
+    with pytest.raises(SystemExit) as status:
+        command([str(folder), "--json"], "check-deploy")
+    assert status.value.code == 1
+    printed = json.loads(capsys.readouterr().out)
+    assert not printed["passed"]
+    assert {one["cause"] for one in printed["findings"]} == {"other action scale of some joints"}
+    (folder / "contract.json").write_text(text)
+    command([str(folder), "--log", str(folder / "golden.csv")], "check-deploy")
+    command([str(folder), "--answers", str(folder / "golden.csv")], "check-deploy")
+    assert capsys.readouterr().out.count("PASSED") == 2
+
+
+def test_folder_without_contract(tmp_path):
+    with pytest.raises(UserError, match="mjlab deploy"):
+        command([str(tmp_path)], "check-deploy")
