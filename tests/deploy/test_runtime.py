@@ -271,6 +271,11 @@ def test_hand_over_of_a_fallen_robot_damps(robot):
     assert not policy.is_ready
 
 
+def test_hand_over_without_a_time_damps(robot):
+    policy, measured, _ = robot
+    assert policy.hand_over({**measured, "time": np.nan}).is_damping
+
+
 # Terms of packages.
 
 

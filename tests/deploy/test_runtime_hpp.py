@@ -244,9 +244,12 @@ def test_hand_over_from_a_standing_pose(robot):
     np.testing.assert_allclose(last["position"], q + 0.3)
 
 
-def test_hand_over_of_a_fallen_robot_damps(robot):
-    fallen = {f"measurement.root_quat.{k}": q for k, q in enumerate((0, 1, 0, 0))}
-    (row,) = robot.run([fallen], mode="hand-over")
+FALLEN = {f"measurement.root_quat.{k}": q for k, q in enumerate((0, 1, 0, 0))}
+
+
+@pytest.mark.parametrize("change", [FALLEN, {"time": "nan"}])
+def test_hand_over_of_a_fallen_robot_or_without_a_time_damps(robot, change):
+    (row,) = robot.run([change], mode="hand-over")
     assert row["is_damping"]
     assert not row["is_ready"]
 

@@ -484,7 +484,7 @@ class Policy {
     // A comparison with NaN is false.
     if (!(age <= limits["max_age"].get<double>()))
       reason_ = "no new measurement for " + std::to_string(age) + " s";
-    else if (!finite)
+    else if (!finite || !std::isfinite(values.time))
       reason_ = "a measurement is not finite";
     else if (is_fast(found(values, "joint_vel")))
       reason_ = "a joint is faster than limits.joint_speed";

@@ -227,7 +227,7 @@ class Policy:
         age = max(gap, self._repeated * self.period)
         if not age <= limits["max_age"]:
             self.reason = f"no new measurement for {age:.3f} s"
-        elif not all(np.isfinite(value.sum()) for value in values.values()):
+        elif not np.isfinite(self._time + sum(value.sum() for value in values.values())):
             self.reason = "a measurement is not finite"
         elif (np.abs(values["joint_vel"]) > limits["joint_speed"]).any():
             self.reason = "a joint is faster than limits.joint_speed"
