@@ -327,7 +327,7 @@ class Policy {
   /// Move from the measured pose to the first pose of the policy, in `seconds`.
   ///
   /// `is_ready` becomes true when time is over and each joint within `tolerance` (rad, m).
-  Targets hand_over(const Values& measurements, double seconds = 2.0, double tolerance = 0.2) {
+  Targets hand_over(const Values& measurements, double seconds = 2.0, double tolerance = 0.3) {
     const Values values = checked(measurements);
     const Vector& q = found(values, "joint_pos");
     if (!reason_.empty()) return damp(q);
