@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from bundles import load_program
@@ -60,3 +64,16 @@ def test_a_robot_hands_over_walks_and_is_damped(simulate):
         simulation.apply(targets)
         speeds.append(np.abs(simulation.data.qvel[6:]).max())
     assert speeds[-1] < 1.0
+
+
+def test_loop_of_the_documentation_walks(bundle, tmp_path, monkeypatch):
+    page = Path(__file__).parents[2] / "docs" / "how-to" / "deploy.md"
+    program = re.findall(r"```python\n(import sys.*?)```", page.read_text(), re.DOTALL)[0]
+    (tmp_path / "go1_bundle").symlink_to(bundle("go1"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delitem(sys.modules, "runtime", raising=False)
+    scope: dict = {}
+    exec(program, scope)
+    assert not scope["targets"].is_damping
+    assert scope["data"].body("robot/trunk").xpos[0] > 3.0
