@@ -142,6 +142,7 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.scripts.describe import DescribeConfig
     from mjlab.scripts.evaluate import EvaluateConfig
     from mjlab.scripts.export_scene import ExportSceneConfig
+    from mjlab.scripts.fit_actuators import FitActuatorsConfig
     from mjlab.scripts.new_robot import NewRobotConfig
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
@@ -168,6 +169,7 @@ def _flags_of() -> dict[str, list[object]]:
         "csv_to_npz": [CsvToNpzConfig()],
         "profile-env": [ProfileConfig(env=train.env)],
         "export-scene": [ExportSceneConfig()],
+        "fit-actuators": [FitActuatorsConfig()],
         "new-robot": [NewRobotConfig()],
         "visualize_terrain": [VisualizeTerrainConfig()],
         "viz-nan": [VizNanConfig()],

@@ -260,6 +260,22 @@ go1, yam, or module:function that returns an MjSpec or EntityCfg) or a task.""",
         ),
     ),
     Command(
+        "fit-actuators",
+        "build",
+        "friction, inertia, gains and delay of real joints",
+        argument="LOG",
+        details="""\
+Fit the drives of a robot that hangs by its base to a log of its joints, and print the values with
+95 % intervals, what the log cannot separate, and the randomization that follows. LOG is a CSV with
+the columns time, target.JOINT, measurement.joint_pos.JOINT and, if measured,
+measurement.joint_vel.JOINT and measurement.joint_torque.JOINT; or an NPZ.""",
+        examples=(
+            "mjlab fit-actuators chirp.csv --robot go1",
+            "mjlab fit-actuators chirp.csv --robot my_robots:get_my_robot_cfg --more steps.csv",
+            "mjlab fit-actuators chirp.npz --robot robot.xml --stiffness 25 --damping 0.6",
+        ),
+    ),
+    Command(
         "visualize-terrain",
         "build",
         "terrains, in the browser",

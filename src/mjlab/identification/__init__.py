@@ -1,0 +1,1 @@
+"""Identification of a robot's drives from logs of its joints."""
