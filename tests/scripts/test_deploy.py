@@ -52,13 +52,23 @@ def test_settings_of_the_run_are_in_the_contract(run, train, tmp_path):
     assert contract["policy"]["clip"] == 2.5
 
 
-def test_a_folder_in_use_is_not_replaced(run, trained, tmp_path):
+@pytest.mark.parametrize("flags", [(), ("--overwrite",)])
+def test_a_folder_of_others_is_not_replaced(run, trained, tmp_path, flags):
     (tmp_path / "bundle").mkdir()
     (tmp_path / "bundle" / "mine.txt").write_text("mine")
-    outcome = run("deploy", str(trained), "--output", str(tmp_path / "bundle"))
+    outcome = run("deploy", str(trained), "--output", str(tmp_path / "bundle"), *flags)
     assert outcome.status == 1
     assert "not empty" in outcome.message
     assert (tmp_path / "bundle" / "mine.txt").exists()
+
+
+def test_a_bundle_is_replaced_on_request(run, trained, tmp_path):
+    flags = ("--output", str(tmp_path / "bundle"), *QUICK)
+    (tmp_path / "bundle").mkdir()
+    (tmp_path / "bundle" / "contract.json").write_text("{}")
+    assert "--overwrite" in run("deploy", str(trained), *flags).message
+    assert run("deploy", str(trained), *flags, "--overwrite").status == 0
+    assert contract_of(tmp_path / "bundle")["golden"]["steps"] == 4
 
 
 def test_only_trained_policies_are_deployed(run, trained, tmp_path):

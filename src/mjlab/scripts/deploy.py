@@ -86,10 +86,12 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
         UserError, ValueError, OSError, CheckpointError: the request cannot be fulfilled.
     """
     folder = Path(cfg.output)
-    if folder.exists() and any(folder.iterdir()) and not cfg.overwrite:
-        raise UserError(
-            f"--output: folder {folder} is not empty; use another folder, or --overwrite."
-        )
+    if folder.exists() and any(folder.iterdir()):
+        # Anything else is not deleted.
+        is_bundle = (folder / "contract.json").is_file()
+        if not (cfg.overwrite and is_bundle):
+            cure = ", or --overwrite" if is_bundle else ""
+            raise UserError(f"--output: folder {folder} is not empty; use another folder{cure}.")
     checkpoint = find_checkpoint(task, cfg)
     if checkpoint is None:
         raise UserError(f"--agent: expected 'trained', got {cfg.agent!r}; a bundle needs a policy.")

@@ -197,6 +197,15 @@ def play(policy, simulation, command, seconds, viewer=None):
     return True
 
 
+def begin(simulation):
+    """Start an episode: a floating robot at its default, an arm and its objects as in the golden trace."""
+    simulation.reset()
+    if not simulation.contract["robot"]["is_floating"]:
+        trace = np.load(HERE / simulation.contract["golden"]["file"])
+        state = {key.removeprefix("state/"): trace[key][0] for key in trace if "state/" in key}
+        simulation.set_state(**state)
+
+
 def main():
     """Play the policy, in the viewer or without."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -216,6 +225,7 @@ def main():
     def command():
         return None if keys is None else keys.value
 
+    begin(simulation)
     if options.seconds is not None:
         play(policy, simulation, command, options.seconds)
         place = simulation.data.body(policy.contract["robot"]["root_body"]).xpos
@@ -228,7 +238,7 @@ def main():
         simulation.model, simulation.data, key_callback=on_key
     ) as viewer:
         while viewer.is_running():
-            simulation.reset()
+            begin(simulation)
             play(policy, simulation, command, 1e9, viewer)
 
 
