@@ -141,8 +141,9 @@ class Package:
 _TWO_LEGS = """\
 ## Two legs
 
-The profile `cpu` rewards air time of the feet, without a teacher. It has taught robots with four
-legs to walk, not yet with two: train on a GPU without a profile, or expect a robot that stands."""
+A controller that steps in place teaches the policy of the profile `cpu` at first (`stepping_action`).
+The observation group `teacher` has its action, and `mdp.SteppingGains` its gains: `gains=` of
+`BIPED` in `task.py`. If robots drift, change `lead`; if they fall sideways, `step_sideways`."""
 
 
 def values_table(report: RobotReport) -> Table:

@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry
+from mjlab.own_robot.anatomy import Leg
+from mjlab.own_robot.posture import pitch_joints, sole_points
 from mjlab.own_robot.python_text import comment_lines, dict_source, number, tuple_source
 from mjlab.own_robot.report import RobotReport
 from mjlab.own_robot.robot_source import (
@@ -30,6 +32,15 @@ SOLVED = {
 number of feet."""
 GEAR_FRICTION = 0.02
 """Dry friction of a drive as a share of its effort limit; 0.017 to 0.024 for the motors of the G1."""
+FEET_DISTANCE = 0.85
+"""Smallest lateral distance of two feet, as a share of that in the initial pose."""
+_STOPS = "Training stops at these shares of the errors of a robot that stands still, and this rate of falls."
+_PROFILES = {
+    2: "from mjlab.tasks.velocity.rl.biped import Biped, cpu_with_stepping\n"
+    "from mjlab.tasks.velocity.rl.ppo import velocity_ppo_runner_cfg",
+    4: "from mjlab.tasks.velocity.rl.ppo import cpu_with_gait, velocity_ppo_runner_cfg",
+}
+_OTHER_PROFILE = "from mjlab.tasks.velocity.rl.ppo import cpu_without_gait, velocity_ppo_runner_cfg"
 
 
 def velocity_source(report: RobotReport, package: str, title: str, task_name: str) -> str:
@@ -38,13 +49,13 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
     tolerance = {name: report.pose_tolerance.value[name] for name in driven_joints(report)}
     fallen = report.anatomy.fall_bodies
     commands = report.commands.value
-    has_gait = len(report.anatomy.feet.value) == 4
+    num_feet = len(report.anatomy.feet.value)
     friction_reason, friction = _joint_friction(report)
     names = [
         "ACTION_SCALE",
         "FEET",
         "FOOT_CONTACTS",
-        *["HEIGHT"] * has_gait,
+        *["HEIGHT"] * (num_feet in _PROFILES),
         "SOLES",
         "TRUNK",
         "UPRIGHT",
@@ -53,7 +64,7 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
         package=package,
         title=title,
         task_name=task_name,
-        profile="cpu_with_gait" if has_gait else "cpu_without_gait",
+        profile=_PROFILES.get(num_feet, _OTHER_PROFILE),
         robot_names="".join(f"    {name},\n" for name in [*names, "get_robot_cfg"]),
         commands="\n".join(reason_lines("Commands", report.commands)),
         lin_vel=_range(commands["lin_vel_x"]),
@@ -137,8 +148,19 @@ def _sole_radius(report: RobotReport) -> float:
 
 
 def _gait(report: RobotReport) -> str:
-    legs = len(report.anatomy.feet.value)
-    solved = SOLVED[2 if legs == 2 else 4]
+    """Return the lines of the profile `cpu`."""
+    num_feet = len(report.anatomy.feet.value)
+    if num_feet == 2:
+        return _walk(report)
+    if num_feet == 4:
+        return _trot(report)
+    reason = f"The gait is unknown: the profile rewards air time of the feet. {_STOPS}"
+    return "\n".join([*comment_lines(reason), "cpu = cpu_without_gait(", *_arguments(report), ")"])
+
+
+def _arguments(report: RobotReport) -> list[str]:
+    """Return the arguments of all profiles."""
+    solved = SOLVED[2 if len(report.anatomy.feet.value) == 2 else 4]
     arguments = [
         "    solved_below={",
         *(f'        "{name}": {limit},' for name, limit in solved.items()),
@@ -146,17 +168,87 @@ def _gait(report: RobotReport) -> str:
     ]
     if not report.anatomy.mirror.value:
         arguments.append("    mirror=None,  # not the same left and right")
-    stops = "Training stops at these shares of the errors of a robot that stands still, and this rate of falls."
-    if legs != 4:
-        reason = (
-            f"The gait is unknown: the profile rewards air time of the feet, and has taught four legs to "
-            f"walk, not yet two. {stops}"
-        )
-        return "\n".join([*comment_lines(reason), "cpu = cpu_without_gait(", *arguments, ")"])
+    return arguments
+
+
+def _walk(report: RobotReport) -> str:
+    left = feet_in_model_order(report).index(report.anatomy.feet.value[0])
+    bounds, pose = leg_limits(report)
+    return "\n".join(
+        [
+            *comment_lines(
+                "Largest offset of a joint target from the initial pose (rad), and weights of squared "
+                "deviations from it: those of the G1 by the role of the joint."
+            ),
+            f"BOUNDS = {dict_source(by_pattern(bounds, report))}",
+            f"DEVIATIONS = {dict_source(by_pattern(pose, report))}",
+            "",
+            *comment_lines(
+                "A walk: a controller that steps in place by inverse kinematics of the legs teaches the "
+                "policy at first. Frequency, swing height and gains follow from HEIGHT, mass and legs. "
+                f"Training episodes end when the trunk sinks below {STANDING_SHARE:.0%} of its height. "
+                f"{_STOPS}"
+            ),
+            "BIPED = Biped(",
+            f"    feet=(FEET[{left}], FEET[{1 - left}]),  # left, right",
+            "    height=0.97 * HEIGHT,",
+            f"    minimum_height={STANDING_SHARE} * HEIGHT,",
+            f"    feet_distance={number(FEET_DISTANCE * feet_distance(report), 2)},",
+            "    bounds=BOUNDS,",
+            "    pose=DEVIATIONS,",
+            ")",
+            "cpu = cpu_with_stepping(",
+            "    BIPED,",
+            *_arguments(report),
+            ")",
+        ]
+    )
+
+
+def leg_limits(report: RobotReport) -> tuple[dict[str, float], dict[str, float]]:
+    """Return bounds (rad) and weights of deviations of the joints of a biped, by joint.
+
+    Those of the G1: hip pitch and knee may move by 1 rad at no cost, a hip's roll and yaw by 0.6 rad, an
+    ankle's pitch by 1 rad and roll by 0.8 rad, and other joints by 0.25 rad.
+    """
+    joints = driven_joints(report)
+    bounds, pose = dict.fromkeys(joints, 0.25), dict.fromkeys(joints, 50.0)
+    for leg in report.anatomy.legs.value:
+        pitch = pitch_joints(report.compiled, leg)
+        knee = leg.joints.index(pitch[1]) if len(pitch) > 1 else len(leg.joints)
+        yaw = _yaw_joint(report, leg)
+        for index, name in enumerate(leg.joints):
+            if name in pitch[:2]:
+                bounds[name], pose[name] = 1.0, 0.01
+            elif index < knee:
+                bounds[name], pose[name] = 0.6, 5.0 if name == yaw else 1.0
+            else:
+                bounds[name], pose[name] = 1.0 if name in pitch else 0.8, 5.0
+    return {n: bounds[n] for n in joints}, {n: pose[n] for n in joints}
+
+
+def _yaw_joint(report: RobotReport, leg: Leg) -> str:
+    """Return the joint of a leg whose axis is closest to the vertical in the initial pose."""
+    model, data = report.compiled, mujoco.MjData(report.compiled)
+    geometry.set_pose(model, data, report.joint_pos.value)
+    return max(leg.joints, key=lambda name: abs(float(data.xaxis[model.joint(name).id][2])))
+
+
+def feet_distance(report: RobotReport) -> float:
+    """Return the lateral distance of two soles in the initial pose (m)."""
+    model, data = report.compiled, mujoco.MjData(report.compiled)
+    geometry.set_pose(model, data, report.joint_pos.value)
+    left, right = (
+        float(np.mean(sole_points(model, data, foot)[:, 1])) for foot in report.anatomy.feet.value
+    )
+    return left - right
+
+
+def _trot(report: RobotReport) -> str:
     first, second = diagonals(report)
     reason = (
         f"A trot: the feet {first} and {second} of FEET, the diagonals, take turns. Training episodes end "
-        f"when the trunk sinks below {STANDING_SHARE:.0%} of its height. {stops}"
+        f"when the trunk sinks below {STANDING_SHARE:.0%} of its height. {_STOPS}"
     )
     return "\n".join(
         [
@@ -164,7 +256,7 @@ def _gait(report: RobotReport) -> str:
             "cpu = cpu_with_gait(",
             f"    ({first}, {second}),",
             f"    minimum_height={STANDING_SHARE} * HEIGHT,",
-            *arguments,
+            *_arguments(report),
             ")",
         ]
     )

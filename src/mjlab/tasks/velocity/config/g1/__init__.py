@@ -32,12 +32,15 @@ _RUNNER = "mjlab.tasks.velocity.rl"
 for _terrain in ("Flat", "Rough"):
     for _suffix in ("", "-No-State-Estimation"):
         _env_cfg = f"unitree_g1_{_terrain}{_suffix}_env_cfg".lower().replace("-", "_")
+        _profiles = {"cpu": f"{_RL_CFG}:cpu"}
+        if _terrain == "Flat":
+            _profiles["cpu-long"] = f"{_RL_CFG}:cpu_long"
         register_mjlab_task(
             task_id=f"Mjlab-Velocity-{_terrain}-Unitree-G1{_suffix}",
             env_cfg=f"{_ENV_CFGS}:{_env_cfg}",
             rl_cfg=f"{_RL_CFG}:unitree_g1_ppo_runner_cfg",
             runner_cls=f"{_RUNNER}:VelocityOnPolicyRunner",
-            profiles={"cpu": f"{_RL_CFG}:cpu"},
+            profiles=_profiles,
         )
 
 __getattr__ = lazy_names(

@@ -1,0 +1,297 @@
+"""The `cpu` profile of bipeds: a humanoid learns to walk on two cores.
+
+PPO does not learn to walk in an hour, so the learner is SAC (`mjlab.rl.sac`), and the task is made easier to
+learn, not easier to pass. `docs/guides/learning.md` has the experiments, with the Unitree G1.
+
+- A textbook controller steps in place (`stepping_action`). The controller acts for the first 60 environment
+  steps, and the policy imitates it, with decreasing weight, for the first 1,200 of about 3,000. Without
+  imitation, policies only learn to stand.
+- Actions are bounded, and policies observe a gait clock, Unitree's `gait_phase`, and the last five joint
+  positions, velocities and gravity directions of the base. The history filters noise; without state
+  estimation, it also shows how fast the base moves over its standing foot. Policies keep all three.
+- Rewards define the gait: feet at the height given by the clock and apart from each other, a trunk at constant
+  height and upright, joints near the default pose. The penalties of the task stay.
+- Commands and pushes grow with a curriculum, pushes to 1.3 times those of the task.
+
+Sizes are those of the G1, 0.74 m above its feet while it walks; for other robots, frequencies, heights and
+velocities scale with the height, at the same Froude number. Evaluations, `evaluate` and `play` use the
+task's physics, rewards, commands, pushes, noise and terminations.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mjlab.envs import ManagerBasedRlEnvCfg
+from mjlab.envs import mdp as envs_mdp
+from mjlab.managers import (
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    SceneEntityCfg,
+    TerminationTermCfg,
+)
+from mjlab.rl.config import (
+    RslRlBaseRunnerCfg,
+    RslRlOffPolicyRunnerCfg,
+    RslRlOnPolicyRunnerCfg,
+    squashed_gaussian,
+)
+from mjlab.rl.learners import with_learner
+from mjlab.tasks.easing import grow_difficulty
+from mjlab.tasks.registry import Profile
+from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.velocity_env_cfg import get_sensor
+
+if TYPE_CHECKING:
+    from mjlab.tasks.registry import ProfileEdit
+
+_NUM_ENVS = 1024
+_CLOCK = "gait"
+_TEACHER = "teacher"
+_LINEAR = "linear"
+_HEIGHT = 0.74
+"""Height of the G1's pelvis above its feet while it walks (m)."""
+_STRIDES_PER_SECOND = 1.88
+"""Stride frequency of the G1 (Hz)."""
+# Observations with history, to filter noise.
+_FILTERED = ("base_lin_vel", "base_ang_vel", "projected_gravity", "joint_pos")
+_HISTORY = 5
+# Pushes at full difficulty: size over that of the task, and interval (s). With those of the task (1 to
+# 3 s), 8.5 instead of 5 % of the episodes fall after 2 M steps more.
+_PUSHES, _PUSH_INTERVAL_S = 1.3, (1.0, 2.5)
+_MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Biped:
+    """A biped, for the `cpu` profile."""
+
+    feet: tuple[str, str]
+    """Sites in the soles, the left one first."""
+    height: float
+    """Height of the root above the feet while the robot walks (m)."""
+    minimum_height: float
+    """Height of the root above the feet below which training episodes terminate (m)."""
+    feet_distance: float
+    """Lateral distance of the feet that keeps one from tripping over the other (m)."""
+    bounds: dict[str, float]
+    """Largest offset of a joint target from the default position (rad), by joint name pattern."""
+    pose: dict[str, float]
+    """Weights of squared joint deviations from the default pose, by joint name pattern."""
+    gains: mdp.SteppingGains | None = None
+    """Gains of the stepping controller. None: those of all bipeds."""
+
+    @property
+    def time(self) -> float:
+        """Time of a motion over that of the G1: sqrt(l / g) at the same Froude number."""
+        return math.sqrt(self.height / _HEIGHT)
+
+    @property
+    def soles(self) -> SceneEntityCfg:
+        """The feet, the left one first."""
+        return SceneEntityCfg("robot", site_names=self.feet, preserve_order=True)
+
+
+def cpu_with_stepping(
+    robot: Biped,
+    *,
+    ease: ProfileEdit | None = None,
+    solved_below: dict[str, float],
+    trigger_below: dict[str, float] | None = None,
+    num_episodes: int = 60,
+    first_iteration: int = 80,
+    min_interval: int = 10,
+    mirror: str | None = _MIRROR,
+) -> Profile:
+    """Return the `cpu` profile of a biped.
+
+    Args:
+        robot: The biped.
+        ease: Easing of the robot's own, as in `Profile`; called first.
+        solved_below: Errors (m/s, rad/s), or their shares of those of a robot that stands still, and
+            failure rate below which training stops.
+        trigger_below: Training errors below which an evaluation starts. None: a tenth above `solved_below`,
+            as errors are with exploration and harder pushes.
+        num_episodes: Episodes of an evaluation.
+        first_iteration: First iteration with an evaluation. Before iteration 80, pushes and commands are
+            those of an easy start.
+        min_interval: Iterations between evaluations. One costs two iterations.
+        mirror: Symmetry augmentation function. None for a robot without left and right.
+    """
+
+    if trigger_below is None:
+        trigger_below = {n: 1.1 * e for n, e in solved_below.items() if n != "failure_rate"}
+
+    def set_policy(
+        env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg
+    ) -> RslRlOffPolicyRunnerCfg:
+        """Add the stepping controller, and return the learner config."""
+        _add_stepping(env_cfg, robot)
+        cfg = _learner(rl_cfg, mirror)
+        evaluation = cfg.evaluation
+        evaluation.num_episodes = num_episodes
+        evaluation.first_iteration, evaluation.min_interval = first_iteration, min_interval
+        evaluation.trigger_return = -math.inf
+        evaluation.trigger_below, evaluation.solved_below = dict(trigger_below), dict(solved_below)
+        return cfg
+
+    def ease_all(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
+        env_cfg.scene.num_envs = _NUM_ENVS
+        if ease is not None:
+            ease(env_cfg, rl_cfg)
+        _ease(env_cfg, robot)
+
+    return Profile(set_policy, ease_all)
+
+
+def _add_stepping(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> None:
+    """Bound actions, and add a gait clock, observation history and the stepping controller as teacher."""
+    # As Unitree's `gait_phase`: starts at 0, and always runs.
+    env_cfg.commands[_CLOCK] = mdp.GaitClockCommandCfg(
+        frequency=_STRIDES_PER_SECOND / robot.time, starts=(0.0,), velocity_command_name=None
+    )
+    for group in env_cfg.observations.values():
+        group.terms[_CLOCK] = ObservationTermCfg(
+            func=mdp.generated_commands, params={"command_name": _CLOCK}
+        )
+    actor = env_cfg.observations["actor"]
+    for name in _FILTERED:
+        if name in actor.terms and actor.history_length is None:
+            actor.terms[name].history_length = _HISTORY
+    teacher = ObservationTermCfg(
+        func=mdp.stepping_action, params={"asset_cfg": robot.soles, "gains": robot.gains}
+    )
+    env_cfg.observations[_TEACHER] = ObservationGroupCfg(terms={"step": teacher})
+    env_cfg.actions["joint_pos"] = envs_mdp.JointPositionActionCfg(
+        entity_name="robot", actuator_names=(".*",), scale=dict(robot.bounds)
+    )
+
+
+def _learner(rl_cfg: RslRlOnPolicyRunnerCfg, mirror: str | None) -> RslRlOffPolicyRunnerCfg:
+    cfg = with_learner(rl_cfg, "sac")
+    assert isinstance(cfg, RslRlOffPolicyRunnerCfg)
+    cfg.num_steps_per_env = 25
+    cfg.max_iterations = 400
+    cfg.save_interval = 20
+    cfg.actor.hidden_dims = cfg.critic.hidden_dims = (256, 128, 64)
+    cfg.actor.distribution_cfg = squashed_gaussian(0.15, log_std_max=-1.2)
+    algorithm = cfg.algorithm
+    # Five updates of batch size 2,048 take as long as stepping 1,024 environments; replay ratio: 10.
+    algorithm.num_updates = 5
+    algorithm.replay_steps = 600
+    algorithm.learning_starts = 20
+    # With a shorter horizon (0.97), falls are too far away to matter: four times as many after 7 M steps.
+    algorithm.gamma = 0.985
+    algorithm.value_range = (-10.0, 30.0)
+    algorithm.tau = 0.08
+    algorithm.actor_learning_rate = 1.5e-3
+    algorithm.critic_learning_rate = 6e-4
+    # With constant rates, a policy that walks may fall five times as often 15 iterations later.
+    algorithm.learning_rate_factor = ((1500, 1.0), (2500, 0.3))
+    algorithm.init_alpha = 0.002
+    algorithm.alpha_learning_rate = 1e-2
+    algorithm.alpha_range = (1e-5, 0.05)
+    algorithm.mean_penalty = 0.02
+    algorithm.policy_average = 0.02
+    algorithm.use_mixed_precision = True
+    algorithm.teacher = _TEACHER
+    algorithm.teacher_steps = 60
+    algorithm.imitation = ((100, 2.0), (400, 0.1), (800, 0.1), (1200, 0.0))
+    if mirror is not None:
+        algorithm.symmetry_cfg = {"data_augmentation_func": mirror}
+    return cfg
+
+
+def _ease(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> None:
+    penalties = {n: term for n, term in env_cfg.rewards.items() if term and term.weight < 0.0}
+    env_cfg.rewards = {
+        **_gait_rewards(env_cfg, robot),
+        **penalties,
+        "action_rate_l2": RewardTermCfg(func=envs_mdp.action_rate_l2, weight=-0.5),
+        "dof_pos_limits": RewardTermCfg(func=envs_mdp.joint_pos_limits, weight=-2.5),
+    }
+    push = env_cfg.events.get("push_robot")
+    if push is not None:
+        ranges = push.params["velocity_range"]
+        push.params["velocity_range"] = {
+            axis: (_PUSHES * low, _PUSHES * high) for axis, (low, high) in ranges.items()
+        }
+        push.interval_range_s = _PUSH_INTERVAL_S
+    # Terminate falling robots earlier: the rest of a fall teaches little.
+    env_cfg.terminations["fell_over"].params["limit_angle"] = math.radians(60.0)
+    env_cfg.terminations["sank"] = TerminationTermCfg(
+        func=mdp.root_near_feet,
+        params={"minimum_height": robot.minimum_height, "asset_cfg": robot.soles},
+    )
+    grow_difficulty(
+        env_cfg,
+        _LINEAR,
+        tracking=0.4,
+        survival=0.6,
+        survival_s=6.0,
+        interval=25,
+        command_from=0.6,
+        push_from=0.1,
+        noise_from=1.0,
+    )
+
+
+def _gait_rewards(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> dict[str, RewardTermCfg]:
+    """Return the rewards of the gait. They replace those of the task; its penalties stay."""
+    size, speed, turn = robot.time**2, robot.time, 1.0 / robot.time
+    # Narrow kernels give no gradient at first, wide ones too little in the end.
+    linear = {
+        name: RewardTermCfg(
+            func=mdp.track_linear_velocity,
+            weight=weight,
+            params={"std": std * speed, "command_name": "twist"},
+        )
+        for name, weight, std in (
+            (_LINEAR, 3.0, 0.5),
+            ("linear_wide", 3.0, 1.0),
+            ("linear_narrow", 2.0, 0.25),
+        )
+    }
+    frames = get_sensor(env_cfg, "foot_height_scan").frame
+    return linear | {
+        "angular": RewardTermCfg(
+            func=mdp.track_angular_velocity,
+            weight=6.5,
+            params={"std": 0.5 * turn, "command_name": "twist"},
+        ),
+        "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
+        "feet": RewardTermCfg(
+            func=mdp.feet_height_by_phase,
+            weight=5.0,
+            params={
+                "height_sensor_name": "foot_height_scan",
+                "swing_height": 0.09 * size,
+                "variance": 0.005 * size**2,
+                "offsets": tuple(0.0 if foot.name == robot.feet[0] else 0.5 for foot in frames),
+            },
+        ),
+        "height": RewardTermCfg(
+            func=mdp.root_height_l2,
+            weight=-50.0 / size**2,
+            params={"target_height": robot.height, "asset_cfg": robot.soles},
+        ),
+        "apart": RewardTermCfg(
+            func=mdp.feet_apart_l2,
+            weight=-100.0 / size**2,
+            params={"distance": robot.feet_distance, "asset_cfg": robot.soles},
+        ),
+        "rolling": RewardTermCfg(
+            func=mdp.body_angular_velocity_penalty, weight=-0.5 * robot.time**2
+        ),
+        "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
+        "deviation": RewardTermCfg(
+            func=mdp.weighted_joint_deviation, weight=-0.25, params={"weights": dict(robot.pose)}
+        ),
+        "soles": RewardTermCfg(
+            func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": robot.soles}
+        ),
+    }
