@@ -6,9 +6,9 @@
 The task's `cpu` profile has the controller as the observation `teacher/step`. Every generation tries
 `--population` sets of gains, each in as many environments as there is room for, and scores them by how long the robots
 stand within `--seconds`, less their drift. The best gains are printed whenever they improve; give them to
-`stepping_action` as `gains=SteppingGains(...)`. The defaults, for the G1, come from such a search over 25 gains, first
-without pushes (6 minutes on two cores) and then with 0.3 of them (8 minutes); gains that made no difference were left
-out afterwards.
+`stepping_action`, or to the task's `Biped`, as `gains=SteppingGains(...)`. The defaults come from such a search for the
+G1 over 25 gains, first without pushes (6 minutes on two cores) and then with 0.3 of them (8 minutes); gains that made no
+difference were left out afterwards.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from mjlab.tasks.registry import load_env_cfg
 from mjlab.tasks.velocity import mdp
 
 NAMES = [field.name for field in fields(mdp.SteppingGains)]
-SIZES = np.array(list(asdict(mdp.SteppingGains()).values()))
+START = np.array(list(asdict(mdp.SteppingGains()).values()))
+SIZES = np.where(START == 0.0, 0.1, START)
 """Scales of the gains in the search."""
 
 
@@ -80,7 +81,7 @@ def search(
     best, found = -np.inf, mdp.SteppingGains()
     for generation in range(generations):
         drawn = strategy.ask()
-        tried = SIZES * (1.0 + np.array(drawn))
+        tried = START + SIZES * np.array(drawn)
         values = scores(env, tried, seconds)
         strategy.tell(drawn, list(-values))
         print(

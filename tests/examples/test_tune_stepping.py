@@ -22,7 +22,7 @@ def example():
 
 def test_good_gains_score_more_than_weak_ones(example):
     env = example.make_env("Mjlab-Velocity-Flat-Unitree-G1", 16, 1.88, 0.0)
-    own, weak = example.scores(env, np.array([example.SIZES, 0.1 * example.SIZES]), 2.0)
+    own, weak = example.scores(env, np.array([example.START, 0.1 * example.START]), 2.0)
     env.close()
     assert own > weak
 
@@ -38,5 +38,5 @@ def test_the_search_returns_the_best_gains_that_it_tried(example, monkeypatch, c
     found = example.search(None, population=6, generations=5, seconds=1.0, seed=1)
     gaps = [abs(gains[0] - 0.15) for gains in tried]
     assert len(gaps) == 30
-    assert abs(found.bend - 0.15) == pytest.approx(min(gaps))
+    assert abs(found.lift - 0.15) == pytest.approx(min(gaps))
     assert repr(found) in capsys.readouterr().out

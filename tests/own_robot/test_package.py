@@ -152,6 +152,36 @@ def test_training_stops_at_shares_of_standing_still(tmp_path: Path, imported, le
     assert {"lin_vel_error", "ang_vel_error"} <= rl_cfg.evaluation.standing_still.keys()
 
 
+def test_two_legs_learn_from_steps(tmp_path: Path, imported) -> None:
+    report = describe_robot(RobotModel(legged_spec(2), "robot", "robot", None, None))
+    folder = written(tmp_path / "package", Package("stilts", "velocity", report))
+    task = imported(folder, "stilts.task")
+    cfg, rl_cfg = task.flat_env_cfg(), task.rl_cfg()
+    learner = task.cpu.policy(cfg, rl_cfg)
+    task.cpu.easing(cfg, learner)
+    assert learner.algorithm.teacher in cfg.observations
+    # At the Froude number of the G1.
+    height = imported(folder, "stilts.robot").HEIGHT
+    assert cfg.commands["gait"].frequency == pytest.approx(1.88 * (0.76 / height) ** 0.5, rel=0.01)
+    cfg.scene.num_envs = 2
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    observations, _ = env.reset()
+    mirrored, _ = mirror_left_right(env, TensorDict(observations, batch_size=[2]))
+    assert mirrored["teacher"].shape == (4, 8)
+    knees = [
+        env.action_manager.get_term("joint_pos").target_names.index(n) for n in ("a0_3", "b0_3")
+    ]
+    assert task.BOUNDS == {".*_1": 0.6, ".*_2": 1.0, ".*_3": 1.0, ".*_4": 1.0}
+    bends = []
+    for _ in range(25):
+        observations, *_ = env.step(observations["teacher"].clamp(-1.0, 1.0))
+        bends.append(observations["teacher"][0, knees])
+    left, right = torch.stack(bends).amax(dim=0)
+    assert left > 0.0
+    assert right > 0.0
+    env.close()
+
+
 def test_own_tests_pass(tmp_path: Path, imported) -> None:
     folder = written(tmp_path / "dog_package", quadruped(tmp_path / "model"))
     imported(folder, "dog.task")

@@ -24,7 +24,7 @@ _ALPHA, _BETA, _BEND = (-0.8, 0.8, 13), (-0.6, 0.6, 9), (0.05, 1.0, 8)
 _LEVEL = 0.05
 _ITERATIONS, _LARGEST_STEP, _DAMPING = 20, 0.5, 1e-7
 # Distance of the knee's axis from hip and sole, as a share of their distance: 0.44 on the G1.
-_MIN_KNEE = 0.2
+_MIN_KNEE = 0.25
 # Cosine between the vertical and the axis of the joint that turns a leg.
 _VERTICAL = 0.8
 

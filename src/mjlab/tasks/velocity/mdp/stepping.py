@@ -24,11 +24,11 @@ import torch
 
 from mjlab.envs.mdp.actions import JointPositionAction
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
-from mjlab.tasks.velocity.mdp.gait import require_gait_clock
 from mjlab.rl.exporter_utils import joint_gains
+from mjlab.tasks.velocity.mdp.gait import require_gait_clock
 from mjlab.utils.errors import check_exists
-from mjlab.utils.leg_kinematics import Leg, LegTable, find_legs
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
+from mjlab.utils.leg_kinematics import Leg, LegTable, find_legs
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity, EntityData
@@ -184,9 +184,7 @@ class stepping_action:
             measured = leg.place(data)
             alpha, beta, _ = measured.split(1, dim=1)
             moved = torch.where(swings, x, 0.0)
-            alpha = torch.lerp(
-                alpha, self._rest + g.lead + g.step_forward * forward + pitch, moved
-            )
+            alpha = torch.lerp(alpha, self._rest + g.lead + g.step_forward * forward + pitch, moved)
             beta = torch.lerp(beta, g.step_sideways * left - roll, moved)
             bend = leg.bend + lift * height.clamp(min=0.0)
             q = leg.table(torch.cat((alpha, beta, bend), dim=1))

@@ -20,7 +20,6 @@ task's physics, rewards, commands, pushes, noise and terminations.
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -131,19 +130,18 @@ def cpu_with_stepping(
     ) -> RslRlOffPolicyRunnerCfg:
         """Add the stepping controller, and return the learner config."""
         _add_stepping(env_cfg, robot)
-        cfg = _learner(rl_cfg, mirror)
-        evaluation = cfg.evaluation
-        evaluation.num_episodes = num_episodes
-        evaluation.first_iteration, evaluation.min_interval = first_iteration, min_interval
-        evaluation.trigger_return = -math.inf
-        evaluation.trigger_below, evaluation.solved_below = dict(trigger_below), dict(solved_below)
-        return cfg
+        return _learner(rl_cfg, mirror)
 
     def ease_all(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
         env_cfg.scene.num_envs = _NUM_ENVS
         if ease is not None:
             ease(env_cfg, rl_cfg)
         _ease(env_cfg, robot)
+        evaluation = rl_cfg.evaluation
+        evaluation.num_episodes = num_episodes
+        evaluation.first_iteration, evaluation.min_interval = first_iteration, min_interval
+        evaluation.trigger_return = -math.inf
+        evaluation.trigger_below, evaluation.solved_below = dict(trigger_below), dict(solved_below)
 
     return Profile(set_policy, ease_all)
 
@@ -291,7 +289,5 @@ def _gait_rewards(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> dict[str, Rewa
         "deviation": RewardTermCfg(
             func=mdp.weighted_joint_deviation, weight=-0.25, params={"weights": dict(robot.pose)}
         ),
-        "soles": RewardTermCfg(
-            func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": robot.soles}
-        ),
+        "soles": RewardTermCfg(func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": robot.soles}),
     }
