@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -380,7 +381,7 @@ PLANTS = (
     Plant("no effort limit", "odd", joints("effort", lambda limits: [None] * len(limits)), "other effort limit"),
     Plant("no effort limit, never reached", "g1", joints("effort", lambda limits: [None] * len(limits)), UNDECIDABLE),
 )  # fmt: skip
-"""Numbered list: the causes of `docs/reference/deployment.md`."""
+"""Numbered list of mistakes of deployments, as users reported them."""
 
 NUMBERS = {f"{number}, {plant.mistake}": plant for number, plant in enumerate(PLANTS, 1)}
 
@@ -399,7 +400,35 @@ def test_planted_mistake_is_named(number, traced, tmp_path):
     assert set(report.causes) == {plant.cause}, str(report)
 
 
-@pytest.mark.parametrize("name", ["go1", "g1", "odd"])
-def test_bundle_as_written_passes(name, traced):
-    report = check_bundle(traced(name))
+PAIRS = [(one, other) for one, other in combinations(PLANTS, 2) if one.bundle == other.bundle]
+"""Pairs of mistakes in the same bundle, about 670."""
+
+
+def assert_no_wrong_name(one: Plant, other: Plant, folder: Path) -> None:
+    one.edit(folder)
+    try:
+        other.edit(folder)
+    except AssertionError:
+        # Both edit the same line.
+        return
+    report = check_bundle(folder)
+    assert not report.is_passed
+    assert set(report.causes) <= {one.cause, other.cause}, str(report)
+
+
+@pytest.mark.parametrize("number", range(0, len(PAIRS), 60))
+def test_two_mistakes_give_no_wrong_name(number, traced, tmp_path):
+    one, other = PAIRS[number]
+    assert_no_wrong_name(one, other, copied(traced(one.bundle), tmp_path / "copy"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(7, len(PAIRS), 7))
+def test_more_pairs_give_no_wrong_name(number, traced, tmp_path):
+    one, other = PAIRS[number]
+    assert_no_wrong_name(one, other, copied(traced(one.bundle), tmp_path / "copy"))
+
+
+def test_untrained_bundle_as_written_passes(traced):
+    report = check_bundle(traced("odd"))
     assert report.is_passed, str(report)

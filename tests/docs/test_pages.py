@@ -138,6 +138,7 @@ def test_links_have_a_text_and_lead_to_files_and_headings(page: Path) -> None:
 def _flags_of() -> dict[str, list[object]]:
     """Each command's flags: configs, whose fields they are, and sets of names."""
     from mjlab.scripts.check import CheckConfig
+    from mjlab.scripts.check_deploy import CheckDeployConfig
     from mjlab.scripts.csv_to_npz import CsvToNpzConfig
     from mjlab.scripts.describe import DescribeConfig
     from mjlab.scripts.evaluate import EvaluateConfig
@@ -175,6 +176,7 @@ def _flags_of() -> dict[str, list[object]]:
         "viz-nan": [VizNanConfig()],
         "verify": [VerifyConfig()],
         "check": [CheckConfig()],
+        "check-deploy": [CheckDeployConfig()],
     }
 
 

@@ -29,6 +29,7 @@ import numpy as np
 
 from mjlab.deploy.causes import Verdict, likely_cause
 from mjlab.deploy.evidence import Difference, Evidence, Programs, flat, one_step
+from mjlab.deploy.fitness import fitness_warnings
 from mjlab.utils.errors import UserError
 from mjlab.utils.tables import Table
 
@@ -149,12 +150,14 @@ class Report:
         findings: First differences; empty if the bundle passes.
         undecided: Mistakes that this trace cannot show, one sentence each.
         notes: Other sentences, such as the timing of a log.
+        warnings: What a robot may not measure or follow, one sentence each.
     """
 
     comparisons: list[Comparison]
     findings: list[Finding] = field(default_factory=list)
     undecided: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def is_passed(self) -> bool:
@@ -188,6 +191,8 @@ class Report:
         parts += self.notes
         if self.undecided:
             parts.append("Not decidable by this trace:\n  " + "\n  ".join(self.undecided))
+        if self.warnings:
+            parts.append("For a robot:\n  " + "\n  ".join(self.warnings))
         equal = sum(one.is_equal for one in self.comparisons)
         result = "PASSED" if self.is_passed else "FAILED"
         parts.append(f"{result}: {equal} of {len(self.comparisons)} values equal.")
@@ -212,6 +217,7 @@ class Report:
             ],
             "undecided": self.undecided,
             "notes": self.notes,
+            "warnings": self.warnings,
         }
 
 
@@ -228,7 +234,7 @@ def check_bundle(folder: Path) -> Report:
         programs = Programs.load(folder)
         values = replay(evidence, programs)
     comparisons = compare(evidence, values)
-    report = Report(comparisons, undecided=undecided(evidence))
+    report = Report(comparisons, undecided=undecided(evidence), warnings=fitness_warnings(evidence))
     if not report.is_passed:
         report.findings = find_causes(evidence, comparisons, replay(evidence, programs))
     return report

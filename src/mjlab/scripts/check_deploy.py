@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mjlab.cli.flags import parse_flags
-from mjlab.deploy.check import check_bundle
+from mjlab.deploy.check import Report, check_bundle
 from mjlab.deploy.logs import check_answers, check_log
 from mjlab.utils.errors import UserError
+from mjlab.utils.ranges import Count, Positive
+from mjlab.utils.screen import shown
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,16 @@ class CheckDeployConfig:
     columns."""
     answers: str | None = None
     """Answers of another program to `golden.csv` (CSV) to compare instead."""
+    strict: bool = False
+    """Exit with status 1 after warnings, too."""
+    stress: bool = False
+    """Write a passport: success with latency, noise, friction, other gains and masses, payload, pushes."""
+    output: str = field(default="passport.html", metadata=shown("stress", "FILE"))
+    """Page of the passport; JSON is written beside it."""
+    episodes: Count = field(default=20, metadata=shown("stress", "N"))
+    """Episodes at each level."""
+    seconds: Positive = field(default=6.0, metadata=shown("stress", "S"))
+    """Duration of an episode (s)."""
     json: bool = False
     """Print JSON."""
 
@@ -29,14 +42,35 @@ def command(argv: list[str], prog: str) -> None:
     """Run `check-deploy`; exits with status 1 at a difference."""
     target, *flags = argv
     cfg = parse_flags(CheckDeployConfig, CheckDeployConfig(), flags, f"{prog} FOLDER")
+    report = _report(Path(target), cfg)
+    print(json.dumps(report.as_dict(), indent=2) if cfg.json else report)
+    if cfg.stress:
+        _stress(Path(target), report, cfg)
+    if not report.is_passed or (cfg.strict and report.warnings):
+        raise SystemExit(1)
+
+
+def _report(folder: Path, cfg: CheckDeployConfig) -> Report:
     if cfg.log is not None and cfg.answers is not None:
         raise UserError("check-deploy: expected --log or --answers, got both; use two calls.")
     if cfg.log is not None:
-        report = check_log(Path(target), Path(cfg.log))
-    elif cfg.answers is not None:
-        report = check_answers(Path(target), Path(cfg.answers))
-    else:
-        report = check_bundle(Path(target))
-    print(json.dumps(report.as_dict(), indent=2) if cfg.json else report)
-    if not report.is_passed:
-        raise SystemExit(1)
+        return check_log(folder, Path(cfg.log))
+    if cfg.answers is not None:
+        return check_answers(folder, Path(cfg.answers))
+    return check_bundle(folder)
+
+
+def _stress(folder: Path, report: Report, cfg: CheckDeployConfig) -> None:
+    """Write the passport."""
+    from mjlab.deploy.evidence import Evidence
+    from mjlab.deploy.passport import write_passport
+    from mjlab.deploy.stress import stress
+
+    evidence = Evidence(folder)
+    # Standard output is the report, which may be JSON.
+    curves = stress(
+        evidence, cfg.episodes, cfg.seconds, report=lambda text: print(text, file=sys.stderr)
+    )
+    settings = {"seeds": f"0 to {cfg.episodes - 1}", "seconds": cfg.seconds}
+    write_passport(Path(cfg.output), evidence.contract, report, curves, settings)
+    print(f"Wrote {cfg.output} and {Path(cfg.output).with_suffix('.json')}.", file=sys.stderr)

@@ -1,0 +1,78 @@
+"""Success under stress, the passport, and warnings."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from mjlab.deploy.check import check_bundle
+from mjlab.deploy.evidence import Evidence
+from mjlab.deploy.fitness import fitness_warnings
+from mjlab.deploy.passport import write_passport
+from mjlab.deploy.stress import LEVELS, UNITS, Setting, stress, succeeds
+from mjlab.utils.errors import UserError
+
+
+@pytest.fixture
+def evidence(bundle):
+    return Evidence(bundle("go1"))
+
+
+def test_nominal_robot_stands_and_a_slow_one_falls(evidence):
+    assert succeeds(evidence, Setting(), seed=0, seconds=1.0)
+    assert succeeds(evidence, Setting(noise=1.0, latency=0.01), seed=0, seconds=1.0)
+    assert not succeeds(evidence, Setting(payload=60.0), seed=0, seconds=1.0)
+    assert not succeeds(evidence, Setting(push=12.0), seed=0, seconds=2.5)
+
+
+def test_each_level_changes_the_episodes(evidence):
+    levels = {"gains": (0.05, 1.0), "joint_friction": (0.0, 40.0)}
+    curves = stress(evidence, episodes=1, seconds=0.6, levels=levels)
+    assert [point.level for point in curves["gains"]] == [0.05, 1.0]
+    assert curves["gains"][1].successes == curves["joint_friction"][0].successes == 1
+    assert curves["gains"][0].successes == 0
+    low, high = curves["gains"][1].interval
+    assert low < 1.0
+    assert high == 1.0
+    assert set(LEVELS) == set(UNITS) == set(vars(Setting()))
+
+
+def test_passport_has_checks_and_curves(evidence, tmp_path):
+    report = check_bundle(evidence.folder)
+    curves = stress(evidence, episodes=1, seconds=0.1, levels={"mass": (1.0, 1.2)})
+    write_passport(tmp_path / "p.html", evidence.contract, report, curves, {"seconds": 0.1})
+    content = json.loads((tmp_path / "p.json").read_text())
+    assert content["source"]["task"] == evidence.contract["source"]["task"]
+    assert content["check"]["passed"]
+    assert [one["level"] for one in content["stress"]["curves"]["mass"]] == [1.0, 1.2]
+    page = (tmp_path / "p.html").read_text()
+    assert page.count("<svg") == 1
+    assert "Check: passed" in page
+    assert "mass" in page
+
+
+def test_scans_cannot_be_stressed(bundle):
+    with pytest.raises(UserError, match="does not measure"):
+        stress(Evidence(bundle("Mjlab-Velocity-Rough-Unitree-Go1")), episodes=1, seconds=0.1)
+
+
+# Warnings.
+
+
+def test_warnings_are_of_the_trace(evidence):
+    before = fitness_warnings(evidence)
+    evidence.trace["measurement/joint_vel"] = evidence.values("joint_vel") + np.eye(12)[3] * 99
+    (speed,) = set(fitness_warnings(evidence)) - set(before)
+    assert "1 of 12 joints above limits.joint_speed; most FL_hip_joint, in 100.0 %" in speed
+    evidence.trace["target"] = evidence.trace["target"] + 9.0 * np.arange(45)[:, None]
+    warnings = " ".join(fitness_warnings(evidence))
+    assert "target_step" in warnings
+    assert "target_high" in warnings
+
+
+def test_unmeasured_inputs_are_warned_of(bundle):
+    evidence = Evidence(bundle("Mjlab-Velocity-Rough-Unitree-Go1"))
+    text = " ".join(fitness_warnings(evidence))
+    assert "imu_lin_vel, which base_lin_vel needs" in text
