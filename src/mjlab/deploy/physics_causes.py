@@ -26,23 +26,30 @@ def _is_program(d: Difference, evidence: Evidence) -> bool:
 
 
 def _mistaken(
-    d: Difference, evidence: Evidence, mistake: Callable[[Any], Any]
+    d: Difference, evidence: Evidence, name: str, mistake: Callable[[Any], Any]
 ) -> np.ndarray | None:
     """Return the values of the original simulation with a mistake, a subclass of it."""
     if not _is_program(d, evidence):
         return None
-    simulation = mistake(evidence.originals.simulate.Simulation)
-    return evidence.physics(simulation=simulation).get(d.name)
+    # Controls, torques and states differ together; computed once for all (3.4 to 1.7 s on a Go1).
+    if name not in evidence.memo:
+        simulation = mistake(evidence.originals.simulate.Simulation)
+        evidence.memo[name] = evidence.physics(simulation=simulation)
+    return evidence.memo[name].get(d.name)
 
 
 def _corrected(
-    d: Difference, evidence: Evidence, correct: Callable[[dict, mujoco.MjModel], bool]
+    d: Difference,
+    evidence: Evidence,
+    name: str,
+    correct: Callable[[dict, mujoco.MjModel], bool],
 ) -> np.ndarray | None:
     """Return the values found, plus what is left to the expected ones after a correction."""
-    contract, model = copy.deepcopy(evidence.contract), copy.copy(evidence.model)
-    if not correct(contract, model):
-        return None
-    found = evidence.physics(contract, model).get(d.name)
+    if name not in evidence.memo:
+        contract, model = copy.deepcopy(evidence.contract), copy.copy(evidence.model)
+        is_other = correct(contract, model)
+        evidence.memo[name] = evidence.physics(contract, model) if is_other else {}
+    found = evidence.memo[name].get(d.name)
     return None if found is None else d.got + found - d.expected
 
 
@@ -59,7 +66,7 @@ def joint_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
         return JointOrder
 
-    return _mistaken(d, evidence, mistake)
+    return _mistaken(d, evidence, "joint_order", mistake)
 
 
 def one_step_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
@@ -74,7 +81,7 @@ def one_step_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
         return Late
 
-    return _mistaken(d, evidence, mistake)
+    return _mistaken(d, evidence, "one_step_late", mistake)
 
 
 def one_substep_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
@@ -92,7 +99,7 @@ def one_substep_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
         return Late
 
-    return _mistaken(d, evidence, mistake)
+    return _mistaken(d, evidence, "one_substep_late", mistake)
 
 
 def stale_sensors(d: Difference, evidence: Evidence) -> np.ndarray | None:
@@ -107,7 +114,7 @@ def stale_sensors(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
         return Stale
 
-    return _mistaken(d, evidence, mistake)
+    return _mistaken(d, evidence, "stale_sensors", mistake)
 
 
 def control_rate(d: Difference, evidence: Evidence) -> np.ndarray | None:
@@ -121,10 +128,10 @@ def control_rate(d: Difference, evidence: Evidence) -> np.ndarray | None:
         return is_other
 
     if not _is_program(d, evidence):
-        return _corrected(d, evidence, correct)
+        return _corrected(d, evidence, "control_rate", correct)
     usual = evidence.contract["rates"]["decimation"]
     found = [
-        _mistaken(d, evidence, _with_decimation(steps))
+        _mistaken(d, evidence, f"decimation {steps}", _with_decimation(steps))
         for steps in sorted({1, usual // 2, usual * 2} - {0, usual})
     ]
     known = [one for one in found if one is not None]
@@ -152,7 +159,7 @@ def physics_rate(d: Difference, evidence: Evidence) -> np.ndarray | None:
         model.opt.timestep = contract["rates"]["physics_dt"]
         return is_other
 
-    return _corrected(d, evidence, correct)
+    return _corrected(d, evidence, "physics_rate", correct)
 
 
 def of_joints(
@@ -168,7 +175,7 @@ def of_joints(
                 values[int(model.joint(joint["scene_name"]).dofadr[0]), 0] = joint[field]
             return not np.allclose(before, values, rtol=1e-9, atol=0.0)
 
-        return _corrected(d, evidence, correct)
+        return _corrected(d, evidence, f"joint {field}", correct)
 
     return explain
 
@@ -212,12 +219,12 @@ def _correct_gains(is_order: bool) -> Callable[[dict, mujoco.MjModel], bool]:
 
 def gains(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Other gains."""
-    return _corrected(d, evidence, _correct_gains(False))
+    return _corrected(d, evidence, "gains", _correct_gains(False))
 
 
 def gains_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Gains in another order."""
-    return _corrected(d, evidence, _correct_gains(True))
+    return _corrected(d, evidence, "gains_order", _correct_gains(True))
 
 
 def effort_limit(d: Difference, evidence: Evidence) -> np.ndarray | None:
@@ -238,7 +245,7 @@ def effort_limit(d: Difference, evidence: Evidence) -> np.ndarray | None:
                 changed, joint["effort"] = True, limit
         return changed
 
-    return _corrected(d, evidence, correct)
+    return _corrected(d, evidence, "effort_limit", correct)
 
 
 def _same(one: float | None, other: float | None) -> bool:
