@@ -39,6 +39,20 @@ def test_csv_and_npz_agree(tmp_path: Path) -> None:
         assert getattr(from_csv, name) == pytest.approx(getattr(from_npz, name))
 
 
+def test_short_names(tmp_path: Path) -> None:
+    columns = columns_of("hip", "knee")
+    long = read_log(write_csv(tmp_path / "long.csv", columns))
+    short = {name: f"{signal}." for signal, name in COLUMNS.items()}
+    renamed = {
+        next((s + key.removeprefix(f"{b}.") for b, s in short.items() if key.startswith(b)), key): v
+        for key, v in columns.items()
+    }
+    assert "torque.knee" in renamed
+    same = read_log(write_csv(tmp_path / "short.csv", renamed))
+    for signal in COLUMNS:
+        assert (getattr(same, signal) == getattr(long, signal)).all()
+
+
 def test_velocity_and_torque_are_optional(tmp_path: Path) -> None:
     path = write_csv(tmp_path / "log.csv", columns_of("hip", signals=("target", "position")))
     log = read_log(path)

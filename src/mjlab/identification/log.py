@@ -17,7 +17,8 @@ COLUMNS = {
     "velocity": "measurement.joint_vel",
     "torque": "measurement.joint_torque",
 }
-"""Beginnings of the columns of a joint in CSV, by signal: `target.FL_hip`, as in the tables of `deploy`."""
+"""Beginnings of the columns of a joint in CSV, by signal: `target.FL_hip`, as in the tables of `deploy`.
+The signals themselves, `position.FL_hip`, are short forms."""
 _OPTIONAL = ("velocity", "torque")
 _MIN_SAMPLES = 100
 
@@ -93,6 +94,8 @@ def _read_csv(path: Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, np.nda
     values = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
     signals: dict[str, np.ndarray | None] = {}
     for signal, beginning in COLUMNS.items():
+        if f"{beginning}.{joints[0]}" not in header:
+            beginning = signal
         names = [f"{beginning}.{joint}" for joint in joints]
         missing = [name for name in names if name not in header]
         if not missing:
