@@ -11,7 +11,7 @@ from mjlab.deploy.check import Report
 from mjlab.deploy.stress import UNITS, Point
 from mjlab.utils.string import escaped
 
-_WIDTH, _HEIGHT, _MARGIN = 300, 180, 36
+_WIDTH, _HEIGHT, _MARGIN = 300, 180, 44
 _STYLE = """body{font:15px sans-serif;max-width:1000px;margin:2em auto;padding:0 1em}
 td,th{padding:2px 10px 2px 0;text-align:left}figure{display:inline-block;margin:8px}"""
 
