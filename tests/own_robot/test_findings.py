@@ -269,6 +269,10 @@ def frictionless(robot: Robot) -> None:
     robot.set(robot.foot, condim="1")
 
 
+def sliding(robot: Robot) -> None:
+    robot.set(robot.foot, solimp="0.015 1 0.036")
+
+
 def unnamed(robot: Robot) -> None:
     start = robot.foot
     name = next(name for name, text in robot.files.items() if start in text)
@@ -305,6 +309,7 @@ FAULTS = {
     "nothing collides": immaterial,
     "soles whose friction cannot be randomized": slippery,
     "frictionless soles": frictionless,
+    "soles that slide": sliding,
     "unnamed feet": unnamed,
     "geoms that terrain rays see": visible,
     "static bodies beside a floating base": table,

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjlab.own_robot import geometry
 from mjlab.own_robot.anatomy import Foot
+from mjlab.own_robot.findings import SOFT_SOLE
 from mjlab.own_robot.guess import Guess
 from mjlab.own_robot.python_text import (
     comment_lines,
@@ -358,6 +359,19 @@ def _physics(spec: mujoco.MjSpec) -> list[str]:
     return lines
 
 
+def _soft_soles(report: RobotReport) -> list[str]:
+    """Return lines that make soles as hard as MuJoCo's default if those of the file slide."""
+    model = report.compiled
+    soles = [model.geom(name) for foot in report.anatomy.feet.value for name in foot.sole]
+    softest = min(float(sole.solimp[0]) for sole in soles)
+    if softest >= SOFT_SOLE:
+        return []
+    return [
+        f"    # Softer ones (impedance {number(softest)} in the file) slide without elliptic cones and impratio 100.",
+        "    sole.solref, sole.solimp = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)",
+    ]
+
+
 def _shared_bodies(report: RobotReport) -> list[str]:
     """Return the bodies beside a floating base that can be left out: without joints, not referred to."""
     spec = report.model.spec.copy()
@@ -383,6 +397,7 @@ def _legged_spec(report: RobotReport) -> list[str]:
         "    # Priority: the friction of the sole counts, not that of the ground. condim: there is friction.",
         "    sole.priority, sole.condim = 1, 3",
         f"    sole.friction[0] = {SOLE_FRICTION}  # middle of the range of the event foot_friction",
+        *_soft_soles(report),
         "for name, (body, position) in FOOT_SITES.items():",
         "    spec.body(body).add_site(name=name, pos=position)",
     ]
