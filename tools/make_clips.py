@@ -121,6 +121,23 @@ CLIPS = {
         lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
     ),
 }  # fmt: skip
+# Packages that `mjlab new-robot` writes, installed: trunk and standing height (m).
+_OWN_ROBOTS = {
+    "Aliengo": ("base", 0.337),
+    "Mini-Cheetah": ("base", 0.317),
+    "B2": ("base", 0.467),
+    "Spot": ("body", 0.464),
+    "Hyqreal2": ("base", 0.494),
+    "Go2": ("base", 0.288),
+}
+for _title, (_trunk, _height) in _OWN_ROBOTS.items():
+    _speed = 0.8 * (_height / 0.28) ** 0.5
+    CLIPS[f"own_{_title.lower().replace('-', '_')}"] = Clip(
+        f"Velocity-Flat-{_title}", "cpu",
+        command={"lin_vel_x": (_speed, _speed), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
+        start=2.0, seconds=2.0, body=f"robot/{_trunk}", lookat=(0.0, 0.0, 0.5 * _height),
+        distance=6.0 * _height, azimuth=125.0,
+    )  # fmt: skip
 
 
 @dataclass
