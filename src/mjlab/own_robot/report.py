@@ -216,8 +216,9 @@ def _action_scale(
 ) -> Guess[dict[str, float]]:
     if is_arm:
         ranges = {n: geo.joint_range(model, model.joint(n).id) for n in effort}
-        scale = {n: 0.125 * (high - low) for n, (low, high) in ranges.items()}
-        return Guess(scale, "a quarter of half the range")
+        # As the YAM's, with which 0.25 million steps teach three times as much as with half of it.
+        scale = {n: min(0.25 * (high - low), 1.5) for n, (low, high) in ranges.items()}
+        return Guess(scale, "a quarter of the range, at most 1.5 rad")
     scale = {n: float(np.clip(0.25 * effort[n] / stiffness[n], 0.2, 0.5)) for n in effort}
     return Guess(scale, "0.25 x effort / stiffness, between 0.2 and 0.5 rad")
 

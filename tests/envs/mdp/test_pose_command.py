@@ -105,7 +105,7 @@ def test_uniform_goals_lie_in_their_ranges(make_world: Any) -> None:
 
 def test_goals_without_ranges_can_be_reached(make_world: Any) -> None:
     arm = make_arm(make_world)
-    goals = make_term(arm, num_goals=200).goals
+    goals = make_term(arm, num_goals=200).reachable.poses
     model, data = arm.sim.mj_model, mujoco.MjData(arm.sim.mj_model)
     base, site = model.body("base"), model.site("grasp")
     # The root frame of an entity without free joint is the world's.
@@ -120,6 +120,25 @@ def test_goals_without_ranges_can_be_reached(make_world: Any) -> None:
             if data.ncon == 0:
                 best = min(best, np.abs(data.site("grasp").xpos - goal[:3]).max())
         assert best < 1e-4
+
+
+def test_goals_are_reached_at_their_joint_positions(make_world: Any) -> None:
+    arm = make_arm(make_world)
+    term = make_term(arm, num_goals=50)
+    joints, robot = term.reachable.joint_ids, arm.scene["robot"]
+    joint_pos = robot.data.joint_pos.clone()
+    joint_pos[:, joints] = term.goal_joint_pos + torch.tensor([0.1, -0.2, 0.01])
+    robot.write_joint_state_to_sim(joint_pos, torch.zeros_like(joint_pos))
+    arm.sim.forward()
+    deviation = mdp.goal_joint_deviation_l1(arm, "hand")
+    torch.testing.assert_close(deviation, torch.full((NUM_ENVS,), 0.31))
+    joint_pos[:, joints] = term.goal_joint_pos
+    robot.write_joint_state_to_sim(joint_pos, torch.zeros_like(joint_pos))
+    arm.sim.forward()
+    assert max(error.max() for error in term.errors()) < 1e-3
+    make_term(arm, ranges=RANGES)
+    with pytest.raises(ValueError, match="ranges"):
+        mdp.goal_joint_deviation_l1(arm, "hand")
 
 
 def candidates(goal: np.ndarray, site_quat: np.ndarray) -> list[np.ndarray]:
@@ -145,7 +164,7 @@ def candidates(goal: np.ndarray, site_quat: np.ndarray) -> list[np.ndarray]:
 
 def test_goals_cover_the_middle_of_the_ranges(make_world: Any) -> None:
     arm = make_arm(make_world)
-    narrow, wide = (make_term(arm, joint_range_fraction=f).goals for f in (0.2, 1.0))
+    narrow, wide = (make_term(arm, joint_range_fraction=f).reachable.poses for f in (0.2, 1.0))
     assert narrow[:, :3].std(dim=0).sum() < 0.4 * wide[:, :3].std(dim=0).sum()
     # The palm, of radius 0.04 m and 0.05 m behind the site, stays above the floor.
     assert wide[:, 2].min() > -0.011
@@ -154,11 +173,11 @@ def test_goals_cover_the_middle_of_the_ranges(make_world: Any) -> None:
 def test_goals_follow_the_seed(make_world: Any) -> None:
     arm = make_arm(make_world)
     torch.manual_seed(3)
-    one = make_term(arm, num_goals=10).goals
+    one = make_term(arm, num_goals=10).reachable.poses
     torch.manual_seed(3)
-    other = make_term(arm, num_goals=10).goals
+    other = make_term(arm, num_goals=10).reachable.poses
     assert torch.equal(one, other)
-    assert not torch.equal(one, make_term(arm, num_goals=10).goals)
+    assert not torch.equal(one, make_term(arm, num_goals=10).reachable.poses)
 
 
 @pytest.mark.parametrize(
@@ -209,6 +228,8 @@ def test_errors_of_a_shifted_goal(make_world: Any) -> None:
     torch.testing.assert_close(mdp.orientation_command_error(arm, "hand"), 0.4 * four)
     closeness = mdp.position_command_error_tanh(arm, "hand", std=0.1)
     torch.testing.assert_close(closeness, (1.0 - math.tanh(1.0)) * four)
+    closeness = mdp.orientation_command_error_tanh(arm, "hand", std=0.2)
+    torch.testing.assert_close(closeness, (1.0 - math.tanh(2.0)) * four)
 
 
 def test_the_orientation_error_is_a_metric() -> None:

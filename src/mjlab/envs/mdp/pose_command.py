@@ -11,7 +11,7 @@ import torch
 from mjlab.compat import suggests_fields
 from mjlab.envs.mdp.frames import Frame, FrameType
 from mjlab.envs.mdp.pose_panel import PosePanel
-from mjlab.envs.mdp.reachable_poses import draw_reachable_poses
+from mjlab.envs.mdp.reachable_poses import ReachablePoses, draw_reachable_poses
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.utils.errors import WrongTypeError, check_count, check_in_range
 from mjlab.utils.lab_api.math import (
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 __all__ = [
     "UniformPoseCommand",
     "UniformPoseCommandCfg",
+    "goal_joint_deviation_l1",
     "orientation_command_error",
+    "orientation_command_error_tanh",
     "pose_command_error",
     "position_command_error",
     "position_command_error_tanh",
@@ -112,7 +114,9 @@ class UniformPoseCommand(CommandTerm):
     Attributes:
         pose_command_b: (N, 7) goal in the root frame.
         frame: The commanded frame.
-        goals: (number of goals, 7) reachable poses in the root frame; None with `ranges`.
+        reachable: Goals to choose from, in the root frame, and their joint positions; None with `ranges`.
+        goal_joint_pos: (N, joints) joint positions at which the goal was found (rad or m), zeros with
+            `ranges`. The same pose may be reached at others.
         goal_age: (N,) time since the goal was sampled (s).
         num_ended: (N,) number of goals of the episode that ended, without the current one.
     """
@@ -127,13 +131,13 @@ class UniformPoseCommand(CommandTerm):
         self._entity: Entity = env.scene[cfg.entity_name]
         self.frame = Frame(env.sim, self._entity, cfg.entity_name, cfg.frame_type, cfg.frame_name)
         self._panel: PosePanel | None = None
-        self.goals: torch.Tensor | None = None
+        self.reachable: ReachablePoses | None = None
         if cfg.ranges is None:
             check_in_range(
                 "UniformPoseCommandCfg.joint_range_fraction", cfg.joint_range_fraction, 0, 1
             )
             check_count("UniformPoseCommandCfg.num_goals", cfg.num_goals)
-            self.goals = draw_reachable_poses(
+            self.reachable = draw_reachable_poses(
                 env, self._entity, self.frame, cfg.num_goals, cfg.joint_range_fraction
             )
 
@@ -142,6 +146,8 @@ class UniformPoseCommand(CommandTerm):
 
         self.pose_command_b = zeros(7).T.contiguous()
         self.pose_command_b[:, 3] = 1.0
+        num_joints = 0 if self.reachable is None else self.reachable.joint_pos.shape[1]
+        self.goal_joint_pos = zeros(num_joints).T.contiguous()
         self.goal_age, self.num_ended = zeros(), zeros()
         self._end_sums = zeros(3)
         self.metrics = {
@@ -218,7 +224,12 @@ class UniformPoseCommand(CommandTerm):
             self._end_sums[:, env_ids] * continues + self._current()[:, env_ids] * counts
         )
         self.goal_age[env_ids] = 0.0
-        self.pose_command_b[env_ids] = self._draw(len(env_ids))
+        if self.reachable is None:
+            self.pose_command_b[env_ids] = self._draw(len(env_ids))
+        else:
+            picks = torch.randint(len(self.reachable.poses), (len(env_ids),), device=self.device)
+            self.pose_command_b[env_ids] = self.reachable.poses[picks]
+            self.goal_joint_pos[env_ids] = self.reachable.joint_pos[picks]
 
     def _follow(self, panel: PosePanel) -> None:
         """Move a goal that the user holds to the panel's handle, else the handle to the goal."""
@@ -237,10 +248,7 @@ class UniformPoseCommand(CommandTerm):
         self.time_left[index] = self.cfg.resampling_time_range[1]
 
     def _draw(self, count: int) -> torch.Tensor:
-        """Return goals, (count, 7)."""
-        if self.goals is not None:
-            picks = torch.randint(len(self.goals), (count,), device=self.device)
-            return self.goals[picks]
+        """Return goals within `ranges`, (count, 7)."""
         r = self.cfg.ranges
         assert r is not None
         bounds = (r.pos_x, r.pos_y, r.pos_z, r.roll, r.pitch, r.yaw)
@@ -313,6 +321,32 @@ def position_command_error_tanh(
 def orientation_command_error(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Angle from the frame to its goal (rad). Raises as `pose_command_error`."""
     return pose_command(env, command_name).errors()[1]
+
+
+def orientation_command_error_tanh(
+    env: ManagerBasedRlEnv, command_name: str, std: float
+) -> torch.Tensor:
+    """`1 - tanh(a / std)` of the angle a to the goal (rad). Raises as `pose_command_error`."""
+    return 1.0 - torch.tanh(orientation_command_error(env, command_name) / std)
+
+
+def goal_joint_deviation_l1(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
+    """Sum of the distances of joints from their positions at the goal (rad or m).
+
+    Leads around joint limits and out of postures from which the goal is out of reach.
+
+    Raises:
+        TypeError: the command is not a `UniformPoseCommand`.
+        ValueError: it has `ranges`, so the joint positions at its goals are unknown.
+    """
+    command = pose_command(env, command_name)
+    if command.reachable is None:
+        raise ValueError(
+            f"goal_joint_deviation_l1 command_name: expected a command without ranges, got "
+            f"{command_name!r}; remove the reward, or the ranges."
+        )
+    joint_pos = env.scene[command.cfg.entity_name].data.joint_pos[:, command.reachable.joint_ids]
+    return (joint_pos - command.goal_joint_pos).abs().sum(dim=1)
 
 
 def pose_command(env: ManagerBasedRlEnv, command_name: str) -> UniformPoseCommand:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,10 +22,21 @@ if TYPE_CHECKING:
 _MAX_DRAWS = 50
 
 
+class ReachablePoses(NamedTuple):
+    """Poses, and the joint positions at which they were found."""
+
+    poses: torch.Tensor
+    """Poses of the frame in the root frame of its entity, (count, 7): position, quaternion."""
+    joint_pos: torch.Tensor
+    """Positions of the joints that move the frame, (count, joints) (rad or m)."""
+    joint_ids: torch.Tensor
+    """Columns of these joints in the entity's joint data, (joints,)."""
+
+
 def draw_reachable_poses(
     env: ManagerBasedRlEnv, entity: Entity, frame: Frame, count: int, fraction: float
-) -> torch.Tensor:
-    """Return poses of `frame` in the root frame of `entity`, (count, 7): position, quaternion.
+) -> ReachablePoses:
+    """Draw poses of `frame`.
 
     Joints between root and frame are drawn uniformly from the middle `fraction` of their ranges,
     unlimited ones from a turn; all others stand at their default positions. Poses are rejected if
@@ -37,7 +48,8 @@ def draw_reachable_poses(
     model = env.sim.mj_model
     data = mujoco.MjData(model)
     home = default_qpos(env)
-    joints = _joints_of(model, entity, frame.body)
+    columns = _joints_of(model, entity, frame.body)
+    joints = entity.indexing.joint_ids.cpu().numpy()[columns]
     low, high = joint_bounds(model, joints, fraction)
     adr = model.jnt_qposadr[joints]
     bodies = np.zeros(model.nbody, dtype=bool)
@@ -48,12 +60,12 @@ def draw_reachable_poses(
     # From torch's generator, which the seed of the run governs.
     seed = int(torch.randint(2**31, (1,)))
     rng = np.random.default_rng(seed)
-    poses = np.empty((count, 12))
+    poses, positions = np.empty((count, 12)), np.empty((count, len(joints)))
     found = 0
     for _ in range(_MAX_DRAWS * count):
         data.qpos[adr] = rng.uniform(low, high)
         if _touching(model, data, bodies) <= allowed:
-            poses[found] = _pose_in_root(data, root, frame)
+            poses[found], positions[found] = _pose_in_root(data, root, frame), data.qpos[adr]
             found += 1
             if found == count:
                 break
@@ -65,7 +77,11 @@ def draw_reachable_poses(
     rotation = torch.as_tensor(poses[:, 3:]).view(-1, 3, 3)
     position = torch.as_tensor(poses[:, :3])
     drawn = torch.cat((position, quat_unique(quat_from_matrix(rotation))), dim=1)
-    return drawn.to(env.device, torch.float32)
+    return ReachablePoses(
+        drawn.to(env.device, torch.float32),
+        torch.as_tensor(positions, dtype=torch.float32, device=env.device),
+        torch.as_tensor(columns, device=env.device),
+    )
 
 
 def default_qpos(env: ManagerBasedRlEnv) -> np.ndarray:
@@ -94,12 +110,12 @@ def joint_bounds(
 
 
 def _joints_of(model: mujoco.MjModel, entity: Entity, body: int) -> np.ndarray:
-    """Return the ids of the entity's hinges and slides that move a body."""
+    """Return the columns, in the entity's joint data, of its hinges and slides that move a body."""
     moves = moving_dofs(model)[body]
     scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     joints = [
-        joint
-        for joint in entity.indexing.joint_ids.tolist()
+        column
+        for column, joint in enumerate(entity.indexing.joint_ids.tolist())
         if int(model.jnt_type[joint]) in scalar and moves[model.jnt_dofadr[joint]]
     ]
     if not joints:

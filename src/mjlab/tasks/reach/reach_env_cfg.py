@@ -109,18 +109,27 @@ _EVENTS: dict[str, EventTermCfg] = {
     ),
 }
 
-# The wide rewards lead to the goal, the narrow one to within centimeters.
+# The wide rewards lead to the goal, the narrow ones to within centimeters and a tenth of a radian. Without
+# that of the joints, policies stop at joint limits: 82 instead of 88 % of the YAM's goals.
 _REWARDS: dict[str, RewardTermCfg] = {
     "position": RewardTermCfg(
-        func=mdp.position_command_error, weight=-1.0, params={"command_name": _COMMAND}
+        func=mdp.position_command_error, weight=-4.0, params={"command_name": _COMMAND}
     ),
     "position_narrow": RewardTermCfg(
         func=mdp.position_command_error_tanh,
-        weight=1.0,
-        params={"command_name": _COMMAND, "std": 0.05},
+        weight=2.0,
+        params={"command_name": _COMMAND, "std": 0.1},
     ),
     "orientation": RewardTermCfg(
-        func=mdp.orientation_command_error, weight=-0.3, params={"command_name": _COMMAND}
+        func=mdp.orientation_command_error, weight=-0.6, params={"command_name": _COMMAND}
+    ),
+    "orientation_narrow": RewardTermCfg(
+        func=mdp.orientation_command_error_tanh,
+        weight=1.0,
+        params={"command_name": _COMMAND, "std": 0.3},
+    ),
+    "joints": RewardTermCfg(
+        func=mdp.goal_joint_deviation_l1, weight=-0.3, params={"command_name": _COMMAND}
     ),
     "action_rate_l2": RewardTermCfg(func=mdp.action_rate_l2, weight=-0.005),
     "joint_vel_l2": RewardTermCfg(

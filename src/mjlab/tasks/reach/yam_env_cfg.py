@@ -7,8 +7,9 @@ from mjlab.envs import ManagerBasedRlEnvCfg, mdp
 from mjlab.tasks.reach.reach_env_cfg import make_reach_env_cfg
 
 _ARM = ("joint[1-6]",)
-# All joints reach the goals' joint positions with actions of at most 3.6 (rad per unit action).
-_ACTION_SCALE = 0.7
+# Joint target (rad) per unit action. All joints reach the goals' joint positions with actions of at most
+# 1.7; with 0.7, the first quarter of a million steps teaches a third as much.
+_ACTION_SCALE = 1.5
 
 
 def yam_reach_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
