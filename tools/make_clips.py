@@ -110,12 +110,6 @@ CLIPS = {
         "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0, elevation=-16.0,
         seconds=3.0,
     ),
-    # The package that `mjlab new-robot go2/go2.xml` writes, installed.
-    "own_robot": Clip(
-        "Velocity-Flat-Go2", "cpu",
-        command={"lin_vel_x": (0.8, 0.8), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
-        start=2.0, seconds=2.0, body="robot/base", lookat=(0.0, 0.0, 0.15), distance=1.7, azimuth=125.0,
-    ),
     "g1_tracking": Clip(
         "Mjlab-Tracking-Flat-Unitree-G1", motion="squat", seconds=4.0, body="robot/pelvis",
         lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
@@ -128,7 +122,7 @@ _OWN_ROBOTS = {
     "B2": ("base", 0.467),
     "Spot": ("body", 0.464),
     "Hyqreal2": ("base", 0.494),
-    "Go2": ("base", 0.288),
+    "Go2": ("base", 0.288),  # docs/images/own_robot.webp
 }
 for _title, (_trunk, _height) in _OWN_ROBOTS.items():
     _speed = 0.8 * (_height / 0.28) ** 0.5
