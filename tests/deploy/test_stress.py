@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from mjlab.deploy.check import check_bundle
 from mjlab.deploy.evidence import Evidence
 from mjlab.deploy.fitness import fitness_warnings
 from mjlab.deploy.passport import write_passport
-from mjlab.deploy.stress import LEVELS, UNITS, Setting, stress, succeeds
+from mjlab.deploy.stress import LEVELS, UNITS, Setting, push, stress, succeeds
 from mjlab.utils.errors import UserError
 
 
@@ -39,6 +40,55 @@ def test_each_level_changes_the_episodes(evidence):
     assert set(LEVELS) == set(UNITS) == set(vars(Setting()))
 
 
+def test_commands_are_those_of_the_seed(evidence, monkeypatch):
+    """Neither noise nor pushes change the commands of an episode."""
+    seen: list[list[np.ndarray]] = []
+    policy = evidence.originals.runtime.Policy
+    step = policy.step
+
+    def recorded(self, measurements, command=None):
+        seen[-1] += command.values()
+        return step(self, measurements, command)
+
+    monkeypatch.setattr(policy, "step", recorded)
+    for setting in (Setting(), Setting(noise=1.0), Setting(push=0.1)):
+        seen.append([])
+        assert succeeds(evidence, setting, seed=3, seconds=2.1)
+    nominal, noisy, pushed = map(np.array, seen)
+    assert np.ptp(nominal, axis=0).max() > 0.0
+    assert (noisy == nominal).all()
+    assert (pushed == nominal).all()
+
+
+def test_pushes_are_of_the_robot():
+    """The robot is not the first floating body."""
+    body = '<body name="{0}"><freejoint/><geom size=".1"/></body>'
+    xml = f"<mujoco><worldbody>{body.format('box')}{body.format('robot')}</worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    push(model, data, model.body("robot").id, speed=2.0, heading=np.pi / 2)
+    assert data.qvel == pytest.approx([*[0.0] * 6, 0.0, 2.0, *[0.0] * 4])
+
+
+def test_latency_is_that_simulated(evidence):
+    dt = evidence.contract["rates"]["physics_dt"]
+    levels = {"latency": (0.0, 0.9 * dt, 1.1 * dt, 1.6 * dt)}
+    curves = stress(evidence, episodes=1, seconds=0.1, levels=levels)
+    assert [point.level for point in curves["latency"]] == pytest.approx([0.0, dt, 2 * dt])
+
+
+def test_noise_of_other_packages_is_named(evidence, tmp_path):
+    term = next(t for one in evidence.contract["observations"] for t in one["terms"] if t["noise"])
+    term["noise"] = {"type": "MyNoiseCfg", "operation": "add"}
+    lines: list[str] = []
+    curves = stress(evidence, 1, 0.1, levels={"noise": (1.0,)}, report=lines.append)
+    assert "MyNoiseCfg" in lines[0]
+    assert term["name"] in lines[0]
+    report = check_bundle(evidence.folder)
+    write_passport(tmp_path / "p.html", evidence.contract, report, curves, {})
+    assert "MyNoiseCfg" in (tmp_path / "p.html").read_text()
+
+
 def test_passport_has_checks_and_curves(evidence, tmp_path):
     report = check_bundle(evidence.folder)
     curves = stress(evidence, episodes=1, seconds=0.1, levels={"mass": (1.0, 1.2)})
@@ -54,7 +104,7 @@ def test_passport_has_checks_and_curves(evidence, tmp_path):
 
 
 def test_scans_cannot_be_stressed(bundle):
-    with pytest.raises(UserError, match="does not measure"):
+    with pytest.raises(UserError, match="scans"):
         stress(Evidence(bundle("Mjlab-Velocity-Rough-Unitree-Go1")), episodes=1, seconds=0.1)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mjlab.deploy.check import Report
+from mjlab.deploy.noise import unknown_noises
 from mjlab.deploy.stress import UNITS, Point
 from mjlab.utils.string import escaped
 
@@ -28,6 +29,7 @@ def as_dict(
         "check": report.as_dict(),
         "stress": {
             "settings": dict(settings),
+            "left_out": unknown_noises(contract),
             "curves": {
                 name: [
                     {
@@ -72,6 +74,7 @@ def write_passport(
         "<h2>Not decidable by the trace</h2>",
         _listed(report.undecided or ["Nothing."]),
         "<h2>Success under stress</h2><p>Share of episodes without a fall; bars are 95 % intervals.</p>",
+        _listed(unknown_noises(contract)),
         *(_curve(name, points) for name, points in curves.items()),
         report.table().html(),
     ]

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from mjlab.deploy.evidence import Evidence
+from mjlab.deploy.noise import Noise, unknown_noises
 from mjlab.utils.errors import UserError
 
 _COMMAND_S, _PUSH_S = 2.0, 2.0
@@ -27,9 +28,9 @@ class Setting:
     """Robot and floor of an episode; the defaults are those of the bundle."""
 
     latency: float = 0.0
-    """Time from a measurement to the motors (s)."""
+    """Time from a measurement to the motors (s); simulated as the nearest number of physics steps."""
     noise: float = 0.0
-    """Noise of the terms, as a multiple of training's."""
+    """Change of the terms by noise, as a multiple of training's. Noise of `unknown_noises` is left out."""
     joint_friction: float = 0.0
     """Friction added to each joint (N m)."""
     gains: float = 1.0
@@ -98,20 +99,28 @@ def stress(
 ) -> dict[str, list[Point]]:
     """Return the successes at each level of each field of `Setting`.
 
+    Levels of latency are rounded to physics steps, as they are simulated.
+
     Args:
         evidence: Evidence.
         episodes: Episodes at each level, with seeds from 0.
         seconds: Duration of an episode (s).
         levels: Levels by field.
-        report: Called with a line about each level.
+        report: Called with a line about each level, and each noise that is left out.
 
     Raises:
         UserError: plain MuJoCo cannot supply the measurements, or the base is fixed.
     """
     _check_possible(evidence)
+    for line in unknown_noises(evidence.contract):
+        report(line)
+    physics_dt = evidence.contract["rates"]["physics_dt"]
     curves: dict[str, list[Point]] = {}
     nominal: Point | None = None
     for name, values in levels.items():
+        if name == "latency":
+            steps = dict.fromkeys(_delay(level, physics_dt) for level in values)
+            values = tuple(count * physics_dt for count in steps)
         for level in values:
             setting = replace(Setting(), **{name: level})
             if setting == Setting() and nominal is not None:
@@ -130,39 +139,47 @@ def _check_possible(evidence: Evidence) -> None:
         one["name"] for one in evidence.contract["measurements"] if one["source"]["kind"] == "trace"
     ]
     if traced:
-        raise UserError(f"--stress: plain MuJoCo does not measure {', '.join(traced)}.")
+        raise UserError(
+            "--stress: expected measurements that plain MuJoCo makes, got "
+            f"{', '.join(traced)}; use a task that observes no scans or images."
+        )
     if not evidence.contract["robot"]["is_floating"]:
-        raise UserError("--stress: expected a floating base; falls are what it counts.")
+        raise UserError(
+            "--stress: expected a floating base, which may fall, got a fixed one; use `evaluate`."
+        )
     if not evidence.has_physics:
-        raise UserError("--stress: an actuator has a law that `simulate.py` does not know.")
+        custom = [one["name"] for one in evidence.contract["actuators"] if one["law"] == "custom"]
+        raise UserError(
+            f"--stress: expected actuators whose laws `simulate.py` knows, got {', '.join(custom)}; "
+            "use `evaluate`."
+        )
 
 
 def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) -> bool:
     """Return True if the robot does not fall in an episode."""
-    random = np.random.default_rng(seed)
+    # One generator each: the level of one thing does not change what another draws.
+    noise, commands, pushes = np.random.default_rng(seed).spawn(3)
     contract, model = _changed(evidence, setting)
     runtime = evidence.originals.runtime
     policy = runtime.Policy.load(evidence.folder, limits=False)
     policy.kp, policy.kd = setting.gains * policy.kp, setting.gains * policy.kd
-    _add_noise(policy, setting.noise, random)
+    _add_noise(policy, setting.noise, noise)
     simulation = evidence.originals.simulate.Simulation(contract, model)
     starts = np.flatnonzero(evidence.first)
     start = int(starts[seed % len(starts)])
     simulation.set_state(**evidence.state(start))
     policy.reset(motion=evidence.motion(start))
     rates, data = contract["rates"], simulation.data
-    delay = round(setting.latency / rates["physics_dt"])
+    delay = _delay(setting.latency, rates["physics_dt"])
     limits, root = contract["limits"], model.body(contract["robot"]["root_body"]).id
     lowest = _LOWEST * contract["robot"]["initial_height"]
     held, waiting, step = policy._commanded(policy.default.copy()), [], 0
     command: dict[str, np.ndarray] = {}
     for k in range(round(seconds / policy.period)):
         if k % round(_COMMAND_S / policy.period) == 0:
-            command = _drawn(contract, random)
+            command = _drawn(contract, commands)
         if setting.push and k % round(_PUSH_S / policy.period) == round(1.0 / policy.period):
-            heading = random.uniform(-math.pi, math.pi)
-            data.qvel[:2] += setting.push * np.array((math.cos(heading), math.sin(heading)))
-            mujoco.mj_forward(model, data)
+            push(model, data, root, setting.push, pushes.uniform(-math.pi, math.pi))
         waiting.append((step + delay, policy.step(simulation.measure(), command)))
         for _ in range(rates["decimation"]):
             while waiting and waiting[0][0] <= step:
@@ -175,6 +192,20 @@ def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) ->
         if upright < math.cos(limits["tilt"]) or data.xpos[root, 2] < lowest:
             return False
     return True
+
+
+def push(
+    model: mujoco.MjModel, data: mujoco.MjData, body: int, speed: float, heading: float
+) -> None:
+    """Change the velocity of a floating body by `speed` (m/s), horizontally along `heading` (rad)."""
+    start = int(model.body_dofadr[body])
+    data.qvel[start : start + 2] += speed * np.array((math.cos(heading), math.sin(heading)))
+    mujoco.mj_forward(model, data)
+
+
+def _delay(latency: float, physics_dt: float) -> int:
+    """Return a latency in physics steps."""
+    return round(latency / physics_dt)
 
 
 def _drawn(contract: Mapping[str, Any], random: np.random.Generator) -> dict[str, np.ndarray]:
@@ -191,21 +222,11 @@ def _drawn(contract: Mapping[str, Any], random: np.random.Generator) -> dict[str
 def _add_noise(policy: Any, level: float, random: np.random.Generator) -> None:
     """Add the noise of training to the values of the terms, times `level`."""
 
-    def noisy(function: Callable, noise: Mapping[str, Any]) -> Callable:
-        def value(inputs: Any, term: Any) -> np.ndarray:
-            exact = function(inputs, term)
-            if "n_min" in noise:
-                drawn = random.uniform(noise["n_min"], noise["n_max"], np.shape(exact))
-            else:
-                drawn = random.normal(
-                    noise.get("mean", 0.0), noise.get("std", 0.0), np.shape(exact)
-                )
-            return exact + level * drawn
-
-        return value
+    def noisy(function: Callable, noise: Noise) -> Callable:
+        return lambda inputs, term: noise(function(inputs, term))
 
     policy._terms = [
-        (key, noisy(function, term["noise"]) if term["noise"] and level else function, term, *rest)
+        (key, noisy(function, Noise(term["noise"], level, random)), term, *rest)
         for key, function, term, *rest in policy._terms
     ]
 
