@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from swing import TRUE, link_spec, make_log
 
 from mjlab.identification.estimate import LimbEstimate
 from mjlab.identification.fit import jackknife
+from mjlab.identification.log import JointLog
 from mjlab.identification.plant import KINDS
 from mjlab.identification.robot import Drives, fit_robot
 from mjlab.utils.errors import UserError
@@ -18,6 +21,14 @@ DRIVES = Drives({"hinge0": 25.0}, {"hinge0": 1.3}, {})
 def fit(mass: float, with_torque: bool) -> LimbEstimate:
     spec = link_spec(mass)
     return fit_robot(spec, DRIVES, [make_log(spec, with_torque)])[0]
+
+
+def cut(log: JointLog, seconds: float) -> JointLog:
+    """Return the first seconds of a log."""
+    rows = round(seconds / log.period)
+    signals = {name: getattr(log, name) for name in ("target", "position", "velocity", "torque")}
+    kept = {name: signal[:rows] for name, signal in signals.items() if signal is not None}
+    return dataclasses.replace(log, **kept)
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +72,19 @@ def test_a_bare_rotor_gives_ratios_only() -> None:
 def test_residuals_are_the_noise(with_torque: LimbEstimate) -> None:
     assert with_torque.rms["position"] == pytest.approx(5e-4, rel=0.1)
     assert with_torque.rms["torque"] == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize("seconds", [(0.48,), (5.2,), (3.0, 2.5), (6.0, 1.2)])
+def test_short_logs_are_refused(seconds: tuple[float, ...]) -> None:
+    """Intervals need the settling time of each log, and five windows of a second in all."""
+    with pytest.raises(UserError, match=r"5\.3 s"):
+        fit_robot(link_spec(), DRIVES, [cut(make_log(link_spec(), False), s) for s in seconds])
+
+
+def test_five_windows_are_enough() -> None:
+    spec = link_spec(0.4)
+    limb = fit_robot(spec, DRIVES, [cut(make_log(spec, True), 5.3)])[0]
+    assert all(np.isfinite(e.half_width) for e in limb.drives[0].parameters.values())
 
 
 def test_missing_gains_are_named() -> None:

@@ -88,7 +88,10 @@ def test_joints_are_picked_in_order(tmp_path: Path) -> None:
         (lambda columns: columns.pop("measurement.joint_pos.knee"), "joint_pos.knee"),
         (lambda columns: columns.pop("measurement.joint_torque.knee"), "joint_torque.knee"),
         (lambda columns: columns.update(time=TIME[::-1]), "increasing"),
-        (lambda columns: columns.update({"target.hip": np.full(200, np.nan)}), "finite"),
+        (
+            lambda columns: columns.update({"target.hip": np.full(200, np.nan)}),
+            "target.hip.*finite",
+        ),
     ],
 )
 def test_mistakes(tmp_path: Path, change, named: str) -> None:
@@ -96,3 +99,24 @@ def test_mistakes(tmp_path: Path, change, named: str) -> None:
     change(columns)
     with pytest.raises(UserError, match=named):
         read_log(write_csv(tmp_path / "log.csv", columns))
+
+
+def test_empty_cells_are_named(tmp_path: Path) -> None:
+    """Those of ignored columns are allowed."""
+    path = tmp_path / "log.csv"
+    rows = [f"{t:.2f},1,2," for t in TIME]
+    header = "time,target.hip,position.hip,torque_of_another_joint"
+    path.write_text("\n".join([header, *rows]))
+    assert (read_log(path).position == 2.0).all()
+    rows[16] = "0.16,1,,"
+    path.write_text("\n".join([header, *rows]))
+    with pytest.raises(UserError, match=r"position\.hip.*row 17"):
+        read_log(path)
+
+
+@pytest.mark.parametrize("text", ["", "time,target.hip", "time,target.hip\n0,left", "time\n0,1"])
+def test_files_that_are_no_tables(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=r"log\.csv: expected"):
+        read_log(path)

@@ -14,7 +14,6 @@ Both are tables (CSV) with the columns of `golden.csv`:
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +23,7 @@ import numpy as np
 
 from mjlab.deploy.check import Comparison, Report, compare, find_causes
 from mjlab.deploy.evidence import Evidence
+from mjlab.utils.csv_table import CsvTable
 from mjlab.utils.errors import UserError
 
 _ANSWERS = {"obs": "input/obs", "action": "action", "target": "target"}
@@ -35,39 +35,6 @@ _OTHER_PERIOD = 0.02
 # Longest lag searched for (steps).
 _LONGEST_LAG = 10
 _ENOUGH = 20
-
-
-class CsvTable:
-    """Columns of a CSV file.
-
-    Attributes:
-        path: File.
-        columns: Values by name, (K,). NaN: empty.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Read a file.
-
-        Raises:
-            UserError: the file cannot be read as a table of numbers.
-        """
-        self.path = path
-        try:
-            with path.open(newline="", encoding="utf-8") as file:
-                header, *rows = csv.reader(file)
-            values = np.array([[float(cell or "nan") for cell in row] for row in rows])
-        except (OSError, ValueError) as error:
-            raise UserError(f"{path}: expected a CSV table of numbers ({error}).") from error
-        if not len(values):
-            raise UserError(f"{path}: expected rows below the header, got none.")
-        self.columns = dict(zip((name.strip() for name in header), values.T, strict=True))
-
-    def group(self, name: str, labels: list[str]) -> np.ndarray | None:
-        """Return the columns `name.<label>`, (K, n); None if one is missing."""
-        keys = [f"{name}.{label}" for label in labels]
-        if not keys or any(key not in self.columns for key in keys):
-            return None
-        return np.stack([self.columns[key] for key in keys], axis=1)
 
 
 # Answers.

@@ -25,10 +25,12 @@ _PASSES = 8
 """Most fits, each with the weights that follow from the one before."""
 _SAME_WEIGHTS = 0.05
 """Change of all weights, as a share, below which the fit is not repeated."""
-_SETTLE = 0.3
+SETTLE = 0.3
 """Time at the start that is left out of the residuals (s): the initial state is measured with noise."""
-_WINDOW = 1.0
+WINDOW = 1.0
 """Length of a window (s); errors of the friction are correlated for a fraction of it."""
+LEAST_WINDOWS = 5
+"""Windows that intervals need: fewer tell no spread of the estimates."""
 _REST_FRICTION, _REST_SPEED = 0.4, 0.1
 """Friction of gears at rest above that in motion, as a share of it, and the speed (rad/s or m/s) below
 which it acts: the larger of common values."""
@@ -212,7 +214,7 @@ def _windows(plant: Plant, num_signals: int) -> np.ndarray:
     parts, first = [np.full(plant.size, -1)], 0
     for log in plant.logs:
         rows = len(log.target) - _skipped(log)
-        count = max(1, round(rows * log.period / _WINDOW))
+        count = max(1, round(rows * log.period / WINDOW))
         window = first + np.arange(rows) * count // rows
         parts += [np.repeat(window, len(log.joints))] * num_signals
         first += count
@@ -261,4 +263,4 @@ def _rms(plant: Plant, x: np.ndarray, signals: list[str]) -> dict[str, np.ndarra
 
 
 def _skipped(log: JointLog) -> int:
-    return round(_SETTLE / log.period)
+    return round(SETTLE / log.period)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from mjlab.utils.errors import UserError
+from mjlab.utils.errors import UserError, check_exists
 
 TIMESTEP = 0.002
 """Longest physics timestep (s), of the Runge-Kutta method. First-order methods would add half a
@@ -33,11 +33,8 @@ def split_into_limbs(
     """
     model = spec.compile()
     names = {model.joint(j).name for j in range(model.njnt)}
-    unknown = [joint for joint in joints if joint not in names]
-    if unknown:
-        raise UserError(
-            f"Joints {unknown} of the log: not in the model, which has {sorted(names)}."
-        )
+    for joint in joints:
+        check_exists("joint of the log", joint, sorted(names), UserError)
     limb_of = {name: int(model.dof_treeid[model.joint(name).dofadr[0]]) for name in joints}
     for group in groups:
         merged = {limb_of[name] for name in group}
@@ -96,7 +93,8 @@ def build_limb(hung: mujoco.MjSpec, joints: Sequence[str], period: float) -> muj
     option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     option.disableflags |= int(_PASSIVE)
     limb = spec.compile()
-    # Dry friction of MuJoCo is viscous below a speed, which is to be small: 2 timesteps are its least.
+    # MuJoCo's dry friction is viscous below a speed that grows with the time constant; 2 timesteps is
+    # the smallest time constant that MuJoCo allows.
     limb.dof_solref[:] = 2.0 * option.timestep, 1.0
     limb.dof_solimp[:, :2] = 0.99
     return limb

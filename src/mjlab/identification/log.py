@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from mjlab.utils.csv_table import CsvTable
 from mjlab.utils.errors import UserError
 
 COLUMNS = {
@@ -20,7 +20,6 @@ COLUMNS = {
 """Beginnings of the columns of a joint in CSV, by signal: `target.FL_hip`, as in the tables of `deploy`.
 The signals themselves, `position.FL_hip`, are short forms."""
 _OPTIONAL = ("velocity", "torque")
-_MIN_SAMPLES = 100
 
 
 @dataclass(frozen=True)
@@ -70,28 +69,32 @@ def read_log(path: Path) -> JointLog:
         UserError: not found, a column is missing, or values are not finite.
     """
     if not path.is_file():
-        raise UserError(f"{path}: no such log.")
+        raise UserError(f"{path}: expected a log, got no such file; use a CSV or NPZ file.")
     if path.suffix == ".npz":
         joints, time, signals = _read_npz(path)
     else:
         joints, time, signals = _read_csv(path)
-    values = [time, *(signal for signal in signals.values() if signal is not None)]
-    if len(time) < _MIN_SAMPLES:
-        raise UserError(f"{path}: expected at least {_MIN_SAMPLES} rows, got {len(time)}.")
-    if not all(np.isfinite(value).all() for value in values):
-        raise UserError(f"{path}: expected finite numbers; leave out rows without measurements.")
-    if not (np.diff(time) > 0.0).all():
-        raise UserError(f"{path} time: expected an increasing column.")
+    if len(time) < 2:
+        raise UserError(f"{path}: expected rows, got {len(time)}; use a longer log.")
+    _check_finite(path, "time", time)
+    for name, signal in signals.items():
+        for joint, column in zip(joints, () if signal is None else signal.T, strict=False):
+            _check_finite(path, f"{name}.{joint}", column)
+    late = np.flatnonzero(np.diff(time) <= 0.0)
+    if len(late):
+        raise UserError(
+            f"{path} time: expected an increasing column, got {time[late[0] + 1]:g} after "
+            f"{time[late[0]]:g} s; use a monotonic clock."
+        )
     return _resampled(joints, time, signals)
 
 
 def _read_csv(path: Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, np.ndarray | None]]:
-    with path.open(newline="") as file:
-        header = [name.strip() for name in next(csv.reader(file), [])]
+    table = CsvTable(path)
+    header = list(table.columns)
     joints = tuple(name.removeprefix("target.") for name in header if name.startswith("target."))
     if "time" not in header or not joints:
         raise UserError(f"{path}: expected columns `time` and `target.JOINT`, got {header[:6]}.")
-    values = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
     signals: dict[str, np.ndarray | None] = {}
     for signal, beginning in COLUMNS.items():
         if f"{beginning}.{joints[0]}" not in header:
@@ -99,12 +102,15 @@ def _read_csv(path: Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, np.nda
         names = [f"{beginning}.{joint}" for joint in joints]
         missing = [name for name in names if name not in header]
         if not missing:
-            signals[signal] = values[:, [header.index(name) for name in names]]
+            signals[signal] = table.group(beginning, list(joints))
         elif signal not in _OPTIONAL or len(missing) < len(names):
-            raise UserError(f"{path}: missing columns {missing[:4]}.")
+            raise UserError(
+                f"{path}: expected columns of {signal} for all joints, got none named {missing[:4]}; "
+                "use those names."
+            )
         else:
             signals[signal] = None
-    return joints, values[:, header.index("time")], signals
+    return joints, table.columns["time"], signals
 
 
 def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, np.ndarray | None]]:
@@ -113,7 +119,7 @@ def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, np.nda
             name for name in ("time", "joint_names", "target", "position") if name not in file
         ]
         if missing:
-            raise UserError(f"{path}: missing arrays {missing}.")
+            raise UserError(f"{path}: expected arrays {missing}, got {file.files}.")
         joints = tuple(str(name) for name in file["joint_names"])
         signals = {name: file[name].astype(float) if name in file else None for name in COLUMNS}
         time = file["time"].astype(float)
@@ -122,6 +128,15 @@ def _read_npz(path: Path) -> tuple[tuple[str, ...], np.ndarray, dict[str, np.nda
         if signal is not None and signal.shape != shape:
             raise UserError(f"{path} {name}: expected shape {shape}, got {signal.shape}.")
     return joints, time, signals
+
+
+def _check_finite(path: Path, name: str, column: np.ndarray) -> None:
+    empty = np.flatnonzero(~np.isfinite(column))
+    if len(empty):
+        raise UserError(
+            f"{path} {name}: expected finite numbers, got none in row {empty[0] + 1} ({len(empty)} in "
+            "all); use the rows with measurements only."
+        )
 
 
 def _resampled(

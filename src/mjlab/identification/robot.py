@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjlab.identification.estimate import LimbEstimate, limb_estimate
-from mjlab.identification.fit import fit_limb
+from mjlab.identification.fit import LEAST_WINDOWS, SETTLE, WINDOW, fit_limb
 from mjlab.identification.limb import build_limb, hang, split_into_limbs
 from mjlab.identification.log import JointLog
 from mjlab.identification.plant import KINDS, Plant
@@ -60,20 +60,22 @@ def fit_robot(
         num_threads: Threads of the simulation.
 
     Raises:
-        UserError: joints or rates of the logs differ, or the robot lacks a joint or its gains.
+        UserError: logs are too short, their joints or rates differ, or the robot lacks a joint or its
+            gains.
     """
     first = logs[0]
+    _check_length(logs)
     for log in logs[1:]:
         if log.joints != first.joints or abs(log.period - first.period) > 0.01 * first.period:
             raise UserError(
-                f"Logs: expected the joints and the period of the first ({first.period:.4g} s), got "
-                f"{list(log.joints)} and {log.period:.4g} s; fit them one by one."
+                f"Logs: expected the joints {list(first.joints)} and the period {first.period:.4g} s of the "
+                f"first, got {list(log.joints)} and {log.period:.4g} s; use one call for each."
             )
     missing = [j for j in first.joints if j not in drives.stiffness or j not in drives.damping]
     if missing:
         raise UserError(
-            f"Joints {missing}: the robot has no position-controlled actuators with gains; give the "
-            "commanded gains by --stiffness and --damping."
+            f"Joints {missing}: expected position-controlled actuators with gains, got none in the robot; "
+            "use --stiffness and --damping for the commanded gains."
         )
     groups = _groups(first.joints, shared)
     hung = hang(spec)
@@ -87,6 +89,19 @@ def fit_robot(
     return estimates
 
 
+def _check_length(logs: Sequence[JointLog]) -> None:
+    """Raise unless the logs have the windows that intervals need."""
+    used = [log.duration - SETTLE for log in logs]
+    # A row is the precision of a window.
+    slack = logs[0].period
+    if min(used) < WINDOW - slack or sum(used) < LEAST_WINDOWS * WINDOW - slack:
+        lengths = ", ".join(f"{log.duration:.3g}" for log in logs)
+        raise UserError(
+            f"Logs: expected {SETTLE + LEAST_WINDOWS * WINDOW:g} s of motion or more, got {lengths} s; use "
+            f"longer ones, or several (--more), each of {SETTLE + WINDOW:g} s or more."
+        )
+
+
 def _groups(joints: Sequence[str], shared: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the joints of each pattern, and other joints alone."""
     groups: list[tuple[str, ...]] = []
@@ -96,7 +111,8 @@ def _groups(joints: Sequence[str], shared: Sequence[str]) -> list[tuple[str, ...
         found = tuple(joint for joint in rest if matches(joint))
         if not found:
             raise UserError(
-                f"--share {pattern!r}: no joint of the log matches; it has {list(joints)}."
+                f"--share {pattern!r}: expected to match joints of the log, got none; use names of "
+                f"{list(joints)}."
             )
         groups.append(found)
         rest = [joint for joint in rest if joint not in found]

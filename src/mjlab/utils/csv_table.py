@@ -1,0 +1,44 @@
+"""Tables of numbers in CSV files."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from mjlab.utils.errors import UserError
+
+
+class CsvTable:
+    """Columns of a CSV file.
+
+    Attributes:
+        path: File.
+        columns: Values by name, (K,). NaN: empty.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read a file.
+
+        Raises:
+            UserError: the file cannot be read as a table of numbers.
+        """
+        self.path = path
+        try:
+            with path.open(newline="", encoding="utf-8-sig") as file:
+                header, *rows = csv.reader(file)
+            values = np.array([[float(cell.strip() or "nan") for cell in row] for row in rows])
+            if not len(values):
+                raise UserError(f"{path}: expected rows below the header, got none.")
+            names = (name.strip() for name in header)
+            self.columns: dict[str, np.ndarray] = dict(zip(names, values.T, strict=True))
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path}: expected a CSV table of numbers ({error}).") from error
+
+    def group(self, name: str, labels: list[str]) -> np.ndarray | None:
+        """Return the columns `name.<label>`, (K, n); None if one is missing."""
+        keys = [f"{name}.{label}" for label in labels]
+        if not keys or any(key not in self.columns for key in keys):
+            return None
+        return np.stack([self.columns[key] for key in keys], axis=1)
