@@ -14,6 +14,7 @@ import torch
 from mjlab.entity import EntityCfg
 from mjlab.envs import mdp
 from mjlab.envs.mdp import UniformPoseCommandCfg
+from mjlab.envs.mdp.reachable_poses import joint_bounds
 from mjlab.utils.lab_api.math import (
     quat_apply,
     quat_box_plus,
@@ -139,6 +140,18 @@ def test_goals_are_reached_at_their_joint_positions(make_world: Any) -> None:
     make_term(arm, ranges=RANGES)
     with pytest.raises(ValueError, match="ranges"):
         mdp.goal_joint_deviation_l1(arm, "hand")
+
+
+def test_joints_that_can_turn_go_the_shorter_way() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><compiler angle="radian"/><worldbody><body>
+        <joint range="-6.3 6.3"/><joint axis="0 1 0"/><joint axis="1 0 0" range="-1 1"/>
+        <geom size="0.1"/></body></worldbody></mujoco>"""
+    )
+    low, high, turns = joint_bounds(model, np.arange(3), 0.8, np.array([3.0, 1.0, 0.0]))
+    np.testing.assert_allclose(low, [3.0 - math.pi, 1.0 - math.pi, -0.8])
+    np.testing.assert_allclose(high, [5.04, 1.0 + math.pi, 0.8])
+    assert turns.tolist() == [True, True, False]
 
 
 def candidates(goal: np.ndarray, site_quat: np.ndarray) -> list[np.ndarray]:

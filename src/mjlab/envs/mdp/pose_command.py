@@ -23,6 +23,7 @@ from mjlab.utils.lab_api.math import (
     quat_unique,
     sample_ranges,
     subtract_frame_transforms,
+    wrap_to_pi,
 )
 
 if TYPE_CHECKING:
@@ -333,7 +334,7 @@ def orientation_command_error_tanh(
 def goal_joint_deviation_l1(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Sum of the distances of joints from their positions at the goal (rad or m).
 
-    Leads around joint limits and out of postures from which the goal is out of reach.
+    For joints that can turn by 2 pi or more, the shorter way. Leads around joint limits and out of postures from which the goal is out of reach.
 
     Raises:
         TypeError: the command is not a `UniformPoseCommand`.
@@ -346,7 +347,8 @@ def goal_joint_deviation_l1(env: ManagerBasedRlEnv, command_name: str) -> torch.
             f"{command_name!r}; remove the reward, or the ranges."
         )
     joint_pos = env.scene[command.cfg.entity_name].data.joint_pos[:, command.reachable.joint_ids]
-    return (joint_pos - command.goal_joint_pos).abs().sum(dim=1)
+    deviation = joint_pos - command.goal_joint_pos
+    return torch.where(command.reachable.turns, wrap_to_pi(deviation), deviation).abs().sum(dim=1)
 
 
 def pose_command(env: ManagerBasedRlEnv, command_name: str) -> UniformPoseCommand:

@@ -31,6 +31,8 @@ class ReachablePoses(NamedTuple):
     """Positions of the joints that move the frame, (count, joints) (rad or m)."""
     joint_ids: torch.Tensor
     """Columns of these joints in the entity's joint data, (joints,)."""
+    turns: torch.Tensor
+    """True for joints that can turn by 2 pi or more, so that the pose has several positions, (joints,)."""
 
 
 def draw_reachable_poses(
@@ -38,9 +40,9 @@ def draw_reachable_poses(
 ) -> ReachablePoses:
     """Draw poses of `frame`.
 
-    Joints between root and frame are drawn uniformly from the middle `fraction` of their ranges,
-    unlimited ones from a turn; all others stand at their default positions. Poses are rejected if
-    they put the entity in contact, unless the same two geoms touch in the default pose.
+    Joints between root and frame are drawn uniformly from the middle `fraction` of their ranges, at most
+    half a turn from their default positions; all others stand at these. Poses are rejected if they put
+    the entity in contact, unless the same two geoms touch in the default pose.
 
     Raises:
         ValueError: no joint moves the frame, or hardly a pose is free of contact.
@@ -50,8 +52,8 @@ def draw_reachable_poses(
     home = default_qpos(env)
     columns = _joints_of(model, entity, frame.body)
     joints = entity.indexing.joint_ids.cpu().numpy()[columns]
-    low, high = joint_bounds(model, joints, fraction)
     adr = model.jnt_qposadr[joints]
+    low, high, turns = joint_bounds(model, joints, fraction, home[adr])
     bodies = np.zeros(model.nbody, dtype=bool)
     bodies[entity.indexing.body_ids.cpu().numpy()] = True
     data.qpos[:] = home
@@ -81,6 +83,7 @@ def draw_reachable_poses(
         drawn.to(env.device, torch.float32),
         torch.as_tensor(positions, dtype=torch.float32, device=env.device),
         torch.as_tensor(columns, device=env.device),
+        torch.as_tensor(turns, device=env.device),
     )
 
 
@@ -99,14 +102,21 @@ def default_qpos(env: ManagerBasedRlEnv) -> np.ndarray:
 
 
 def joint_bounds(
-    model: mujoco.MjModel, joints: np.ndarray, fraction: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds of the middle `fraction` of joint ranges; unlimited joints: of a turn."""
-    ranges = np.where(
-        model.jnt_limited[joints, None].astype(bool), model.jnt_range[joints], (-math.pi, math.pi)
-    )
-    middle, half = ranges.mean(axis=1), 0.5 * fraction * np.ptp(ranges, axis=1)
-    return middle - half, middle + half
+    model: mujoco.MjModel, joints: np.ndarray, fraction: float, home: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the bounds (low, high) of the middle `fraction` of joint ranges, and where joints can turn.
+
+    Joints that can turn by 2 pi or more have bounds of at most half a turn from `home`, which give the
+    same poses.
+    """
+    limited = model.jnt_limited[joints].astype(bool)
+    low, high = model.jnt_range[joints].T
+    middle, half = 0.5 * (low + high), 0.5 * fraction * (high - low)
+    is_wide = ~limited | (high - low >= 2.0 * math.pi)
+    half_turn = np.where(is_wide, math.pi, np.inf)
+    low = np.maximum(np.where(limited, middle - half, -np.inf), home - half_turn)
+    high = np.minimum(np.where(limited, middle + half, np.inf), home + half_turn)
+    return low, high, is_wide & (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE)
 
 
 def _joints_of(model: mujoco.MjModel, entity: Entity, body: int) -> np.ndarray:
