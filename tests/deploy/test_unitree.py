@@ -11,6 +11,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
+from bundles import load_program
 
 from mjlab.deploy.unitree import MOTORS, UnknownToUnitreeError, deploy_settings, motor_map
 
@@ -80,8 +81,8 @@ class Reader:
         return np.clip(stick, *np.array(bounds).T)
 
     def gait_phase(self, state, stick, period):
-        angle = 2 * np.pi * self.phase
         self.phase = (self.phase + self.cfg["step_dt"] / period) % 1.0
+        angle = 2 * np.pi * self.phase
         return np.array([np.sin(angle), np.cos(angle)])
 
 
@@ -91,6 +92,11 @@ def test_the_programs_act_as_in_training(bundle, name):
     reader, trace = Reader(folder), dict(np.load(folder / "golden.npz"))
     assert reader.input.name == "obs"
     motors = reader.motors
+    if "gait_phase" in reader.cfg["observations"]:
+        # Their clock is a step ahead of training's.
+        reader.phase = (
+            -reader.cfg["step_dt"] / reader.cfg["observations"]["gait_phase"]["params"]["period"]
+        )
     for k in range(len(trace["time"])):
         assert bool(trace["first"][k]) == (k == 0)
         q, dq = np.empty(len(motors)), np.empty(len(motors))
@@ -129,7 +135,7 @@ def test_breadth_first_joints_of_the_g1():
     assert motor_map([f"{motors[k]}_joint" for k in order]) == order
 
 
-def _with_term(contract: dict, **changes: Any) -> dict:
+def with_term(contract: dict, **changes: Any) -> dict:
     changed = copy.deepcopy(contract)
     changed["observations"][0]["terms"][0].update(changes)
     return changed
@@ -138,9 +144,81 @@ def _with_term(contract: dict, **changes: Any) -> dict:
 def test_unregistered_terms_are_named(bundle):
     contract = json.loads((bundle("go1") / "contract.json").read_text())
     with pytest.raises(UnknownToUnitreeError, match="base_ang_vel"):
-        deploy_settings(_with_term(contract, kind="custom"))
+        deploy_settings(with_term(contract, kind="custom"))
     with pytest.raises(UnknownToUnitreeError, match="base_ang_vel"):
-        deploy_settings(_with_term(contract, columns=[0, 1]))
+        deploy_settings(with_term(contract, columns=[0, 1]))
+
+
+def edited(folder: Path, change: Any) -> dict:
+    contract = json.loads((folder / "contract.json").read_text())
+    change(contract)
+    return contract
+
+
+@pytest.mark.parametrize(
+    ("clip", "written"),
+    [((None, 2.0), [-1e9, 2.0]), ((-3.0, None), [-3.0, 1e9]), ((-3.0, 2.0), [-3.0, 2.0])],
+)
+def test_clip_with_an_open_side(bundle, clip, written):
+    contract = edited(bundle("go1"), lambda c: c["observations"][0]["terms"][0].update(clip=clip))
+    assert deploy_settings(contract)["observations"]["base_ang_vel"]["clip"] == written
+
+
+def test_clip_of_actions_is_refused(bundle):
+    contract = edited(bundle("go1"), lambda c: c["policy"].update(clip=1.0))
+    with pytest.raises(UnknownToUnitreeError, match="actions of the policy"):
+        deploy_settings(contract)
+
+
+@pytest.mark.parametrize("body", ["robot/torso_link", "robot/pelvis"])
+def test_anchor_of_a_motion_is_the_torso(bundle, body):
+    def change(contract: dict) -> None:
+        source = {"kind": "body_quat", "body": body}
+        contract["measurements"].append({"name": "anchor_quat", "source": source})
+        inputs = ["command/motion/anchor_quat", "anchor_quat"]
+        contract["observations"][0]["terms"][0].update(kind="orientation_in_frame", inputs=inputs)
+
+    contract = edited(bundle("g1"), change)
+    if body == "robot/torso_link":
+        assert "motion_anchor_ori_b" in deploy_settings(contract)["observations"]
+    else:
+        with pytest.raises(UnknownToUnitreeError, match="base_ang_vel"):
+            deploy_settings(contract)
+
+
+def test_gait_phase_is_a_step_ahead_of_the_clock(bundle, tmp_path):
+    clock = {
+        "name": "gait",
+        "kind": "gait_clock",
+        "frequency": 1.6,
+        "fade_s": 0.0,
+        "start": 0.0,
+        "velocity_command": None,
+        "components": [{"name": "sin"}, {"name": "cos"}],
+    }
+
+    def change(contract: dict) -> None:
+        contract["commands"].append(clock)
+        term = contract["observations"][0]["terms"][-1]
+        term.update(name="gait", kind="command", size=2, scale=None, inputs=["command/gait"])
+        term.update(start=0, stop=2, columns=None, factor=None, offset=None, clip=None)
+        contract["observations"][0]["terms"] = [term]
+
+    contract = edited(bundle("go1"), change)
+    settings = deploy_settings(contract)
+    reader = Reader(bundle("go1"))
+    reader.cfg = settings
+    params = settings["observations"]["gait_phase"]["params"]
+    policy = load_program(bundle("go1"), "runtime").Policy(
+        contract, lambda outputs, inputs: [np.zeros((1, 12))], limits=False
+    )
+    expected, got = [], []
+    for k in range(60):
+        measured = {"time": 0.02 * k, "joint_pos": np.zeros(12), "joint_vel": np.zeros(12)}
+        policy.step(measured, {"twist": np.zeros(3)})
+        expected.append(policy.values["obs", "gait"])
+        got.append(reader.gait_phase({}, np.zeros(3), **params))
+    np.testing.assert_allclose(got[:-1], expected[1:], atol=1e-5)
 
 
 def test_no_file_for_a_policy_that_cannot_run_there(bundle):

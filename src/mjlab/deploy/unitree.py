@@ -2,6 +2,9 @@
 
 The programs register a fixed set of terms. A policy with another one cannot run there, and the file is then
 not written. Gains are in the order of the motors, everything else in that of the policy.
+
+Their gait phase advances before it is read, in training after: it is ahead of training's by one control step
+since the start, or by two where their reset reads it as well.
 """
 
 from __future__ import annotations
@@ -30,6 +33,9 @@ MOTORS: dict[str, tuple[str, ...]] = {
     ),
 }
 """Joint of each motor, without `_joint`, in the order of the motor commands."""
+_UNBOUNDED = 1e9
+# Body whose orientation the programs compare with the motion's.
+_ANCHOR = "torso_link"
 
 
 class UnknownToUnitreeError(ValueError):
@@ -106,9 +112,11 @@ def _observation(contract: Mapping[str, Any], term: Mapping[str, Any]) -> tuple[
     """Return the programs' name of a term, and its settings."""
     name, params = _registered(contract, term)
     low, high = term["clip"] or (None, None)
+    clip = [-_UNBOUNDED if low is None else low, _UNBOUNDED if high is None else high]
     return name, {
         "params": params,
-        "clip": None if low is None or high is None else [low, high],
+        # A pair or nothing: the programs know no open side.
+        "clip": None if low is None and high is None else clip,
         "scale": np.broadcast_to(term["scale"] or [1.0], term["size"]).tolist(),
         "history_length": max(1, term["history"]["length"]),
     }
@@ -139,7 +147,7 @@ def _registered(contract: Mapping[str, Any], term: Mapping[str, Any]) -> tuple[s
         always = command["kind"] == "gait_clock" and command["velocity_command"] is None
         if always and command["fade_s"] == 0.0 and command["start"] == 0.0:
             return "gait_phase", {"period": 1.0 / command["frequency"]}
-    if kind == "orientation_in_frame" and inputs[0].startswith("command/"):
+    if kind == "orientation_in_frame" and _is_of_anchor(inputs, sources):
         return "motion_anchor_ori_b", {}
     raise UnknownToUnitreeError(f"they do not register the term {term['name']!r}.")
 
@@ -151,6 +159,12 @@ def _is_gyro_of_root(contract: Mapping[str, Any], source: Mapping[str, Any]) -> 
         return source["body"] == root
     has_axes_of_root = source.get("body") == root and source["site_quat"] == [1.0, 0.0, 0.0, 0.0]
     return source.get("type") == "gyro" and has_axes_of_root
+
+
+def _is_of_anchor(inputs: Sequence[str], sources: Mapping[str, Any]) -> bool:
+    """Return True for a motion's orientation in the frame of the torso."""
+    body = sources.get(inputs[1], {}).get("body", "")
+    return inputs[0].startswith("command/") and body.rsplit("/", 1)[-1] == _ANCHOR
 
 
 def _is_velocity(command: Mapping[str, Any]) -> bool:
@@ -174,6 +188,8 @@ def _action(contract: Mapping[str, Any]) -> dict[str, Any]:
         raise UnknownToUnitreeError(
             "they expect one joint position action of all joints, in order."
         )
+    if contract["policy"]["clip"] is not None:
+        raise UnknownToUnitreeError("they do not clip the actions of the policy.")
     if action["clip"] is not None:
         raise UnknownToUnitreeError("they do not clip joint targets.")
     return {
