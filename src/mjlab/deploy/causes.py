@@ -2,7 +2,8 @@
 
 A cause is a function of the expected values, those found and the evidence. It returns the values that
 the mistake would give, NaN where it says nothing, or None where it does not apply. `likely_cause` names one only if
-it brings the residual within tolerance and all others of its kind leave ten times more.
+it brings the residual within tolerance, and if all others with as little freedom leave ten times more. Those
+with more fitted numbers do not count: they explain all that simpler ones explain.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from mjlab.deploy.evidence import Difference, Evidence, flat, rotations
 
 
 def period(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Other control period than that of the trace."""
+    """Return the period found: another one than that of the trace."""
     return d.got
 
 
@@ -25,56 +25,56 @@ def period(d: Difference, evidence: Evidence) -> np.ndarray:
 
 
 def sign(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Opposite sign."""
+    """Return values of the opposite sign."""
     return -d.expected
 
 
 def nothing(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Always zero."""
+    """Return zeros."""
     return np.zeros_like(d.expected)
 
 
 def late(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Value of the step before."""
+    """Return the values of the step before."""
     return evidence.previous(d.expected)
 
 
 def early(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Value of the next step."""
+    """Return the values of the next step."""
     return evidence.previous(d.expected, -1)
 
 
 def degrees(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Degrees for radians."""
+    """Return degrees for radians."""
     return np.degrees(d.expected)
 
 
 def one_scale(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """One factor on all components."""
+    """Return the values times the factor that fits best."""
     e = d.expected
     square = (e * e).sum()
     return None if square == 0.0 else (e * d.got).sum() / square * e
 
 
 def some_signs(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Opposite sign of some components."""
+    """Return the values with opposite sign of some components."""
     signs = np.where((d.expected * d.got).sum(axis=0) < 0.0, -1.0, 1.0)
     return None if d.expected.shape[1] == 1 else signs * d.expected
 
 
 def scales(d: Difference, evidence: Evidence) -> np.ndarray:
-    """One factor a component."""
+    """Return the values times the factor of each component that fits best."""
     square = np.maximum((d.expected**2).sum(axis=0), 1e-30)
     return (d.expected * d.got).sum(axis=0) / square * d.expected
 
 
 def offsets(d: Difference, evidence: Evidence) -> np.ndarray:
-    """A constant added to each component."""
+    """Return the values plus a constant for each component."""
     return d.expected + np.median(d.got - d.expected, axis=0)
 
 
 def order(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Components in another order, of the values or of the measurement they are computed from."""
+    """Return components in another order, of the values or of the measurement they are computed from."""
     if d.expected.shape[1] < 2:
         return None
     explained, term = _reordered(d.expected, d.got), _term(d, evidence)
@@ -102,7 +102,7 @@ def _reordered(expected: np.ndarray, got: np.ndarray) -> np.ndarray:
 
 
 def turned(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Vector in the axes of another frame, turned by a constant rotation."""
+    """Return vectors turned by the constant rotation that fits best."""
     if d.expected.shape[1] != 3:
         return None
     u, _, v = np.linalg.svd(d.got.T @ d.expected)
@@ -111,14 +111,14 @@ def turned(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def bounded(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Clip at one lowest and one highest value."""
+    """Return the values between one lowest and one highest value."""
     low, high = d.got.min(), d.got.max()
     inside = (d.expected > low) & (d.expected < high)
     return d.expected.clip(low, high) if inside.mean() > 0.1 else None
 
 
 def bounded_each(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Clip of each component at its own lowest and highest value."""
+    """Return the values between the lowest and highest value of each component."""
     low, high = d.got.min(axis=0), d.got.max(axis=0)
     inside = (d.expected > low) & (d.expected < high)
     return d.expected.clip(low, high) if inside.mean() > 0.1 else None
@@ -128,17 +128,17 @@ def bounded_each(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def quaternion_cycle(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Quaternion (x, y, z, w) for (w, x, y, z)."""
+    """Return values of a quaternion (x, y, z, w) read as (w, x, y, z)."""
     return _quaternion(d, evidence, lambda q: q[:, [1, 2, 3, 0]])
 
 
 def quaternion_cycle_back(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Quaternion (z, w, x, y) order: shifted the other way."""
+    """Return values of a quaternion (w, x, y, z) read as (x, y, z, w)."""
     return _quaternion(d, evidence, lambda q: q[:, [3, 0, 1, 2]])
 
 
 def conjugate(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Inverse rotation: R for R', or the conjugate quaternion."""
+    """Return values of the inverse rotation: R for R', or the conjugate quaternion."""
     return _quaternion(d, evidence, lambda q: q * [1.0, -1.0, -1.0, -1.0])
 
 
@@ -156,21 +156,21 @@ def _quaternion(
 
 
 def to_world(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Vector in world axes, not in those of the body."""
+    """Return vectors in world axes, not in those of the body."""
     if d.expected.shape[1] != 3:
         return None
     return np.einsum("kij,kj->ki", evidence.root_rotation, d.expected)
 
 
 def to_body(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Vector turned into the axes of the body once too often."""
+    """Return vectors turned into the axes of the body once too often."""
     if d.expected.shape[1] != 3:
         return None
     return np.einsum("kji,kj->ki", evidence.root_rotation, d.expected)
 
 
 def other_link(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """IMU, or origin of the velocity, on another link."""
+    """Return the IMU, or the velocity, of the link that fits best."""
     if not evidence.has_states:
         return None
     quats, velocities = evidence.bodies
@@ -201,7 +201,7 @@ def _term(d: Difference, evidence: Evidence) -> dict[str, Any] | None:
 
 
 def default_kept(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Default pose not subtracted."""
+    """Return joint positions without the default pose subtracted."""
     term = _term(d, evidence)
     if term is None or term["kind"] != "reading":
         return None
@@ -210,7 +210,7 @@ def default_kept(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def processed_action(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Joint targets of the step before, not the network's last answer."""
+    """Return the joint targets of the step before, not the network's last answer."""
     # Of the program itself: its answers to wrong last actions are other ones.
     targets = (evidence.found.get("target", evidence.trace["target"]), evidence.trace["target"])
     tried = [_of_last_action(d, evidence, values) for values in targets]
@@ -219,7 +219,7 @@ def processed_action(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def scaled_action(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Last action after scale, without offset."""
+    """Return the last action after scale, without offset."""
     scale, _ = _scale_and_offset(evidence)
     action = evidence.trace["action"]
     return _of_last_action(d, evidence, action * scale if len(scale) == action.shape[1] else action)
@@ -257,7 +257,7 @@ def _newest(d: Difference, evidence: Evidence) -> tuple[np.ndarray, int] | None:
 
 
 def newest_first(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """History with the newest value first."""
+    """Return histories with the newest value first."""
     found = _newest(d, evidence)
     if found is None or found[1] < 2:
         return None
@@ -265,7 +265,7 @@ def newest_first(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def by_component(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """History by component, not by step."""
+    """Return histories by component, not by step."""
     found = _newest(d, evidence)
     if found is None or found[1] < 2 or found[0].shape[1] < 2:
         return None
@@ -273,7 +273,7 @@ def by_component(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def from_zeros(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """History that starts with zeros."""
+    """Return histories that start with zeros."""
     found = _newest(d, evidence)
     if found is None or found[1] < 2:
         return None
@@ -323,7 +323,7 @@ def _clip(d: Difference, evidence: Evidence) -> _Clip | None:
 
 
 def not_clipped(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Clip left out."""
+    """Return values without the clip."""
     clip = _clip(d, evidence)
     if clip is None or not clip.is_clipped:
         return None
@@ -331,7 +331,7 @@ def not_clipped(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def clipped_last(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Clip after scale, not before."""
+    """Return values clipped after scale, not before."""
     clip = _clip(d, evidence)
     if clip is None or not clip.is_clipped or np.allclose(clip.scale, 1.0):
         return None
@@ -340,7 +340,7 @@ def clipped_last(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def not_scaled(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Scale left out."""
+    """Return values without the scale."""
     clip = _clip(d, evidence)
     if clip is None or np.allclose(clip.scale, 1.0):
         return None
@@ -357,7 +357,7 @@ def _terms_of(d: Difference, evidence: Evidence) -> dict[str, np.ndarray]:
 
 
 def term_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Terms in another order."""
+    """Return inputs with the terms in another order."""
     parts = _terms_of(d, evidence)
     if len(parts) < 2 or sum(p.shape[1] for p in parts.values()) != d.got.shape[1]:
         return None
@@ -377,7 +377,7 @@ def term_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def by_frame(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """History of whole observations: one step of all terms after another."""
+    """Return the history of whole observations: one step of all terms after another."""
     parts = _terms_of(d, evidence)
     input_name = d.name.removeprefix("input/")
     lengths, steps, single = set(), [], []
@@ -400,12 +400,12 @@ def by_frame(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def other_network(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """`policy.onnx` is not the network of the trace: another checkpoint, or without its normalizer."""
+    """Return the answers of `policy.onnx` where it is not the network of the trace."""
     return None if _is_network(evidence) else evidence.answers()
 
 
 def no_normalizer(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Normalizer left out."""
+    """Return the answers without the normalizer."""
     if evidence.normalizer is None or not _is_network(evidence):
         return None
     mean, std = evidence.normalizer
@@ -413,7 +413,7 @@ def no_normalizer(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def normalized_twice(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Normalizer applied twice; the network already has it."""
+    """Return the answers with the normalizer applied twice; the network already has it."""
     if evidence.normalizer is None or not _is_network(evidence):
         return None
     mean, std = evidence.normalizer
@@ -421,12 +421,12 @@ def normalized_twice(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def no_memory(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Memory of the recurrent network not fed back."""
+    """Return the answers of the recurrent network without its memory fed back."""
     return evidence.answers(memory="cleared") if _has_memory(evidence) else None
 
 
 def memory_kept(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Memory of the recurrent network not cleared at the start of an episode."""
+    """Return the answers of the recurrent network with its memory kept at the start of an episode."""
     return evidence.answers(memory="not reset") if _has_memory(evidence) else None
 
 
@@ -462,7 +462,7 @@ def _scale_and_offset(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def target_scale(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """One other action scale for all joints."""
+    """Return targets with one other action scale for all joints."""
     _, offset = _scale_and_offset(evidence)
     moved = d.expected - offset
     square = (moved * moved).sum()
@@ -470,7 +470,7 @@ def target_scale(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def target_scales(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Another action scale of some joints."""
+    """Return targets with another action scale of some joints."""
     _, offset = _scale_and_offset(evidence)
     moved = d.expected - offset
     square = np.maximum((moved * moved).sum(axis=0), 1e-30)
@@ -478,25 +478,25 @@ def target_scales(d: Difference, evidence: Evidence) -> np.ndarray:
 
 
 def no_offset(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Default pose not added to the scaled action."""
+    """Return targets without the default pose added."""
     return d.expected - _scale_and_offset(evidence)[1]
 
 
 def raw_action(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Answer of the network taken as the target, without scale and offset."""
+    """Return the answer of the network as the target, without scale and offset."""
     action = evidence.trace["action"].astype(float)
     return action if action.shape == d.got.shape else None
 
 
 def joint_range(d: Difference, evidence: Evidence) -> np.ndarray:
-    """Targets clipped to the range of the joints."""
+    """Return targets clipped to the range of the joints."""
     ranges = {one["name"]: one["range"] or (-np.inf, np.inf) for one in evidence.contract["joints"]}
     low, high = np.array([ranges.get(j, (-np.inf, np.inf)) for j in evidence.target_joints]).T
     return d.expected.clip(low, high)
 
 
 def target_not_clipped(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Clip of the targets left out."""
+    """Return targets without their clip."""
     action, free = evidence.trace["action"].astype(float), d.expected.copy()
     for entry in evidence.contract["actions"]:
         if "scale" in entry:
