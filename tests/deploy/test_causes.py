@@ -416,7 +416,13 @@ def assert_no_wrong_name(one: Plant, other: Plant, folder: Path) -> None:
     assert set(report.causes) <= {one.cause, other.cause}, str(report)
 
 
-@pytest.mark.parametrize("number", range(0, len(PAIRS), 60))
+SOME = [
+    pytest.param(number, marks=() if number % 180 == 0 else pytest.mark.slow)
+    for number in range(0, len(PAIRS), 60)
+]
+
+
+@pytest.mark.parametrize("number", SOME)
 def test_two_mistakes_give_no_wrong_name(number, traced, tmp_path):
     one, other = PAIRS[number]
     assert_no_wrong_name(one, other, copied(traced(one.bundle), tmp_path / "copy"))

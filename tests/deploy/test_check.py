@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from mjlab.deploy.check import TOLERANCES, check_bundle
+from mjlab.deploy.check import TOLERANCES, check_bundle, undecided
+from mjlab.deploy.evidence import Evidence
+from mjlab.deploy.fitness import fitness_warnings
 from mjlab.utils.errors import UserError
 
 BUNDLES = (
@@ -32,20 +38,34 @@ def test_bundle_as_written_passes(bundle, name):
     assert {one.stage for one in report.comparisons} == set(TOLERANCES)
 
 
-def test_report_says_where_and_why(bundle, tmp_path):
-    folder = tmp_path / "bundle"
-    folder.mkdir()
-    for path in bundle("go1").iterdir():
-        (folder / path.name).symlink_to(path)
+@pytest.fixture
+def folder(bundle, tmp_path) -> Path:
+    """Return a copy of the Go1's bundle."""
+    return Path(shutil.copytree(bundle("go1"), tmp_path / "bundle"))
+
+
+def term_of(content: dict[str, Any], name: str) -> dict[str, Any]:
+    return next(one for one in content["observations"][0]["terms"] if one["name"] == name)
+
+
+def edit_contract(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
     content = json.loads((folder / "contract.json").read_text())
-    terms = content["observations"][0]["terms"]
-    next(term for term in terms if term["name"] == "joint_pos")["offset"] = None
-    (folder / "contract.json").unlink()
+    change(content)
     (folder / "contract.json").write_text(json.dumps(content))
+
+
+def edit_program(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def test_report_says_where_and_why(folder):
+    edit_contract(folder, lambda content: term_of(content, "joint_pos").update(offset=None))
     report = check_bundle(folder)
-    assert "term, raw/obs/joint_pos: first difference in step 0, " in str(report)
+    assert "raw/obs/joint_pos" in str(report)
     assert "_calf_joint" in str(report)
-    assert "Likely cause: default pose not subtracted." in str(report)
+    assert report.causes == ["default pose not subtracted"]
     (finding,) = report.as_dict()["findings"]
     assert finding["stage"] == "term"
     assert finding["cause"] == "default pose not subtracted"
@@ -54,12 +74,41 @@ def test_report_says_where_and_why(bundle, tmp_path):
     assert equal >= {"sensors", "torque", "state", "next sensors"}
 
 
-def test_program_that_raises_is_named(bundle, tmp_path):
-    folder = tmp_path / "bundle"
-    folder.mkdir()
-    for path in bundle("go1").iterdir():
-        (folder / path.name).symlink_to(path)
-    (folder / "runtime.py").unlink()
+def test_formula_of_the_user_is_known_to_the_causes(folder):
+    function = "my_package.mdp:speeds"
+    edit_contract(
+        folder,
+        lambda content: term_of(content, "joint_vel").update(kind="custom", function=function),
+    )
+    program = folder / "runtime.py"
+    program.write_text(f"{program.read_text()}\nTERMS['{function}'] = lambda i, term: i[0]\n")
+    assert check_bundle(folder).is_passed
+    edit_program(program, "-rotation(i[0])[2]", "rotation(i[0])[2]")
+    assert check_bundle(folder).causes == ["opposite sign"]
+
+
+def test_sensor_that_is_left_out_differs(folder):
+    edit_program(
+        folder / "simulate.py",
+        """if source["kind"] != "trace":""",
+        """if measurement["name"] != "imu_ang_vel":""",
+    )
+    report = check_bundle(folder)
+    wrong = {one.name for one in report.comparisons if not one.is_equal}
+    assert "measurement/imu_ang_vel" in wrong
+    assert {one.comparison.name for one in report.findings} == {"measurement/imu_ang_vel"}
+
+
+def test_limits_of_geared_actuators_are_torques(bundle):
+    evidence = Evidence(bundle("go1"))
+    before = fitness_warnings(evidence), undecided(evidence)
+    evidence = Evidence(bundle("go1"))
+    evidence.model.actuator_gear[:, 0] *= 10.0
+    evidence.trace["actuator_force"] = evidence.trace["actuator_force"] / 10.0
+    assert (fitness_warnings(evidence), undecided(evidence)) == before
+
+
+def test_program_that_raises_is_named(folder):
     (folder / "runtime.py").write_text("import no_such_module\n")
     with pytest.raises(UserError, match="no_such_module"):
         check_bundle(folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,7 +63,9 @@ def part(columns: Columns, start: int, stop: int) -> list[str]:
 def test_golden_table_is_a_log_without_differences(log_of, name):
     report = log_of(lambda columns: None, name)
     assert report.is_passed, str(report)
-    assert {one.stage for one in report.comparisons} == {"history", "vector", "action", "target"}
+    stages = {one.stage for one in report.comparisons}
+    assert stages == {"rates", "history", "vector", "action", "target"}
+    assert all(one.num_rows == len(one.expected) for one in report.comparisons)
     assert any(note.startswith("sensors, torque") for note in report.undecided)
     assert "median 20.00 ms" in " ".join(report.notes)
 
@@ -108,8 +111,10 @@ def test_late_targets_are_named(log_of):
 
 def test_period_of_a_log(log_of):
     slow = log_of(in_place("time", lambda x: 1.25 * x))
-    assert "25.00 ms" in slow.notes[0]
-    assert any("other control rate" in note for note in slow.notes)
+    assert not slow.is_passed
+    assert slow.causes == ["other control rate"]
+    assert slow.findings[0].comparison.stage == "rates"
+    assert log_of(in_place("time", lambda x: 1.01 * x)).is_passed
 
 
 def test_missing_columns_are_named(log_of):
@@ -124,7 +129,67 @@ def test_missing_columns_are_named(log_of):
     assert report.is_passed
 
 
+@pytest.mark.parametrize("kept", [("time",), ("time", "measurement"), ("time", "target")])
+def test_log_that_decides_nothing_is_refused(log_of, kept):
+    def drop(columns: Columns) -> None:
+        for name in [name for name in columns if name.split(".")[0] not in kept]:
+            del columns[name]
+
+    with pytest.raises(UserError, match="expected"):
+        log_of(drop)
+
+
+def test_motion_of_an_episode(bundle, tmp_path):
+    folder = bundle("Mjlab-Tracking-Flat-Unitree-G1")
+    columns, path = golden(folder), tmp_path / "log.csv"
+    first, second = json.loads((folder / "contract.json").read_text())["golden"]["episodes"]
+    assert first["motion"] != second["motion"]
+    # With `step`, the motions are those of the golden trace.
+    assert check_log(folder, written(path, columns)).is_passed
+    step = columns.pop("step")
+    assert not check_log(folder, written(path, columns)).is_passed
+    columns["motion"] = np.where(step < second["row"], first["motion"], second["motion"])
+    assert check_log(folder, written(path, columns)).is_passed
+    columns["motion"] = columns["motion"] + 10
+    with pytest.raises(UserError, match="motion"):
+        check_log(folder, written(path, columns))
+
+
 # Answers.
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_answers_that_are_not_finite_differ(bundle, tmp_path, value):
+    folder = bundle("go1")
+    columns = golden(folder)
+    answers = {k: v for k, v in columns.items() if k.split(".")[0] in ("obs", "action")}
+    for name in part(answers, 0, 3):
+        answers[name][7] = value
+    report = check_answers(folder, written(tmp_path / "a.csv", answers))
+    assert not report.is_passed
+    assert all(one.num_rows == len(one.expected) for one in report.comparisons)
+    wrong = [one for one in report.comparisons if not one.is_equal]
+    assert {one.name for one in wrong} == {"term/obs/base_ang_vel", "input/obs"}
+    assert {one.first[0] for one in wrong} == {7}
+
+
+def test_empty_cells_are_not_compared(bundle, tmp_path):
+    folder = bundle("go1")
+    answers = {k: v for k, v in golden(folder).items() if k.startswith("action")}
+    header, *rows = written(tmp_path / "a.csv", answers).read_text().splitlines()
+    rows[3] = "," * (len(answers) - 1)
+    (tmp_path / "a.csv").write_text("\n".join([header, *rows]))
+    (action,) = check_answers(folder, tmp_path / "a.csv").comparisons
+    assert action.num_rows == len(rows) - 1
+    assert action.is_equal
+    (tmp_path / "a.csv").write_text("\n".join([header, *[rows[3]] * len(rows)]))
+    assert not check_answers(folder, tmp_path / "a.csv").is_passed
+
+
+@pytest.mark.parametrize("check", [check_answers, check_log])
+def test_folder_without_a_contract(tmp_path, check):
+    with pytest.raises(UserError, match=r"contract\.json"):
+        check(tmp_path, tmp_path / "a.csv")
 
 
 def test_answers_of_another_program(bundle, tmp_path):

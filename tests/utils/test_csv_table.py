@@ -21,6 +21,9 @@ def test_columns_by_name(tmp_path: Path) -> None:
     assert group is not None
     assert group[0].tolist() == [2.0, 1.0]
     assert np.isnan(group[1, 1])
+    assert table.empty["q.a"].tolist() == [False, True]
+    path.write_text("a\nnan\n")
+    assert not CsvTable(path).empty["a"][0]
     assert table.group("q", ["a", "c"]) is None
 
 

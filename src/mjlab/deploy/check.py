@@ -69,6 +69,7 @@ class Comparison:
         expected: Values of the trace, (K, n). NaN: unknown.
         got: Values of the programs, (K, n).
         labels: Name of each component.
+        bound: Largest difference that is none; None: that of the stage.
     """
 
     stage: str
@@ -76,6 +77,7 @@ class Comparison:
     expected: np.ndarray
     got: np.ndarray
     labels: list[str]
+    bound: float | None = None
 
     @property
     def span(self) -> float:
@@ -86,7 +88,12 @@ class Comparison:
     @property
     def tolerance(self) -> float:
         """Largest difference that is none."""
-        return TOLERANCES[self.stage] * self.span
+        return TOLERANCES[self.stage] * self.span if self.bound is None else self.bound
+
+    @property
+    def num_rows(self) -> int:
+        """Number of rows with a value to compare with."""
+        return int(np.isfinite(self.expected).any(axis=1).sum())
 
     @property
     def errors(self) -> np.ndarray:
@@ -161,8 +168,9 @@ class Report:
 
     @property
     def is_passed(self) -> bool:
-        """True if there is no difference."""
-        return all(one.is_equal for one in self.comparisons)
+        """True if values beside the period were compared, and there is no difference."""
+        is_compared = any(one.num_rows for one in self.comparisons if one.stage != "rates")
+        return is_compared and all(one.is_equal for one in self.comparisons)
 
     @property
     def causes(self) -> list[str]:
@@ -176,13 +184,14 @@ class Report:
                 one.stage,
                 one.name,
                 one.expected.shape[1],
+                f"{one.num_rows} of {len(one.expected)}",
                 float(f"{one.largest:.2g}"),
                 float(f"{one.largest / one.span:.2g}"),
-                "equal" if one.is_equal else f"differs from step {one.first[0]}",
+                _result(one),
             )
             for one in self.comparisons
         ]
-        columns = ("stage", "values", "size", "difference", "of range", "result")
+        columns = ("stage", "values", "size", "steps", "difference", "of range", "result")
         return Table("stages", columns, rows)
 
     def __str__(self) -> str:
@@ -193,9 +202,10 @@ class Report:
             parts.append("Not decidable by this trace:\n  " + "\n  ".join(self.undecided))
         if self.warnings:
             parts.append("For a robot:\n  " + "\n  ".join(self.warnings))
-        equal = sum(one.is_equal for one in self.comparisons)
+        compared = [one for one in self.comparisons if one.num_rows]
+        equal = sum(one.is_equal for one in compared)
         result = "PASSED" if self.is_passed else "FAILED"
-        parts.append(f"{result}: {equal} of {len(self.comparisons)} values equal.")
+        parts.append(f"{result}: {equal} of {len(compared)} values equal.")
         return "\n\n".join(parts)
 
     def as_dict(self) -> dict[str, Any]:
@@ -221,14 +231,18 @@ class Report:
         }
 
 
+def _result(one: Comparison) -> str:
+    if not one.num_rows:
+        return "not compared"
+    return "equal" if one.is_equal else f"differs from step {one.first[0]}"
+
+
 def check_bundle(folder: Path) -> Report:
     """Return the report of a bundle.
 
     Raises:
         UserError: `folder` is not a bundle, or its programs raise.
     """
-    if not (folder / "contract.json").exists():
-        raise UserError(f"{folder}: expected a bundle with contract.json; use `mjlab deploy`.")
     evidence = Evidence(folder)
     with _named_failures(folder):
         programs = Programs.load(folder)
@@ -269,9 +283,8 @@ def replay(evidence: Evidence, programs: Programs) -> dict[tuple[str, str], np.n
         if evidence.first[k]:
             policy.reset(motion=evidence.motion(k))
         simulation.set_state(**evidence.state(k))
-        for name, value in simulation.measure().items():
-            if name != "time":
-                add("sensors", f"measurement/{name}", value)
+        for name, value in _sensors(evidence, simulation).items():
+            add("sensors", f"measurement/{name}", value)
         targets = policy.step(evidence.measured(k), evidence.command(k))
         add("rates", "time", [targets.period])
         for (place, term), value in policy.values.items():
@@ -299,6 +312,16 @@ def replay(evidence: Evidence, programs: Programs) -> dict[tuple[str, str], np.n
     return {key: np.array(rows) for key, rows in found.items()}
 
 
+def _sensors(evidence: Evidence, simulation: Any) -> dict[str, np.ndarray]:
+    """Return the measurements that kinematics give; NaN for those that `measure` leaves out."""
+    measured = simulation.measure()
+    return {
+        one["name"]: np.asarray(measured.get(one["name"], np.full(one["shape"], np.nan)))
+        for one in evidence.contract["measurements"]
+        if one["source"]["kind"] != "trace"
+    }
+
+
 def _sent(evidence: Evidence, targets: Any) -> np.ndarray:
     """Return the motor commands in the order of the targets."""
     fields = {"joint_velocity": targets.velocity, "joint_effort": targets.effort}
@@ -324,8 +347,7 @@ def _free(evidence: Evidence, policy: Any, simulation: Any) -> Iterator[tuple[st
         policy.reset(motion=evidence.motion(start))
         simulation.set_state(**evidence.state(start))
         for k in range(start, start + _FREE_STEPS):
-            measured = {**evidence.measured(k), **simulation.measure()}
-            measured["time"] = float(evidence.trace["time"][k])
+            measured = {**evidence.measured(k), **_sensors(evidence, simulation)}
             targets = policy.step(measured, evidence.command(k))
             for place, value in policy.inputs.items():
                 if f"input/{place}" in evidence.trace:
@@ -374,12 +396,12 @@ def _expected(evidence: Evidence, stage: str, name: str) -> np.ndarray | None:
 
 def _motor_torques(evidence: Evidence) -> np.ndarray:
     """Return the torques of controls that a motor's kp and kd give; NaN for others, (K, nu)."""
-    torques = evidence.trace["actuator_force"].astype(float)
+    torques = evidence.torques.copy()
     joints = {one["scene_name"]: one for one in evidence.contract["joints"]}
     for k, actuator in enumerate(evidence.contract["actuators"]):
         is_motor = actuator["joint"] in joints and actuator["law"] in ("position", "pd")
-        gear = evidence.model.actuator_gear[k, 0] if k < evidence.model.nu else 1.0
-        torques[:, k] = torques[:, k] * gear if is_motor else np.nan
+        if not is_motor:
+            torques[:, k] = np.nan
     return torques
 
 
@@ -497,7 +519,7 @@ def undecided(evidence: Evidence) -> list[str]:
     """Return the mistakes that this trace cannot show."""
     trace, contract = evidence.trace, evidence.contract
     notes = []
-    force = np.abs(trace["actuator_force"]).max(axis=0)
+    force = np.abs(evidence.torques).max(axis=0)
     for k, actuator in enumerate(contract["actuators"]):
         limit = actuator["effort"]
         if limit is not None and force[k] < limit * (1 - 1e-6):

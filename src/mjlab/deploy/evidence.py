@@ -20,6 +20,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjlab.utils.errors import UserError
+
 FILES = Path(__file__).parent / "files"
 """Folder of the original programs."""
 
@@ -98,15 +100,39 @@ class Evidence:
     """
 
     def __init__(self, folder: Path, trace: Mapping[str, np.ndarray] | None = None) -> None:
-        """Read a bundle; `trace` replaces its golden trace."""
+        """Read a bundle; `trace` replaces its golden trace.
+
+        Raises:
+            UserError: `folder` is not a bundle.
+        """
         self.folder = folder
+        if not (folder / "contract.json").exists():
+            raise UserError(f"{folder}: expected a bundle with contract.json; use `mjlab deploy`.")
         self.contract = json.loads((folder / "contract.json").read_text(encoding="utf-8"))
         golden = folder / self.contract["golden"]["file"]
         self.trace = dict(np.load(golden) if trace is None else trace)
         self.first = self.trace["first"].astype(bool)
         self.originals = Programs.load(FILES)
+        self._add_formulas()
         self.found: dict[str, np.ndarray] = {}
         self.memo: dict[str, Any] = {}
+
+    def _add_formulas(self) -> None:
+        """Give the original runtime the formulas that `runtime.py` of the folder adds.
+
+        Raises:
+            UserError: that runtime, needed for a term of the user's own, cannot be imported.
+        """
+        known = self.originals.runtime.TERMS
+        if all(one["kind"] in known or one["function"] in known for one in self.terms.values()):
+            return
+        try:
+            added = getattr(_imported(self.folder, "runtime"), "TERMS", {})
+        except Exception as error:
+            raise UserError(
+                f"{self.folder}/runtime.py raises {type(error).__name__}: {error}"
+            ) from error
+        known.update({kind: formula for kind, formula in added.items() if kind not in known})
 
     # Contract.
 
@@ -154,6 +180,8 @@ class Evidence:
 
     def motion(self, k: int) -> int:
         """Return the motion that starts in row `k`."""
+        if "motion" in self.trace:
+            return int(self.trace["motion"][k])
         episodes = self.contract["golden"]["episodes"]
         return next((one["motion"] for one in episodes if one["row"] == k), 0)
 
@@ -164,6 +192,14 @@ class Evidence:
             for key, values in self.trace.items()
             if key.startswith("state/")
         }
+
+    @cached_property
+    def torques(self) -> np.ndarray:
+        """Torques at the joints: forces of the actuators times their gears, (K, nu)."""
+        torques = self.trace["actuator_force"].astype(float)
+        gears = self.model.actuator_gear[: torques.shape[1], 0]
+        torques[:, : len(gears)] *= gears
+        return torques
 
     def previous(self, values: np.ndarray, steps: int = 1) -> np.ndarray:
         """Return the rows `steps` earlier; NaN where the episode was younger."""
@@ -234,7 +270,8 @@ class Evidence:
             term: Entry of the term.
             change: Function of name and values of an input, which returns changed values.
         """
-        formula = self.originals.runtime.TERMS.get(term["kind"])
+        formulas = self.originals.runtime.TERMS
+        formula = formulas.get(term["kind"]) or formulas.get(term["function"])
         names = term["inputs"]
         keys = [n if n.startswith("command/") else f"measurement/{n}" for n in names]
         if formula is None or not names or not all(key in self.trace for key in keys):

@@ -21,7 +21,7 @@ def fitness_warnings(evidence: Evidence) -> list[str]:
 
 
 def _torques(evidence: Evidence) -> list[str]:
-    force = np.abs(evidence.trace["actuator_force"])
+    force = np.abs(evidence.torques)
     shares = {
         actuator["name"]: float((force[:, k] >= actuator["effort"] * (1 - 1e-6)).mean())
         for k, actuator in enumerate(evidence.contract["actuators"])

@@ -4,6 +4,8 @@ Both are tables (CSV) with the columns of `golden.csv`:
 
     time                                   s, monotonic
     first                                  1 where an episode begins; without it, the first row
+    motion                                 motion of the episode; without it, that of the golden trace where
+                                           there is a column step, else 0
     measurement.<name>.<k or joint>        raw measurements; also `quaternion.<w, x, y, z>`,
                                            `gyroscope.<x, y, z>`, `position.<joint>`, `velocity.<joint>`
     command.<name>.<k>                     commands
@@ -15,7 +17,7 @@ Both are tables (CSV) with the columns of `golden.csv`:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +38,28 @@ _OTHER_PERIOD = 0.02
 _LONGEST_LAG = 10
 _ENOUGH = 20
 
-
 # Answers.
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Answers of a program, as far as a table says them.
+
+    Attributes:
+        values: Values, (K, n).
+        known: Cells that are not empty, (K, n). One may hold NaN.
+    """
+
+    values: np.ndarray
+    known: np.ndarray
+
+    def part(self, start: int, stop: int) -> Answers:
+        """Return some of the columns."""
+        return Answers(self.values[:, start:stop], self.known[:, start:stop])
+
+    def row(self, k: int) -> np.ndarray | None:
+        """Return row `k` in float32; None if a cell is empty."""
+        return self.values[k].astype(np.float32) if self.known[k].all() else None
 
 
 def check_answers(folder: Path, path: Path) -> Report:
@@ -54,18 +76,18 @@ def check_answers(folder: Path, path: Path) -> Report:
         raise UserError(f"{path} step: expected 0 to {count - 1}, got up to {rows.max()}.")
     values = {}
     for name, answers in _answers(evidence, table).items():
-        got = np.full((count, answers.shape[1]), np.nan)
-        got[rows] = answers
-        values[_STAGES[name], name] = got
-    if not values:
-        raise UserError(
-            f"{path}: expected columns obs.<k>, action.<k> or target.<joint>, got none."
-        )
-    return _report(evidence, values, [])
+        shape = (count, answers.values.shape[1])
+        values[name] = Answers(np.zeros(shape), np.zeros(shape, bool))
+        values[name].values[rows], values[name].known[rows] = answers.values, answers.known
+    return _report(evidence, values, [], [])
 
 
-def _answers(evidence: Evidence, table: CsvTable) -> dict[str, np.ndarray]:
-    """Return the answers in a table, by name in the trace."""
+def _answers(evidence: Evidence, table: CsvTable) -> dict[str, Answers]:
+    """Return the answers in a table, by name in the trace.
+
+    Raises:
+        UserError: the table has none.
+    """
     sizes = {one["input"]: one["shape"] for one in evidence.contract["observations"]}
     numbers = {
         "obs": sizes["obs"][-1] if len(sizes.get("obs", ())) == 1 else 0,
@@ -73,32 +95,46 @@ def _answers(evidence: Evidence, table: CsvTable) -> dict[str, np.ndarray]:
     }
     labels = {name: [str(k) for k in range(size)] for name, size in numbers.items()}
     labels["target"] = evidence.target_joints
-    found = {_ANSWERS[name]: table.group(name, labels[name]) for name in _ANSWERS}
-    return {name: values for name, values in found.items() if values is not None}
+    found = {}
+    for name in _ANSWERS:
+        values = table.group(name, labels[name])
+        if values is not None:
+            empty = np.stack([table.empty[f"{name}.{label}"] for label in labels[name]], axis=1)
+            found[_ANSWERS[name]] = Answers(values, ~empty)
+    if not found:
+        raise UserError(
+            f"{table.path}: expected columns obs.<k>, action.<k> or target.<joint>, got none."
+        )
+    return found
 
 
 def _report(
-    evidence: Evidence, values: dict[tuple[str, str], np.ndarray], notes: list[str]
+    evidence: Evidence,
+    answers: Mapping[str, Answers],
+    timing: list[Comparison],
+    undecided: list[str],
 ) -> Report:
-    """Return the report on answers; those that are NaN are not compared."""
-    observed = values.get(("vector", "input/obs"))
-    if observed is not None:
+    """Return the report on answers; those that a table leaves empty are not compared."""
+    found = {(_STAGES[name], name): value for name, value in answers.items()}
+    if "input/obs" in answers:
         for (place, term), entry in evidence.terms.items():
             if place == "obs":
-                part = observed[:, entry["start"] : entry["stop"]]
-                values["history", f"term/obs/{term}"] = part
-    comparisons = [_where_known(one) for one in compare(evidence, values)]
-    report = Report(comparisons, undecided=notes)
+                part = answers["input/obs"].part(entry["start"], entry["stop"])
+                found["history", f"term/obs/{term}"] = part
+    compared = compare(evidence, {key: value.values for key, value in found.items()})
+    known = {name: value.known for (_, name), value in found.items()}
+    comparisons = timing + [_where_known(one, known[one.name]) for one in compared]
+    report = Report(comparisons, undecided=undecided)
     if not report.is_passed:
         report.findings = find_causes(evidence, comparisons, {})
     return report
 
 
-def _where_known(one: Comparison) -> Comparison:
+def _where_known(one: Comparison, known: np.ndarray) -> Comparison:
     """Leave out what the table does not say."""
     if one.got.shape != one.expected.shape:
         return one
-    known = np.isfinite(one.got) & np.isfinite(one.expected)
+    known = known & np.isfinite(one.expected)
     return replace(
         one, expected=np.where(known, one.expected, np.nan), got=np.where(known, one.got, 0.0)
     )
@@ -111,7 +147,7 @@ def check_log(folder: Path, path: Path) -> Report:
     """Return the report of a log: terms, vector, action and target recomputed from its raw columns.
 
     Raises:
-        UserError: the log lacks time, or all measurements.
+        UserError: the log lacks time, answers, or all that they are computed from.
     """
     bundle, table = Evidence(folder), CsvTable(path)
     if "time" not in table.columns:
@@ -120,9 +156,8 @@ def check_log(folder: Path, path: Path) -> Report:
     answers = _answers(bundle, table)
     trace = _recomputed(bundle, table, raw, answers)
     evidence = Evidence(folder, trace)
-    values = {(_STAGES[name], name): value for name, value in answers.items()}
-    timing = _timing(bundle, table.columns["time"], trace["first"])
-    timing += _lags(bundle, raw, answers)
+    period, sentences = _timing(bundle, table.columns["time"], trace["first"])
+    sentences += _lags(bundle, raw, answers)
     notes = [
         f"{name}: not in the log; what is computed from it is not compared." for name in missing
     ]
@@ -132,7 +167,10 @@ def check_log(folder: Path, path: Path) -> Report:
         "sensors, torque, state and what is read when: raw columns are taken as they are, and a log has "
         "no true state."
     )
-    return replace(_report(evidence, values, notes), notes=timing)
+    report = replace(_report(evidence, answers, period, notes), notes=sentences)
+    if not any(one.num_rows for one in report.comparisons if one.stage != "rates"):
+        raise UserError(f"{path}: expected measurements to compute answers from, got none.")
+    return report
 
 
 def _raw(evidence: Evidence, table: CsvTable) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -142,7 +180,7 @@ def _raw(evidence: Evidence, table: CsvTable) -> tuple[dict[str, np.ndarray], li
         name, source = entry["name"], entry["source"]
         joints = evidence.joint_names if name in ("joint_pos", "joint_vel") else None
         labels = joints or [str(k) for k in range(entry["size"])]
-        values = table.group(f"measurement.{name}", labels)
+        values = table.group(f"measurement.{name.replace('/', '.')}", labels)
         if values is None:
             values = table.group(*_plain_name(name, source, labels))
         if values is None:
@@ -173,7 +211,7 @@ def _recomputed(
     evidence: Evidence,
     table: CsvTable,
     raw: Mapping[str, np.ndarray],
-    answers: Mapping[str, np.ndarray],
+    answers: Mapping[str, Answers],
 ) -> dict[str, np.ndarray]:
     """Return the trace that the original runtime gives for the raw columns of a log.
 
@@ -183,6 +221,7 @@ def _recomputed(
     policy = evidence.originals.runtime.Policy.load(evidence.folder, limits=False)
     count = len(table.columns["time"])
     first = table.columns.get("first", np.arange(count) == 0).astype(bool)
+    motions = _motions(evidence, table)
     rows: dict[str, list] = {}
 
     def add(name: str, value: Any) -> None:
@@ -192,7 +231,7 @@ def _recomputed(
     names = [one["name"] for one in evidence.contract["measurements"]]
     for k in range(count):
         if first[k]:
-            policy.reset()
+            policy.reset(motion=int(motions[k]))
         measured: dict[str, Any] = {name: raw[f"measurement/{name}"][k] for name in names}
         measured["time"] = float(table.columns["time"][k])
         policy.step(measured, {name: raw[f"command/{name}"][k] for name in given})
@@ -203,25 +242,47 @@ def _recomputed(
         for (place, term), entry in evidence.terms.items():
             if place == "obs":
                 add(f"term/obs/{term}", policy.inputs[place][0, entry["start"] : entry["stop"]])
-        if "input/obs" in answers and len(policy.inputs) == 1:
-            x = answers["input/obs"][k : k + 1].astype(np.float32)
-            (action,) = policy._run(policy._outputs, {"obs": x})
+        x = answers["input/obs"].row(k) if "input/obs" in answers else None
+        if x is not None and len(policy.inputs) == 1:
+            (action,) = policy._run(policy._outputs, {"obs": x[None]})
             clip = evidence.contract["policy"]["clip"] or np.inf
             policy.action = action[0].clip(-clip, clip)
         add("action", policy.action.copy())
-        if "action" in answers:
-            policy.action = answers["action"][k].astype(np.float32)
+        logged = answers["action"].row(k) if "action" in answers else None
+        if logged is not None:
+            policy.action = logged
         policy._targets()
         add("target", policy.target.copy())
     trace = {name: np.array(values) for name, values in rows.items()}
-    return {**trace, **raw, "first": first, "time": table.columns["time"]}
+    return {**trace, **raw, "first": first, "motion": motions, "time": table.columns["time"]}
 
 
-def _timing(evidence: Evidence, time: np.ndarray, first: np.ndarray) -> list[str]:
-    """Return sentences on the period of a log."""
+def _motions(evidence: Evidence, table: CsvTable) -> np.ndarray:
+    """Return the motion of each row, (K,); of rows that start an episode where the table has none.
+
+    Raises:
+        UserError: the contract has no such motion.
+    """
+    count = len(table.columns["time"])
+    if "motion" not in table.columns:
+        steps = table.columns.get("step", np.full(count, -1))
+        return np.array([evidence.motion(int(step)) for step in steps])
+    motions = table.columns["motion"]
+    sizes = [len(one["motions"]) for one in evidence.contract["commands"] if "motions" in one]
+    if not np.isin(motions, np.arange(max(sizes, default=1))).all():
+        raise UserError(
+            f"{table.path} motion: expected 0 to {max(sizes, default=1) - 1}, got {motions.max():g}."
+        )
+    return motions.astype(int)
+
+
+def _timing(
+    evidence: Evidence, time: np.ndarray, first: np.ndarray
+) -> tuple[list[Comparison], list[str]]:
+    """Return the comparison of the period of a log, and a sentence on its steadiness."""
     gaps = np.diff(time)[~first[1:].astype(bool)]
     if not len(gaps):
-        return []
+        return [], []
     period, wanted = float(np.median(gaps)), evidence.contract["rates"]["step_dt"]
     missed = int((gaps > _MISSED * wanted).sum())
     text = (
@@ -229,12 +290,13 @@ def _timing(evidence: Evidence, time: np.ndarray, first: np.ndarray) -> list[str
         f"{1e3 * gaps.std():.2f} ms, longest {1e3 * gaps.max():.2f} ms; {missed} gaps above "
         f"{_MISSED} periods."
     )
-    other = abs(period / wanted - 1) > _OTHER_PERIOD
-    return [text, "Likely cause: other control rate."] if other else [text]
+    expected, got = np.full((len(time), 1), wanted), np.full((len(time), 1), period)
+    bound = _OTHER_PERIOD * wanted
+    return [Comparison("rates", "time", expected, got, ["period"], bound)], [text]
 
 
 def _lags(
-    evidence: Evidence, raw: Mapping[str, np.ndarray], answers: Mapping[str, np.ndarray]
+    evidence: Evidence, raw: Mapping[str, np.ndarray], answers: Mapping[str, Answers]
 ) -> list[str]:
     """Return a sentence on the lag of joint positions behind their targets, and that of the trace."""
     if "target" not in answers:
@@ -243,7 +305,7 @@ def _lags(
     index = [joints.index(name) for name in evidence.target_joints if name in joints]
     texts = []
     for target, position in (
-        (answers["target"], raw["measurement/joint_pos"]),
+        (answers["target"].values, raw["measurement/joint_pos"]),
         (evidence.trace["target"], evidence.trace["measurement/joint_pos"]),
     ):
         lag = _lag(target, position[:, index]) if target.shape[1] == len(index) else None

@@ -54,7 +54,7 @@ def _corrected(
 
 
 def joint_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Controls in the order of the joints, not of the scene's actuators."""
+    """Write controls in the order of the joints, not of the scene's actuators."""
 
     def mistake(base: Any) -> Any:
         class JointOrder(base):
@@ -70,7 +70,7 @@ def joint_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def one_step_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Targets applied one control step late."""
+    """Apply targets one control step late."""
 
     def mistake(base: Any) -> Any:
         class Late(base):
@@ -85,7 +85,7 @@ def one_step_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def one_substep_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Targets applied one physics step late."""
+    """Apply targets one physics step late."""
 
     def mistake(base: Any) -> Any:
         class Late(base):
@@ -103,7 +103,7 @@ def one_substep_late(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def stale_sensors(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Sensors read after `mj_step` without `mj_forward`: of one physics step before."""
+    """Read sensors after `mj_step` without `mj_forward`: those of one physics step before."""
 
     def mistake(base: Any) -> Any:
         class Stale(base):
@@ -118,7 +118,7 @@ def stale_sensors(d: Difference, evidence: Evidence) -> np.ndarray | None:
 
 
 def control_rate(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Other number of physics steps in a control step."""
+    """Run another number of physics steps in a control step."""
 
     def correct(contract: dict, model: mujoco.MjModel) -> bool:
         times = np.diff(evidence.trace["time"])
@@ -152,7 +152,7 @@ def _with_decimation(steps: int) -> Callable[[Any], Any]:
 
 
 def physics_rate(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Time step of the scene other than `rates.physics_dt`."""
+    """Correct a time step of the scene other than `rates.physics_dt`."""
 
     def correct(contract: dict, model: mujoco.MjModel) -> bool:
         is_other = not np.isclose(model.opt.timestep, contract["rates"]["physics_dt"], rtol=1e-6)
@@ -218,17 +218,17 @@ def _correct_gains(is_order: bool) -> Callable[[dict, mujoco.MjModel], bool]:
 
 
 def gains(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Other gains."""
+    """Correct gains other than those of the contract's actuators."""
     return _corrected(d, evidence, "gains", _correct_gains(False))
 
 
 def gains_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Gains in another order."""
+    """Correct gains in another order."""
     return _corrected(d, evidence, "gains_order", _correct_gains(True))
 
 
 def effort_limit(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Effort limit missing, or another one."""
+    """Correct an effort limit that is missing, or another one."""
 
     def correct(contract: dict, model: mujoco.MjModel) -> bool:
         joints, changed = {j["scene_name"]: j for j in contract["joints"]}, False
@@ -236,11 +236,12 @@ def effort_limit(d: Difference, evidence: Evidence) -> np.ndarray | None:
             joint, limit = joints.get(actuator["joint"]), actuator["effort"]
             if joint is None:
                 continue
-            limited = bool(model.actuator_forcelimited[k])
-            held = float(model.actuator_forcerange[k, 1]) if limited else None
+            limited, gear = bool(model.actuator_forcelimited[k]), model.actuator_gear[k, 0]
+            held = float(model.actuator_forcerange[k, 1] * gear) if limited else None
             if actuator["law"] == "position" and not _same(held, limit):
                 changed, model.actuator_forcelimited[k] = True, limit is not None
-                model.actuator_forcerange[k] = (0, 0) if limit is None else (-limit, limit)
+                bound = 0.0 if limit is None else limit / gear
+                model.actuator_forcerange[k] = -bound, bound
             if not _same(joint["effort"], limit):
                 changed, joint["effort"] = True, limit
         return changed

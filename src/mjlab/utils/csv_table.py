@@ -15,7 +15,8 @@ class CsvTable:
 
     Attributes:
         path: File.
-        columns: Values by name, (K,). NaN: empty.
+        columns: Values by name, (K,). NaN: empty, or written so.
+        empty: Cells without text by name, (K,).
     """
 
     def __init__(self, path: Path) -> None:
@@ -28,11 +29,14 @@ class CsvTable:
         try:
             with path.open(newline="", encoding="utf-8-sig") as file:
                 header, *rows = csv.reader(file)
-            values = np.array([[float(cell.strip() or "nan") for cell in row] for row in rows])
+            cells = [[cell.strip() for cell in row] for row in rows]
+            values = np.array([[float(cell or "nan") for cell in row] for row in cells])
             if not len(values):
                 raise UserError(f"{path}: expected rows below the header, got none.")
-            names = (name.strip() for name in header)
+            names = [name.strip() for name in header]
             self.columns: dict[str, np.ndarray] = dict(zip(names, values.T, strict=True))
+            empty = np.array([[not cell for cell in row] for row in cells])
+            self.empty: dict[str, np.ndarray] = dict(zip(names, empty.T, strict=True))
         except (OSError, ValueError) as error:
             raise UserError(f"{path}: expected a CSV table of numbers ({error}).") from error
 
