@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mjlab.actuator import BuiltinMotorActuatorCfg, IdealPdActuatorCfg, TransmissionType
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.identification.estimate import DriveEstimate, Estimate, LimbEstimate
@@ -47,6 +48,31 @@ def test_actuators_have_the_values(written: dict[str, Any]) -> None:
     assert (first.delay_min_lag, first.delay_max_lag) == (1, 3)
 
 
+def test_untold_values_are_marked() -> None:
+    told, untold = (actuators_source([leg("FR", share)], {}, TIMESTEP) for share in (0.1, 0.5))
+    assert "not told" not in told
+    marked = {line.split("=")[0].strip() for line in untold.splitlines() if "not told" in line}
+    assert marked == {"armature", "viscous_damping", "frictionloss", "stiffness", "damping"}
+
+
+def test_other_actuators_stay_as_they_are() -> None:
+    others = [
+        IdealPdActuatorCfg(
+            target_names_expr=("waist", "neck"),
+            stiffness=40.179238,
+            damping=2.0,
+            effort_limit=float("inf"),
+            delay_max_lag=2,
+        ),
+        BuiltinMotorActuatorCfg(
+            target_names_expr=("tail",), transmission_type=TransmissionType.TENDON, effort_limit=3.0
+        ),
+    ]
+    names: dict[str, Any] = {}
+    exec(actuators_source(LIMBS, {}, TIMESTEP, others), names)
+    assert list(names["ACTUATORS"][12:]) == others
+
+
 def test_ranges_are_intervals_of_known_values(written: dict[str, Any]) -> None:
     ranges = written["EVENTS"]["joint_friction"].params["ranges"]
     assert ranges["FR_hip_joint"] == pytest.approx((0.44, 0.56))
@@ -54,7 +80,14 @@ def test_ranges_are_intervals_of_known_values(written: dict[str, Any]) -> None:
     assert ranges["RL_hip_joint"] == pytest.approx((0.475, 0.525))
     # An interval of half the value is no knowledge.
     assert "RR_hip_joint" not in ranges
-    assert "RR_hip_joint" in events_source(LIMBS)
+    lines = [line for line in events_source(LIMBS).splitlines() if "RR_hip_joint" in line]
+    assert [line.split(":")[0].strip() for line in lines if "not told" in line] == [
+        "# armature",
+        "# joint_friction",
+        "# joint_damping",
+        "# gains",
+        "# gains",
+    ]
     assert written["EVENTS"]["gains"].params["kp_range"] == (0.88, 1.12)
 
 

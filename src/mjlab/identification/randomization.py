@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any
 
 from mjlab.identification.estimate import DriveEstimate, Estimate, LimbEstimate
-from mjlab.own_robot.python_text import dict_source, number, tuple_source
+from mjlab.own_robot.python_text import commented, dict_source, literal, number, tuple_source
+from mjlab.utils.tables import settings_of
 
 LEAST_WIDTH = 0.05
 """Least half-width of a randomized range, as a share of the value: drives change with temperature and
 wear by more than an interval shows."""
 _UNKNOWN_GAINS = (0.9, 1.1)
+_NOT_TOLD = "not told by the log"
+_FIELDS = {
+    "armature": "armature",
+    "damping": "viscous_damping",
+    "friction": "frictionloss",
+    "kp": "stiffness",
+    "kd": "damping",
+}
+"""Fields of actuator configs by kind of parameter."""
 _EVENTS = (
     ("armature", "joint_armature", "armature"),
     ("joint_friction", "joint_friction", "friction"),
@@ -20,16 +34,23 @@ _EVENTS = (
 
 
 def actuators_source(
-    limbs: Sequence[LimbEstimate], effort_limit: dict[str, float], timestep: float
+    limbs: Sequence[LimbEstimate],
+    effort_limit: dict[str, float],
+    timestep: float,
+    others: Sequence[Any] = (),
 ) -> str:
-    """Return actuator configs with the estimated values.
+    """Return actuator configs with the estimated values; a comment marks those that the logs do not tell.
 
     Args:
         limbs: Estimates.
         effort_limit: Effort limits by joint (N m or N).
         timestep: Physics timestep of the task (s), the unit of delays.
+        others: Configs of the actuators of joints that the logs leave out.
     """
-    lines = ["from mjlab.actuator import BuiltinPositionActuatorCfg", "", "ACTUATORS = ("]
+    classes = [("mjlab.actuator", "BuiltinPositionActuatorCfg")]
+    classes += [(_module(cfg), type(cfg).__name__) for cfg in others]
+    lines = [f"from {module} import {name}" for module, name in sorted(set(classes))]
+    lines += ["", "ACTUATORS = ("]
     for limb in limbs:
         low, high = _lags(limb.delay, timestep)
         for drive in limb.drives:
@@ -47,9 +68,15 @@ def actuators_source(
                 "delay_max_lag": high,
                 "delay_hold_prob": 1.0,
             }
+            untold = {_FIELDS[kind] for kind, e in drive.parameters.items() if not e.is_known}
             lines.append("    BuiltinPositionActuatorCfg(")
-            lines += [_indented(f"{name}={value},", 8) for name, value in fields.items()]
+            for name, value in fields.items():
+                line = _indented(f"{name}={value},", 8)
+                lines.append(commented(line, _NOT_TOLD if name in untold else ""))
             lines.append("    ),")
+    if others:
+        lines.append("    # Joints that the log leaves out.")
+        lines += [_indented(f"{_config_source(cfg)},", 4) for cfg in others]
     return "\n".join([*lines, ")"])
 
 
@@ -69,19 +96,51 @@ def events_source(limbs: Sequence[LimbEstimate]) -> str:
         known = [drive for drive in drives if drive.parameters[kind].is_known]
         unknown = [joint for drive in drives if drive not in known for joint in drive.joints]
         if unknown:
-            lines.append(f"    # {event}: not told by the log for {', '.join(unknown)}.")
+            lines.append(f"    # {event}: {_NOT_TOLD} for {', '.join(unknown)}.")
         if known:
             ranges = {
                 joint: _bounds(drive.parameters[kind]) for drive in known for joint in drive.joints
             }
             params = {"operation": '"abs"', "ranges": dict_source(ranges)}
             lines.append(_event(event, function, known, params))
+    for kind in ("kp", "kd"):
+        unknown = [j for d in drives if not d.parameters[kind].is_known for j in d.joints]
+        if unknown:
+            lines.append(f"    # gains: {kind} {_NOT_TOLD} for {', '.join(unknown)}.")
     gains = {
         f"{kind}_range": repr(_factors([drive.parameters[kind] for drive in drives]))
         for kind in ("kp", "kd")
     }
     lines.append(_event("gains", "pd_gains", drives, gains))
     return "\n".join([*lines, "}"])
+
+
+def _config_source(cfg: Any) -> str:
+    """Return the source of a config: fields that are not at their defaults."""
+    lines = [
+        _indented(f"{name}={_value_source(value)},", 4)
+        for name, value in settings_of(cfg, changed_only=True).items()
+    ]
+    return "\n".join([f"{type(cfg).__name__}(", *lines, ")"])
+
+
+def _value_source(value: Any) -> str:
+    if isinstance(value, Enum):
+        return literal(value.value)
+    if isinstance(value, float):
+        return repr(float(value)) if math.isfinite(value) else number(value)
+    if isinstance(value, (tuple, list)):
+        is_text = all(isinstance(item, str) for item in value)
+        return tuple_source(value, 27) if is_text else repr(tuple(value))
+    if dataclasses.is_dataclass(value):
+        return _config_source(value)
+    return literal(str(value) if isinstance(value, Path) else value)
+
+
+def _module(cfg: Any) -> str:
+    """Return the module that a config's class is imported from."""
+    module = type(cfg).__module__
+    return "mjlab.actuator" if module.startswith("mjlab.actuator.") else module
 
 
 def _event(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +22,7 @@ from mjlab.identification.robot import Drives, fit_robot
 from mjlab.own_robot.anatomy import actuated_joint
 from mjlab.own_robot.gains import servo_stiffness
 from mjlab.own_robot.model_source import load_model, name_elements
-from mjlab.own_robot.subject import effort_limits
+from mjlab.own_robot.subject import driven_joints, effort_limits
 from mjlab.scripts.export_scene import ROBOTS, made_robot
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.processes import available_cores
@@ -28,9 +30,11 @@ from mjlab.utils.string import counted
 from mjlab.utils.tables import Table, tables_text
 
 if TYPE_CHECKING:
+    from mjlab.actuator import ActuatorCfg
     from mjlab.entity import Entity, EntityCfg
 
 _MOST_JITTER = 0.2
+_TIMESTEP = 0.005
 
 
 @dataclass(frozen=True)
@@ -47,27 +51,53 @@ class FitActuatorsConfig:
     """Commanded gain kp of all joints (N m/rad), the first guess. None: the robot's."""
     damping: float | None = None
     """Commanded gain kd of all joints (N m s/rad), the first guess. None: the robot's."""
-    timestep: float = 0.005
-    """Physics timestep of the task (s): delays of actuators are counted in it."""
+    timestep: float | None = None
+    """Physics timestep of the task (s), in which delays of actuators are counted. None: that of the
+    task in --robot, or 0.005."""
     json: bool = False
     """Print JSON."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Robot of a log, as its file, function or task has it."""
+
+    spec: mujoco.MjSpec
+    """Spec with named elements."""
+    drives: Drives
+    actuators: tuple[tuple[ActuatorCfg, tuple[str, ...]], ...]
+    """Each config with the names of its targets."""
+    timestep: float
+    """Physics timestep of the task (s)."""
+
+    def others(self, joints: Sequence[str]) -> list[ActuatorCfg]:
+        """Return the actuators without those of `joints`."""
+        configs = []
+        for cfg, names in self.actuators:
+            is_joint = cfg.transmission_type.value == "joint"
+            rest = tuple(name for name in names if not (is_joint and name in joints))
+            if len(rest) == len(names):
+                configs.append(cfg)
+            elif rest:
+                configs.append(dataclasses.replace(cfg, target_names_expr=rest))
+        return configs
 
 
 def command(argv: list[str], prog: str) -> None:
     """Run `fit-actuators`."""
     log, *flags = argv
     cfg = parse_flags(FitActuatorsConfig, FitActuatorsConfig(), flags, f"{prog} LOG")
-    spec, drives = _robot(cfg)
+    robot = _robot(cfg)
     logs = [read_log(Path(path)) for path in (log, *cfg.more)]
     logging.getLogger("mjlab.identification").setLevel(logging.INFO)
-    limbs = fit_robot(spec, drives, logs, cfg.share, num_threads=available_cores())
+    limbs = fit_robot(robot.spec, robot.drives, logs, cfg.share, num_threads=available_cores())
     if cfg.json:
         print(json.dumps([_as_json(limb) for limb in limbs], indent=2))
     else:
-        print(report(logs, limbs, drives, cfg.timestep))
+        print(report(logs, limbs, robot))
 
 
-def report(logs: list[JointLog], limbs: list[LimbEstimate], drives: Drives, timestep: float) -> str:
+def report(logs: list[JointLog], limbs: list[LimbEstimate], robot: Robot) -> str:
     """Return the tables of estimates and residuals, remarks, and the randomization that follows."""
     seconds, rate = sum(log.duration for log in logs), 1.0 / logs[0].period
     parts = [f"{seconds:.1f} s at {rate:.0f} Hz, {counted(len(logs[0].joints), 'joint')}"]
@@ -86,8 +116,10 @@ def report(logs: list[JointLog], limbs: list[LimbEstimate], drives: Drives, time
     ]
     if remarks:
         parts.append("\n".join(["Not separated by the log:", *remarks]))
+    others = robot.others(logs[0].joints)
+    actuators = actuators_source(limbs, robot.drives.effort_limit, robot.timestep, others)
     parts += [
-        "Actuators (robot.py):\n\n" + actuators_source(limbs, drives.effort_limit, timestep),
+        "Actuators (robot.py):\n\n" + actuators,
         "Events (task.py), ranges from the intervals:\n\n" + events_source(limbs),
     ]
     return "\n\n".join(parts)
@@ -133,24 +165,31 @@ def _as_json(limb: LimbEstimate) -> dict[str, Any]:
     }
 
 
-def _robot(cfg: FitActuatorsConfig) -> tuple[mujoco.MjSpec, Drives]:
-    """Return the robot's spec, with named elements, and what it says of its drives."""
+def _robot(cfg: FitActuatorsConfig) -> Robot:
+    """Return the robot of the flags."""
     if cfg.robot is None:
         raise BadCallError("fit-actuators --robot: expected the robot of the log, got none.")
-    target = cfg.robot
-    gains: dict[str, tuple[float, float]] = {}
+    target, entity, timestep = cfg.robot, None, _TIMESTEP
     if Path(target).exists() or target.startswith("menagerie:"):
-        spec = load_model(target).spec
+        made = load_model(target).spec
+    elif target in ROBOTS or ":" in target:
+        made = made_robot(target)
     else:
-        robot = made_robot(target) if target in ROBOTS or ":" in target else _robot_of_task(target)
-        if isinstance(robot, mujoco.MjSpec):
-            spec = robot
-        else:
-            entity = robot.build()
-            spec, gains = entity.spec, _entity_gains(entity)
+        made, timestep = _robot_of_task(target)
+    if isinstance(made, mujoco.MjSpec):
+        spec = made
+    else:
+        entity = made.build()
+        spec = entity.spec
     name_elements(spec)
     model = spec.compile()
-    gains = _servo_gains(model) | gains
+    gains, limits = _servo_gains(model), effort_limits(model)
+    if entity is None:
+        actuators = _file_actuators(model)
+    else:
+        gains |= _entity_gains(entity)
+        limits = _entity_limits(entity, limits)
+        actuators = tuple((one.cfg, tuple(one.target_names)) for one in entity.actuators)
     joints = [model.joint(j).name for j in range(model.njnt)]
     stiffness = {joint: kp for joint, (kp, _) in gains.items()}
     damping = {joint: kd for joint, (_, kd) in gains.items()}
@@ -158,16 +197,40 @@ def _robot(cfg: FitActuatorsConfig) -> tuple[mujoco.MjSpec, Drives]:
         stiffness = dict.fromkeys(joints, cfg.stiffness)
     if cfg.damping is not None:
         damping = dict.fromkeys(joints, cfg.damping)
-    return spec, Drives(stiffness, damping, effort_limits(model))
+    drives = Drives(stiffness, damping, limits)
+    return Robot(spec, drives, actuators, cfg.timestep or timestep)
 
 
-def _robot_of_task(task: str) -> EntityCfg:
+def _robot_of_task(task: str) -> tuple[EntityCfg, float]:
+    """Return the robot and the physics timestep (s) of a task."""
     from mjlab.tasks.registry import load_env_cfg
 
-    entities = load_env_cfg(task).scene.entities
+    cfg = load_env_cfg(task)
+    entities = cfg.scene.entities
     if "robot" not in entities:
         raise UserError(f"Task {task}: expected an entity 'robot', got {list(entities)}.")
-    return entities["robot"]
+    return entities["robot"], cfg.sim.mujoco.timestep
+
+
+def _file_actuators(model: mujoco.MjModel) -> tuple[tuple[ActuatorCfg, tuple[str, ...]], ...]:
+    """Return the config of the actuators of a model, if it has them."""
+    from mjlab.actuator import XmlActuatorCfg
+
+    names = tuple(sorted(driven_joints(model)))
+    return ((XmlActuatorCfg(target_names_expr=names), names),) if names else ()
+
+
+def _entity_limits(entity: Entity, of_model: dict[str, float]) -> dict[str, float]:
+    """Return the effort limit of each joint with one: the lower of the model's and its config's."""
+    limits = dict(of_model)
+    for actuator in entity.actuators:
+        limit = getattr(actuator.cfg, "effort_limit", None)
+        if limit is None or actuator.transmission_type.value != "joint":
+            continue
+        limit = abs(getattr(actuator.cfg, "gear", 1.0)) * float(limit)
+        for name in actuator.target_names if math.isfinite(limit) else ():
+            limits[name] = min(limit, limits.get(name, limit))
+    return limits
 
 
 def _entity_gains(entity: Entity) -> dict[str, tuple[float, float]]:
