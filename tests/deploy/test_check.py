@@ -13,6 +13,7 @@ import pytest
 from mjlab.deploy.check import TOLERANCES, check_bundle, undecided
 from mjlab.deploy.evidence import Evidence
 from mjlab.deploy.fitness import fitness_warnings
+from mjlab.deploy.logs import check_log
 from mjlab.utils.errors import UserError
 
 BUNDLES = (
@@ -80,6 +81,9 @@ def test_formula_of_the_user_is_known_to_the_causes(folder):
         folder,
         lambda content: term_of(content, "joint_vel").update(kind="custom", function=function),
     )
+    for check in (check_bundle, lambda folder: check_log(folder, folder / "golden.csv")):
+        with pytest.raises(UserError, match=function):
+            check(folder)
     program = folder / "runtime.py"
     program.write_text(f"{program.read_text()}\nTERMS['{function}'] = lambda i, term: i[0]\n")
     assert check_bundle(folder).is_passed
@@ -94,6 +98,8 @@ def test_sensor_that_is_left_out_differs(folder):
         """if measurement["name"] != "imu_ang_vel":""",
     )
     report = check_bundle(folder)
+    # JSON has no NaN.
+    json.dumps(report.as_dict(), allow_nan=False)
     wrong = {one.name for one in report.comparisons if not one.is_equal}
     assert "measurement/imu_ang_vel" in wrong
     assert {one.comparison.name for one in report.findings} == {"measurement/imu_ang_vel"}

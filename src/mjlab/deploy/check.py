@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -212,7 +212,7 @@ class Report:
         """Return the report for JSON."""
         return {
             "passed": self.is_passed,
-            "stages": self.table().records(),
+            "stages": [_finite(record) for record in self.table().records()],
             "findings": [
                 {
                     "stage": one.comparison.stage,
@@ -220,7 +220,7 @@ class Report:
                     "step": one.comparison.first[0],
                     "component": one.comparison.labels[one.comparison.first[1]],
                     "cause": one.verdict.cause,
-                    "left_after": one.verdict.residuals,
+                    "left_after": _finite(one.verdict.residuals),
                     "note": one.verdict.note,
                 }
                 for one in self.findings
@@ -229,6 +229,14 @@ class Report:
             "notes": self.notes,
             "warnings": self.warnings,
         }
+
+
+def _finite(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with None for infinite numbers, which JSON does not have."""
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in record.items()
+    }
 
 
 def _result(one: Comparison) -> str:

@@ -134,6 +134,17 @@ class Evidence:
             ) from error
         known.update({kind: formula for kind, formula in added.items() if kind not in known})
 
+    def policy(self) -> Any:
+        """Return the policy of the original runtime, without limits.
+
+        Raises:
+            UserError: a term or an action has no formula.
+        """
+        try:
+            return self.originals.runtime.Policy.load(self.folder, limits=False)
+        except ValueError as error:
+            raise UserError(f"{self.folder}/runtime.py: {error}") from error
+
     # Contract.
 
     @cached_property
@@ -293,7 +304,7 @@ class Evidence:
             change: Function applied to an input.
             memory: `kept`, `cleared` before each step, or `not reset` at starts.
         """
-        policy = self.originals.runtime.Policy.load(self.folder, limits=False)
+        policy = self.policy()
         rows = []
         for k, is_first in enumerate(self.first):
             if (is_first and memory != "not reset") or memory == "cleared" or k == 0:

@@ -218,7 +218,7 @@ def _recomputed(
     Each stage starts from the log where it has the stage before: the last action from its actions, the action
     from its observations, the target from its actions.
     """
-    policy = evidence.originals.runtime.Policy.load(evidence.folder, limits=False)
+    policy = evidence.policy()
     count = len(table.columns["time"])
     first = table.columns.get("first", np.arange(count) == 0).astype(bool)
     motions = _motions(evidence, table)
