@@ -1,6 +1,6 @@
 // Run runtime.hpp on a table of measurements; prints one line of JSON for each row.
 //
-//     replay BUNDLE LAYERS.json TABLE.csv [limits|hand-over]
+//     replay BUNDLE LAYERS.json TABLE.csv [limits|hand-over|hand-over-reset]
 //
 // The table has the columns of golden.csv. The network is a list of layers, as plain loops. Memory, if
 // the contract has it, counts steps and is added to the actions.
@@ -115,7 +115,9 @@ int main(int count, char** arguments) {
         if (stem.rfind("command.", 0) == 0)
           values["command/" + stem.substr(8)].push_back(std::stod(cells[k]));
       }
-      const bool hands_over = mode == "hand-over" && !policy.is_ready();
+      const bool was_ready = policy.is_ready();
+      if (was_ready && mode == "hand-over-reset") policy.reset();
+      const bool hands_over = mode.rfind("hand-over", 0) == 0 && !was_ready;
       print(policy, hands_over ? policy.hand_over(values, 0.1) : policy.step(values));
     }
   } catch (const std::invalid_argument& error) {

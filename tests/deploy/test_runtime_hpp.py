@@ -182,6 +182,7 @@ def test_target_jumps_are_limited(robot):
     [
         ({"measurement.joint_vel.FR_calf_joint": "40"}, "faster"),
         ({f"measurement.root_quat.{k}": q for k, q in enumerate((0.76, 0.64, 0, 0))}, "tilted"),
+        ({f"measurement.root_quat.{k}": 0 for k in range(4)}, "quaternion"),
         ({"measurement.imu_ang_vel.1": "nan"}, "finite"),
         ({"measurement.joint_pos.FR_calf_joint": "inf"}, "finite"),
         ({"command.twist.0": "nan"}, "finite"),
@@ -252,6 +253,29 @@ def test_hand_over_of_a_fallen_robot_or_without_a_time_damps(robot, change):
     (row,) = robot.run([change], mode="hand-over")
     assert row["is_damping"]
     assert not row["is_ready"]
+
+
+def test_first_target_after_the_hand_over_is_near_its_last(robot):
+    robot.contract["limits"]["target_step"] = [0.1] * 12
+    default = {joint["name"]: joint["default_pos"] for joint in robot.contract["joints"]}
+    rest = {f"measurement.joint_pos.{name}": x for name, x in default.items()}
+    rest |= {f"measurement.joint_vel.{name}": 0.0 for name in default}
+    rows = [{**rest, "time": time} for time in (0.0, 0.1)]
+    *_, last, first = robot.run([*rows, {**rest, "time": 0.12}], mode="hand-over-reset", action=5.0)
+    assert last["is_ready"]
+    np.testing.assert_allclose(np.subtract(first["position"], last["position"]), 0.1)
+
+
+def test_robot_without_tilt_is_not_limited(robot):
+    robot.contract["limits"]["tilt_from"] = None
+    (row,) = robot.run([FALLEN])
+    assert not row["is_damping"]
+
+
+def test_one_array_is_not_for_two_commands(robot):
+    robot.contract["commands"].append({**robot.contract["commands"][0], "name": "other"})
+    with pytest.raises(RuntimeError, match="command/other"):
+        robot.run([{}])
 
 
 # Terms of packages, and errors.

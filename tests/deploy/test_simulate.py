@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from bundles import load_program
@@ -64,6 +68,34 @@ def test_a_robot_hands_over_walks_and_is_damped(simulate):
         simulation.apply(targets)
         speeds.append(np.abs(simulation.data.qvel[6:]).max())
     assert speeds[-1] < 1.0
+
+
+def test_fall_is_an_exit_status(bundle, tmp_path):
+    folder = tmp_path / "bundle"
+    shutil.copytree(bundle("go1"), folder)
+    contract = json.loads((folder / "contract.json").read_text())
+    contract["limits"]["tilt"] = 1e-4
+    (folder / "contract.json").write_text(json.dumps(contract))
+    command = [sys.executable, str(folder / "simulate.py"), "--seconds", "1"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    assert "tilted" in done.stdout
+
+
+def test_kinematics_of_the_robot_give_computed_measurements(bundle):
+    folder = bundle("Mjlab-Tracking-Flat-Unitree-G1")
+    load_program(folder, "runtime")
+    simulate = load_program(folder, "simulate")
+    contract = json.loads((folder / "contract.json").read_text())
+    robot = mujoco.MjModel.from_xml_path(str(folder / "robot" / "robot.xml"))
+    trace = np.load(folder / "golden.npz")
+    names = ("joint_pos", "joint_vel", "root_quat")
+    measured = {name: trace[f"measurement/{name}"][20] for name in names}
+    computed = simulate.Simulation(contract, robot).compute(measured)
+    assert computed.keys() == {"torso_link_quat"}
+    quat = trace["measurement/torso_link_quat"][20]
+    assert abs(computed["torso_link_quat"] @ quat) == pytest.approx(1.0, abs=1e-6)
+    assert abs(measured["root_quat"] @ quat) < 0.9999
 
 
 def test_loop_of_the_documentation_walks(bundle, tmp_path, monkeypatch):

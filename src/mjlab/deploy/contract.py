@@ -6,6 +6,7 @@ a version, and a program of version 1 reads any file of version 1.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,11 +24,14 @@ from mjlab.deploy.measurements import (
     Subject,
     joint_pos,
     joint_vel,
+    name_of,
+    plain,
     root_quat,
     scene_joints,
+    shape_of,
 )
 from mjlab.deploy.nominal import Nominal, robot_of
-from mjlab.deploy.terms import Term, describe, name_of
+from mjlab.deploy.terms import Term, describe
 from mjlab.envs.mdp.actions import (
     BinaryJointPositionAction,
     JointEffortAction,
@@ -36,13 +40,11 @@ from mjlab.envs.mdp.actions import (
 )
 from mjlab.rl.exporter_utils import joint_gains, shortest
 from mjlab.utils.lab_api.string import resolve_matching_names_values
-from mjlab.utils.tables import json_value
 
 if TYPE_CHECKING:
     from mjlab.actuator import Actuator
     from mjlab.entity import Entity
     from mjlab.envs import ManagerBasedRlEnv
-    from mjlab.managers import ObservationTermCfg
 
 SCHEMA = "mjlab-contract"
 VERSION = 1
@@ -87,14 +89,39 @@ class Contract:
             for group in groups:
                 for term in manager.active_terms[group]:
                     found = describe(self.subject, term, manager.get_term_cfg(group, term))
+                    found = self._with_own_names(term, found)
                     self.terms[name, term] = found
                     self._add(*(one for one in found.inputs if isinstance(one, Measurement)))
         robot = self.subject.robot
-        # Needed for damping and for the hand-over, also where the policy does not observe them.
+        # Needed for damping, hand-over and tilt, also where the policy does not observe them.
         self._add(joint_pos(self.subject, robot), joint_vel(self.subject, robot))
+        if not self.subject.entity.is_fixed_base:
+            self._add(root_quat(self.subject, robot))
+
+    def _with_own_names(self, name: str, term: Term) -> Term:
+        """Return the term called `name`; values named as another's, such as a second scan by one
+        sensor, are named after the term."""
+        inputs = tuple(
+            dataclasses.replace(one, name=f"term/{name}")
+            if isinstance(one, Measurement) and one.term is not None and self._is_taken(one)
+            else one
+            for one in term.inputs
+        )
+        return dataclasses.replace(term, inputs=inputs)
+
+    def _is_taken(self, measurement: Measurement) -> bool:
+        """Return True if the name is that of a measurement with another source."""
+        known = self.measurements.get(measurement.name)
+        return known is not None and known.source != measurement.source
 
     def _add(self, *measurements: Measurement) -> None:
         for measurement in measurements:
+            if self._is_taken(measurement):
+                known = self.measurements[measurement.name].source
+                raise ValueError(
+                    f"Measurement {measurement.name!r}: expected one source, got {known} and "
+                    f"{measurement.source}; rename the sensor or the observation term."
+                )
             self.measurements.setdefault(measurement.name, measurement)
 
     def as_dict(self, source: Mapping[str, Any], golden: Mapping[str, Any]) -> dict[str, Any]:
@@ -168,7 +195,7 @@ class Contract:
     def _term(self, input_name: str, group: str, name: str) -> dict[str, Any]:
         term = self.terms[input_name, name]
         cfg = self.subject.env.observation_manager.get_term_cfg(group, name)
-        shape = _shape_of(self.subject.env, cfg)
+        shape = list(shape_of(self.subject.env, cfg))
         return {
             "name": name,
             "kind": term.kind,
@@ -181,8 +208,8 @@ class Contract:
             "unit": term.unit,
             "frame": term.frame,
             "function": name_of(cfg.func),
-            "params": {key: _plain(value) for key, value in cfg.params.items()},
-            "noise": _plain(self.nominal.noise.get((group, name))),
+            "params": {key: plain(value) for key, value in cfg.params.items()},
+            "noise": plain(self.nominal.noise.get((group, name))),
             "clip": _bounds(cfg.clip),
             "scale": None if cfg.scale is None else np.ravel(shortest(cfg.scale)).tolist(),
             "delay": list(self.nominal.delays.get((group, name), (0, 0))),
@@ -246,11 +273,6 @@ def _network_inputs(policy: Path) -> tuple[list[dict[str, Any]], dict[str, list[
             groups[item.name] = [item.name]
         entries.append(entry)
     return entries, groups
-
-
-def _shape_of(env: ManagerBasedRlEnv, cfg: ObservationTermCfg) -> list[int]:
-    """Return the shape of one value of a term, without history."""
-    return list(cfg.func(env, **cfg.params).shape[1:])
 
 
 # Joints and actuators.
@@ -469,7 +491,7 @@ def _terminations(env: ManagerBasedRlEnv) -> list[dict[str, Any]]:
         {
             "name": name,
             "function": name_of(cfg.func),
-            "params": {key: _plain(value) for key, value in cfg.params.items()},
+            "params": {key: plain(value) for key, value in cfg.params.items()},
             "is_time_out": cfg.time_out,
         }
         for name in manager.active_terms
@@ -482,15 +504,3 @@ def _bounds(pair: Any) -> list[float | None] | None:
         return None
     values = [None if value is None else float(value) for value in pair]
     return [None if value is None or math.isinf(value) else value for value in values]
-
-
-def _plain(value: Any) -> Any:
-    """Return `value` for JSON, without infinities."""
-    value = json_value(value)
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -6,14 +6,13 @@ same answers to the same measurements.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Generator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 import torch
-
-from mjlab.utils.state import is_stateful
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,9 +36,9 @@ def record(contract: Contract, policy: Any, steps: int) -> tuple[dict[str, np.nd
         steps: Number of control steps K.
     """
     env = contract.subject.env
-    recorder = _Recorder(contract)
     clip, episodes, is_over = contract.nominal.action_clip, [], False
-    with env.curricula_held(), torch.no_grad():
+    with env.curricula_held(), torch.no_grad(), _values_kept(contract) as values:
+        recorder = _Recorder(contract, values)
         for k in range(steps):
             if not episodes or k - episodes[-1]["row"] == EPISODE_STEPS or is_over:
                 # Seeded, because building the policy may have drawn random numbers.
@@ -56,6 +55,36 @@ def record(contract: Contract, policy: Any, steps: int) -> tuple[dict[str, np.nd
     return recorder.arrays(), episodes
 
 
+@contextlib.contextmanager
+def _values_kept(contract: Contract) -> Generator[dict[int, torch.Tensor]]:
+    """Keep the last value of each observation function, by id of the term's config.
+
+    A second call would advance a function with state, such as a filter.
+    """
+    values: dict[int, torch.Tensor] = {}
+    manager = contract.subject.env.observation_manager
+    names = {group for groups in contract.groups.values() for group in groups}
+    cfgs = [manager.get_term_cfg(g, term) for g in names for term in manager.active_terms[g]]
+    functions = {id(cfg): (cfg, cfg.func) for cfg in cfgs}
+
+    def kept(key: int, func: Callable[..., torch.Tensor]) -> Callable[..., torch.Tensor]:
+        def call(env: Any, **params: Any) -> torch.Tensor:
+            value = func(env, **params)
+            # It may be a view of simulation memory.
+            values[key] = value.clone()
+            return value
+
+        return call
+
+    try:
+        for key, (cfg, func) in functions.items():
+            cfg.func = kept(key, func)
+        yield values
+    finally:
+        for cfg, func in functions.values():
+            cfg.func = func
+
+
 def _motion(env: Any) -> int:
     """Return the index of the motion played; 0 without motions."""
     terms = (env.command_manager.get_term(name) for name in env.command_manager.active_terms)
@@ -65,8 +94,8 @@ def _motion(env: Any) -> int:
 class _Recorder:
     """Rows of the trace."""
 
-    def __init__(self, contract: Contract) -> None:
-        self._contract = contract
+    def __init__(self, contract: Contract, values: Mapping[int, torch.Tensor]) -> None:
+        self._contract, self._values = contract, values
         self._env = contract.subject.env
         self._host = mujoco.MjData(contract.subject.model)
         self._rows: dict[str, list[np.ndarray]] = {}
@@ -82,7 +111,11 @@ class _Recorder:
         self._add("time", np.array(k * env.step_dt))
         self._state("state")
         for name, measurement in contract.measurements.items():
-            self._add(f"measurement/{name}", _row(measurement.read(env)))
+            if measurement.read is None:
+                value = self._values[id(measurement.term)]
+            else:
+                value = measurement.read(env)
+            self._add(f"measurement/{name}", _row(value))
         for name in env.command_manager.active_terms:
             term: Any = env.command_manager.get_term(name)
             self._add(f"command/{name}", _row(term.command))
@@ -96,10 +129,8 @@ class _Recorder:
         for group in groups:
             values = self._split(group, observations[group])
             for term in manager.active_terms[group]:
-                cfg = manager.get_term_cfg(group, term)
-                if not is_stateful(cfg.func):
-                    raw = cfg.func(self._env, **cfg.params)
-                    self._add(f"raw/{name}/{term}", _row(raw.float()))
+                raw = self._values[id(manager.get_term_cfg(group, term))]
+                self._add(f"raw/{name}/{term}", _row(raw.float()))
                 self._add(f"term/{name}/{term}", _row(values[term]))
 
     def _split(self, group: str, observation: Any) -> dict[str, torch.Tensor]:
@@ -162,7 +193,8 @@ def write_csv(path: Path, contract: Mapping[str, Any], arrays: Mapping[str, np.n
             continue
         labels = named.get(name, range(flat.shape[1]))
         for k, label in enumerate(labels):
-            columns[f"{shown.replace('/', '.')}.{label}"] = flat[:, k]
+            # Names of measurements may contain a slash.
+            columns[f"{shown.replace('/', '.', 1)}.{label}"] = flat[:, k]
     # Nine digits: float32 reads back as the same number.
     lines = [",".join(columns)]
     lines += [

@@ -6,6 +6,7 @@ MuJoCo gives it (`source`), and how the environment gives it (`read`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,6 +15,9 @@ import mujoco
 import torch
 
 from mjlab.utils.lab_api.math import subtract_frame_transforms
+from mjlab.utils.random import preserved_rng
+from mjlab.utils.state import changes_undone, is_stateful
+from mjlab.utils.tables import json_value
 
 if TYPE_CHECKING:
     from mjlab.entity import Entity
@@ -48,8 +52,10 @@ class Measurement:
     """Reason of the availability, in words."""
     source: dict[str, Any]
     """Origin in plain MuJoCo; the page of the contract has the kinds."""
-    read: Callable[[ManagerBasedRlEnv], torch.Tensor]
-    """Return the value in all environments, (N, *shape)."""
+    read: Callable[[ManagerBasedRlEnv], torch.Tensor] | None
+    """Return the value in all environments, (N, *shape). None: it is that of `term`."""
+    term: ObservationTermCfg | None = None
+    """Observation term that the value is that of; reading it again would advance terms with state."""
 
     def entry(self) -> dict[str, Any]:
         """Return the entry of the contract."""
@@ -65,6 +71,7 @@ class Measurement:
             "availability": self.availability,
             "why": self.why,
             "source": self.source,
+            "is_quaternion": "quat" in f"{self.source['kind']} {self.source.get('type', '')}",
         }
 
 
@@ -387,12 +394,38 @@ def traced(
     cfg: ObservationTermCfg,
 ) -> Measurement:
     """Value of a term that no kinematics gives, such as scans, images and contacts."""
+    source = {
+        "kind": "trace",
+        "function": name_of(cfg.func),
+        "params": plain(dict(cfg.params)),
+    }
+    shape = shape_of(subject.env, cfg)
+    return Measurement(name, shape, unit, "", availability, why, source, None, cfg)
 
-    def read(env: ManagerBasedRlEnv) -> torch.Tensor:
-        return cfg.func(env, **cfg.params)
 
-    shape = tuple(read(subject.env).shape[1:])
-    return Measurement(name, shape, unit, "", availability, why, {"kind": "trace"}, read)
+def shape_of(env: ManagerBasedRlEnv, cfg: ObservationTermCfg) -> tuple[int, ...]:
+    """Return the shape of one value of a term, without history; its state does not advance."""
+    parts = [cfg.func] if is_stateful(cfg.func) else []
+    with preserved_rng(), changes_undone(parts):
+        return tuple(cfg.func(env, **cfg.params).shape[1:])
+
+
+def name_of(func: Any) -> str:
+    """Return `module:name` of a term's function, or of the class of a term with state."""
+    func = func if hasattr(func, "__qualname__") else type(func)
+    return f"{func.__module__}:{func.__qualname__}"
+
+
+def plain(value: Any) -> Any:
+    """Return `value` for JSON, without infinities."""
+    value = json_value(value)
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 # Shared.

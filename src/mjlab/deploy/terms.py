@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mjlab.deploy import measurements as m
-from mjlab.deploy.measurements import Measurement, Subject
+from mjlab.deploy.measurements import Measurement, Subject, name_of
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.rl.exporter_utils import shortest
 
@@ -48,19 +48,13 @@ class Term:
     """Frame of the value."""
 
 
-def name_of(func: Any) -> str:
-    """Return `module:name` of a term's function, or of the class of a term with state."""
-    func = func if hasattr(func, "__qualname__") else type(func)
-    return f"{func.__module__}:{func.__qualname__}"
-
-
 def describe(subject: Subject, name: str, cfg: ObservationTermCfg) -> Term:
     """Return the formula of the term called `name`, of kind `custom` if no row has its function."""
     row = TERMS.get(name_of(cfg.func))
     if row is not None:
         return row(subject, cfg)
     why = f"{name_of(cfg.func)} is not known to the runtime"
-    value = m.traced(subject, name, "", why, "none", cfg)
+    value = m.traced(subject, f"term/{name}", "", why, "none", cfg)
     return Term("custom", (value,))
 
 

@@ -272,6 +272,8 @@ class Policy {
     for (const json& action : contract_["actions"]) actions_.push_back(make_action(action));
     for (const json& command : contract_["commands"])
       if (command["kind"] == "motion") read_motion(folder, command);
+    for (const json& entry : contract_["measurements"])
+      if (entry.value("is_quaternion", false)) quaternions_.push_back(entry["name"]);
     const json& bounds = contract_["limits"];
     target_low_ = numbers(bounds["target_low"]);
     target_high_ = numbers(bounds["target_high"]);
@@ -287,13 +289,18 @@ class Policy {
     reason_.clear();
     time_.reset();
     begin_.reset();
-    sent_.clear();
+    sent_ = std::exchange(handed_, {});  // The first jump is that from the last of the hand-over.
     repeated_ = 0;
     is_first_ = true;
     is_ready_ = false;
     std::fill(action_.begin(), action_.end(), 0.0f);
     motion_ = motion;
     frame_.reset();
+    for (const json& command : contract_["commands"]) {
+      if (command["kind"] != "motion") continue;
+      const size_t first = command["motions"].at(motion)["start"], frame = command["start_frame"];
+      default_ = arrays_["joint_pos"].row(first + frame - 1, 0, names_.size());
+    }
     for (size_t k : memory_) std::fill(inputs_[k].data.begin(), inputs_[k].data.end(), 0.0f);
     clocks_.clear();
     for (const json& command : contract_["commands"])
@@ -328,6 +335,7 @@ class Policy {
   ///
   /// `is_ready` becomes true when time is over and each joint within `tolerance` (rad, m).
   Targets hand_over(const Values& measurements, double seconds = 2.0, double tolerance = 0.3) {
+    handed_.clear();
     const Values values = checked(measurements);
     const Vector& q = found(values, "joint_pos");
     if (!reason_.empty()) return damp(q);
@@ -341,7 +349,10 @@ class Policy {
       farthest = std::max(farthest, std::abs(q[k] - default_[k]));
     }
     is_ready_ = share == 1.0 && farthest < tolerance;
-    return commanded(position);
+    Targets result = commanded(position);
+    for (const Action& action : actions_)
+      for (size_t joint : action.index) handed_.push_back(field(result, action)[joint]);
+    return result;
   }
 
   /// Return commands that only brake: no stiffness, targets at the measured positions.
@@ -455,8 +466,6 @@ class Policy {
     arrays_ = read_npz(folder / command["file"].get<std::string>());
     for (const char* name : {"joint_pos", "joint_vel", "body_pos_w", "body_quat_w"})
       if (!arrays_.count(name)) fail(std::string("Motion: no float32 array ") + name + ".");
-    const size_t first = command["motions"][0]["start"], frame = command["start_frame"];
-    default_ = arrays_["joint_pos"].row(first + frame - 1, 0, names_.size());
   }
 
   static const Vector& found(const Values& values, const std::string& name) {
@@ -488,10 +497,22 @@ class Policy {
       reason_ = "a measurement is not finite";
     else if (is_fast(found(values, "joint_vel")))
       reason_ = "a joint is faster than limits.joint_speed";
-    else if (!limits["tilt"].is_null() && values.count(limits["tilt_from"]) &&
-             rotation(values.at(limits["tilt_from"]))[2][2] < std::cos(limits["tilt"].get<double>()))
+    else if (!are_quaternions(values))
+      reason_ = "a quaternion is not of length 1";
+    else if (!limits["tilt"].is_null() && !limits["tilt_from"].is_null() &&
+             rotation(found(values, limits["tilt_from"]))[2][2] <
+                 std::cos(limits["tilt"].get<double>()))
       reason_ = "the robot is tilted by more than limits.tilt";
     return values;
+  }
+
+  bool are_quaternions(const Values& values) const {
+    return std::all_of(quaternions_.begin(), quaternions_.end(), [&values](const auto& name) {
+      if (!values.count(name)) return true;
+      const Vector& q = values.at(name);
+      const double norm = std::sqrt(std::inner_product(q.begin(), q.end(), q.begin(), 0.0));
+      return std::abs(norm - 1) <= 0.05;
+    });
   }
 
   bool is_fast(const Vector& speed) const {
@@ -502,6 +523,10 @@ class Policy {
 
   /// Add given commands, gait clocks and motions to `values`.
   void add_commands(Values& values, const Vector& command) {
+    const auto count = std::count_if(contract_["commands"].begin(), contract_["commands"].end(),
+                                     [](const json& entry) { return entry["kind"] == "given"; });
+    if (!command.empty() && count > 1)
+      fail("Command: several are given; add each to the measurements, as command/<name>.");
     for (const json& entry : contract_["commands"]) {
       if (entry["kind"] != "given") continue;
       const std::string key = "command/" + entry["name"].get<std::string>();
@@ -583,6 +608,12 @@ class Policy {
                   &data[term.begin + block * term.stride]);
   }
 
+  /// Return the motor commands that an action sets.
+  static Vector& field(Targets& targets, const Action& action) {
+    if (action.kind == "joint_velocity") return targets.velocity;
+    return action.kind == "joint_effort" ? targets.effort : targets.position;
+  }
+
   Targets commanded(Vector position) const {
     const Vector zero(names_.size(), 0.0);
     return {names_, std::move(position), zero, zero, kp_, kd_, period_, false, ""};
@@ -608,12 +639,8 @@ class Policy {
     sent_ = sent;
     Targets result = commanded(default_);
     size_t next = 0;
-    for (const Action& action : actions_) {
-      Vector& field = action.kind == "joint_velocity" ? result.velocity
-                      : action.kind == "joint_effort" ? result.effort
-                                                      : result.position;
-      for (size_t joint : action.index) field[joint] = sent[next++];
-    }
+    for (const Action& action : actions_)
+      for (size_t joint : action.index) field(result, action)[joint] = sent[next++];
     return result;
   }
 
@@ -621,7 +648,7 @@ class Policy {
   Network network_;
   bool has_limits_;
   double period_ = 0.0, clip_ = 0.0;
-  std::vector<std::string> names_, outputs_;
+  std::vector<std::string> names_, outputs_, quaternions_;
   Vector kp_, kd_, default_;
   Vector target_low_, target_high_, target_step_, joint_speed_;
   std::vector<Input> inputs_;
@@ -640,7 +667,7 @@ class Policy {
   std::map<std::string, std::pair<float, float>> clocks_;  // Phase and amplitude.
   std::map<std::string, Vector> values_;
   std::vector<float> action_;
-  Vector target_, sent_;
+  Vector target_, sent_, handed_;
 };
 
 }  // namespace mjlab

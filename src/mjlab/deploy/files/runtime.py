@@ -78,12 +78,13 @@ TERMS = {
     # Two columns of the relative rotation matrix, row by row.
     "orientation_in_frame": lambda i, term: (rotation(i[1]).T @ rotation(i[0]))[:, :2].ravel(),
     "pose_error": pose_error,
-    # A term of your own: "my_package.mdp:wheel_speed": lambda inputs, term: ...
+    # A term of your own; its inputs are the measurements that contract.json lists for it:
+    # "my_package.mdp:wheel_speed": lambda inputs, term: ...
 }
 
 
 class Policy:
-    """Policy with its contract, memory, clocks and limits."""
+    """Policy with its contract, memory, clocks and limits: faults damp until `reset`."""
 
     @classmethod
     def load(cls, folder, limits=True):
@@ -99,7 +100,7 @@ class Policy:
         """Prepare the terms; `run(names of outputs, inputs)` is that of an onnxruntime session."""
         if (contract["schema"], contract["version"]) != ("mjlab-contract", 1):
             raise ValueError("contract.json: expected schema mjlab-contract, version 1.")
-        self.contract, self._run, self._has_limits = contract, run, limits
+        self.contract, self._run, self._has_limits, self._handed = contract, run, limits, None
         self.period, joints = contract["rates"]["step_dt"], contract["joints"]
         self.names = [joint["name"] for joint in joints]
         keys = ("kp", "kd", "default_pos")
@@ -112,12 +113,13 @@ class Policy:
         self._terms = [self._term(o, dict(t)) for o in contract["observations"] for t in o["terms"]]
         self._actions = [self._action(dict(action)) for action in contract["actions"]]
         self._commands = {command["name"]: command for command in contract["commands"]}
-        self._given = [n for n, command in self._commands.items() if command["kind"] == "given"]
-        for command in self._commands.values():
-            if command["kind"] == "motion":
-                self.motion = dict(np.load(Path(folder) / command["file"]))
-                frame = command["motions"][0]["start"] + command["start_frame"] - 1
-                self.default = self.motion["joint_pos"][frame].astype(float)
+        self._given = {f"command/{n}": n for n, c in self._commands.items() if c["kind"] == "given"}
+        self._motions = [c for c in contract["commands"] if c["kind"] == "motion"]
+        self._entries = {entry["name"]: entry for entry in contract["measurements"]}
+        self._turns = {n for n, entry in self._entries.items() if entry.get("is_quaternion")}
+        self._entries |= {f"command/{name}": entry for name, entry in self._commands.items()}
+        for command in self._motions:
+            self.motion = dict(np.load(Path(folder) / command["file"]))
         self.values, self.action = {}, np.zeros(contract["policy"]["size"], np.float32)
         self.reset()
 
@@ -125,14 +127,10 @@ class Policy:
         """Return key, formula, settings, place in the input, and size in a history of one term."""
         function = TERMS.get(term["kind"]) or TERMS.get(term["function"])
         if function is None:
-            raise ValueError(
-                f"Term {term['name']!r}: unknown function {term['function']!r}. Add its formula to TERMS "
-                "under this name; its inputs are the measurements that contract.json lists for it."
-            )
+            raise ValueError(f"Term {term['name']!r}: add {term['function']!r} to TERMS.")
         term |= {key: arrayed(term[key]) for key in ("offset", "scale")}
         term["clip"] = None if term["clip"] in (None, [None, None]) else term["clip"]
-        if term["kind"] == "last_action":
-            term["inputs"] = ["last_action"]
+        term["inputs"] = ["last_action"] if term["kind"] == "last_action" else term["inputs"]
         place = (0, *(slice(None),) * observation["axis"], slice(term["start"], term["stop"]))
         slot = self.inputs[observation["input"]][place]
         history = term["size"] if term["history"]["length"] else 0
@@ -143,6 +141,7 @@ class Policy:
         if action["kind"] == "custom":
             raise ValueError(f"Action {action['name']!r} is a {action['class']}: compute it here.")
         action |= {k: arrayed(action.get(k)) for k in ("scale", "offset", "open", "closed")}
+        action["field"] = action["kind"].rpartition("_")[2]  # position, velocity or effort
         clip = action.get("clip") or [[None, None]] * len(action["joints"])
         action["low"], action["high"] = np.array(clip, float).T  # None: NaN, which fmin ignores.
         action["index"] = [self.names.index(name) for name in action["joints"]]
@@ -151,27 +150,24 @@ class Policy:
     def reset(self, motion=0):
         """Start an episode, in motion tracking of a motion: clear memory, clocks and faults."""
         self.reason, self._time, self._repeated, self._is_first = "", None, 0, True
-        self.is_ready, self._start = False, None
-        self.action, self._sent = np.zeros_like(self.action), None
-        self._motion, self.frame = motion, None
+        self.is_ready, self._start, self._motion, self.frame = False, None, motion, None
+        # The first jump of targets is that from the last of the hand-over.
+        self.action, self._sent, self._handed = np.zeros_like(self.action), self._handed, None
+        for command in self._motions:
+            frame = command["motions"][motion]["start"] + command["start_frame"] - 1
+            self.default = self.motion["joint_pos"][frame].astype(float)
         for name in self._memory.values():
             self.inputs[name][:] = 0.0
-        # Phase and amplitude of gait clocks.
-        start = {n: np.float32(command.get("start", 0)) for n, command in self._commands.items()}
-        self._clocks = {name: [phase, np.float32(0)] for name, phase in start.items()}
+        start = {name: command.get("start", 0) for name, command in self._commands.items()}
+        self._clocks = {n: np.array((x, 0), "f4") for n, x in start.items()}  # Phase, amplitude.
 
     def step(self, measurements, command=None):
-        """Return the motor commands of one period.
-
-        `command` is that of the only given command, or a dict by name. After non-finite or stale
-        measurements, a tilt or joint speed beyond the limits, all steps damp until `reset`.
-        """
+        """Return the motor commands of a period; `command` is of the only given one, or a dict."""
         values = self._checked(measurements)
         self._add_commands(values, command)
         values["last_action"] = self.action
         for key, function, term, slot, history in self._terms:
-            value = function([values[name] for name in term["inputs"]], term)
-            self.values[key] = value
+            self.values[key] = value = function([values[n] for n in term["inputs"]], term)
             if term["clip"] is not None:
                 value = np.clip(value, *term["clip"])
             if term["scale"] is not None:
@@ -194,18 +190,17 @@ class Policy:
         return self._targets()
 
     def hand_over(self, measurements, seconds=2.0, tolerance=0.3):
-        """Move from the measured pose to the first pose of the policy, in `seconds`.
-
-        `is_ready` becomes True then, with all joints within `tolerance`: the Go1 sags by 0.23 rad.
-        """
-        values = self._checked(measurements)
+        """Move to the first pose in `seconds`; ready within `tolerance`: a Go1 sags by 0.23 rad."""
+        values, self._handed = self._checked(measurements), None
         q, now = values["joint_pos"], float(measurements["time"])
         if self.reason:
             return self.damp(q)
         begin, pose = self._start = self._start or (now, q)
         share = min((now - begin) / seconds, 1.0)
         self.is_ready = share == 1.0 and bool(np.abs(q - self.default).max() < tolerance)
-        return self._commanded(pose + share * (self.default - pose))
+        to = self._commanded(pose + share * (self.default - pose))
+        self._handed = np.concatenate([getattr(to, a["field"])[a["index"]] for a in self._actions])
+        return to
 
     def damp(self, q):
         """Return commands that only brake: no stiffness, targets at the measured positions."""
@@ -216,9 +211,16 @@ class Policy:
         zero = np.zeros(len(self.names))
         return Targets(self.names, position, zero, zero.copy(), self.kp, self.kd, self.period)
 
+    def _sized(self, name, value):
+        """Return a measurement or command as an array; raise ValueError for a wrong size."""
+        value, entry = np.asarray(value, float), self._entries.get(name)
+        if entry is not None and value.size != entry["size"]:
+            raise ValueError(f"{name}: expected {entry['size']} numbers, got {value.size}.")
+        return value if entry is None else value.reshape(entry["shape"])
+
     def _checked(self, measurements):
         """Return the values; set `reason` if they are stale, not finite, or beyond the limits."""
-        values = {k: np.asarray(v, float) for k, v in measurements.items() if k != "time"}
+        values = {k: self._sized(k, v) for k, v in measurements.items() if k != "time"}
         limits, last, self._time = self._limits, self._time, float(measurements["time"])
         if self.reason or not self._has_limits:
             return values
@@ -231,7 +233,9 @@ class Policy:
             self.reason = "a measurement is not finite"
         elif (np.abs(values["joint_vel"]) > limits["joint_speed"]).any():
             self.reason = "a joint is faster than limits.joint_speed"
-        elif limits["tilt"] is not None and limits["tilt_from"] in values:
+        elif any(abs(np.linalg.norm(values[k]) - 1) > 0.05 for k in values.keys() & self._turns):
+            self.reason = "a quaternion is not of length 1"
+        elif limits["tilt"] is not None and limits["tilt_from"] is not None:
             _, x, y, _ = values[limits["tilt_from"]]
             if 1 - 2 * (x * x + y * y) < np.cos(limits["tilt"]):
                 self.reason = "the robot is tilted by more than limits.tilt"
@@ -240,9 +244,9 @@ class Policy:
     def _add_commands(self, values, command):
         """Add given commands, gait clocks and motions to `values`."""
         if not isinstance(command, dict):
-            command = dict.fromkeys(self._given, command)
-        for name in self._given:
-            values[f"command/{name}"] = np.asarray(command[name], float)
+            command = dict.fromkeys(self._given.values(), command) if len(self._given) == 1 else {}
+        for key, name in self._given.items():
+            values[key] = self._sized(key, np.asarray(command[name], float))
         for name, entry in self._commands.items():
             if entry["kind"] == "gait_clock":
                 values[f"command/{name}"] = self._clock(entry, values)
@@ -286,14 +290,11 @@ class Policy:
             parts.append(np.fmax(np.fmin(target, action["high"]), action["low"]))
         self.target = sent = np.concatenate(parts)
         if self._has_limits:
-            limits = self._limits
-            sent = sent.clip(limits["target_low"], limits["target_high"])
+            sent = sent.clip(self._limits["target_low"], self._limits["target_high"])
             if self._sent is not None:
-                step = limits["target_step"]
+                step = self._limits["target_step"]
                 sent = sent.clip(self._sent - step, self._sent + step)
         self._sent, commands = sent, self._commanded(self.default.copy())
-        fields = {"joint_velocity": commands.velocity, "joint_effort": commands.effort}
-        for action in self._actions:
-            part = sent[action["target_start"] : action["target_stop"]]
-            fields.get(action["kind"], commands.position)[action["index"]] = part
+        for a in self._actions:
+            getattr(commands, a["field"])[a["index"]] = sent[a["target_start"] : a["target_stop"]]
         return commands

@@ -72,6 +72,18 @@ class Simulation:
                 found[measurement["name"]] = self._read(source)
         return found
 
+    def compute(self, measured):
+        """Return the measurements that kinematics give: from joints, and the orientation of the root."""
+        robot, data = self.contract["robot"], self.data
+        data.qpos[self.qpos], data.qvel[self.qvel] = measured["joint_pos"], measured["joint_vel"]
+        if robot["is_floating"]:
+            root = int(self.model.body(robot["root_body"]).jntadr[0])
+            start = int(self.model.jnt_qposadr[root]) + 3
+            data.qpos[start : start + 4] = measured["root_quat"]
+        mujoco.mj_forward(self.model, data)
+        entries = (e for e in self.contract["measurements"] if e["availability"] == "computed")
+        return {entry["name"]: self._read(entry["source"]) for entry in entries}
+
     def _read(self, source):
         model, data, kind = self.model, self.data, source["kind"]
         if kind in ("joint_pos", "joint_vel"):
@@ -227,10 +239,10 @@ def main():
 
     begin(simulation)
     if options.seconds is not None:
-        play(policy, simulation, command, options.seconds)
+        stands = play(policy, simulation, command, options.seconds)
         place = simulation.data.body(policy.contract["robot"]["root_body"]).xpos
         print("position of the robot after", simulation.data.time, "s:", np.round(place, 3))
-        return
+        raise SystemExit(0 if stands else 1)
     import mujoco.viewer
 
     on_key = keys.press if keys is not None else None
