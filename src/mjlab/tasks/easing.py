@@ -6,11 +6,13 @@ managers and not the config, so flags set the final values.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
 import torch
 
+from mjlab.actuator import ActuatorCfg
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.managers.curriculum_manager import CurriculumTermCfg
 from mjlab.managers.manager_base import ManagerTermBase
@@ -67,7 +69,8 @@ def grow_difficulty(
 def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> None:
     """Reduce the decimation to `num_steps` and lengthen the physics timestep to match.
 
-    Histories of contact sensors keep their number of substeps.
+    Command delays of actuators keep their time, rounded to substeps; histories of contact sensors
+    keep their number of substeps.
 
     Raises:
         ValueError: `num_steps` is not less than the decimation.
@@ -79,7 +82,29 @@ def coarsen_physics(env_cfg: ManagerBasedRlEnvCfg, num_steps: int) -> None:
         )
     mujoco = env_cfg.sim.mujoco
     mujoco.timestep = mujoco.timestep * env_cfg.decimation / num_steps
+    for entity in env_cfg.scene.entities.values():
+        if entity.articulation is not None:
+            # Tasks share the config of a robot: replaced, not edited.
+            entity.articulation = dataclasses.replace(
+                entity.articulation,
+                actuators=tuple(
+                    _with_scaled_delay(actuator, num_steps / env_cfg.decimation)
+                    for actuator in entity.articulation.actuators
+                ),
+            )
     env_cfg.decimation = num_steps
+
+
+def _with_scaled_delay(actuator: ActuatorCfg, factor: float) -> ActuatorCfg:
+    """Return the actuator with `factor` times its command delay, in whole substeps."""
+    if actuator.delay_max_lag == 0:
+        return actuator
+    return dataclasses.replace(
+        actuator,
+        delay_min_lag=round(factor * actuator.delay_min_lag),
+        delay_max_lag=round(factor * actuator.delay_max_lag),
+        delay_update_period=round(factor * actuator.delay_update_period),
+    )
 
 
 def simplify_contacts(env_cfg: ManagerBasedRlEnvCfg) -> None:

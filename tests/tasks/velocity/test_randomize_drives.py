@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.cpu_profile import cpu_profile
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity.velocity_env_cfg import randomize_drives
 
 NUM_ENVS = 16
@@ -62,6 +63,25 @@ def test_latency_is_kept_for_an_episode(env) -> None:
         assert actuator.has_delay
         assert actuator.cfg.delay_max_lag * env.physics_dt == pytest.approx(0.015)
         assert actuator.cfg.delay_hold_prob == 1.0
+
+
+@pytest.mark.parametrize(
+    ("physics_steps", "lags"), [(None, (1, 3)), (3, (1, 2)), (2, (0, 2)), (1, (0, 1))]
+)
+def test_latency_keeps_its_time_with_the_cpu_profile(physics_steps, lags) -> None:
+    task = "Mjlab-Velocity-Flat-Unitree-Go1-No-State-Estimation"
+    cfg = load_env_cfg(task)
+    randomize_drives(cfg)
+    robot = cfg.scene.entities["robot"]
+    for actuator in robot.articulation.actuators:
+        actuator.delay_min_lag = 1
+    cpu_profile(physics_steps=physics_steps).easing(cfg, load_rl_cfg(task))
+    for actuator in robot.articulation.actuators:
+        assert (actuator.delay_min_lag, actuator.delay_max_lag) == lags
+        # 5 and 15 ms, within half a substep.
+        half = 0.5 * cfg.sim.mujoco.timestep + 1e-9
+        assert abs(actuator.delay_min_lag * cfg.sim.mujoco.timestep - 0.005) <= half
+        assert abs(actuator.delay_max_lag * cfg.sim.mujoco.timestep - 0.015) <= half
 
 
 def test_other_tasks_of_the_robot_are_unchanged() -> None:

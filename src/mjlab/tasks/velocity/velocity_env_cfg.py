@@ -268,7 +268,7 @@ def randomize_drives(
         cfg.events[name] = EventTermCfg(
             func=func, mode="startup", params={"asset_cfg": copy.deepcopy(joints), **params}
         )
-    # From measurement to torque, robots of this size need 5 to 15 ms. One lag per episode.
+    # From measurement to torque, robots of this size need up to 15 ms: 0 to 15 ms, one lag per episode.
     robot, substeps = cfg.scene.entities["robot"], round(0.015 / cfg.sim.mujoco.timestep)
     assert robot.articulation is not None
     robot.articulation = dataclasses.replace(

@@ -123,7 +123,7 @@ STANDING_ERRORS = {
     "lin_vel_error": standing_lin_vel_error,
     "ang_vel_error": standing_ang_vel_error,
 }
-"""The errors of a robot that stands still."""
+"""The errors of a robot that stands still; for heading commands, a mean over uniform heading errors."""
 UNITS = {"lin_vel_error": "m/s", "ang_vel_error": "rad/s"}
 """Units of `TRACKING_ERRORS`."""
 
