@@ -12,6 +12,7 @@ from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
 
 from mjlab.rl import RslRlVecEnvWrapper, evaluation
 from mjlab.rl.evaluation import (
+    Bound,
     Episodes,
     EvaluationResult,
     episodes_to_show,
@@ -242,6 +243,16 @@ def test_metrics_are_given_as_shares_of_those_of_standing_still():
     assert result.to_dict()["standing_still"] == {"error": 4.0}
     with pytest.raises(ValueError, match="standing_still"):
         evaluate_policy(counting(), still, standing_still=still_error)
+
+
+def test_no_share_of_an_error_of_zero():
+    zeros = {"error": lambda env: torch.zeros(4)}
+    ones = {"error": lambda env: torch.ones(4)}
+    result = evaluate_policy(counting(), still, metrics=ones, standing_still=zeros)
+    assert set(result.metrics) == {"error"}
+    assert math.isnan(result.value("error_share"))
+    assert not Bound("error_share", 0.5, is_upper=True).is_met(result)
+    json.loads(result.to_json(), parse_constant=pytest.fail)
 
 
 def test_share_is_a_ratio_of_means():

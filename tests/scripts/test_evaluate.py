@@ -71,6 +71,14 @@ def test_errors_of_standing_still_are_beside_the_measured_ones():
     assert not any(line.startswith("error_share") for line in lines)
 
 
+def test_no_share_of_an_error_that_standing_still_has_not():
+    measured = {"error": {"mean": 0.1, "interval": None}}
+    metrics = {**METRICS, "failure_rate": None, "metrics": measured}
+    text = evaluate._table({**metrics, "standing_still": {"error": 0.0}, "units": {}}, [])
+    assert "error        0.1   no interval   (standing still, 0)" in text
+    assert "%" not in text.splitlines()[-1]
+
+
 def test_elsewhere_lines_are_rare_and_go_to_stderr(capsys):
     with EvaluationProgress(8, Console(file=io.StringIO())) as progress:
         progress.update(1, 0.2)

@@ -99,7 +99,7 @@ def evaluate_policy(
         metrics: Functions by name, `func(env) -> (num_envs,)`, read before every step and averaged
             over the steps of an episode.
         standing_still: Functions like those of `metrics`, by the metric's name: its value for a robot that
-            stands still. The result has the metric's share of it, `NAME_share`.
+            stands still. The result has the metric's share of it, `NAME_share`, unless that is 0.
         seed: Seed of the evaluation; None: generators are not seeded. With the same seed,
             environments in the same state give the same episodes.
         progress: Function called every few steps with the number of finished episodes, and with the
@@ -218,9 +218,10 @@ class EvaluationResult:
     """Fraction of episodes with the termination true in the last step, by name."""
     metrics: dict[str, MeanAndInterval] = dataclasses.field(default_factory=dict)
     """Metrics of the task, averaged over the steps of an episode and then over episodes; and of those in
-    `standing_still`, the share of it, `NAME_share`."""
+    `standing_still`, the share of it, `NAME_share`, unless that is 0."""
     standing_still: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Metrics of a robot that stands still, with the same commands."""
+    """Metrics of a robot that stands still, with the same commands; of the yaw error with heading commands,
+    the mean over uniform heading errors."""
     curricula: dict[str, Any] = dataclasses.field(default_factory=dict)
     """State of the curricula, which stands still in an evaluation: numbers that differ from the task's
     config, by path (`commands.twist.ranges.lin_vel_x`), and lowest and highest terrain level. Episodes
@@ -274,11 +275,15 @@ class EvaluationResult:
     def value(self, name: str) -> float:
         """Return a value by name: a metric of the task, or a field such as `failure_rate`.
 
+        NaN for the share of a metric that is 0 for a robot that stands still.
+
         Raises:
             ValueError: the name is unknown; the message lists the available names.
         """
         if name in self.metrics:
             return self.metrics[name].mean
+        if name.endswith(SHARE) and name.removesuffix(SHARE) in self.standing_still:
+            return math.nan
         value = getattr(self, name, None) if name in RESULT_FIELDS else None
         if value is None:
             known = [*self.metrics, *(f for f in RESULT_FIELDS if getattr(self, f) is not None)]
@@ -719,7 +724,9 @@ def summarize(
     failures = episodes.failed.double().mean().item()
     metrics = {name: mean_and_interval(v) for name, v in episodes.metrics.items()}
     for name, still in episodes.standing_still.items():
-        metrics[f"{name}{SHARE}"] = ratio_and_interval(episodes.metrics[name], still)
+        # All commands are 0 in a task of standing.
+        if still.double().mean() != 0.0:
+            metrics[f"{name}{SHARE}"] = ratio_and_interval(episodes.metrics[name], still)
     return EvaluationResult(
         num_episodes=count,
         mean_return=mean_return.mean,

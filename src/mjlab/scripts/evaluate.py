@@ -222,8 +222,10 @@ def _table(metrics: dict[str, Any], failures: list[str]) -> str:
         line = f"{name:<12} {value['mean']:.4g} {unit}".rstrip()
         line += f"   {_interval(value['interval'], '.4g')}"
         if name in still:
-            share = measured[f"{name}{SHARE}"]["mean"]
-            line += f"   ({share:.0%} of standing still, {still[name]:.4g} {unit})"
+            # Standing still is no yardstick where it has no error.
+            share = measured.get(f"{name}{SHARE}")
+            of = f"{share['mean']:.0%} of " if share else ""
+            line += f"   ({of}standing still, {f'{still[name]:.4g} {unit}'.rstrip()})"
         lines.append(line)
     if state := curricula_text(metrics["curricula"]):
         lines.append(f"Curricula    {state}")
