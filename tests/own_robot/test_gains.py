@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from mjlab.own_robot.gains import (
     rail_model,
     settle,
     static_torques,
+    stiffened,
 )
 from mjlab.own_robot.model_source import RobotModel
 from mjlab.own_robot.report import RobotReport, describe_robot
@@ -71,12 +74,17 @@ def test_stands_free(reports, robot):
     assert data.xmat[trunk].reshape(3, 3)[2, 2] > 0.98
 
 
-def test_low_belly_stays_off_the_ground():
+def low_robot(z: float) -> RobotModel:
+    """Return a quadruped with a belly at height `z` in the trunk."""
     spec = legged_spec(4)
     spec.body("trunk").add_geom(
-        name="belly", type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.05, 0.05, 0.01), pos=(0, 0, -0.28)
+        name="belly", type=mujoco.mjtGeom.mjGEOM_BOX, size=(0.05, 0.05, 0.01), pos=(0, 0, z)
     )
-    report = describe_robot(RobotModel(spec, "robot", "low", None, None))
+    return RobotModel(spec, "robot", "low", None, None)
+
+
+def test_low_belly_stays_off_the_ground():
+    report = describe_robot(low_robot(-0.28))
     model = free_model(report)
     data = mujoco.MjData(model)
     geo.set_pose(model, data, report.joint_pos.value, report.root_height.value)
@@ -104,6 +112,55 @@ def free_model(report: RobotReport) -> mujoco.MjModel:
             spec.geom(geom).condim = 3
     spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return spec.compile()
+
+
+def with_servos(spec: mujoco.MjSpec, stiffness: float) -> RobotModel:
+    """Return the robot with a position servo per joint."""
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            actuator = spec.add_actuator(target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            actuator.set_to_position(kp=stiffness, kv=0.1)
+            actuator.forcelimited, actuator.forcerange = True, (-20.0, 20.0)
+    return RobotModel(spec, "robot", "servos", None, None)
+
+
+@pytest.mark.parametrize(("share", "is_kept"), [(0.01, False), (0.15, False), (0.9, True)])
+def test_servo_far_below_the_rule_is_a_stand_in(share, is_kept):
+    by_rule = describe_robot(with_servos(legged_spec(4), 0.0)).stiffness.value
+    own = round(share * max(by_rule.values()), 1)
+    found = describe_robot(with_servos(legged_spec(4), own)).stiffness
+    assert (own in found.value.values()) == is_kept
+    assert (found.value == by_rule) == (not is_kept)
+    assert ("overridden" in found.rule) == (not is_kept)
+
+
+@pytest.mark.parametrize(
+    ("belly", "answers", "is_asked"),
+    [
+        (-0.28, {}, False),
+        # Knees that the user made soft are not stiffened, nor the others for them.
+        (-0.28, {"stiffness.[ab]0_3": "9"}, True),
+        (-0.30, {}, True),
+        (-0.30, {"stiffness": "30"}, False),
+    ],
+)
+def test_stiffness_is_asked_if_no_trial_stands(belly, answers, is_asked):
+    report = describe_robot(low_robot(belly), answers)
+    assert ("stiffness" in {question.key for question in report.questions}) == is_asked
+    for setting, value in answers.items():
+        pattern = setting.partition(".")[2] or ".*"
+        for joint, kp in report.stiffness.value.items():
+            assert kp == float(value) or not re.fullmatch(pattern, joint)
+
+
+def test_stiffened_up_to_a_ceiling():
+    stiffness, ceiling = {"hip": 10.0, "knee": 20.0, "ankle": 5.0}, {"hip": 12.0, "knee": 15.0}
+    assert stiffened(stiffness, 1.1, ceiling, {"hip"}) == {**stiffness, "hip": 11.0}
+    assert stiffened(stiffness, 2.0, ceiling, {"hip"}) == {**stiffness, "hip": 12.0}
+    # Above its ceiling already, as far as the sag demands.
+    assert stiffened(stiffness, 2.0, ceiling, {"knee"}) == stiffness
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

@@ -1,12 +1,14 @@
 """Effort limits, rotor inertias and gains of position actuators.
 
-Gains of a leg joint: the effort limit per rad, or the static torque of the standing pose per
-`STATIC_SAG`, whichever is larger, and at most (`STABLE` / dt)^2 I with the inertia I at the joint, so
-that the oscillation is resolved by the time step. Joints that sag by more than `MAX_SAG` in simulation
-get more.
+A joint has the stiffness of the file's servo, unless that is far below the rule (`STAND_IN`). Rule for a
+leg joint: the effort limit per rad, or the static torque of the standing pose per `STATIC_SAG`,
+whichever is larger, and at most (`STABLE` / dt)^2 I with the inertia I at the joint, so that the
+oscillation is resolved by the time step. Joints that sag by more than `MAX_SAG` in simulation get more.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import mujoco
 import numpy as np
@@ -25,6 +27,9 @@ STABLE = 0.5
 """Greatest product of a joint's angular frequency and the time step."""
 TIMESTEP = 0.005
 """Time step of the velocity tasks (s)."""
+STAND_IN = 0.2
+"""Share of the rule's stiffness below which the gain of a file's servo is a stand-in: 0.05 of the
+Berkeley Humanoid's ankles, 1 N m/rad with an effort of 20 N m; Apollo's neck has 0.26."""
 ARM_ERROR = 0.1
 """Position error at which the joint of an arm has its effort limit (rad)."""
 SWAY_MARGIN = 2.5
@@ -228,27 +233,33 @@ def find_gains(
     effort: dict[str, float],
     armature: dict[str, float],
     answers: dict[str, float] | None = None,
-) -> tuple[Guess[dict[str, float]], Guess[dict[str, float]]]:
-    """Return stiffness (N m/rad, N/m) and damping (N m s/rad, N s/m) of each joint."""
+) -> tuple[Guess[dict[str, float]], Guess[dict[str, float]], list[Question]]:
+    """Return stiffness (N m/rad, N/m) and damping (N m s/rad, N s/m) of each joint, with questions."""
     answers = answers or {}
     legged = anatomy.kind.value == "legged"
     torque = static_torques(model, anatomy, joint_pos)
     inertia = joint_inertias(model, joint_pos, armature)
     own = servo_stiffness(model)
-    stiffness, cap = {}, {}
+    stiffness, cap, stand_ins = {}, {}, []
     sway = _sway_stiffness(model, anatomy, height)
     for name in joint_pos:
         cap[name] = (STABLE / TIMESTEP) ** 2 * inertia[name]
         error = 1.0 if legged else ARM_ERROR
         wanted = max(effort[name] / error, abs(torque[name]) / STATIC_SAG, sway.get(name, 0.0))
         if own.get(name, 0.0) * 0.2 > abs(torque[name]):
-            wanted = own[name]
+            if own[name] < STAND_IN * min(wanted, cap[name]) and name not in answers:
+                stand_ins.append(name)
+            else:
+                wanted = own[name]
         stiffness[name] = min(wanted, cap[name])
     groups = like_joints(anatomy, list(joint_pos))
     stiffness = _alike(stiffness, groups) | answers
     rule = (
         "servo of the file, or effort per rad and static torque per 0.14 rad, at most (0.5/dt)^2 I"
     )
+    if stand_ins:
+        rule += f"; servo of the file below {STAND_IN:g} of that, overridden: {_some(stand_ins)}"
+    questions = []
     if legged:
         railed = rail_model(spec, model, anatomy, effort, armature)
         for _ in range(MAX_ROUNDS):
@@ -267,44 +278,70 @@ def find_gains(
                 stiffness[name] = min(raised, 4.0 * cap[name])
             stiffness = _alike(stiffness, groups) | answers
         rule += f"; sag in simulation at most {max(sag[n] for n in anatomy.leg_joints):.2f} rad"
-        if len(anatomy.legs.value) >= 4:
+        if len(anatomy.legs.value) >= 4 and set(anatomy.leg_joints) - answers.keys():
             free = rail_model(spec, model, anatomy, effort, armature, free=True)
-            factor = _standing_factor(free, anatomy, joint_pos, height, stiffness, inertia)
-            if factor > 1.0:
-                rule += f"; x {factor:.2f} to keep all but the feet off the ground"
-                legs = set(anatomy.leg_joints) - answers.keys()
-                stiffness |= {name: float(f"{factor * stiffness[name]:.3g}") for name in legs}
+            # Like joints stay alike, so the smallest bound of them counts.
+            ceiling = {n: 4.0 * min(cap[m] for m in group) for group in groups for n in group}
+            trials = (
+                stiffened(stiffness, 1.15**step, ceiling, set(anatomy.leg_joints) - answers.keys())
+                for step in range(MAX_ROUNDS)
+            )
+            found = _first_that_stands(free, anatomy, joint_pos, height, trials, inertia)
+            if found is None:
+                text = "stiffness of the legs: other bodies than the feet touch the ground"
+                most = f"up to {1.15 ** (MAX_ROUNDS - 1):.2g} times as stiff, or as the time step allows"
+                questions.append(
+                    Question(
+                        "stiffness", f"{text}, {most}", "what holds the trunk on a vertical rail"
+                    )
+                )
+            elif found != stiffness:
+                factor = max(found[name] / stiffness[name] for name in anatomy.leg_joints)
+                rule += f"; up to x {factor:.2f} to keep all but the feet off the ground"
+                stiffness = found
     damping = _alike(_damping(stiffness, inertia, legged), groups)
-    return Guess(stiffness, rule, "set" if answers else "rule"), Guess(
-        damping,
-        "damping ratio 0.7 with the inertia at the joint, stiffness / 40 s to "
-        + ("/ 20 s" if legged else "/ 5 s"),
+    return (
+        Guess(stiffness, rule, "set" if answers else "rule"),
+        Guess(
+            damping,
+            "damping ratio 0.7 with the inertia at the joint, stiffness / 40 s to "
+            + ("/ 20 s" if legged else "/ 5 s"),
+        ),
+        questions,
     )
 
 
-def _standing_factor(
+def stiffened(
+    stiffness: dict[str, float], factor: float, ceiling: dict[str, float], joints: set[str]
+) -> dict[str, float]:
+    """Return the stiffness with that of `joints` times `factor`, raised to `ceiling` at most."""
+    raised = {
+        name: float(f"{max(stiffness[name], min(factor * stiffness[name], ceiling[name])):.3g}")
+        for name in joints
+    }
+    return stiffness | raised
+
+
+def _first_that_stands(
     model: mujoco.MjModel,
     anatomy: Anatomy,
     joint_pos: dict[str, float],
     height: float,
-    stiffness: dict[str, float],
+    trials: Iterable[dict[str, float]],
     inertia: dict[str, float],
-) -> float:
-    """Return the factor of the legs' stiffness at which the robot stands on its feet alone; 1 if none does.
+) -> dict[str, float] | None:
+    """Return the first stiffness with which the robot stands on its feet alone; None if none does.
 
     Without a rail, the trunk pitches and sways too: knees of the HyQReal2 that sag by 0.14 rad on the rail
     give way by 0.22 rad, so that its thighs touch the ground.
     """
     fallen = {model.body(name).id for name in anatomy.fall_bodies.value}
     groups = like_joints(anatomy, list(joint_pos))
-    for step in range(MAX_ROUNDS):
-        factor = 1.15**step
-        trial = dict(stiffness)
-        trial |= {name: factor * stiffness[name] for name in anatomy.leg_joints}
+    for trial in trials:
         set_gains(model, trial, _alike(_damping(trial, inertia, legged=True), groups))
         if not _touches(model, fallen, joint_pos, height + DROP):
-            return factor
-    return 1.0
+            return trial
+    return None
 
 
 def _touches(

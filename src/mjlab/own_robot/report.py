@@ -102,7 +102,7 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
     armature, asked = rotor_inertias(compiled, effort.value, is_arm, answers["armature"])
     questions += asked
     pose = joint_pos.value
-    stiffness, damping = find_gains(
+    stiffness, damping, asked = find_gains(
         spec,
         compiled,
         anatomy,
@@ -112,6 +112,7 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         armature.value,
         answers["stiffness"],
     )
+    questions += asked
     scale = _action_scale(compiled, is_arm, effort.value, stiffness.value)
     commands = command_ranges(height.value, len(anatomy.feet.value))
     return RobotReport(
