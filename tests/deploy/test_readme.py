@@ -67,6 +67,7 @@ def modules(simulation: Any, clock: list[float]) -> dict[str, ModuleType]:
             handlers[0](state())
             if len(sent) == STEPS:
                 raise Done
+            assert len(sent) < STEPS or not any(values["kp"])
 
     contents = {
         "core.channel": {
@@ -83,6 +84,7 @@ def modules(simulation: Any, clock: list[float]) -> dict[str, ModuleType]:
         "utils.crc": {"CRC": lambda: SimpleNamespace(Crc=lambda cmd: 7)},
     }
     made = {"unitree_sdk2py": ModuleType("unitree_sdk2py")}
+    vars(made["unitree_sdk2py"])["sent"] = sent
     for path, names in contents.items():
         parts = path.split(".")
         for end in range(1, len(parts) + 1):
@@ -94,14 +96,16 @@ def modules(simulation: Any, clock: list[float]) -> dict[str, ModuleType]:
 
 def test_loop_for_unitree_drives_the_robot(bundle, monkeypatch):
     folder = bundle("go1")
-    (program,) = re.findall(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.DOTALL)
-    assert len(program.splitlines()) <= 40
+    parts = re.findall(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.DOTALL)
+    assert len(parts[1].splitlines()) <= 40
+    program = "".join(parts)
     load_program(folder, "runtime")
     simulate = load_program(folder, "simulate")
     policy = simulate.Policy.load(folder)
     simulation = simulate.Simulation(policy.contract, simulate.load_model(folder))
     clock = [100.0]
-    for name, module in modules(simulation, clock).items():
+    made = modules(simulation, clock)
+    for name, module in made.items():
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(time, "sleep", lambda seconds: None)
@@ -109,6 +113,24 @@ def test_loop_for_unitree_drives_the_robot(bundle, monkeypatch):
     scope: dict[str, Any] = {}
     with contextlib.suppress(Done):
         exec(program.replace("np.zeros(3)", "np.array([0.8, 0.0, 0.0])"), scope)
+    # The end of the loop damps.
+    assert len(vars(made["unitree_sdk2py"])["sent"]) == STEPS + 1
     assert scope["has_begun"]
     assert not scope["policy"].reason
     assert simulation.data.body("robot/trunk").xpos[0] > 0.3
+
+
+def test_loops_have_the_measurements_of_the_contract(bundle):
+    folder = bundle("Mjlab-Tracking-Flat-Unitree-G1")
+    text = (folder / "README.md").read_text()
+    measured = load_program(folder, "runtime").Policy.load(folder).contract["measurements"]
+    python = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+    cpp = re.findall(r"```cpp\n(.*?)```", text, re.DOTALL)[-1]
+    compile(python, "README.md", "exec")
+    assert "robot.compute(measured)" in python
+    for one in measured:
+        if one["name"] not in ("joint_pos", "joint_vel"):
+            assert f'measured["{one["name"]}"] = ' in cpp
+        assert (f'"{one["name"]}": ' in python) == (one["availability"] != "computed")
+    assert "np.full(3, np.nan)" in python
+    assert len(cpp.splitlines()) <= 40

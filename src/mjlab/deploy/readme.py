@@ -51,8 +51,78 @@ def readme(contract: Mapping[str, Any], notes: Sequence[str]) -> str:
         joints=", ".join(joint["name"] for joint in contract["joints"]),
         heading=_HEADING if any(c["kind"] == "motion" for c in contract["commands"]) else "",
         commands=_commands(contract["commands"]),
+        **_loops(contract),
         notes=f"\n## Notes\n\n{listed}\n" if listed else "\n",
     )
+
+
+def _origin(contract: Mapping[str, Any], one: Mapping[str, Any]) -> str:
+    """Return the origin of a measurement in the loops: a field of the robot's state, "kinematics" or ""."""
+    source, root = one["source"], contract["robot"]["root_body"]
+    kind = source.get("type") if source["kind"] == "sensor" else source["kind"]
+    if one["name"] in ("joint_pos", "joint_vel"):
+        return one["name"]
+    if source.get("body", root) == root or source["kind"] == "sensor":
+        fields = {
+            "body_quat": "quaternion",
+            "framequat": "quaternion",
+            "body_ang_vel_b": "gyroscope",
+            "gyro": "gyroscope",
+        }
+        if kind in fields:
+            return fields[kind]
+    return "kinematics" if one["availability"] == "computed" else ""
+
+
+_PYTHON = {
+    "joint_pos": "[m.q for m in motors]",
+    "joint_vel": "[m.dq for m in motors]",
+    "quaternion": "imu.quaternion",
+    "gyroscope": "imu.gyroscope",
+}
+_CPP = {
+    "quaternion": "{turn[3], turn[0], turn[1], turn[2]}",
+    "gyroscope": "{rate[0], rate[1], rate[2]}",
+}
+_NAN_NOTE = " Replace each NaN by the measurement of the line: until then, the robot is damped."
+
+
+def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
+    """Return the parts of the loops that depend on measurements and commands."""
+    python, cpp, computes, is_missing = "", "", False, False
+    for one in contract["measurements"]:
+        name, size, origin = one["name"], one["size"], _origin(contract, one)
+        if origin == "kinematics":
+            computes = True
+        else:
+            value = _PYTHON.get(origin, f"np.full({size}, np.nan)")
+            python += f',\n                "{name}": {value}'
+        if origin not in ("joint_pos", "joint_vel"):
+            value = _CPP.get(origin, f"mjlab::Vector({size}, NAN)")
+            note = "  // As Simulation.compute in simulate.py." if origin == "kinematics" else ""
+            cpp += f'  measured["{name}"] = {value};{note}\n'
+        is_missing = is_missing or origin in ("", "kinematics")
+    given = [one for one in contract["commands"] if one["kind"] == "given"]
+    zeros = ", ".join(f'"{one["name"]}": np.zeros({one["size"]})' for one in given)
+    sizes = [one["size"] for one in given]
+    is_twist = sizes == [3]
+    return {
+        "measured_py": python,
+        "measured_cpp": cpp,
+        "return_py": "measured | robot.compute(measured)" if computes else "measured",
+        "import_py": "\nimport mujoco\nfrom simulate import Simulation" if computes else "",
+        "robot_py": _ROBOT if computes else "",
+        "nan_note": _NAN_NOTE if is_missing else "",
+        "command_py": f"np.zeros({sizes[0]})" if len(sizes) == 1 else f"{{{zeros}}}",
+        "command_cpp": "{twist.linear.x, twist.linear.y, twist.angular.z}"
+        if is_twist
+        else "command_",
+    }
+
+
+_ROBOT = """# Kinematics of the robot, for measurements that follow from joints and root.
+robot = Simulation(policy.contract, mujoco.MjModel.from_xml_path("robot/robot.xml"))
+"""
 
 
 def _components(commands: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
