@@ -44,6 +44,12 @@ def test_values_and_next_commands_are_printed(run, model: str, folder: Path) -> 
     assert (folder / "src" / "dog" / "task.py").is_file()
 
 
+def test_front_is_said_not_to_turn_commands(run, model: str, folder: Path) -> None:
+    assert "lin_vel_x" not in run("new_robot", model, "--output", str(folder)).out.split("Wrote")[1]
+    outcome = run("new_robot", model, "--output", str(folder), "--set", "front=-x")
+    assert "lin_vel_x" in outcome.out.split("Wrote")[1]
+
+
 def test_archive_is_named_by_its_file(run, tmp_path: Path, folder: Path) -> None:
     outcome = run("new_robot", str(write_archive(tmp_path / "model")), "--output", str(folder))
     assert outcome.status == 0, outcome.err

@@ -203,6 +203,11 @@ def _summary(package: Package, folder: Path, kept: list[str]) -> str:
         lines.append(
             f"Edited by you, and kept: {', '.join(kept)}. The new ones: FILE.new beside them."
         )
+    if package.report.anatomy.front.value < 0.0:
+        lines.append(
+            "Front -x sets the direction of the knees only: commands of lin_vel_x > 0 are along the trunk's x. "
+            "Turn the trunk in the model file by pi about z to walk with the front ahead."
+        )
     if package.report.questions:
         lines.append("Answer questions with --set KEY=VALUE, or edit the values.")
     lines += ["Next:", f"    uv pip install -e {folder}"]
