@@ -139,7 +139,8 @@ class Package:
 _TWO_LEGS = """\
 ## Two legs
 
-No biped but the G1 has been trained to walk with these rules yet: a start, not a recipe.
+The profile `cpu` is that of the G1. No other biped has been trained to walk with it yet: take it for
+a start, not a recipe.
 
 A controller that steps in place teaches the policy of the profile `cpu` at first (`stepping_action`).
 The observation group `teacher` has its action, and `mdp.SteppingGains` its gains: `gains=` of
