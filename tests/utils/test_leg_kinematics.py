@@ -9,7 +9,7 @@ import torch
 
 from mjlab.asset_zoo.robots import get_g1_robot_cfg
 from mjlab.entity import Entity
-from mjlab.utils.leg_kinematics import Leg, LegTable, find_legs
+from mjlab.utils.leg_kinematics import Leg, LegTable, find_legs, turning_joint
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 LINK = 0.3
@@ -18,8 +18,20 @@ LINK = 0.3
 ORDERS = ("yxz y yx", "zxy y yx", "zxy y y", "xy y ")
 
 
-def biped_model(order: str, bend: float = 0.3) -> tuple[mujoco.MjModel, mujoco.MjData, list[int]]:
-    """Return a biped whose legs are in line with their hips, its pose with bent knees, and its soles."""
+def biped_model(
+    order: str,
+    bend: float = 0.3,
+    knee_range: tuple[float, float] | None = None,
+    hip_roll: float = 0.0,
+) -> tuple[mujoco.MjModel, mujoco.MjData, list[int]]:
+    """Return a biped whose legs are in line with their hips, its pose, and its soles.
+
+    Args:
+        order: Axes of hip, knee and ankle.
+        bend: Half of the knee's angle (rad).
+        knee_range: Range of the knees (rad).
+        hip_roll: Angle of both legs outward (rad).
+    """
     hip, knee, ankle = order.split(" ")
     spec = mujoco.MjSpec()
     trunk = spec.worldbody.add_body(name="trunk", pos=(0, 0, 1))
@@ -31,7 +43,9 @@ def biped_model(order: str, bend: float = 0.3) -> tuple[mujoco.MjModel, mujoco.M
             for index, axis in enumerate(axes):
                 offset = below if part == "hip" and index == 0 else (0, 0, -length * (index == 0))
                 body = body.add_body(name=f"{name}_{part}_{axis}", pos=offset)
-                body.add_joint(name=f"{name}_{part}_{axis}", axis=AXES[axis])
+                joint = body.add_joint(name=f"{name}_{part}_{axis}", axis=AXES[axis])
+                if part == "knee" and knee_range is not None:
+                    joint.limited, joint.range = True, np.rad2deg(knee_range)
                 body.add_geom(size=(0.02, 0, 0))
         end = (0.05, 0.0, -0.05) if ankle else (0.0, 0.0, -LINK)
         body.add_site(name=f"{name}_sole", pos=end)
@@ -45,6 +59,8 @@ def biped_model(order: str, bend: float = 0.3) -> tuple[mujoco.MjModel, mujoco.M
         ):
             if "y" in axes:
                 data.joint(f"{name}_{part}_y").qpos = angle
+        if hip_roll:
+            data.joint(f"{name}_hip_x").qpos = hip_roll if name == "left" else -hip_roll
     mujoco.mj_kinematics(model, data)
     return model, data, [model.site(f"{name}_sole").id for name in ("left", "right")]
 
@@ -102,6 +118,64 @@ def test_equal_links_bend_as_an_isosceles_triangle(order: str) -> None:
     )[: names.count("y")]  # fmt: skip
     assert found == pytest.approx(wanted, abs=0.01)
     assert right.sole[1] < 0.0 < left.sole[1]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(("low", "high", "side"), [(-0.2, 2.2, 1), (0.0, 2.2, 1), (-2.2, 0.2, -1)])
+def test_straight_default_leg_bends_as_its_knee_can(order, low, high, side) -> None:
+    """No node bends the knee to the other side, and all are in the knee's range."""
+    model, data, soles = biped_model(order, 0.0, (low, high))
+    for leg in legs_of(model, data, soles):
+        where = places()
+        knee = LegTable(leg, "cpu")(torch.tensor(where, dtype=torch.float32))[:, leg.knee].numpy()
+        assert leg.bend == pytest.approx(0.0, abs=0.01)
+        assert (side * knee >= 0.0).all()
+        assert (np.abs(knee) <= max(-low, high)).all()
+        # An isosceles triangle.
+        assert np.cos(0.5 * knee) == pytest.approx(np.cos(where[:, 2]), abs=0.02)
+
+
+def test_knee_stops_at_its_range() -> None:
+    left, _ = legs_of(*biped_model("zxy y yx", 0.3, (0.2, 1.0)))
+    assert left.largest_bend == pytest.approx(np.arccos(np.cos(0.5) / np.cos(0.1)), abs=0.01)
+    knee = left.reach(left.place(*places().T))[:, left.knee]
+    assert 0.2 <= knee.min() < knee.max() <= 1.0
+
+
+def test_crouched_leg_lifts_its_foot() -> None:
+    """A table ends `lift` beyond the default bend, or close to the end of the knee's range."""
+    where = torch.tensor([[0.0, 0.0, 1.2], [0.0, 0.0, 1.5]])
+    free, _ = legs_of(*biped_model("zxy y yx", 0.9))
+    assert LegTable(free, "cpu", 0.4)(where)[:, free.knee].tolist() == pytest.approx(
+        [2.4, 2.6], abs=0.02
+    )
+    held, _ = legs_of(*biped_model("zxy y yx", 0.9, (0.0, 2.2)))
+    assert 2.0 < LegTable(held, "cpu", 0.4)(where)[:, held.knee].max() < 2.2
+
+
+@pytest.mark.parametrize("outward", [-0.1, 0.0, 0.15])
+def test_lateral_angle_of_the_default_pose(outward: float) -> None:
+    left, right = legs_of(*biped_model("zxy y y", hip_roll=outward))
+    assert (left.beta, right.beta) == pytest.approx((outward, -outward), abs=1e-3)
+
+
+def test_leg_that_cannot_move_sideways() -> None:
+    left, _ = legs_of(*biped_model("y y y"))
+    with pytest.raises(ValueError, match=r"left_sole.*cm at alpha, beta and bend"):
+        LegTable(left, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("axes", "wanted"),
+    [
+        ([(1, 0, 0), (0, 1, 0)], None),
+        ([(0.8, 0, -0.6), (0, 1, 0)], None),
+        ([(0, 1, 0), (0.3, 0, -0.95), (1, 0, 0)], 1),
+        (np.zeros((0, 3)), None),
+    ],
+)
+def test_joint_closest_to_the_vertical(axes, wanted) -> None:
+    assert turning_joint(np.array(axes, dtype=float)) == wanted
 
 
 def test_default_pose_is_its_own_place() -> None:

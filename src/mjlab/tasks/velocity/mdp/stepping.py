@@ -85,12 +85,13 @@ class stepping_action:
     s = min(1, 4 c):
 
         swing    alpha* = alpha + x (rest + lead + step_forward v_x + pitch - alpha)
-                 beta*  = beta + x (step_sideways v_y - roll - beta)
+                 beta*  = beta + x (rest_sideways + step_sideways v_y - roll - beta)
         stance   alpha* = alpha, beta* = beta
         bend     b = b_0 + A lift max(0, sin 2 pi c), with A the clock's amplitude
         joints   q* = inverse kinematics of alpha*, beta* and b, with a level sole
 
-    The bend b_0 is that of the default pose, and at the angle `rest` the ankle is below the center of mass.
+    The bend b_0 and the angle `rest_sideways` of a leg are those of the default pose, as feet may be wider
+    apart than the hips; at the angle `rest` the ankle is below the center of mass.
     A grows from 0 to that of the clock at the start of an episode. Stance legs add torques t about the axes
     of the trunk, as offsets of the targets of joints with axis a and stiffness k,
 
@@ -138,7 +139,9 @@ class stepping_action:
         self._rest = math.atan2(center[0] - legs[0].hip[0], self._length)
         unit = float(model.body_subtreemass[root]) * _GRAVITY * self._length
         stiffness = {joint: kp for joint, (kp, _) in joint_gains(asset, model).items()}
-        self._legs = [_SteppingLeg(leg, asset, term, stiffness, unit) for leg in legs]
+        gains = params.get("gains") or SteppingGains()
+        lift = float(torch.as_tensor(gains.lift).max())
+        self._legs = [_SteppingLeg(leg, asset, term, stiffness, unit, lift) for leg in legs]
         # Steps since the reset, of environments whose first episode starts in the middle too.
         self._age = torch.zeros(env.num_envs, 1, device=env.device)
         self._last_step = env.common_step_counter
@@ -185,7 +188,7 @@ class stepping_action:
             alpha, beta, _ = measured.split(1, dim=1)
             moved = torch.where(swings, x, 0.0)
             alpha = torch.lerp(alpha, self._rest + g.lead + g.step_forward * forward + pitch, moved)
-            beta = torch.lerp(beta, g.step_sideways * left - roll, moved)
+            beta = torch.lerp(beta, leg.rest_sideways + g.step_sideways * left - roll, moved)
             bend = leg.bend + lift * height.clamp(min=0.0)
             q = leg.table(torch.cat((alpha, beta, bend), dim=1))
             # Measured hips differ from those of the table after the leg has turned.
@@ -205,6 +208,7 @@ class _SteppingLeg:
     Attributes:
         table: Inverse kinematics.
         bend: Bend in the default pose (rad).
+        rest_sideways: Angle to the left in the default pose (rad).
         side: Distance of the hip from the middle, to the left, over the length of the leg.
         columns: Columns of the joints in the action, (J,).
         free: Columns of the joint that turns the leg, (1,), or none, (0,).
@@ -220,6 +224,7 @@ class _SteppingLeg:
         term: JointPositionAction,
         stiffness: dict[str, float],
         unit: float,
+        lift: float,
     ) -> None:
         """Read a leg.
 
@@ -229,6 +234,7 @@ class _SteppingLeg:
             term: Joint position action.
             stiffness: Stiffness of the joints (N m/rad).
             unit: Unit of torques (N m).
+            lift: Largest additional bend (rad).
 
         Raises:
             ValueError: a joint is not in the action, or has no stiffness.
@@ -248,7 +254,8 @@ class _SteppingLeg:
         yaw = [] if leg.yaw is None else [leg.yaw]
         self.columns = torch.tensor(columns, device=device)
         self.free, self._joints = self.columns[yaw], torch.tensor(joints, device=device)
-        self.table, self.bend = LegTable(leg, device), leg.bend
+        self.table, self.bend = LegTable(leg, device, lift), leg.bend
+        self.rest_sideways = leg.beta
         self.side, self._length = float(leg.hip[1]) / leg.length, leg.length
         self._foot = asset.indexing.body_ids.tolist().index(leg.foot)
         # Axes in the default pose, (2, J).
