@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -196,6 +197,7 @@ def _walk(report: RobotReport) -> str:
             f"    feet_distance={number(FEET_DISTANCE * feet_distance(report), 2)},",
             "    bounds=BOUNDS,",
             "    pose=DEVIATIONS,",
+            *["    has_ankles=False,"] * (not has_ankles(report)),
             ")",
             "cpu = cpu_with_stepping(",
             "    BIPED,",
@@ -215,8 +217,8 @@ def leg_limits(report: RobotReport) -> tuple[dict[str, float], dict[str, float]]
     bounds, pose = dict.fromkeys(joints, 0.25), dict.fromkeys(joints, 50.0)
     for leg in report.anatomy.legs.value:
         pitch = pitch_joints(report.compiled, leg)
-        knee = leg.joints.index(pitch[1]) if len(pitch) > 1 else len(leg.joints)
-        yaw = _yaw_joint(report, leg)
+        knee = _knee(report, leg)
+        yaw = _yaw_joint(report, leg.joints[:knee])
         for index, name in enumerate(leg.joints):
             if name in pitch[:2]:
                 bounds[name], pose[name] = 1.0, 0.01
@@ -227,11 +229,26 @@ def leg_limits(report: RobotReport) -> tuple[dict[str, float], dict[str, float]]
     return {n: bounds[n] for n in joints}, {n: pose[n] for n in joints}
 
 
-def _yaw_joint(report: RobotReport, leg: Leg) -> str:
-    """Return the joint of a leg whose axis is closest to the vertical in the initial pose."""
+def has_ankles(report: RobotReport) -> bool:
+    """Return true if all legs have joints below the knee."""
+    return all(_knee(report, leg) + 1 < len(leg.joints) for leg in report.anatomy.legs.value)
+
+
+def _knee(report: RobotReport, leg: Leg) -> int:
+    """Return the index of a leg's knee, its second pitch joint; the number of joints without one."""
+    pitch = pitch_joints(report.compiled, leg)
+    return leg.joints.index(pitch[1]) if len(pitch) > 1 else len(leg.joints)
+
+
+def _yaw_joint(report: RobotReport, joints: Sequence[str]) -> str | None:
+    """Return the joint that turns a leg, of those above its knee; None without one."""
+    # Imports torch.
+    from mjlab.utils.leg_kinematics import turning_joint
+
     model, data = report.compiled, mujoco.MjData(report.compiled)
     geometry.set_pose(model, data, report.joint_pos.value)
-    return max(leg.joints, key=lambda name: abs(float(data.xaxis[model.joint(name).id][2])))
+    index = turning_joint(data.xaxis[[model.joint(name).id for name in joints]])
+    return None if index is None else joints[index]
 
 
 def feet_distance(report: RobotReport) -> float:

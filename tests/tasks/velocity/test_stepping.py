@@ -12,6 +12,7 @@ from mjlab.envs import mdp as envs_mdp
 from mjlab.managers import ObservationGroupCfg, ObservationTermCfg, SceneEntityCfg
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.rl.biped import Biped, cpu_with_stepping
 from mjlab.tasks.velocity.symmetry import mirror_left_right, mirror_of_joints
 
 FEET = ("left_foot", "right_foot")
@@ -23,11 +24,15 @@ def make_env(
     profile: str | None = "cpu",
     num_envs: int = 4,
     feet: tuple[str, ...] = FEET,
+    outward: float = 0.0,
     **params: Any,
 ):
     cfg = load_env_cfg(task, profile=profile)
     cfg.scene.num_envs, cfg.seed = num_envs, 0
     cfg.events.pop("push_robot")
+    if outward:
+        pose = cfg.scene.entities["robot"].init_state.joint_pos
+        pose |= {"left_hip_roll_joint": outward, "right_hip_roll_joint": -outward}
     if profile is None:
         cfg.commands["gait"] = mdp.GaitClockCommandCfg()
     params["asset_cfg"] = SceneEntityCfg("robot", site_names=feet)
@@ -120,6 +125,29 @@ def test_the_image_of_what_it_does_is_what_it_does_in_the_mirror(env):
     torch.testing.assert_close(found[has_opinion], wanted[has_opinion], atol=1e-4, rtol=0.0)
 
 
+@pytest.mark.parametrize("outward", [-0.05, 0.0, 0.15])
+def test_swing_feet_return_to_where_the_robot_stands(outward):
+    """At rest in the default pose, with feet wider apart than the hips or closer, too."""
+    env = make_env(outward=outward)
+    try:
+        env.reset()
+        robot, clock = env.scene["robot"], env.command_manager.get_term("gait")
+        state = robot.data.default_root_state.clone()
+        state[:, :3] += env.scene.env_origins
+        robot.write_root_state_to_sim(state)
+        robot.write_joint_state_to_sim(robot.data.default_joint_pos, robot.data.default_joint_vel)
+        env.sim.forward()
+        cfg = env.observation_manager.get_term_cfg("teacher", "step")
+        term = env.action_manager.get_term("joint_pos")
+        for cycles, side in ((0.4, "left"), (0.9, "right")):
+            clock.cycles.fill_(cycles)
+            column = term.target_names.index(f"{side}_hip_roll_joint")
+            offset = (cfg.func(env, **cfg.params) * term.scale)[:, column]
+            assert offset.tolist() == pytest.approx([0.0] * env.num_envs, abs=0.01)
+    finally:
+        env.close()
+
+
 @pytest.mark.parametrize(
     ("task", "profile", "params", "facts"),
     [
@@ -153,3 +181,20 @@ def test_it_needs_an_action_of_joint_positions():
     )
     with pytest.raises(ValueError, match="JointPositionAction.*'joint_pos'.*JointEffortAction"):
         ManagerBasedRlEnv(cfg, device="cpu").close()
+
+
+@pytest.mark.parametrize("has_ankles", [True, False])
+def test_tilt_of_soles_counts_for_legs_with_ankles(has_ankles):
+    robot = Biped(
+        feet=FEET,
+        height=0.74,
+        minimum_height=0.5,
+        feet_distance=0.2,
+        bounds={".*": 0.5},
+        pose={".*": 1.0},
+        has_ankles=has_ankles,
+    )
+    profile = cpu_with_stepping(robot, solved_below={"failure_rate": 0.2})
+    cfg, rl_cfg = load_env_cfg(G1), load_rl_cfg(G1)
+    profile.easing(cfg, profile.policy(cfg, rl_cfg))
+    assert ("soles" in cfg.rewards) == has_ankles

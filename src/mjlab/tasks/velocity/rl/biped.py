@@ -43,6 +43,7 @@ from mjlab.rl.learners import with_learner
 from mjlab.tasks.easing import grow_difficulty
 from mjlab.tasks.registry import Profile
 from mjlab.tasks.velocity import mdp
+from mjlab.tasks.velocity.rl.ppo import MIRROR
 from mjlab.tasks.velocity.velocity_env_cfg import get_sensor
 
 if TYPE_CHECKING:
@@ -62,7 +63,6 @@ _HISTORY = 5
 # Pushes at full difficulty: size over that of the task, and interval (s). With those of the task (1 to
 # 3 s), 8.5 instead of 5 % of the episodes fall after 2 M steps more.
 _PUSHES, _PUSH_INTERVAL_S = 1.3, (1.0, 2.5)
-_MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +81,8 @@ class Biped:
     """Largest offset of a joint target from the default position (rad), by joint name pattern."""
     pose: dict[str, float]
     """Weights of squared joint deviations from the default pose, by joint name pattern."""
+    has_ankles: bool = True
+    """Joints below the knees, which keep the soles level. Without them, no reward depends on their tilt."""
     gains: mdp.SteppingGains | None = None
     """Gains of the stepping controller. None: those of all bipeds."""
 
@@ -104,7 +106,7 @@ def cpu_with_stepping(
     num_episodes: int = 60,
     first_iteration: int = 80,
     min_interval: int = 10,
-    mirror: str | None = _MIRROR,
+    mirror: str | None = MIRROR,
 ) -> Profile:
     """Return the `cpu` profile of a biped.
 
@@ -255,7 +257,7 @@ def _gait_rewards(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> dict[str, Rewa
         )
     }
     frames = get_sensor(env_cfg, "foot_height_scan").frame
-    return linear | {
+    rewards = linear | {
         "angular": RewardTermCfg(
             func=mdp.track_angular_velocity,
             weight=6.5,
@@ -289,5 +291,9 @@ def _gait_rewards(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> dict[str, Rewa
         "deviation": RewardTermCfg(
             func=mdp.weighted_joint_deviation, weight=-0.25, params={"weights": dict(robot.pose)}
         ),
-        "soles": RewardTermCfg(func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": robot.soles}),
     }
+    if robot.has_ankles:
+        rewards["soles"] = RewardTermCfg(
+            func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": robot.soles}
+        )
+    return rewards

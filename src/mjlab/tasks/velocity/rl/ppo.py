@@ -62,7 +62,8 @@ _EASED_SAMPLES = 6_000_000
 # Robots that drag their feet fall at each change of command, so these penalties grow faster.
 _LIFTING = ("foot_clearance", "foot_swing_height")
 _LIFTING_EASED_SAMPLES = 2_000_000
-_MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
+MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
+"""Symmetry augmentation function of robots with left and right."""
 _SOLVED = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
 
@@ -139,7 +140,7 @@ def _ease_penalties(env_cfg: ManagerBasedRlEnvCfg) -> None:
 
 
 def cpu_without_gait(
-    *, solved_below: dict[str, float] | None = None, mirror: str | None = _MIRROR
+    *, solved_below: dict[str, float] | None = None, mirror: str | None = MIRROR
 ) -> Profile:
     """Return the `cpu` profile of a legged robot of unknown gait.
 
@@ -176,7 +177,7 @@ def cpu_with_gait(
     *,
     minimum_height: float,
     solved_below: dict[str, float] | None = None,
-    mirror: str | None = _MIRROR,
+    mirror: str | None = MIRROR,
 ) -> Profile:
     """Return the `cpu` profile of a legged robot whose gait is known.
 
