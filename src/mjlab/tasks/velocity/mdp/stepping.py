@@ -256,6 +256,8 @@ class _SteppingLeg:
         self.free, self._joints = self.columns[yaw], torch.tensor(joints, device=device)
         self.table, self.bend = LegTable(leg, device, lift), leg.bend
         self.rest_sideways = leg.beta
+        # The weight acts at the hip: with the lever of the soles, farther outside, the H1 stands for 4.6
+        # instead of 5.1 s of 6 s.
         self.side, self._length = float(leg.hip[1]) / leg.length, leg.length
         self._foot = asset.indexing.body_ids.tolist().index(leg.foot)
         # Axes in the default pose, (2, J).
