@@ -36,6 +36,7 @@ def test_training_and_playing_prepare_torch_first(monkeypatch, tmp_path, command
 
 
 G1 = "Mjlab-Velocity-Flat-Unitree-G1"
+GO1 = "Mjlab-Velocity-Flat-Unitree-Go1"
 
 
 def test_evaluations_have_the_flags_of_the_run():
@@ -53,7 +54,8 @@ def test_evaluations_have_the_flags_of_the_run():
     assert evaluated.rewards["foot_slip"] is None
     assert evaluated.rewards.keys() == registered.rewards.keys()
     assert evaluated.sim.num_threads == 1
-    assert evaluated.decimation == registered.decimation != cfg.env.decimation
+    assert evaluated.terminations.keys() == registered.terminations.keys()
+    assert "sank" in cfg.env.terminations.keys() - evaluated.terminations.keys()
 
 
 def test_evaluations_have_the_changes_of_a_program():
@@ -68,8 +70,8 @@ def test_evaluations_have_the_changes_of_a_program():
 
 def test_another_time_between_actions_is_reported(capsys):
     flags = ["--profile", "cpu", "--env.decimation", "2"]
-    cfg = parse_train_flags(G1, flags, "train")
-    evaluation_env_cfg(G1, cfg, typed_settings(cfg.env, "env", flags))
+    cfg = parse_train_flags(GO1, flags, "train")
+    evaluation_env_cfg(GO1, cfg, typed_settings(cfg.env, "env", flags))
     printed = "".join(capsys.readouterr())
     assert "every 0.01 s in evaluations, and every 0.01333 s in training" in " ".join(
         printed.split()

@@ -101,10 +101,10 @@ def _pose(subject: Subject, term: Any) -> dict[str, Any]:
     ranges, bounds = term.cfg.ranges, [None] * 7
     if ranges is not None:
         bounds[:3] = [ranges.pos_x, ranges.pos_y, ranges.pos_z]
-    elif term.reachable is not None:
+    elif term.goals is not None:
         lowest, highest = (
-            term.reachable.poses.amin(0).tolist(),
-            term.reachable.poses.amax(0).tolist(),
+            term.goals.amin(0).tolist(),
+            term.goals.amax(0).tolist(),
         )
         bounds = list(zip(lowest, highest, strict=True))
     return {

@@ -106,7 +106,7 @@ def test_uniform_goals_lie_in_their_ranges(make_world: Any) -> None:
 
 def test_goals_without_ranges_can_be_reached(make_world: Any) -> None:
     arm = make_arm(make_world)
-    goals = make_term(arm, num_goals=200).reachable.poses
+    goals = make_term(arm, num_goals=200).goals
     model, data = arm.sim.mj_model, mujoco.MjData(arm.sim.mj_model)
     base, site = model.body("base"), model.site("grasp")
     # The root frame of an entity without free joint is the world's.
@@ -126,7 +126,7 @@ def test_goals_without_ranges_can_be_reached(make_world: Any) -> None:
 def test_goals_are_reached_at_their_joint_positions(make_world: Any) -> None:
     arm = make_arm(make_world)
     term = make_term(arm, num_goals=50)
-    joints, robot = term.reachable.joint_ids, arm.scene["robot"]
+    joints, robot = term.joint_ids, arm.scene["robot"]
     joint_pos = robot.data.joint_pos.clone()
     joint_pos[:, joints] = term.goal_joint_pos + torch.tensor([0.1, -0.2, 0.01])
     robot.write_joint_state_to_sim(joint_pos, torch.zeros_like(joint_pos))
@@ -177,7 +177,7 @@ def candidates(goal: np.ndarray, site_quat: np.ndarray) -> list[np.ndarray]:
 
 def test_goals_cover_the_middle_of_the_ranges(make_world: Any) -> None:
     arm = make_arm(make_world)
-    narrow, wide = (make_term(arm, joint_range_fraction=f).reachable.poses for f in (0.2, 1.0))
+    narrow, wide = (make_term(arm, joint_range_fraction=f).goals for f in (0.2, 1.0))
     assert narrow[:, :3].std(dim=0).sum() < 0.4 * wide[:, :3].std(dim=0).sum()
     # The palm, of radius 0.04 m and 0.05 m behind the site, stays above the floor.
     assert wide[:, 2].min() > -0.011
@@ -186,11 +186,11 @@ def test_goals_cover_the_middle_of_the_ranges(make_world: Any) -> None:
 def test_goals_follow_the_seed(make_world: Any) -> None:
     arm = make_arm(make_world)
     torch.manual_seed(3)
-    one = make_term(arm, num_goals=10).reachable.poses
+    one = make_term(arm, num_goals=10).goals
     torch.manual_seed(3)
-    other = make_term(arm, num_goals=10).reachable.poses
+    other = make_term(arm, num_goals=10).goals
     assert torch.equal(one, other)
-    assert not torch.equal(one, make_term(arm, num_goals=10).reachable.poses)
+    assert not torch.equal(one, make_term(arm, num_goals=10).goals)
 
 
 @pytest.mark.parametrize(

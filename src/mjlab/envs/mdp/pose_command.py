@@ -11,7 +11,7 @@ import torch
 from mjlab.compat import suggests_fields
 from mjlab.envs.mdp.frames import Frame, FrameType
 from mjlab.envs.mdp.pose_panel import PosePanel
-from mjlab.envs.mdp.reachable_poses import ReachablePoses, draw_reachable_poses
+from mjlab.envs.mdp.reachable_poses import draw_reachable_poses
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.utils.errors import WrongTypeError, check_count, check_in_range
 from mjlab.utils.lab_api.math import (
@@ -115,7 +115,10 @@ class UniformPoseCommand(CommandTerm):
     Attributes:
         pose_command_b: (N, 7) goal in the root frame.
         frame: The commanded frame.
-        reachable: Goals to choose from, in the root frame, and their joint positions; None with `ranges`.
+        goals: (number of goals, 7) reachable poses in the root frame; None with `ranges`.
+        goals_joint_pos: (number of goals, joints) joint positions at which they were found (rad or m).
+        joint_ids: (joints,) columns of these joints in the entity's joint data.
+        turns: (joints,) True for joints that can turn by 2 pi or more.
         goal_joint_pos: (N, joints) joint positions at which the goal was found (rad or m), zeros with
             `ranges`. The same pose may be reached at others.
         goal_age: (N,) time since the goal was sampled (s).
@@ -132,23 +135,24 @@ class UniformPoseCommand(CommandTerm):
         self._entity: Entity = env.scene[cfg.entity_name]
         self.frame = Frame(env.sim, self._entity, cfg.entity_name, cfg.frame_type, cfg.frame_name)
         self._panel: PosePanel | None = None
-        self.reachable: ReachablePoses | None = None
+        self.goals: torch.Tensor | None = None
+        self.goals_joint_pos = torch.empty(0, 0, device=self.device)
         if cfg.ranges is None:
             check_in_range(
                 "UniformPoseCommandCfg.joint_range_fraction", cfg.joint_range_fraction, 0, 1
             )
             check_count("UniformPoseCommandCfg.num_goals", cfg.num_goals)
-            self.reachable = draw_reachable_poses(
+            found = draw_reachable_poses(
                 env, self._entity, self.frame, cfg.num_goals, cfg.joint_range_fraction
             )
+            self.goals, self.goals_joint_pos, self.joint_ids, self.turns = found
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(*shape, self.num_envs, dtype=torch.float32, device=self.device)
 
         self.pose_command_b = zeros(7).T.contiguous()
         self.pose_command_b[:, 3] = 1.0
-        num_joints = 0 if self.reachable is None else self.reachable.joint_pos.shape[1]
-        self.goal_joint_pos = zeros(num_joints).T.contiguous()
+        self.goal_joint_pos = zeros(self.goals_joint_pos.shape[1]).T.contiguous()
         self.goal_age, self.num_ended = zeros(), zeros()
         self._end_sums = zeros(3)
         self.metrics = {
@@ -225,12 +229,12 @@ class UniformPoseCommand(CommandTerm):
             self._end_sums[:, env_ids] * continues + self._current()[:, env_ids] * counts
         )
         self.goal_age[env_ids] = 0.0
-        if self.reachable is None:
+        if self.goals is None:
             self.pose_command_b[env_ids] = self._draw(len(env_ids))
         else:
-            picks = torch.randint(len(self.reachable.poses), (len(env_ids),), device=self.device)
-            self.pose_command_b[env_ids] = self.reachable.poses[picks]
-            self.goal_joint_pos[env_ids] = self.reachable.joint_pos[picks]
+            picks = torch.randint(len(self.goals), (len(env_ids),), device=self.device)
+            self.pose_command_b[env_ids] = self.goals[picks]
+            self.goal_joint_pos[env_ids] = self.goals_joint_pos[picks]
 
     def _follow(self, panel: PosePanel) -> None:
         """Move a goal that the user holds to the panel's handle, else the handle to the goal."""
@@ -341,14 +345,14 @@ def goal_joint_deviation_l1(env: ManagerBasedRlEnv, command_name: str) -> torch.
         ValueError: it has `ranges`, so the joint positions at its goals are unknown.
     """
     command = pose_command(env, command_name)
-    if command.reachable is None:
+    if command.goals is None:
         raise ValueError(
             f"goal_joint_deviation_l1 command_name: expected a command without ranges, got "
             f"{command_name!r}; remove the reward, or the ranges."
         )
-    joint_pos = env.scene[command.cfg.entity_name].data.joint_pos[:, command.reachable.joint_ids]
+    joint_pos = env.scene[command.cfg.entity_name].data.joint_pos[:, command.joint_ids]
     deviation = joint_pos - command.goal_joint_pos
-    return torch.where(command.reachable.turns, wrap_to_pi(deviation), deviation).abs().sum(dim=1)
+    return torch.where(command.turns, wrap_to_pi(deviation), deviation).abs().sum(dim=1)
 
 
 def pose_command(env: ManagerBasedRlEnv, command_name: str) -> UniformPoseCommand:
