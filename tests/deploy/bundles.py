@@ -11,6 +11,18 @@ from typing import Any
 
 import numpy as np
 
+# Observations of all kinds: sensors, gravity, history and clock, motions, objects, poses, scans, images.
+BUNDLES = (
+    "go1",
+    "g1",
+    "Mjlab-Cartpole-Swingup",
+    "Mjlab-Tracking-Flat-Unitree-G1",
+    "Mjlab-Lift-Cube-Yam",
+    "Mjlab-Reach-Yam",
+    "Mjlab-Velocity-Rough-Unitree-Go1",
+    "Mjlab-Lift-Cube-Yam-Depth",
+)
+"""Bundled policies and stock tasks."""
 STEPS = 45
 """Control steps of the traces: an episode of each bundle, and one that begins within."""
 

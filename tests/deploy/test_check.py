@@ -9,23 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from bundles import BUNDLES
 
 from mjlab.deploy.check import TOLERANCES, check_bundle, undecided
 from mjlab.deploy.evidence import Evidence
 from mjlab.deploy.fitness import fitness_warnings
 from mjlab.deploy.logs import check_log
 from mjlab.utils.errors import UserError
-
-BUNDLES = (
-    "go1",
-    "g1",
-    "Mjlab-Cartpole-Swingup",
-    "Mjlab-Tracking-Flat-Unitree-G1",
-    "Mjlab-Lift-Cube-Yam",
-    "Mjlab-Reach-Yam",
-    "Mjlab-Velocity-Rough-Unitree-Go1",
-    "Mjlab-Lift-Cube-Yam-Depth",
-)
 
 
 @pytest.mark.parametrize("name", BUNDLES)

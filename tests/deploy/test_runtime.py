@@ -12,23 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bundles import load_program, row_of, write_random
+from bundles import BUNDLES, load_program, row_of, write_random
 
 from mjlab.envs.mdp import last_action
 from mjlab.managers import ObservationTermCfg
 from mjlab.utils.noise import UniformNoiseCfg
 
-# Observations of all kinds: sensors, gravity, history and clock, motions, objects, poses, scans, images.
-BUNDLES = (
-    "go1",
-    "g1",
-    "Mjlab-Cartpole-Swingup",
-    "Mjlab-Tracking-Flat-Unitree-G1",
-    "Mjlab-Lift-Cube-Yam",
-    "Mjlab-Reach-Yam",
-    "Mjlab-Velocity-Rough-Unitree-Go1",
-    "Mjlab-Lift-Cube-Yam-Depth",
-)
 TOLERANCE = 1e-5
 """Largest difference, as a fraction of the range of a term."""
 

@@ -41,7 +41,7 @@ class Bundle:
     contract: dict[str, Any]
     """Content of `contract.json`."""
     notes: list[str]
-    """What a user should know, one sentence each."""
+    """Sentences to print: missing measurements, unknown terms, and other obstacles to a robot."""
 
 
 def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], steps: int) -> Bundle:

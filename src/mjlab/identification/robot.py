@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Drives:
-    """What is known of a robot's drives before the fit, by joint."""
+    """Drives of a robot before the fit: commanded gains and effort limits, by joint."""
 
     stiffness: dict[str, float]
     """Commanded gains kp (N m/rad or N/m): first guesses."""

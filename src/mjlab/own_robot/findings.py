@@ -13,7 +13,7 @@ import numpy as np
 
 from mjlab.own_robot import geometry as geo
 from mjlab.own_robot import measures
-from mjlab.own_robot.anatomy import finger_joints
+from mjlab.own_robot.anatomy import Anatomy, finger_joints
 from mjlab.own_robot.finding import Finding as Finding
 from mjlab.own_robot.finding import listed
 from mjlab.own_robot.gains import (
@@ -505,12 +505,17 @@ def _soles(subject: Subject) -> Iterator[Finding]:
     )
 
 
+def soft_soles(model: mujoco.MjModel, anatomy: Anatomy) -> list[int]:
+    """Return the soles with a contact impedance below `SOFT_SOLE`, as geom ids."""
+    soles = [model.geom(name).id for foot in anatomy.feet.value for name in foot.sole]
+    return [g for g in soles if model.geom_solimp[g, 0] < SOFT_SOLE]
+
+
 def _soft_soles(subject: Subject) -> Iterator[Finding]:
     model = subject.model
     if model.opt.impratio >= _HOLDING_IMPRATIO:
         return
-    soles = [model.geom(name).id for foot in subject.anatomy.feet.value for name in foot.sole]
-    found = [g for g in soles if model.geom_solimp[g, 0] < SOFT_SOLE]
+    found = soft_soles(model, subject.anatomy)
     if found:
         softest = min(float(model.geom_solimp[g, 0]) for g in found)
         yield Finding(

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjlab.own_robot import geometry
 from mjlab.own_robot.anatomy import Foot
-from mjlab.own_robot.findings import SOFT_SOLE
+from mjlab.own_robot.findings import soft_soles
 from mjlab.own_robot.guess import Guess
 from mjlab.own_robot.python_text import (
     comment_lines,
@@ -362,10 +362,10 @@ def _physics(spec: mujoco.MjSpec) -> list[str]:
 def _soft_soles(report: RobotReport) -> list[str]:
     """Return lines that make soles as hard as MuJoCo's default if those of the file slide."""
     model = report.compiled
-    soles = [model.geom(name) for foot in report.anatomy.feet.value for name in foot.sole]
-    softest = min(float(sole.solimp[0]) for sole in soles)
-    if softest >= SOFT_SOLE:
+    found = soft_soles(model, report.anatomy)
+    if not found:
         return []
+    softest = min(float(model.geom_solimp[g, 0]) for g in found)
     return [
         f"    # Softer ones (impedance {number(softest)} in the file) slide without elliptic cones and impratio 100.",
         "    sole.solref, sole.solimp = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)",

@@ -220,7 +220,7 @@ def begin(simulation):
 
 def main():
     """Play the policy, in the viewer or without."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Run the policy of this folder in plain MuJoCo.")
     parser.add_argument("--seconds", type=float, help="duration without a window (s)")
     parser.add_argument("--command", type=float, nargs="*", help="constant command")
     options = parser.parse_args()
