@@ -105,7 +105,7 @@ def simulate(old: str, new: str) -> Edit:
     return source("simulate.py", old, new)
 
 
-CHECKED = "values = self._checked(measurements)\n        self._add_commands"
+CHECKED = "values = self._checked(measurements)\n        self.add_commands"
 
 
 def measured(code: str) -> Edit:
@@ -269,7 +269,7 @@ class Policy(Policy):
             self.inputs["obs"][:] = self.kept
         return super().step(measurements, command)
 
-    def _run_stacked(self, outputs, inputs):
+    def stacked(self, outputs, inputs):
         x = self.kept = inputs["obs"].copy()
         entries = self.contract["observations"][0]["terms"]
         parts = [x[:, t["start"] : t["stop"]] for t in entries]
@@ -277,11 +277,11 @@ class Policy(Policy):
         rest = [p for p, t in zip(parts, entries) if t["history"]["length"] <= 1]
         stacked = np.concatenate(deep, axis=1).reshape(1, -1)
         inputs["obs"][:] = np.concatenate([stacked, *rest], axis=1)
-        return self._network(outputs, inputs)
+        return self.unstacked(outputs, inputs)
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
-        self._network, self._run = self._run, self._run_stacked
+        self.unstacked, self.network = self.network, self.stacked
 """
 
 
@@ -349,13 +349,13 @@ PLANTS = (
     Plant("history by component", "g1", runtime("elif self._is_first:\n                slot.reshape(-1, history)[:] = value", f"elif history:\n                {BY_COMPONENT}"), "history by component, not by step"),
     Plant("history of whole observations", "odd", appended(WHOLE), "history of whole observations"),
     Plant("history from zeros", "g1", runtime("slot.reshape(-1, history)[:] = value", "slot[:], slot[-history:] = 0, value"), "history starts with zeros"),
-    Plant("clip after scale", "odd", runtime('value = np.clip(value, *term["clip"])', 'value = np.clip(value * term["scale"], *term["clip"]) / term["scale"]'), "clip after scale"),
+    Plant("clip after scale", "odd", runtime('np.clip(value, *term["clip"])', 'np.clip(value * term["scale"], *term["clip"]) / term["scale"]'), "clip after scale"),
     Plant("clip left out", "odd", term("joint_vel", clip=None), "clip left out"),
     # Network.
     Plant("normalizer left out", "go1", feeding("x * std + mean"), "normalizer left out"),
     Plant("normalizer applied twice", "go1", feeding("(x - mean) / std"), "normalizer applied twice"),
     Plant("network without its normalizer", "go1", network(without_normalizer), "policy.onnx is not the network of the trace"),
-    Plant("memory not fed back", "odd", runtime("self.inputs[name][:] = value\n        self.action", "pass\n        self.action"), "memory not fed back"),
+    Plant("memory not fed back", "odd", runtime("self.inputs[name][:] = value\n        return", "pass\n        return"), "memory not fed back"),
     Plant("memory kept at a start", "odd", runtime("self.inputs[name][:] = 0.0", "pass"), "memory not cleared at the start"),
     # Targets.
     Plant("action scale", "go1", action("scale", lambda scale: 0.5 * scale), "other action scale"),

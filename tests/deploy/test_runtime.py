@@ -118,7 +118,7 @@ def test_plain_mujoco_follows_training(bundle, name):
             if measurement != "time":
                 np.testing.assert_allclose(value, trace[f"measurement/{measurement}"][k], atol=2e-6)
         policy.action[:] = trace["action"][k]
-        simulation.apply(policy._targets())
+        simulation.apply(policy.targets())
         np.testing.assert_allclose(simulation.data.qpos, trace["after/qpos"][k], atol=1e-6)
         np.testing.assert_allclose(simulation.data.qvel, trace["after/qvel"][k], atol=1e-4)
 
@@ -172,20 +172,20 @@ def robot(bundle):
 def test_targets_keep_within_limits(robot):
     policy, measured, command = robot
     low, high = (np.array(policy.contract["limits"][f"target_{end}"]) for end in ("low", "high"))
-    policy._run = lambda outputs, inputs: [np.full((1, 12), 1000.0, np.float32)]
+    policy.network = lambda outputs, inputs: [np.full((1, 12), 1000.0, np.float32)]
     np.testing.assert_allclose(policy.step(measured, command).position, high)
     assert (policy.target > high).all()
     policy.reset()
-    policy._run = lambda outputs, inputs: [np.full((1, 12), -1000.0, np.float32)]
+    policy.network = lambda outputs, inputs: [np.full((1, 12), -1000.0, np.float32)]
     np.testing.assert_allclose(policy.step(measured, command).position, low)
 
 
 def test_target_jumps_are_limited(robot):
     policy, measured, command = robot
     largest = policy.contract["limits"]["target_step"] = [0.1] * 12
-    policy._limits["target_step"] = np.array(largest)
+    policy.limits["target_step"] = np.array(largest)
     before = policy.step(measured, command).position
-    policy._run = lambda outputs, inputs: [np.ones((1, 12), np.float32)]
+    policy.network = lambda outputs, inputs: [np.ones((1, 12), np.float32)]
     after = policy.step({**measured, "time": 0.02}, command).position
     assert np.abs(after - before).max() == pytest.approx(0.1)
 
@@ -251,7 +251,7 @@ def test_one_array_is_not_for_two_commands(robot):
     policy, measured, _ = robot
     contract = json.loads(json.dumps(policy.contract))
     contract["commands"].append({**contract["commands"][0], "name": "other"})
-    other = type(policy)(contract, policy._run)
+    other = type(policy)(contract, policy.network)
     twist = np.zeros(3)
     with pytest.raises(KeyError, match="twist"):
         other.step(measured, twist)
@@ -284,8 +284,8 @@ def test_hand_over_from_a_standing_pose(robot):
 
 def test_first_target_after_the_hand_over_is_near_its_last(robot):
     policy, measured, command = robot
-    policy._limits["target_step"] = np.full(12, 0.1)
-    policy._run = lambda outputs, inputs: [np.ones((1, 12), np.float32)]
+    policy.limits["target_step"] = np.full(12, 0.1)
+    policy.network = lambda outputs, inputs: [np.ones((1, 12), np.float32)]
     there = {**measured, "joint_pos": policy.default}
     policy.hand_over({**there, "time": 0.0}, seconds=0.1)
     last = policy.hand_over({**there, "time": 0.1}, seconds=0.1).position
@@ -384,7 +384,7 @@ def test_custom_terms_and_second_scans_have_measurements_of_their_own(tmp_path):
 
 def test_robot_without_tilt_is_not_limited(robot):
     policy, measured, command = robot
-    policy._limits["tilt_from"] = None
+    policy.limits["tilt_from"] = None
     fallen = {**measured, "root_quat": [0.0, 1.0, 0.0, 0.0]}
     assert not policy.step(fallen, command).is_damping
 

@@ -500,7 +500,6 @@ def _terminations(env: ManagerBasedRlEnv) -> list[dict[str, Any]]:
 
 
 def _bounds(pair: Any) -> list[float | None] | None:
-    if pair is None:
-        return None
-    values = [None if value is None else float(value) for value in pair]
-    return [None if value is None or math.isinf(value) else value for value in values]
+    values = [None if value is None else float(value) for value in pair or (None, None)]
+    values = [None if value is None or math.isinf(value) else value for value in values]
+    return None if values == [None, None] else values

@@ -315,13 +315,9 @@ class Evidence:
                     value = self.trace[key][k]
                     policy.inputs[entry["name"]][0] = value if change is None else change(value)
             if "time_step" in policy.inputs:
-                policy._add_commands({}, self.command(k))
-            action, *kept = policy._run(policy._outputs, policy.inputs)
-            for name, value in zip(policy._memory.values(), kept, strict=True):
-                policy.inputs[name][:] = value
-            rows.append(action[0].copy())
-        clip = self.contract["policy"]["clip"]
-        return np.array(rows) if clip is None else np.clip(rows, -clip, clip)
+                policy.add_commands({}, self.command(k))
+            rows.append(policy.infer(policy.inputs).copy())
+        return np.array(rows)
 
     @cached_property
     def normalizer(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -361,7 +357,7 @@ class Evidence:
         policy = self.originals.runtime.Policy(contract, None, self.folder, limits=False)
         found: dict[str, list] = {}
         for k in range(len(self.first)):
-            targets = self.golden_targets(policy._commanded(policy.default.copy()), k)
+            targets = self.golden_targets(policy.commanded(policy.default.copy()), k)
             for name, value in one_step(self, body, targets, k).items():
                 found.setdefault(name, []).append(value)
         return {name: np.array(rows) for name, rows in found.items()}

@@ -244,14 +244,12 @@ def _recomputed(
                 add(f"term/obs/{term}", policy.inputs[place][0, entry["start"] : entry["stop"]])
         x = answers["input/obs"].row(k) if "input/obs" in answers else None
         if x is not None and len(policy.inputs) == 1:
-            (action,) = policy._run(policy._outputs, {"obs": x[None]})
-            clip = evidence.contract["policy"]["clip"] or np.inf
-            policy.action = action[0].clip(-clip, clip)
+            policy.action = policy.infer({"obs": x[None]})
         add("action", policy.action.copy())
         logged = answers["action"].row(k) if "action" in answers else None
         if logged is not None:
             policy.action = logged
-        policy._targets()
+        policy.targets()
         add("target", policy.target.copy())
     trace = {name: np.array(values) for name, values in rows.items()}
     return {**trace, **raw, "first": first, "motion": motions, "time": table.columns["time"]}

@@ -163,7 +163,7 @@ def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) ->
     runtime = evidence.originals.runtime
     policy = runtime.Policy.load(evidence.folder, limits=False)
     policy.kp, policy.kd = setting.gains * policy.kp, setting.gains * policy.kd
-    _add_noise(policy, setting.noise, noise)
+    _add_noise(evidence, policy, setting.noise, noise)
     simulation = evidence.originals.simulate.Simulation(contract, model)
     starts = np.flatnonzero(evidence.first)
     start = int(starts[seed % len(starts)])
@@ -173,7 +173,7 @@ def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) ->
     delay = _delay(setting.latency, rates["physics_dt"])
     limits, root = contract["limits"], model.body(contract["robot"]["root_body"]).id
     lowest = _LOWEST * contract["robot"]["initial_height"]
-    held, waiting, step = policy._commanded(policy.default.copy()), [], 0
+    held, waiting, step = policy.commanded(policy.default.copy()), [], 0
     command: dict[str, np.ndarray] = {}
     for k in range(round(seconds / policy.period)):
         if k % round(_COMMAND_S / policy.period) == 0:
@@ -219,16 +219,14 @@ def _drawn(contract: Mapping[str, Any], random: np.random.Generator) -> dict[str
     return commands
 
 
-def _add_noise(policy: Any, level: float, random: np.random.Generator) -> None:
+def _add_noise(evidence: Evidence, policy: Any, level: float, random: np.random.Generator) -> None:
     """Add the noise of training to the values of the terms, times `level`."""
 
-    def noisy(function: Callable, noise: Noise) -> Callable:
-        return lambda inputs, term: noise(function(inputs, term))
+    def noisy(formula: Callable, noise: Noise) -> Callable:
+        return lambda inputs, term: noise(formula(inputs, term))
 
-    policy._terms = [
-        (key, noisy(function, Noise(term["noise"], level, random)), term, *rest)
-        for key, function, term, *rest in policy._terms
-    ]
+    for key, formula in policy.formulas.items():
+        policy.formulas[key] = noisy(formula, Noise(evidence.terms[key]["noise"], level, random))
 
 
 def _changed(evidence: Evidence, setting: Setting) -> tuple[dict[str, Any], mujoco.MjModel]:

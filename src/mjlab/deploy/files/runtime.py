@@ -38,9 +38,6 @@ def arrayed(value):
     return np.array(value) if isinstance(value, list) else value
 
 
-# Formulas of the observation terms: f(values of the inputs, term) -> value.
-
-
 def rotation(q):
     """Return the matrix of a unit quaternion (w, x, y, z)."""
     w, x, y, z = q
@@ -69,6 +66,7 @@ def pose_error(inputs, term):
     return np.concatenate((goal[:3] - place, ratio * turn[1:]))
 
 
+# Formulas of the observation terms: f(values of the inputs, term) -> value.
 TERMS = {
     **dict.fromkeys(("reading", "command", "last_action"), reading),
     "cos_sin": lambda i, term: np.array((np.cos(x := reading(i, term)), np.sin(x))).ravel(),
@@ -96,20 +94,21 @@ class Policy:
         session = onnxruntime.InferenceSession(str(folder / contract["policy"]["file"]), options)
         return cls(contract, session.run, folder, limits)
 
-    def __init__(self, contract, run, folder=".", limits=True):
-        """Prepare the terms; `run(names of outputs, inputs)` is that of an onnxruntime session."""
+    def __init__(self, contract, network, folder=".", limits=True):
+        """Prepare the terms; `network` answers as `session.run` of onnxruntime does."""
         if (contract["schema"], contract["version"]) != ("mjlab-contract", 1):
             raise ValueError("contract.json: expected schema mjlab-contract, version 1.")
-        self.contract, self._run, self._has_limits, self._handed = contract, run, limits, None
+        self.contract, self.network, self._limited, self._handed = contract, network, limits, None
         self.period, joints = contract["rates"]["step_dt"], contract["joints"]
         self.names = [joint["name"] for joint in joints]
         keys = ("kp", "kd", "default_pos")
         self.kp, self.kd, self.default = (np.array([j[key] for j in joints]) for key in keys)
-        self._limits = {k: arrayed(v) for k, v in contract["limits"].items()}
+        self.limits = {k: arrayed(v) for k, v in contract["limits"].items()}
         self._clip, inputs = contract["policy"]["clip"], contract["policy"]["inputs"]
         self.inputs = {entry["name"]: np.zeros(entry["shape"], np.float32) for entry in inputs}
         self._memory = {e["output"]: e["name"] for e in inputs if e["kind"] == "memory"}
         self._outputs = [contract["policy"]["output"], *self._memory]
+        self.formulas = {}  # By input and name of the term.
         self._terms = [self._term(o, dict(t)) for o in contract["observations"] for t in o["terms"]]
         self._actions = [self._action(dict(action)) for action in contract["actions"]]
         self._commands = {command["name"]: command for command in contract["commands"]}
@@ -124,17 +123,17 @@ class Policy:
         self.reset()
 
     def _term(self, observation, term):
-        """Return key, formula, settings, place in the input, and size in a history of one term."""
-        function = TERMS.get(term["kind"]) or TERMS.get(term["function"])
-        if function is None:
+        """Add the formula of a term; return key, settings, slot in the input, size in a history."""
+        key, formula = (observation["input"], term["name"]), TERMS.get(term["kind"])
+        self.formulas[key] = formula or TERMS.get(term["function"])
+        if self.formulas[key] is None:
             raise ValueError(f"Term {term['name']!r}: add {term['function']!r} to TERMS.")
         term |= {key: arrayed(term[key]) for key in ("offset", "scale")}
-        term["clip"] = None if term["clip"] in (None, [None, None]) else term["clip"]
         term["inputs"] = ["last_action"] if term["kind"] == "last_action" else term["inputs"]
         place = (0, *(slice(None),) * observation["axis"], slice(term["start"], term["stop"]))
         slot = self.inputs[observation["input"]][place]
         history = term["size"] if term["history"]["length"] else 0
-        return (observation["input"], term["name"]), function, term, slot, history
+        return key, term, slot, history
 
     def _action(self, action):
         """Return an action term with arrays and the places of its joints."""
@@ -158,20 +157,18 @@ class Policy:
             self.default = self.motion["joint_pos"][frame].astype(float)
         for name in self._memory.values():
             self.inputs[name][:] = 0.0
-        start = {name: command.get("start", 0) for name, command in self._commands.items()}
-        self._clocks = {n: np.array((x, 0), "f4") for n, x in start.items()}  # Phase, amplitude.
+        starts = ((name, command.get("start", 0)) for name, command in self._commands.items())
+        self._clocks = {n: np.array((x, 0), "f4") for n, x in starts}  # Phase, amplitude.
 
     def step(self, measurements, command=None):
         """Return the motor commands of a period; `command` is of the only given one, or a dict."""
         values = self._checked(measurements)
-        self._add_commands(values, command)
+        self.add_commands(values, command)
         values["last_action"] = self.action
-        for key, function, term, slot, history in self._terms:
-            self.values[key] = value = function([values[n] for n in term["inputs"]], term)
-            if term["clip"] is not None:
-                value = np.clip(value, *term["clip"])
-            if term["scale"] is not None:
-                value = value * term["scale"]
+        for key, term, slot, history in self._terms:
+            self.values[key] = value = self.formulas[key]([values[n] for n in term["inputs"]], term)
+            value = value if term["clip"] is None else np.clip(value, *term["clip"])
+            value = value if term["scale"] is None else value * term["scale"]
             if not history:
                 slot[:] = value
             elif self._is_first:
@@ -179,15 +176,17 @@ class Policy:
             else:
                 slot[:-history], slot[-history:] = slot[history:].copy(), value
         self._is_first = False
-        action, *memory = self._run(self._outputs, self.inputs)
-        if not all(np.isfinite(x.sum()) for x in (action, *self.inputs.values())):
+        self.action = self.infer(self.inputs)
+        return self.damp(values["joint_pos"]) if self.reason else self.targets()
+
+    def infer(self, inputs):
+        """Return the answer of the network, within the clip of raw actions, and keep its memory."""
+        (action,), *memory = self.network(self._outputs, inputs)
+        if self._limited and not all(np.isfinite(x.sum()) for x in (action, *inputs.values())):
             self.reason = self.reason or "a command or the answer of the policy is not finite"
-        if self.reason and self._has_limits:
-            return self.damp(values["joint_pos"])
         for name, value in zip(self._memory.values(), memory, strict=True):
             self.inputs[name][:] = value
-        self.action = action[0] if self._clip is None else action[0].clip(-self._clip, self._clip)
-        return self._targets()
+        return action if self._clip is None else action.clip(-self._clip, self._clip)
 
     def hand_over(self, measurements, seconds=2.0, tolerance=0.3):
         """Move to the first pose in `seconds`; ready within `tolerance`: a Go1 sags by 0.23 rad."""
@@ -198,7 +197,7 @@ class Policy:
         begin, pose = self._start = self._start or (now, q)
         share = min((now - begin) / seconds, 1.0)
         self.is_ready = share == 1.0 and bool(np.abs(q - self.default).max() < tolerance)
-        to = self._commanded(pose + share * (self.default - pose))
+        to = self.commanded(pose + share * (self.default - pose))
         self._handed = np.concatenate([getattr(to, a["field"])[a["index"]] for a in self._actions])
         return to
 
@@ -207,7 +206,8 @@ class Policy:
         q, zero = np.where(np.isfinite(q), q, self.default), np.zeros(len(self.names))
         return Targets(self.names, q, zero, zero, zero, self.kd, self.period, True, self.reason)
 
-    def _commanded(self, position):
+    def commanded(self, position):
+        """Return commands of joint positions, with the gains of the contract."""
         zero = np.zeros(len(self.names))
         return Targets(self.names, position, zero, zero.copy(), self.kp, self.kd, self.period)
 
@@ -221,8 +221,8 @@ class Policy:
     def _checked(self, measurements):
         """Return the values; set `reason` if they are stale, not finite, or beyond the limits."""
         values = {k: self._sized(k, v) for k, v in measurements.items() if k != "time"}
-        limits, last, self._time = self._limits, self._time, float(measurements["time"])
-        if self.reason or not self._has_limits:
+        limits, last, self._time = self.limits, self._time, float(measurements["time"])
+        if self.reason or not self._limited:
             return values
         gap = self.period if last is None else self._time - last
         self._repeated = self._repeated + 1 if gap <= 0 else 0
@@ -241,7 +241,7 @@ class Policy:
                 self.reason = "the robot is tilted by more than limits.tilt"
         return values
 
-    def _add_commands(self, values, command):
+    def add_commands(self, values, command):
         """Add given commands, gait clocks and motions to `values`."""
         if not isinstance(command, dict):
             command = dict.fromkeys(self._given.values(), command) if len(self._given) == 1 else {}
@@ -278,7 +278,7 @@ class Policy:
         if "time_step" in self.inputs:
             self.inputs["time_step"][:] = t
 
-    def _targets(self):
+    def targets(self):
         """Return the motor commands of the last action, within the limits."""
         parts = []
         for action in self._actions:
@@ -289,12 +289,12 @@ class Policy:
                 target = raw * action["scale"] + action["offset"]
             parts.append(np.fmax(np.fmin(target, action["high"]), action["low"]))
         self.target = sent = np.concatenate(parts)
-        if self._has_limits:
-            sent = sent.clip(self._limits["target_low"], self._limits["target_high"])
+        if self._limited:
+            sent = sent.clip(self.limits["target_low"], self.limits["target_high"])
             if self._sent is not None:
-                step = self._limits["target_step"]
+                step = self.limits["target_step"]
                 sent = sent.clip(self._sent - step, self._sent + step)
-        self._sent, commands = sent, self._commanded(self.default.copy())
+        self._sent, commands = sent, self.commanded(self.default.copy())
         for a in self._actions:
             getattr(commands, a["field"])[a["index"]] = sent[a["target_start"] : a["target_stop"]]
         return commands
