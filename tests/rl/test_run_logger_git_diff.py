@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from mjlab.rl.run_logger import write_git_diff
+from mjlab.runs import Run
 
 
 def git(folder: Path, *arguments: str) -> None:
@@ -63,3 +64,16 @@ def test_code_without_a_repository_or_a_git_has_no_state(repository, tmp_path, m
     assert write_git_diff(tmp_path / "run", tmp_path / "task.py") is None
     monkeypatch.setenv("PATH", "")
     assert write_git_diff(tmp_path / "run", repository / "task.py") is None
+
+
+def test_a_run_knows_its_commit(repository, tmp_path):
+    folder = tmp_path / "run"
+    assert Run(folder).commit is None
+    write_git_diff(folder, repository / "task.py")
+    head = subprocess.check_output(["git", "rev-parse", "HEAD"], cwd=repository, text=True)
+    assert Run(folder).commit == head.strip()
+    # Of two repositories, either may be the task's.
+    (folder / "git" / "other.diff").write_text("--- git commit ---\n0123456789\n")
+    assert Run(folder).commit is None
+    (folder / "git" / "my_tasks.diff").unlink()
+    assert Run(folder).commit == "0123456789"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +18,19 @@ def contract_of(folder: Path) -> dict:
 
 
 def test_a_run_is_deployed_from_its_last_checkpoint(run, trained, tmp_path):
-    folder = tmp_path / "bundle"
-    outcome = run("deploy", str(trained), "--output", str(folder), *QUICK)
+    recorded = shutil.copytree(trained, tmp_path / "runs" / trained.name)
+    shutil.rmtree(recorded / "git", ignore_errors=True)
+    (recorded / "git").mkdir()
+    (recorded / "git" / "tasks.diff").write_text("--- git commit ---\n0123abcd\n")
+    folder = tmp_path / "out" / "bundle"
+    outcome = run("deploy", str(recorded), "--output", str(folder), *QUICK)
     assert outcome.status == 0, outcome.err
     source = contract_of(folder)["source"]
     assert source["task"] == "Mjlab-Cartpole-Swingup"
     assert source["run"] == trained.name
+    # The commit of the training, not of the package that deploys.
+    assert source["commit"] == "0123abcd"
+    assert source["package_commit"] != "0123abcd"
     assert source["checkpoint"] == "model_1.pt"
     assert source["seed"] == 7
     assert source["iteration"] == 2
@@ -30,7 +38,7 @@ def test_a_run_is_deployed_from_its_last_checkpoint(run, trained, tmp_path):
     assert names >= {"contract.json", "policy.onnx", "golden.npz", "golden.csv", "README.md"}
     assert names >= {"runtime.py", "simulate.py", "scene", "robot"}
     # Nothing else is left beside it.
-    assert [path.name for path in tmp_path.iterdir()] == ["bundle"]
+    assert [path.name for path in folder.parent.iterdir()] == ["bundle"]
 
 
 def test_a_checkpoint_and_its_export_are_the_same_policy(run, trained, tmp_path):

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from mjlab.deploy.contract import Contract
+from mjlab.deploy.efferent import write_manifest
 from mjlab.deploy.golden import record, write_csv
 from mjlab.deploy.readme import readme
 from mjlab.deploy.unitree import write_unitree
@@ -75,6 +76,7 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
     for name in PROGRAMS:
         if (FILES / name).exists():
             shutil.copyfile(FILES / name, folder / name)
+    write_manifest(content, folder)
     notes = _notes(content)
     if (why := write_unitree(content, folder)) is not None:
         notes.append(why)
@@ -84,19 +86,16 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
     return Bundle(folder, content, notes)
 
 
-def origin(
-    task: str, profile: str | None, checkpoint: Path, seed: int | None, **known: Any
-) -> dict:
-    """Return the origin of a policy for the contract."""
+def origin(task: str, profile: str | None, checkpoint: Path, **known: Any) -> dict[str, Any]:
+    """Return the origin of a policy for the contract; `known` is what its run records."""
     return {
         "task": task,
         "profile": profile,
         "run": checkpoint.resolve().parent.name,
         "checkpoint": checkpoint.name,
-        "seed": seed,
         **known,
-        "commit": _commit(),
         "package": f"mjlab {version('mjlab')}",
+        "package_commit": _commit(),
         "mujoco": mujoco.__version__,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from mjlab.deploy.usual_terms import is_velocity, usual_term
+
 _LEGS = ("FR", "FL", "RR", "RL")
 _SIDES = ("left", "right")
 _LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -126,24 +128,12 @@ def _registered(contract: Mapping[str, Any], term: Mapping[str, Any]) -> tuple[s
     kind, inputs = term["kind"], term["inputs"]
     sources = {one["name"]: one["source"] for one in contract["measurements"]}
     commands = {one["name"]: one for one in contract["commands"]}
-    if kind == "last_action" and term["columns"] is None:
-        return "last_action", {}
-    if kind == "gravity" and inputs == ["root_quat"]:
-        return "projected_gravity", {}
-    if kind == "reading" and term["columns"] is None and term["factor"] is None:
-        source = sources[inputs[0]]
-        if source["kind"] == "joint_pos":
-            return ("joint_pos" if term["offset"] is None else "joint_pos_rel"), {}
-        if source["kind"] == "joint_vel":
-            return "joint_vel_rel", {}
-        if _is_gyro_of_root(contract, source):
-            return "base_ang_vel", {}
+    if (usual := usual_term(contract, term)) is not None:
+        return usual, {}
     if kind == "command":
         command = commands[inputs[0].removeprefix("command/")]
         if command["kind"] == "motion":
             return "motion_command", {}
-        if _is_velocity(command):
-            return "velocity_commands", {}
         always = command["kind"] == "gait_clock" and command["velocity_command"] is None
         if always and command["fade_s"] == 0.0 and command["start"] == 0.0:
             return "gait_phase", {"period": 1.0 / command["frequency"]}
@@ -152,30 +142,16 @@ def _registered(contract: Mapping[str, Any], term: Mapping[str, Any]) -> tuple[s
     raise UnknownToUnitreeError(f"they do not register the term {term['name']!r}.")
 
 
-def _is_gyro_of_root(contract: Mapping[str, Any], source: Mapping[str, Any]) -> bool:
-    """Return True for the angular velocity of the root in its own axes, which the IMU measures."""
-    root = contract["robot"]["root_body"]
-    if source["kind"] == "body_ang_vel_b":
-        return source["body"] == root
-    has_axes_of_root = source.get("body") == root and source["site_quat"] == [1.0, 0.0, 0.0, 0.0]
-    return source.get("type") == "gyro" and has_axes_of_root
-
-
 def _is_of_anchor(inputs: Sequence[str], sources: Mapping[str, Any]) -> bool:
     """Return True for a motion's orientation in the frame of the torso."""
     body = sources.get(inputs[1], {}).get("body", "")
     return inputs[0].startswith("command/") and body.rsplit("/", 1)[-1] == _ANCHOR
 
 
-def _is_velocity(command: Mapping[str, Any]) -> bool:
-    names = [component["name"] for component in command["components"]]
-    return names == ["lin_vel_x", "lin_vel_y", "ang_vel_z"]
-
-
 def _commands(contract: Mapping[str, Any]) -> dict[str, Any]:
     """Return the ranges that the programs clamp the stick to."""
     for command in contract["commands"]:
-        if _is_velocity(command):
+        if is_velocity(command):
             ranges = {one["name"]: one["range"] for one in command["components"]}
             return {"base_velocity": {"ranges": {**ranges, "heading": None}}}
     return {}

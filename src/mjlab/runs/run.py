@@ -57,6 +57,8 @@ DONE = ("solved", "finished")
 
 # Characters of a value in a message.
 _LONGEST = 100
+# First lines of a file in `git/`, also as rsl_rl writes it.
+_COMMIT = re.compile(r"--- git commit ---\s+([0-9a-f]{7,64})\b")
 _TIME = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")
 
 
@@ -171,6 +173,24 @@ class Run:
         """Seed; None if not recorded."""
         seed = self.params["agent"].get("seed")
         return seed if isinstance(seed, int) and seed >= 0 else None
+
+    @property
+    def commit(self) -> str | None:
+        """Commit of the task's repository at the start (`git/`); None if not recorded.
+
+        None also for several repositories: the folder does not tell whose the task is.
+        """
+        files = list((self.folder / "git").glob("*.diff"))
+        if len(files) != 1:
+            return None
+        with (
+            contextlib.suppress(OSError),
+            files[0].open(encoding="utf-8", errors="replace") as file,
+        ):
+            # The changes that follow may be long.
+            found = _COMMIT.match(file.read(200))
+            return found[1] if found else None
+        return None
 
     @property
     def started(self) -> datetime | None:

@@ -42,7 +42,7 @@ class DeployConfig(PolicyFlags):
 def command(argv: list[str], prog: str) -> None:
     """Run `deploy`."""
     target, *flags = argv
-    task, path, defaults = _policy_of(target, flags)
+    task, path, defaults = policy_of(target, flags)
     flags = ["--checkpoint-file", str(path), *defaults, *flags]
     cfg = parse_policy_flags(DeployConfig, flags, task, f"{prog} {target}", purpose="evaluate")
     bundle = run_deploy(task, cfg)
@@ -51,7 +51,7 @@ def command(argv: list[str], prog: str) -> None:
         print(f"  {note}")
 
 
-def _policy_of(target: str, flags: list[str]) -> tuple[str, Path, list[str]]:
+def policy_of(target: str, flags: list[str]) -> tuple[str, Path, list[str]]:
     """Return task and path of the policy that `target` names, and flags that it implies.
 
     Raises:
@@ -110,12 +110,14 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
             _export(task, env, checkpoint, made, cfg.profile)
             contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
             is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
+            run = Run(checkpoint.path.parent)
             source = origin(
                 task,
                 cfg.profile,
                 checkpoint.path,
-                seed=Run(checkpoint.path.parent).seed,
                 iteration=checkpoint.iteration if is_ours else None,
+                seed=run.seed,
+                commit=run.commit,
             )
             bundle = write_bundle(contract, made, source, cfg.steps)
             if folder.exists():
