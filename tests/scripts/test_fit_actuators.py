@@ -12,6 +12,7 @@ from swing import TRUE, link_spec, make_log
 
 from mjlab.actuator import BuiltinMotorActuatorCfg, IdealPdActuatorCfg, XmlActuatorCfg
 from mjlab.cli.main import main
+from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 from mjlab.identification.estimate import DriveEstimate, Estimate, LimbEstimate
 from mjlab.identification.log import COLUMNS, JointLog
 from mjlab.identification.robot import Drives
@@ -130,6 +131,33 @@ def test_file_keeps_its_other_actuators(printed, folder: Path) -> None:
     (folder / "driven.xml").write_text(spec.to_xml())
     _, (_, other), _ = printed("driven.xml", "--stiffness", "25", "--damping", "1")
     assert (type(other), other.target_names_expr) == (XmlActuatorCfg, ("hinge1",))
+
+
+def test_fitted_joints_have_one_actuator(printed, folder: Path) -> None:
+    spec = link_spec(joints=2)
+    for name in ("hinge0", "hinge1"):
+        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    spec.compile()
+    (folder / "driven.xml").write_text(spec.to_xml())
+    _, actuators, out = printed("driven.xml", "--stiffness", "25", "--damping", "1")
+    names: dict = {}
+    source = out[out.index("from mjlab.actuator") :]
+    exec(source[: source.index("Events (")], names)
+
+    def make() -> mujoco.MjSpec:
+        spec = mujoco.MjSpec.from_file(str(folder / "driven.xml"))
+        names["remove_file_actuators"](spec)
+        return spec
+
+    articulation = EntityArticulationInfoCfg(actuators=actuators)
+    model = EntityCfg(spec_fn=make, articulation=articulation).build().spec.compile()
+    driven = [model.joint(int(joint)).name for joint in model.actuator_trnid[:, 0]]
+    assert sorted(driven) == ["hinge0", "hinge1"]
+
+
+def test_configs_replace_themselves(printed) -> None:
+    """Actuators that configs add need not be removed."""
+    assert "remove_file_actuators" not in printed("hinged:make")[2]
 
 
 def test_delays_are_in_timesteps_of_the_task(printed, monkeypatch) -> None:

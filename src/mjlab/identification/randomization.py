@@ -80,6 +80,25 @@ def actuators_source(
     return "\n".join([*lines, ")"])
 
 
+def removal_source(joints: Sequence[str]) -> str:
+    """Return a function that removes the actuators of the robot's file from `joints`.
+
+    The file's and the fitted actuators would otherwise both drive them.
+    """
+    return "\n".join(
+        (
+            f"DRIVEN_BY_FILE = {tuple_source(joints, 17)}",
+            "",
+            "",
+            "def remove_file_actuators(spec):",
+            '    """Remove the actuators that the fitted ones replace; call it in `spec_fn`."""',
+            "    for actuator in list(spec.actuators):",
+            "        if actuator.target in DRIVEN_BY_FILE:",
+            "            spec.delete(actuator)",
+        )
+    )
+
+
 def events_source(limbs: Sequence[LimbEstimate]) -> str:
     """Return the events that randomize the estimated values within their intervals.
 

@@ -17,7 +17,7 @@ from mjlab.cli.flags import parse_flags
 from mjlab.identification.estimate import UNITS, Estimate, LimbEstimate
 from mjlab.identification.log import JointLog, read_log
 from mjlab.identification.plant import KINDS
-from mjlab.identification.randomization import actuators_source, events_source
+from mjlab.identification.randomization import actuators_source, events_source, removal_source
 from mjlab.identification.robot import Drives, fit_robot
 from mjlab.own_robot.anatomy import actuated_joint
 from mjlab.own_robot.gains import servo_stiffness
@@ -70,6 +70,18 @@ class Robot:
     timestep: float
     """Physics timestep of the task (s)."""
 
+    def of_file(self, joints: Sequence[str]) -> list[str]:
+        """Return those of `joints` that an actuator of the robot's file drives."""
+        from mjlab.actuator import XmlActuatorCfg
+
+        driven = {
+            name
+            for cfg, names in self.actuators
+            if isinstance(cfg, XmlActuatorCfg) and cfg.transmission_type.value == "joint"
+            for name in names
+        }
+        return [name for name in joints if name in driven]
+
     def others(self, joints: Sequence[str]) -> list[ActuatorCfg]:
         """Return the actuators without those of `joints`."""
         configs = []
@@ -116,8 +128,11 @@ def report(logs: list[JointLog], limbs: list[LimbEstimate], robot: Robot) -> str
     ]
     if remarks:
         parts.append("\n".join(["Not separated by the log:", *remarks]))
-    others = robot.others(logs[0].joints)
+    joints = logs[0].joints
+    others = robot.others(joints)
     actuators = actuators_source(limbs, robot.drives.effort_limit, robot.timestep, others)
+    if of_file := robot.of_file(joints):
+        actuators += "\n\n\n" + removal_source(of_file)
     parts += [
         "Actuators (robot.py):\n\n" + actuators,
         "Events (task.py), ranges from the intervals:\n\n" + events_source(limbs),
