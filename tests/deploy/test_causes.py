@@ -11,6 +11,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from bundles import write_demo, write_random
@@ -53,19 +54,50 @@ def odd_task(env: Any, agent: Any) -> None:
     agent.actor.rnn_hidden_dim = 8
 
 
+def geared_task(env: Any, agent: Any) -> None:
+    """Let a servo with a gear of 2 in the robot's file move the cart."""
+    from mjlab.actuator import XmlActuatorCfg
+    from mjlab.entity import EntityArticulationInfoCfg
+    from mjlab.envs.mdp import JointPositionActionCfg
+
+    robot = env.scene.entities["cartpole"]
+    make = robot.spec_fn
+
+    def geared() -> mujoco.MjSpec:
+        spec = make()
+        for actuator in list(spec.actuators):
+            spec.delete(actuator)
+        joint = mujoco.mjtTrn.mjTRN_JOINT
+        servo = spec.add_actuator(name="slider", target="slider", trntype=joint)
+        servo.set_to_position(kp=20.0, kv=2.0)
+        servo.gear[0], servo.forcerange, servo.forcelimited = 2.0, (-30.0, 30.0), True
+        return spec
+
+    robot.spec_fn = geared
+    servo = XmlActuatorCfg(target_names_expr=("slider",))
+    robot.articulation = EntityArticulationInfoCfg(actuators=(servo,))
+    cart = {"entity_name": "cartpole", "actuator_names": ("slider",)}
+    env.actions = {"position": JointPositionActionCfg(**cart, scale=0.2)}
+
+
+def write_traced(name: str, folder: Path) -> Path:
+    """Write a bundle: `go1`, `g1`, or the untrained `odd` and `geared`."""
+    if name == "odd":
+        return write_random("Mjlab-Velocity-Flat-Unitree-Go1", folder, odd_task, STEPS)
+    if name == "geared":
+        return write_random("Mjlab-Cartpole-Swingup", folder, geared_task, STEPS)
+    return write_demo(name, folder, STEPS)
+
+
 @pytest.fixture(scope="session")
 def traced(tmp_path_factory) -> Callable[[str], Path]:
-    """Return a function that writes a bundle: `go1`, `g1`, or `odd`, which is untrained."""
+    """Return `write_traced` that writes each bundle once."""
     written: dict[str, Path] = {}
 
     def make(name: str) -> Path:
         if name not in written:
             folder = tmp_path_factory.mktemp("traced") / "bundle"
-            if name == "odd":
-                write_random("Mjlab-Velocity-Flat-Unitree-Go1", folder, odd_task, STEPS)
-            else:
-                write_demo(name, folder, STEPS)
-            written[name] = folder
+            written[name] = write_traced(name, folder)
         return written[name]
 
     return make
@@ -292,6 +324,7 @@ def appended(code: str) -> Edit:
     return edit
 
 
+# Expressions are replaced by expressions in parentheses, so that two edits of one compose.
 GIVEN = "np.asarray(command[name], float)"
 SHIFT = "slot[:-history], slot[-history:] = slot[history:].copy(), value"
 LAST = 'values["last_action"] = self.action\n'
@@ -337,9 +370,9 @@ PLANTS = (
     Plant("joint velocities in degrees", "go1", measured('values["joint_vel"] = np.degrees(values["joint_vel"])'), "degrees for radians"),
     Plant("observation scaled", "go1", term("joint_vel", scale=[0.05]), "another scale"),
     Plant("observation scale left out", "odd", term("joint_vel", scale=None), "scale left out"),
-    Plant("command scaled", "go1", runtime(GIVEN, f"{GIVEN} * [2.0, 2.0, 0.25]"), "another scale of some components"),
+    Plant("command scaled", "go1", runtime(GIVEN, f"({GIVEN} * [2.0, 2.0, 0.25])"), "another scale of some components"),
     Plant("command clipped", "go1", runtime(GIVEN, f"{GIVEN}.clip(-0.3, 0.3)"), "clipped"),
-    Plant("yaw command negated", "go1", runtime(GIVEN, f"{GIVEN} * [1, 1, -1]"), "opposite sign of some components"),
+    Plant("yaw command negated", "go1", runtime(GIVEN, f"({GIVEN} * [1, 1, -1])"), "opposite sign of some components"),
     Plant("targets as the last action", "go1", runtime(LAST, 'values["last_action"] = self._sent if self._sent is not None else self.action\n'), "joint targets instead of the raw last action"),
     Plant("last action scaled", "go1", runtime(LAST, 'values["last_action"] = self.action * self.contract["actions"][0]["scale"]\n'), "last action after scale"),
     Plant("last action one step late", "go1", runtime(LAST, 'values["last_action"] = getattr(self, "old", self.action)\n        self.old = self.action.copy()\n'), "one control step late"),
@@ -380,6 +413,7 @@ PLANTS = (
     Plant("no joint friction", "odd", model("dof_frictionloss", lambda x: 0.0 * x), "other joint friction"),
     Plant("no effort limit", "odd", joints("effort", lambda limits: [None] * len(limits)), "other effort limit"),
     Plant("no effort limit, never reached", "g1", joints("effort", lambda limits: [None] * len(limits)), UNDECIDABLE),
+    Plant("gains of the scene, with a gear", "geared", model("actuator_gainprm", lambda x: 0.8 * x), "other gains"),
 )  # fmt: skip
 """Numbered list of mistakes of deployments, as users reported them."""
 
@@ -435,6 +469,16 @@ def test_more_pairs_give_no_wrong_name(number, traced, tmp_path):
     assert_no_wrong_name(one, other, copied(traced(one.bundle), tmp_path / "copy"))
 
 
-def test_untrained_bundle_as_written_passes(traced):
-    report = check_bundle(traced("odd"))
+@pytest.mark.parametrize("name", ["odd", "geared"])
+def test_untrained_bundle_as_written_passes(traced, name):
+    report = check_bundle(traced(name))
     assert report.is_passed, str(report)
+
+
+def test_gains_are_those_at_the_joint(traced):
+    """A servo with gear g follows g q, and its force acts on the joint times g."""
+    content = json.loads((traced("geared") / "contract.json").read_text())
+    (slider,) = (joint for joint in content["joints"] if joint["name"] == "slider")
+    assert (slider["kp"], slider["kd"], slider["effort"]) == (80.0, 8.0, 60.0)
+    (action,) = content["actions"]
+    assert action["scale"] == [0.1]

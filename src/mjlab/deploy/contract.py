@@ -280,7 +280,7 @@ def _network_inputs(policy: Path) -> tuple[list[dict[str, Any]], dict[str, list[
 
 def _joints(subject: Subject) -> list[dict[str, Any]]:
     entity, model = subject.entity, subject.model
-    gains, limits = joint_gains(entity, model), _efforts(entity, model)
+    gains, limits = _gains(entity, model), _efforts(entity, model)
     data = entity.data
     entries = []
     for k, (name, full) in enumerate(
@@ -311,6 +311,28 @@ def _joints(subject: Subject) -> list[dict[str, Any]]:
     return entries
 
 
+def _gears(entity: Entity, model: mujoco.MjModel) -> dict[str, float]:
+    """Return the gear of each actuated joint: motion of the actuator per motion of the joint."""
+    gears = {}
+    for actuator in entity.actuators:
+        if str(getattr(actuator.transmission_type, "value", "joint")) != "joint":
+            continue
+        elements = actuator.global_element_ids.tolist()
+        for k, name in enumerate(actuator.target_names):
+            element = elements[k * len(elements) // len(actuator.target_names)]
+            gears[name] = float(model.actuator_gear[element, 0])
+    return gears
+
+
+def _gains(entity: Entity, model: mujoco.MjModel) -> dict[str, tuple[float, float]]:
+    """Return kp and kd of each actuated joint, at the joint: those of the actuator times gear squared."""
+    gears = _gears(entity, model)
+    return {
+        name: (kp * gears[name] ** 2, kd * gears[name] ** 2)
+        for name, (kp, kd) in joint_gains(entity, model).items()
+    }
+
+
 def _efforts(entity: Entity, model: mujoco.MjModel) -> dict[str, float | None]:
     """Return the largest effort of each actuated joint; None without a limit."""
     found: dict[str, float | None] = {}
@@ -326,10 +348,10 @@ def _effort(actuator: Actuator, element: int, model: mujoco.MjModel) -> float | 
     limit = getattr(actuator.cfg, "effort_limit", None)
     gear = abs(float(model.actuator_gear[element, 0]))
     joint = int(model.actuator_trnid[element, 0])
-    if isinstance(limit, int | float) and not isinstance(actuator, DirectActuator):
-        bounds = [float(limit)]
-    else:
-        bounds = [float(limit)] if isinstance(limit, int | float) else []
+    # Limits of configs with a gear are before it.
+    factor = abs(getattr(actuator.cfg, "gear", 1.0))
+    bounds = [factor * float(limit)] if isinstance(limit, int | float) else []
+    if isinstance(actuator, DirectActuator) or not bounds:
         if model.actuator_forcelimited[element]:
             bounds.append(gear * float(np.abs(model.actuator_forcerange[element]).max()))
         is_motor = int(model.actuator_biastype[element]) == int(mujoco.mjtBias.mjBIAS_NONE)
@@ -346,7 +368,7 @@ def _actuators(env: ManagerBasedRlEnv, nominal: Nominal) -> list[dict[str, Any]]
     model = env.sim.mj_model
     entries: dict[int, dict[str, Any]] = {}
     for entity_name, entity in env.scene.entities.items():
-        gains = joint_gains(entity, model)
+        gains = _gains(entity, model)
         for actuator in entity.actuators:
             laws = _laws(actuator)
             names, columns = actuator.target_names, actuator.global_ctrl_ids.tolist()
@@ -365,9 +387,10 @@ def _actuators(env: ManagerBasedRlEnv, nominal: Nominal) -> list[dict[str, Any]]
                     "kp": kp,
                     "kd": kd,
                     "effort": _effort(actuator, element, model),
+                    "gear": float(model.actuator_gear[element, 0]),
                     "delay": list(delay),
                 }
-    unknown = {"joint": None, "law": "custom", "kp": 0.0, "kd": 0.0, "effort": None}
+    unknown = {"joint": None, "law": "custom", "kp": 0.0, "kd": 0.0, "effort": None, "gear": 1.0}
     return [
         entries.get(k, {"name": f"ctrl {k}", **unknown, "delay": [0, 0]})
         for k in range(env.sim.data.ctrl.shape[1])
@@ -388,7 +411,7 @@ def _actions(env: ManagerBasedRlEnv) -> list[dict[str, Any]]:
     manager, start, target, entries = env.action_manager, 0, 0, []
     for name in manager.active_terms:
         term: Any = manager.get_term(name)
-        kind = _ACTIONS.get(type(term), "custom")
+        kind, factors = _ACTIONS.get(type(term), "custom"), joint_factors(env, term)
         entry: dict[str, Any] = {
             "name": name,
             "kind": kind,
@@ -402,31 +425,47 @@ def _actions(env: ManagerBasedRlEnv) -> list[dict[str, Any]]:
         if kind == "binary_joint_position":
             cfg = term.cfg
             for key, table in (("open", cfg.open_command_expr), ("closed", cfg.close_command_expr)):
-                entry[key] = list(resolve_matching_names_values(table, term.target_names)[2])
+                targets = resolve_matching_names_values(table, term.target_names)[2]
+                entry[key] = _at_joints(targets, factors)
         elif kind == "custom":
             entry["class"] = name_of(type(term))
         else:
             entry |= {
-                "scale": _each(term.scale, term.action_dim),
-                "offset": _each(term.offset, term.action_dim),
-                "clip": _clips(term),
+                "scale": _at_joints(_each(term.scale, term.action_dim), factors),
+                "offset": _at_joints(_each(term.offset, term.action_dim), factors),
+                "clip": _clips(term, factors),
             }
         entries.append(entry)
         start, target = entry["stop"], entry["target_stop"]
     return entries
 
 
+def joint_factors(env: ManagerBasedRlEnv, term: Any) -> list[float]:
+    """Return the motion of each joint, or the torque, per unit of the controls that an action sets.
+
+    1 but for actuators with a gear g, which follow g q: 1 / g for positions and velocities, g for efforts.
+    """
+    entity: Any = env.scene[term.cfg.entity_name]
+    gears = _gears(entity, env.sim.mj_model)
+    power = 1 if _ACTIONS.get(type(term)) == "joint_effort" else -1
+    return [gears.get(name, 1.0) ** power for name in getattr(term, "target_names", ())]
+
+
+def _at_joints(values: Sequence[float], factors: Sequence[float]) -> list[float]:
+    return [value * factor for value, factor in zip(values, factors, strict=True)]
+
+
 def _each(value: Any, count: int) -> list[float]:
     return [float(value)] * count if isinstance(value, int | float) else shortest(value[0])
 
 
-def _clips(term: Any) -> list[list[float | None]] | None:
+def _clips(term: Any, factors: Sequence[float]) -> list[list[float | None]] | None:
     if term.cfg.clip is None:
         return None
     bounds: list[Any] = [[None, None] for _ in term.target_names]
     found = resolve_matching_names_values(term.cfg.clip, term.target_names)
     for index, pair in zip(found[0], found[2], strict=True):
-        bounds[index] = _bounds(pair)
+        bounds[index] = _bounds(sorted(factors[index] * bound for bound in pair)) or [None, None]
     return bounds
 
 

@@ -14,6 +14,8 @@ import mujoco
 import numpy as np
 import torch
 
+from mjlab.deploy.contract import joint_factors
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -151,8 +153,7 @@ class _Recorder:
         terms: list[Any] = [
             env.action_manager.get_term(name) for name in env.action_manager.active_terms
         ]
-        targets = [getattr(term, "_processed_actions", term.raw_action) for term in terms]
-        self._add("target", _row(torch.cat(targets, dim=1)))
+        self._add("target", _row(torch.cat([_targets(env, term) for term in terms], dim=1)))
         for name, value in self._outputs.items():
             self._add(name, _row(value))
         self._state("after")
@@ -168,6 +169,15 @@ class _Recorder:
 
     def _add(self, name: str, value: np.ndarray) -> None:
         self._rows.setdefault(name, []).append(value)
+
+
+def _targets(env: Any, term: Any) -> torch.Tensor:
+    """Return the targets of an action, at the joints, (N, T)."""
+    targets: torch.Tensor = getattr(term, "_processed_actions", term.raw_action)
+    factors = joint_factors(env, term)
+    # An action of another package may have targets of its own.
+    is_of_joints = len(factors) == targets.shape[1]
+    return targets * targets.new_tensor(factors) if is_of_joints else targets
 
 
 def _row(value: torch.Tensor) -> np.ndarray:

@@ -190,7 +190,9 @@ def _gains(contract: dict, model: mujoco.MjModel) -> np.ndarray:
             continue
         held = (actuator["kp"], actuator["kp"], actuator["kd"])
         if actuator["law"] == "position":
-            gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
+            # At the joint.
+            square = model.actuator_gear[k, 0] ** 2
+            gain, bias = square * model.actuator_gainprm[k], square * model.actuator_biasprm[k]
             held = (gain[0], -bias[1], -bias[2])
         rows.append((held, (joint["kp"], joint["kp"], joint["kd"])))
     return np.array(rows).swapaxes(0, 1)
@@ -208,7 +210,8 @@ def _correct_gains(is_order: bool) -> Callable[[dict, mujoco.MjModel], bool]:
             if joint is None:
                 continue
             if actuator["law"] == "position":
-                kp, kd = actuator["kp"], actuator["kd"]
+                square = model.actuator_gear[k, 0] ** 2
+                kp, kd = actuator["kp"] / square, actuator["kd"] / square
                 model.actuator_gainprm[k, 0] = kp
                 model.actuator_biasprm[k, 1:3] = -kp, -kd
             joint["kp"], joint["kd"] = actuator["kp"], actuator["kd"]

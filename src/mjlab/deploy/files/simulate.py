@@ -147,12 +147,14 @@ class Simulation:
         ):
             if j < 0:
                 continue
-            law = actuator["law"]
+            law, gear = actuator["law"], actuator.get("gear", 1.0)
             if law == "position" and targets.is_damping:
                 # A servo without stiffness: its target follows the joint.
-                control = self.data.qpos[self.qpos[j]]
-            elif law in ("position", "velocity", "effort"):
-                control = getattr(targets, law)[j]
+                control = gear * self.data.qpos[self.qpos[j]]
+            elif law in ("position", "velocity"):
+                control = gear * getattr(targets, law)[j]
+            elif law == "effort":
+                control = targets.effort[j] / gear
             elif law == "pd":
                 error = targets.position[j] - self.data.qpos[self.qpos[j]]
                 speed = targets.velocity[j] - self.data.qvel[self.qvel[j]]
