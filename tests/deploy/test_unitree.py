@@ -13,7 +13,13 @@ import pytest
 import yaml
 from bundles import load_program
 
-from mjlab.deploy.unitree import MOTORS, UnknownToUnitreeError, deploy_settings, motor_map
+from mjlab.deploy.unitree import (
+    MOTORS,
+    UnknownToUnitreeError,
+    deploy_settings,
+    motor_map,
+    phase_note,
+)
 
 
 class Reader:
@@ -93,7 +99,7 @@ def test_the_programs_act_as_in_training(bundle, name):
     assert reader.input.name == "obs"
     motors = reader.motors
     if "gait_phase" in reader.cfg["observations"]:
-        # Their clock is a step ahead of training's.
+        # Their clock advances before it is read.
         reader.phase = (
             -reader.cfg["step_dt"] / reader.cfg["observations"]["gait_phase"]["params"]["period"]
         )
@@ -186,7 +192,7 @@ def test_anchor_of_a_motion_is_the_torso(bundle, body):
             deploy_settings(contract)
 
 
-def test_gait_phase_is_a_step_ahead_of_the_clock(bundle, tmp_path):
+def test_gait_phase_is_two_steps_ahead_of_the_clock(bundle, tmp_path):
     clock = {
         "name": "gait",
         "kind": "gait_clock",
@@ -212,13 +218,17 @@ def test_gait_phase_is_a_step_ahead_of_the_clock(bundle, tmp_path):
     policy = load_program(bundle("go1"), "runtime").Policy(
         contract, lambda outputs, inputs: [np.zeros((1, 12))], limits=False
     )
+    # Their reset reads each term.
+    reader.gait_phase({}, np.zeros(3), **params)
     expected, got = [], []
     for k in range(60):
         measured = {"time": 0.02 * k, "joint_pos": np.zeros(12), "joint_vel": np.zeros(12)}
         policy.step(measured, {"twist": np.zeros(3)})
         expected.append(policy.values["obs", "gait"])
         got.append(reader.gait_phase({}, np.zeros(3), **params))
-    np.testing.assert_allclose(got[:-1], expected[1:], atol=1e-5)
+    np.testing.assert_allclose(got[:-2], expected[2:], atol=1e-5)
+    assert "two control steps" in str(phase_note(contract))
+    assert phase_note(edited(bundle("go1"), lambda content: None)) is None
 
 
 def test_no_file_for_a_policy_that_cannot_run_there(bundle):

@@ -20,7 +20,7 @@ from mjlab.deploy.contract import Contract
 from mjlab.deploy.efferent import write_manifest
 from mjlab.deploy.golden import record, write_csv
 from mjlab.deploy.readme import readme
-from mjlab.deploy.unitree import write_unitree
+from mjlab.deploy.unitree import phase_note, write_unitree
 from mjlab.rl.exporter_utils import OnnxPolicy, attach_metadata_to_onnx, get_base_metadata
 from mjlab.scene import Scene, SceneCfg
 
@@ -80,8 +80,11 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
     notes = _notes(content)
     if (why := write_unitree(content, folder)) is not None:
         notes.append(why)
-    elif (folder / "params").exists() and _is_go1(env):
-        notes.append("A Go1 speaks unitree_legged_sdk (UDP), which Unitree's programs do not.")
+    elif (folder / "params").exists():
+        if _is_go1(env):
+            notes.append("A Go1 speaks unitree_legged_sdk (UDP), which Unitree's programs do not.")
+        if (note := phase_note(content)) is not None:
+            notes.append(note)
     (folder / "README.md").write_text(readme(content, notes), encoding="utf-8")
     return Bundle(folder, content, notes)
 

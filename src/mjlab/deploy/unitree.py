@@ -3,8 +3,8 @@
 The programs register a fixed set of terms. A policy with another one cannot run there, and the file is then
 not written. Gains are in the order of the motors, everything else in that of the policy.
 
-Their gait phase advances before it is read, in training after: it is ahead of training's by one control step
-since the start, or by two where their reset reads it as well.
+Their gait phase advances before it is read, and their reset reads it as well: since the start it is two
+control steps ahead of training's. They read its period and nothing else, so the file cannot correct that.
 """
 
 from __future__ import annotations
@@ -62,6 +62,17 @@ def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
     (folder / "params" / "deploy.yaml").write_text(head + text, encoding="utf-8")
     shutil.copyfile(folder / contract["policy"]["file"], folder / "exported" / "policy.onnx")
     return None
+
+
+def phase_note(contract: Mapping[str, Any]) -> str | None:
+    """Return a sentence on the gait phase of Unitree's programs; None for a policy without a clock."""
+    clocks = [one for one in contract["commands"] if one["kind"] == "gait_clock"]
+    if not clocks:
+        return None
+    return (
+        "Unitree's programs give a gait phase two control steps ahead of training's, and newer versions zeros "
+        "for commands shorter than 0.1: `runtime.py` gives that of training."
+    )
 
 
 def has_motors(contract: Mapping[str, Any]) -> bool:
