@@ -19,11 +19,11 @@ from mjlab.deploy.check import check_bundle  # noqa: E402
 PAGE = ROOT / "docs" / "reference" / "causes.md"
 HEAD = """# Mistakes that check-deploy names
 
-`tools/causes_page.py` wrote this page: each mistake was planted into a copy of a bundle, by an edit of its
-`runtime.py`, `simulate.py`, contract, scene or network, and
-[`check-deploy`](../how-to/check_deploy.md) was run on it. `tests/deploy/test_causes.py` has the edits.
-Bundles: `go1` and `g1` of the bundled policies; `odd`, a Go1 with clips, scales, histories, explicit
-motors and a recurrent network; `geared`, a cart with a geared servo; 120 steps each.
+`tools/causes_page.py` wrote this page: each mistake was planted into a copy of a bundle, by an edit
+of its `runtime.py`, `simulate.py`, contract, scene or network, and
+[`check-deploy`](../how-to/check_deploy.md) was run on it. `tests/deploy/test_causes.py` has the
+edits. Bundles, of 120 steps: `go1` and `g1` of the bundled policies; `odd`, a Go1 with clips,
+scales, histories, explicit motors and a recurrent network; `geared`, a cart with a geared servo.
 
 | | mistake | bundle | first difference | printed cause |
 | --- | --- | --- | --- | --- |

@@ -131,11 +131,8 @@ inline Vector difference(const Vector& a, const Vector& b) {
 
 /// Return factor * x - offset of the chosen components.
 inline Vector reading(const std::vector<Vector>& inputs, const Term& term) {
-  Vector x = inputs.at(0);
-  if (!term.columns.empty()) {
-    x.clear();
-    for (size_t column : term.columns) x.push_back(inputs[0].at(column));
-  }
+  Vector x = term.columns.empty() ? inputs.at(0) : Vector{};
+  for (size_t column : term.columns) x.push_back(inputs.at(0).at(column));
   for (size_t k = 0; k < x.size(); ++k)
     x[k] = term.factor * x[k] - (term.offset.empty() ? 0.0 : at(term.offset, k));
   return x;
@@ -211,7 +208,7 @@ inline std::map<std::string, Array> read_npz(const std::filesystem::path& path) 
   const std::string bytes{std::istreambuf_iterator<char>(file), {}};
   const auto number = [&bytes](size_t place, size_t count) {
     uint64_t value = 0;
-    for (size_t k = count; k-- > 0;) value = 256 * value + static_cast<uint8_t>(bytes.at(place + k));
+    for (size_t k = count; k-- > 0;) value = 256 * value + uint8_t(bytes.at(place + k));
     return value;
   };
   std::map<std::string, Array> arrays;
@@ -235,7 +232,8 @@ inline std::map<std::string, Array> read_npz(const std::filesystem::path& path) 
   return arrays;
 }
 
-/// Policy with its contract, memory, clocks and limits: faults damp until `reset`.
+/// Policy with its contract, memory, clocks and limits. After a measurement that is stale, not
+/// finite or beyond the limits, all steps damp until `reset`.
 class Policy {
  public:
   /// Read contract.json of a folder. Without limits, targets are those of the policy.
@@ -256,7 +254,7 @@ class Policy {
     for (const auto& [name, value] : contract_["limits"].items())
       if (!value.is_string()) limits_[name] = numbers(value);
     const json& policy = contract_["policy"];
-    clip_ = policy["clip"].is_null() ? INFINITY : policy["clip"].get<double>();
+    if (!policy["clip"].is_null()) clip_ = policy["clip"];
     action_.resize(policy["size"]);
     outputs_ = {policy["output"]};
     for (const json& entry : policy["inputs"]) add_input(entry);
@@ -282,14 +280,13 @@ class Policy {
       default_ = motion_.at("joint_pos").row(first + frame - 1, 0, names_.size());
     }
     for (const auto& [key, entry] : commands_["gait_clock"])
-      episode_.clocks[key].phase = entry["start"];
+      episode_.clocks[key].first = entry["start"];
   }
 
   /// Return the motor commands of one period.
   ///
   /// `command` is that of the only given command; several are entries `command/<name>` of the
-  /// measurements. After non-finite or stale measurements, a tilt or joint speed beyond the limits,
-  /// all steps damp until `reset`. Raises std::invalid_argument if numbers are missing.
+  /// measurements. Raises std::invalid_argument if numbers are missing.
   Targets step(const Values& measurements, const Vector& command = {}) {
     Values values = checked(measurements);
     add_commands(values, command);
@@ -314,9 +311,8 @@ class Policy {
       action_[k] = static_cast<float>(std::clamp<double>(answers[0][k], -clip_, clip_));
   }
 
-  /// Move from the measured pose to the first pose of the policy, in `seconds`.
-  ///
-  /// `is_ready` becomes true when time is over and each joint within `tolerance` (rad, m).
+  /// Move to the first pose of the policy in `seconds`; ready then, if each joint is within
+  /// `tolerance` (rad, m).
   Targets hand_over(const Values& measurements, double seconds = 2.0, double tolerance = 0.3) {
     handed_.clear();
     const Values values = checked(measurements);
@@ -325,14 +321,13 @@ class Policy {
     if (!episode_.begin) episode_.begin = {measurements.time, q};
     const auto& [start, pose] = *episode_.begin;
     const double share = std::min((measurements.time - start) / seconds, 1.0);
-    Vector position(pose);
+    Targets result = commanded(pose);
     double farthest = 0.0;
     for (size_t k = 0; k < q.size(); ++k) {
-      position[k] += share * (default_[k] - pose[k]);
+      result.position[k] += share * (default_[k] - pose[k]);
       farthest = std::max(farthest, std::abs(q[k] - default_[k]));
     }
     episode_.is_ready = share == 1.0 && farthest < tolerance;
-    Targets result = commanded(position);
     for (const Action& action : actions_)
       for (size_t joint : action.index) handed_.push_back((result.*action.field)[joint]);
     return result;
@@ -374,17 +369,13 @@ class Policy {
     std::vector<std::array<double, 2>> clip;
   };
 
-  struct Clock {
-    float phase = 0.0f, amplitude = 0.0f;
-  };
-
   struct Episode {
     std::string reason;  // Of damping.
     std::optional<double> time;
     int repeated = 0;  // Measurements.
     bool is_first = true, is_ready = false;
     std::optional<std::pair<double, Vector>> begin;  // Time and pose at the start of the hand-over.
-    std::map<std::string, Clock> clocks;
+    std::map<std::string, std::pair<float, float>> clocks;  // Phase and amplitude.
     size_t motion = 0;
     std::optional<size_t> frame;
   };
@@ -409,8 +400,7 @@ class Policy {
     const std::string function = entry["function"];
     term.key = input + "/" + entry["name"].get<std::string>();
     const auto known = TERMS.count(kind) ? TERMS.find(kind) : TERMS.find(function);
-    if (known == TERMS.end())
-      fail("Term '" + term.key + "': add the formula of '" + function + "' to mjlab::TERMS.");
+    if (known == TERMS.end()) fail("Term '" + term.key + "': add '" + function + "' to TERMS.");
     term.formula = known->second;
     term.inputs = entry["inputs"].get<std::vector<std::string>>();
     if (kind == "last_action") term.inputs = {"last_action"};
@@ -458,9 +448,9 @@ class Policy {
     return place->second;
   }
 
-  static void check_size(const json& entry, const std::string& name, const Vector& value) {
-    if (value.size() != entry["size"])
-      fail("'" + name + "': expected " + entry["size"].dump() + " numbers, got " +
+  static void check_size(const std::string& name, const Vector& value, size_t size) {
+    if (value.size() != size)
+      fail("'" + name + "': expected " + std::to_string(size) + " numbers, got " +
            std::to_string(value.size()) + ".");
   }
 
@@ -470,7 +460,7 @@ class Policy {
     for (const json& entry : contract_["measurements"]) {
       const auto given = values.find(entry["name"]);
       if (given == values.end()) continue;
-      check_size(entry, given->first, given->second);
+      check_size(given->first, given->second, entry["size"]);
       const bool is_turn = entry.value("is_quaternion", false);
       are_unit = are_unit && !(is_turn && std::abs(norm(given->second) - 1) > 0.05);
     }
@@ -507,7 +497,7 @@ class Policy {
       fail("Command: several are given; add each to the measurements, as command/<name>.");
     for (const auto& [key, entry] : commands_["given"]) {
       if (!command.empty()) values[key] = command;
-      check_size(entry, key, found(values, key));
+      check_size(key, found(values, key), entry["size"]);
     }
     for (const auto& [key, entry] : commands_["gait_clock"]) values[key] = tick(key, entry, values);
     for (const auto& [key, entry] : commands_["motion"]) play(key, entry, values);
@@ -525,11 +515,10 @@ class Policy {
       stands = speed < entry["standing_threshold"].get<double>();
     }
     if (!episode_.is_first) {
-      const double advance = entry["frequency"].get<double>() * period_;
-      phase = std::fmod(phase + static_cast<float>(advance), 1.0f);
-      const float change = static_cast<float>(stands ? -period_ : period_) /
-                           static_cast<float>(fade_s > 0 ? fade_s : 1.0);
-      fade = std::clamp(fade + change, 0.0f, 1.0f);
+      const float advance = static_cast<float>(entry["frequency"].get<double>() * period_);
+      const float change = static_cast<float>(stands ? -period_ : period_);
+      phase = std::fmod(phase + advance, 1.0f);
+      fade = std::clamp(fade + change / static_cast<float>(fade_s > 0 ? fade_s : 1.0), 0.0f, 1.0f);
     }
     const float amplitude = fade_s > 0 ? fade : (stands ? 0.0f : 1.0f);
     const float angle = phase * 6.28318530717958648f;
@@ -557,9 +546,7 @@ class Policy {
     std::vector<Vector> inputs;
     for (const std::string& name : term.inputs) inputs.push_back(found(values, name));
     const Vector& value = values_[term.key] = term.formula(inputs, term);
-    if (value.size() != term.size)
-      fail("Term '" + term.key + "': expected " + std::to_string(term.size) + " numbers, got " +
-           std::to_string(value.size()) + ".");
+    check_size(term.key, value, term.size);
     float* slot = &inputs_[term.index].data[term.begin];
     // A history is one block. The first value of an episode fills it.
     if (term.total > term.size) std::copy(slot + term.size, slot + term.total, slot);
@@ -598,7 +585,7 @@ class Policy {
   json contract_;
   Network network_;
   bool is_limited_;
-  double period_ = 0.0, clip_ = 0.0;
+  double period_ = 0.0, clip_ = INFINITY;
   std::vector<std::string> names_, outputs_;
   Vector kp_, kd_, default_;
   std::map<std::string, Vector> limits_;

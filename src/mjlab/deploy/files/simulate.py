@@ -243,7 +243,7 @@ def main():
     if options.seconds is not None:
         stands = play(policy, simulation, command, options.seconds)
         place = simulation.data.body(policy.contract["robot"]["root_body"]).xpos
-        print("position of the robot after", simulation.data.time, "s:", np.round(place, 3))
+        print(f"position of the robot after {simulation.data.time:.2f} s: {np.round(place, 3)}")
         raise SystemExit(0 if stands else 1)
     import mujoco.viewer
 
