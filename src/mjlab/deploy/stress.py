@@ -1,7 +1,8 @@
 """Stress: success of a deployed policy in plain MuJoCo, with one thing changed at a time.
 
 An episode succeeds if the robot tilts by less than `limits.tilt` and stays above half of its initial height.
-It starts from a start of the golden trace, with commands drawn from the ranges of training.
+It starts in the initial pose, as after a hand-over, or at the start of a motion, and has commands drawn from
+the ranges of training.
 """
 
 from __future__ import annotations
@@ -165,10 +166,11 @@ def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) ->
     policy.kp, policy.kd = setting.gains * policy.kp, setting.gains * policy.kd
     _add_noise(evidence, policy, setting.noise, noise)
     simulation = evidence.originals.simulate.Simulation(contract, model)
-    starts = np.flatnonzero(evidence.first)
-    start = int(starts[seed % len(starts)])
-    simulation.set_state(**evidence.state(start))
-    policy.reset(motion=evidence.motion(start))
+    if any(one["kind"] == "motion" for one in contract["commands"]):
+        starts = np.flatnonzero(evidence.first)
+        start = int(starts[seed % len(starts)])
+        simulation.set_state(**evidence.state(start))
+        policy.reset(motion=evidence.motion(start))
     rates, data = contract["rates"], simulation.data
     delay = _delay(setting.latency, rates["physics_dt"])
     limits, root = contract["limits"], model.body(contract["robot"]["root_body"]).id
