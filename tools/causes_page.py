@@ -5,17 +5,15 @@ uv run python tools/causes_page.py
 
 from __future__ import annotations
 
+import importlib
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
+
+from mjlab.deploy.check import check_bundle
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "deploy"))
-
-from test_causes import PLANTS, UNDECIDABLE, Plant, copied, write_traced  # noqa: E402
-
-from mjlab.deploy.check import check_bundle  # noqa: E402
-
 PAGE = ROOT / "docs" / "reference" / "causes.md"
 HEAD = """# Mistakes that check-deploy names
 
@@ -30,11 +28,11 @@ scales, histories, explicit motors and a recurrent network; `geared`, a cart wit
 """
 
 
-def row(number: int, plant: Plant, folder: Path) -> str:
+def row(number: int, plant: Any, folder: Path) -> str:
     """Return the row of a mistake that is planted in `folder`."""
     plant.edit(folder)
     report = check_bundle(folder)
-    if plant.cause == UNDECIDABLE:
+    if not plant.cause:
         (where,) = [text for text in report.undecided if "never reached" in text]
         shown = ["none", f"not decidable by this trace: {where}"]
     else:
@@ -45,13 +43,15 @@ def row(number: int, plant: Plant, folder: Path) -> str:
 
 def main() -> None:
     """Check all mistakes, and write the page."""
-    rows: list[str] = []
+    sys.path.insert(0, str(ROOT / "tests" / "deploy"))
+    tests, rows = importlib.import_module("test_causes"), []
     with tempfile.TemporaryDirectory() as temporary:
-        for number, plant in enumerate(PLANTS, 1):
+        for number, plant in enumerate(tests.PLANTS, 1):
             bundle = Path(temporary) / plant.bundle
             if not bundle.exists():
-                write_traced(plant.bundle, bundle)
-            rows.append(row(number, plant, copied(bundle, Path(temporary) / f"copy {number}")))
+                tests.write_traced(plant.bundle, bundle)
+            copy = tests.copied(bundle, Path(temporary) / f"copy {number}")
+            rows.append(row(number, plant, copy))
             print(rows[-1], flush=True)
     PAGE.write_text(HEAD + "\n".join(rows) + "\n", encoding="utf-8")
 
