@@ -78,7 +78,7 @@ ATTRIBUTES: dict[str, dict[str, str]] = {
         "applied_torque_limits": "joint_torques_l2; actuators clip at their effort_limit",
         "contact_forces": "undesired_contacts, or soft_landing in mjlab.tasks.velocity.mdp",
         "track_lin_vel_xy_exp": f"track_linear_velocity {_VELOCITY}",
-        "track_ang_vel_z_exp": f"track_angular_velocity {_VELOCITY}",
+        "track_ang_vel_z_exp": f"track_ang_vel_z_exp {_VELOCITY}",
         "feet_slide": f"feet_slip {_VELOCITY}",
         "is_terminated_term": "env.termination_manager.get_term(name)",
         # Terminations.

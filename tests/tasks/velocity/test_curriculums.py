@@ -72,6 +72,12 @@ def test_who_goes_up_does_not_go_down_however_much_was_asked_for():
     assert moves[1:] == ([1, 0, 0, 0], [0, 1, 1, 1])
 
 
+def test_levels_stay_until_the_first_step():
+    for first_step, up in ((100, 1), (101, 0)):
+        _, moves = levels(walked(0.0, 2.4, 2.6, 4.1), first_step=first_step)
+        assert moves[1:] == ([0, 0, 0, up], [up, up, 0, 0])
+
+
 def test_only_environments_that_reset_are_moved():
     _, moves = levels(walked(4.1, 4.1, 0.0, 0.0), torch.tensor([1, 3]))
     assert moves == ([1, 3], [1, 0], [0, 1])

@@ -43,6 +43,13 @@ def test_yaw_rate_is_tracked_and_roll_and_pitch_are_kept_zero():
     assert reward.tolist() == pytest.approx([math.exp(-(0.16 + 0.01 + 0.04) / 4.0), 1.0])
 
 
+def test_yaw_rate_alone_is_tracked():
+    env: Any = StandInEnv().command((9.0, 9.0, 0.5), (0.0, 0.0, -1.0))
+    env.data.root_link_ang_vel_b[:] = torch.tensor([[7.0, 8.0, 0.9], [0.0, 0.0, -1.0]])
+    reward = mdp.track_ang_vel_z_exp(env, std=2.0, command_name="twist")
+    assert reward.tolist() == pytest.approx([math.exp(-0.16 / 4.0), 1.0])
+
+
 # Standing upright.
 
 

@@ -31,12 +31,12 @@ def test_contacts_are_simple_in_training(task):
 @pytest.mark.parametrize("task", [task for task in TASKS if "Go1" in task])
 @pytest.mark.parametrize("gait", [((0, 3), (1, 2)), None])
 def test_penalties_are_eased_and_nothing_else(task, gait):
-    """Of the rewards: a gait is added, or where it is unknown, a reward for air time fades out."""
+    """A gait and the yaw rate are rewarded; where the gait is unknown, a reward for air time fades out."""
     table, rl_cfg = load_env_cfg(task), load_rl_cfg(task)
     env_cfg = load_env_cfg(task)
     profile = ppo.cpu if gait is None else ppo.cpu_with_gait(gait, minimum_height=0.1)
     profile.easing(env_cfg, rl_cfg)
-    added = set() if gait is None else {"gait"}
+    added = set() if gait is None else {"gait", "yaw"}
     assert env_cfg.rewards.keys() - table.rewards.keys() == added
     eased = {name for name, term in table.rewards.items() if term.weight < 0}
     if gait is None:

@@ -50,6 +50,7 @@ def terrain_levels_vel(
     command_name: str,
     asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
     use_elapsed_time: bool = False,
+    first_step: int = 0,
 ) -> dict[str, torch.Tensor]:
     """Raise the terrain level of robots that walked far, and lower it for robots that did not.
 
@@ -65,6 +66,8 @@ def terrain_levels_vel(
         use_elapsed_time: Use the time since the reset instead of the full episode length. Otherwise
             robots whose episodes were truncated early are sent down although they walked well.
             Training truncates first episodes early, because it randomizes their initial lengths.
+        first_step: `common_step_counter` before which all keep their level, because robots that do not
+            walk yet would all be sent to the lowest.
 
     Returns, for logging: mean and maximum level, and the mean level per sub-terrain if each
     sub-terrain has one column.
@@ -86,6 +89,7 @@ def terrain_levels_vel(
     move_down = (distance < required) & ~move_up
     # Before the first reset, robots are at their model pose.
     has_moved = env.episode_length_buf[env_ids] > (0 if env.common_step_counter > 0 else torch.inf)
+    has_moved &= env.common_step_counter >= first_step
     terrain.update_env_origins(env_ids, move_up & has_moved, move_down & has_moved)
     return _levels_to_log(terrain)
 

@@ -36,6 +36,7 @@ __all__ = [
     "feet_slip",
     "feet_swing_height",
     "soft_landing",
+    "track_ang_vel_z_exp",
     "track_angular_velocity",
     "track_linear_velocity",
     "upright",
@@ -84,6 +85,22 @@ def track_angular_velocity(
     error = asset.data.root_link_ang_vel_b.clone()
     error[:, 2].sub_(command[:, 2])
     return torch.exp(error.square().sum(dim=1) / -(std**2))
+
+
+def track_ang_vel_z_exp(
+    env: ManagerBasedRlEnv,
+    std: float,
+    command_name: str,
+    asset_cfg: SceneEntityCfg = _DEFAULT_ASSET_CFG,
+) -> torch.Tensor:
+    """Reward tracking of the commanded yaw rate alone: exp(-(c_z - w_z)^2 / std^2).
+
+    w_z is the yaw rate of the root link in its own frame (rad/s). A robot that rolls and pitches at 0.5 rad/s
+    while it walks gets as much as one that does not; see `track_angular_velocity`.
+    """
+    command = velocity_command(env, command_name)
+    error = command[:, 2] - env.scene[asset_cfg.name].data.root_link_ang_vel_b[:, 2]
+    return torch.exp(error.square_() / -(std**2))
 
 
 class upright:

@@ -191,7 +191,7 @@ def _learner(rl_cfg: RslRlOnPolicyRunnerCfg, mirror: str | None) -> RslRlOffPoli
     algorithm.actor_learning_rate = 1.5e-3
     algorithm.critic_learning_rate = 6e-4
     # With constant rates, a policy that walks may fall five times as often 15 iterations later.
-    algorithm.learning_rate_factor = ((1500, 1.0), (2500, 0.3))
+    algorithm.learning_rate_factor = ((2200, 1.0), (3200, 0.3))
     algorithm.init_alpha = 0.002
     algorithm.alpha_learning_rate = 1e-2
     algorithm.alpha_range = (1e-5, 0.05)
@@ -251,47 +251,57 @@ def _gait_rewards(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> dict[str, Rewa
             params={"std": std * speed, "command_name": "twist"},
         )
         for name, weight, std in (
-            (_LINEAR, 3.0, 0.5),
+            (_LINEAR, 4.0, 0.5),
             ("linear_wide", 3.0, 1.0),
-            ("linear_narrow", 2.0, 0.25),
+            ("linear_narrow", 3.0, 0.25),
         )
     }
-    frames = get_sensor(env_cfg, "foot_height_scan").frame
-    rewards = linear | {
-        "angular": RewardTermCfg(
-            func=mdp.track_angular_velocity,
-            weight=6.5,
-            params={"std": 0.5 * turn, "command_name": "twist"},
-        ),
-        "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
-        "feet": RewardTermCfg(
-            func=mdp.feet_height_by_phase,
-            weight=5.0,
-            params={
-                "height_sensor_name": "foot_height_scan",
-                "swing_height": 0.09 * size,
-                "variance": 0.005 * size**2,
-                "offsets": tuple(0.0 if foot.name == robot.feet[0] else 0.5 for foot in frames),
-            },
-        ),
-        "height": RewardTermCfg(
-            func=mdp.root_height_l2,
-            weight=-50.0 / size**2,
-            params={"target_height": robot.height, "asset_cfg": robot.soles},
-        ),
-        "apart": RewardTermCfg(
-            func=mdp.feet_apart_l2,
-            weight=-100.0 / size**2,
-            params={"distance": robot.feet_distance, "asset_cfg": robot.soles},
-        ),
-        "rolling": RewardTermCfg(
-            func=mdp.body_angular_velocity_penalty, weight=-0.5 * robot.time**2
-        ),
-        "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
-        "deviation": RewardTermCfg(
-            func=mdp.weighted_joint_deviation, weight=-0.25, params={"weights": dict(robot.pose)}
-        ),
+    # Of the yaw rate alone: rolling and pitching with the steps hides how much a trunk sways.
+    yaw = {
+        name: RewardTermCfg(
+            func=mdp.track_ang_vel_z_exp,
+            weight=weight,
+            params={"std": std * turn, "command_name": "twist"},
+        )
+        for name, weight, std in (("yaw", 4.0, 0.5), ("yaw_narrow", 3.0, 0.25))
     }
+    frames = get_sensor(env_cfg, "foot_height_scan").frame
+    rewards = (
+        linear
+        | yaw
+        | {
+            "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
+            "feet": RewardTermCfg(
+                func=mdp.feet_height_by_phase,
+                weight=5.0,
+                params={
+                    "height_sensor_name": "foot_height_scan",
+                    "swing_height": 0.09 * size,
+                    "variance": 0.005 * size**2,
+                    "offsets": tuple(0.0 if foot.name == robot.feet[0] else 0.5 for foot in frames),
+                },
+            ),
+            "height": RewardTermCfg(
+                func=mdp.root_height_l2,
+                weight=-50.0 / size**2,
+                params={"target_height": robot.height, "asset_cfg": robot.soles},
+            ),
+            "apart": RewardTermCfg(
+                func=mdp.feet_apart_l2,
+                weight=-100.0 / size**2,
+                params={"distance": robot.feet_distance, "asset_cfg": robot.soles},
+            ),
+            "rolling": RewardTermCfg(
+                func=mdp.body_angular_velocity_penalty, weight=-0.5 * robot.time**2
+            ),
+            "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
+            "deviation": RewardTermCfg(
+                func=mdp.weighted_joint_deviation,
+                weight=-0.25,
+                params={"weights": dict(robot.pose)},
+            ),
+        }
+    )
     if robot.has_ankles:
         rewards["soles"] = RewardTermCfg(
             func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": robot.soles}
