@@ -351,13 +351,11 @@ class Policy {
   const std::vector<std::string>& names() const { return names_; }
   double period() const { return period_; }
   bool is_ready() const { return episode_.is_ready; }
-  /// Values of the terms of the last step, before clip and scale, by `<input>/<term>`.
+  // Of the last step: values of the terms before clip and scale, by `<input>/<term>`; inputs and
+  // answer of the network; targets before the limits, in order of the actions.
   const std::map<std::string, Vector>& values() const { return values_; }
-  /// Network inputs of the last step.
   const std::vector<Input>& inputs() const { return inputs_; }
-  /// Answer of the network in the last step.
   const std::vector<float>& action() const { return action_; }
-  /// Targets of the last step before the limits, in order of the actions.
   const Vector& target() const { return target_; }
 
  private:
@@ -397,10 +395,10 @@ class Policy {
   Term make_term(const json& observation, const json& entry) const {
     Term term;
     const std::string input = observation["input"], kind = entry["kind"];
-    const std::string function = entry["function"];
     term.key = input + "/" + entry["name"].get<std::string>();
-    const auto known = TERMS.count(kind) ? TERMS.find(kind) : TERMS.find(function);
-    if (known == TERMS.end()) fail("Term '" + term.key + "': add '" + function + "' to TERMS.");
+    const auto known = TERMS.find(TERMS.count(kind) ? kind : entry["function"].get<std::string>());
+    if (known == TERMS.end())
+      fail("Term '" + term.key + "': add " + entry["function"].dump() + " to mjlab::TERMS.");
     term.formula = known->second;
     term.inputs = entry["inputs"].get<std::vector<std::string>>();
     if (kind == "last_action") term.inputs = {"last_action"};
@@ -509,8 +507,7 @@ class Policy {
     const double fade_s = entry["fade_s"];
     bool stands = false;
     if (!entry["velocity_command"].is_null()) {
-      const std::string name = entry["velocity_command"];
-      const Vector& v = found(values, "command/" + name);
+      const Vector& v = found(values, "command/" + entry["velocity_command"].get<std::string>());
       const double speed = std::hypot(v.at(0), v.at(1)) + std::abs(v.at(2));
       stands = speed < entry["standing_threshold"].get<double>();
     }
