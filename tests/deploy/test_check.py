@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bundles import BUNDLES
+from bundles import BUNDLES, write_random
 
 from mjlab.deploy.check import TOLERANCES, check_bundle, undecided
 from mjlab.deploy.evidence import Evidence
@@ -33,6 +33,22 @@ def test_bundle_as_written_passes(bundle, name):
 def folder(bundle, tmp_path) -> Path:
     """Return a copy of the Go1's bundle."""
     return Path(shutil.copytree(bundle("go1"), tmp_path / "bundle"))
+
+
+def test_period_that_float32_rounds(tmp_path):
+    def at_30_hz(env: Any, agent: Any) -> None:
+        env.sim.mujoco.timestep, env.decimation = 1.0 / 120.0, 4
+
+    folder = write_random("Mjlab-Cartpole-Swingup", tmp_path / "bundle", at_30_hz)
+    content = json.loads((folder / "contract.json").read_text())
+    assert content["rates"]["step_dt"] == pytest.approx(1.0 / 30.0, rel=1e-15)
+    report = check_bundle(folder)
+    assert report.is_passed, str(report)
+    # An older bundle, and another rate.
+    edit_contract(folder, lambda content: content["rates"].update(step_dt=0.033333335))
+    assert check_bundle(folder).is_passed
+    edit_contract(folder, lambda content: content["rates"].update(step_dt=0.0334))
+    assert check_bundle(folder).causes == ["other control rate"]
 
 
 def term_of(content: dict[str, Any], name: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -84,6 +85,22 @@ def test_plain_names_of_columns(log_of):
     report = log_of(rename)
     assert report.is_passed
     assert not any("not in the log" in note for note in report.undecided)
+
+
+def test_gyroscope_of_a_log_is_that_of_the_root(bundle, tmp_path):
+    folder = Path(shutil.copytree(bundle("go1"), tmp_path / "bundle"))
+    columns = golden(folder)
+    for k, letter in enumerate("xyz"):
+        columns[f"gyroscope.{letter}"] = columns.pop(f"measurement.imu_ang_vel.{k}")
+    log = written(tmp_path / "log.csv", columns)
+    assert not any("imu_ang_vel" in note for note in check_log(folder, log).undecided)
+    text = (folder / "contract.json").read_text()
+    (folder / "contract.json").write_text(
+        text.replace(
+            '"body": "robot/trunk",\n    "site_pos"', '"body": "robot/FR_hip",\n    "site_pos"'
+        )
+    )
+    assert any("imu_ang_vel" in note for note in check_log(folder, log).undecided)
 
 
 def test_wrong_observation_in_a_log_is_named(log_of):
@@ -202,6 +219,15 @@ def test_answers_of_another_program(bundle, tmp_path):
     some = {"step": columns["step"][3:], **{k: v[3:] for k, v in answers.items()}}
     report = check_answers(folder, written(tmp_path / "a.csv", some))
     assert report.causes == ["one control step late"]
+
+
+def test_some_answers_need_their_steps(bundle, tmp_path):
+    folder = bundle("go1")
+    columns = {k: v[:1] for k, v in golden(folder).items() if k.startswith(("step", "action."))}
+    assert check_answers(folder, written(tmp_path / "a.csv", columns)).is_passed
+    del columns["step"]
+    with pytest.raises(UserError, match="step"):
+        check_answers(folder, written(tmp_path / "a.csv", columns))
 
 
 def test_answers_need_a_known_column(bundle, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import sys
 import time
@@ -10,6 +11,8 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from bundles import load_program
+
+from mjlab.deploy.readme import readme
 
 STEPS = 180
 """Control steps: two seconds of hand-over, and the policy."""
@@ -27,17 +30,20 @@ def motor(**values: float) -> SimpleNamespace:
 def modules(simulation: Any, clock: list[float]) -> dict[str, ModuleType]:
     """Return stand-ins for the SDK: states of the simulation out, commands in."""
     handlers, sent = [], []
-    count = len(simulation.contract["joints"])
+    names = [joint["name"] for joint in simulation.contract["joints"]]
+    # Order of a Go2's messages.
+    legs, parts = ("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf")
+    motors = [names.index(f"{leg}_{part}_joint") for leg in legs for part in parts]
+    joints = [motors.index(k) for k in range(len(names))]
 
     def state() -> SimpleNamespace:
         measured = simulation.measure()
         positions, velocities = measured["joint_pos"], measured["joint_vel"]
         return SimpleNamespace(
-            motor_state=[motor(q=q, dq=dq) for q, dq in zip(positions, velocities, strict=True)],
+            motor_state=[motor(q=positions[k], dq=velocities[k]) for k in motors],
             imu_state=SimpleNamespace(
                 quaternion=measured["root_quat"], gyroscope=measured["imu_ang_vel"]
             ),
-            mode_machine=5,
         )
 
     class Subscriber:
@@ -57,11 +63,11 @@ def modules(simulation: Any, clock: list[float]) -> dict[str, ModuleType]:
 
         def Write(self, cmd: Any) -> None:
             sent.append(cmd)
-            assert (cmd.crc, cmd.mode_machine) == (7, 5)
-            motors = cmd.motor_cmd[:count]
-            assert all(m.mode == 1 for m in motors)
+            assert (cmd.crc, cmd.head, cmd.level_flag) == (7, [0xFE, 0xEF], 0xFF)
+            ordered = [cmd.motor_cmd[k] for k in joints]
+            assert all(m.mode == 1 for m in ordered)
             fields = {"position": "q", "velocity": "dq", "effort": "tau", "kp": "kp", "kd": "kd"}
-            values = {key: [getattr(m, name) for m in motors] for key, name in fields.items()}
+            values = {key: [getattr(m, name) for m in ordered] for key, name in fields.items()}
             simulation.apply(SimpleNamespace(**values, is_damping=not any(values["kp"])))
             clock[0] += 0.02
             handlers[0](state())
@@ -76,11 +82,11 @@ def modules(simulation: Any, clock: list[float]) -> dict[str, ModuleType]:
             "ChannelSubscriber": Subscriber,
         },
         "idl.default": {
-            "unitree_hg_msg_dds__LowCmd_": lambda: SimpleNamespace(
-                motor_cmd=[motor() for _ in range(35)]
+            "unitree_go_msg_dds__LowCmd_": lambda: SimpleNamespace(
+                motor_cmd=[motor() for _ in range(20)]
             )
         },
-        "idl.unitree_hg.msg.dds_": {"LowCmd_": object, "LowState_": object},
+        "idl.unitree_go.msg.dds_": {"LowCmd_": object, "LowState_": object},
         "utils.crc": {"CRC": lambda: SimpleNamespace(Crc=lambda cmd: 7)},
     }
     made = {"unitree_sdk2py": ModuleType("unitree_sdk2py")}
@@ -134,3 +140,17 @@ def test_loops_have_the_measurements_of_the_contract(bundle):
         assert (f'"{one["name"]}": ' in python) == (one["availability"] != "computed")
     assert "np.full(3, np.nan)" in python
     assert len(cpp.splitlines()) <= 40
+    assert all(part in python for part in ("unitree_hg", "mode_pr", "MOTORS = range"))
+
+
+def test_gyroscope_of_another_link_is_missing(bundle):
+    contract = json.loads((bundle("go1") / "contract.json").read_text())
+    assert '"imu_ang_vel": imu.gyroscope' in readme(contract, [])
+    (gyro,) = [one for one in contract["measurements"] if one["name"] == "imu_ang_vel"]
+    gyro["source"]["body"] = "robot/FR_hip"
+    assert '"imu_ang_vel": np.full(3, np.nan)' in readme(contract, [])
+
+
+def test_motors_of_an_unknown_robot_are_asked_for(bundle):
+    contract = json.loads((bundle("Mjlab-Cartpole-Swingup") / "contract.json").read_text())
+    assert "replace it by that of your robot" in readme(contract, [])

@@ -41,6 +41,38 @@ def test_keys_command_within_the_ranges_of_training(simulate):
     assert not keys.value.any()
 
 
+def test_keys_return_a_pose_to_one_without_turn(simulate):
+    keys = simulate[0].Keys({"components": None, "size": 7})
+    keys.press(UP)
+    keys.press(BACKSPACE)
+    assert keys.value.tolist() == [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+
+
+def test_command_of_another_size_is_refused(simulate, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["simulate.py", "--seconds", "0.1", "--command", "0.5"])
+    with pytest.raises(SystemExit) as stopped:
+        simulate[0].main()
+    assert stopped.value.code == 2
+    assert "expected 3 numbers, got 1" in capsys.readouterr().err
+
+
+def test_all_given_commands_are_sent(simulate, monkeypatch):
+    program, policy, _ = simulate
+    second = {**policy.contract["commands"][0], "name": "second"}
+    policy.contract["commands"].append(second)
+    sent = []
+    monkeypatch.setattr(program.Policy, "load", lambda folder: policy)
+    monkeypatch.setattr(program, "play", lambda *args: sent.append(args[2]()) or True)
+    arguments = ["--seconds", "0.1", "--command", "0.5", "0", "0"]
+    monkeypatch.setattr(sys, "argv", ["simulate.py", *arguments])
+    with pytest.raises(SystemExit):
+        program.main()
+    assert [(key, value.tolist()) for key, value in sent[0].items()] == [
+        ("twist", [0.5, 0.0, 0.0]),
+        ("second", [0.0, 0.0, 0.0]),
+    ]
+
+
 def test_a_robot_hands_over_walks_and_is_damped(simulate):
     program, policy, simulation = simulate
     simulation.reset()

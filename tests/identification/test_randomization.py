@@ -48,6 +48,17 @@ def test_actuators_have_the_values(written: dict[str, Any]) -> None:
     assert (first.delay_min_lag, first.delay_max_lag) == (1, 3)
 
 
+def test_joints_of_a_group_keep_their_effort_limits() -> None:
+    (drive,) = leg("FR", 0.1).drives[:1]
+    shared = dataclasses.replace(drive, joints=("left", "right", "middle"))
+    limb = dataclasses.replace(leg("FR", 0.1), drives=(shared,))
+    names: dict[str, Any] = {}
+    exec(actuators_source([limb], {"left": 20.0, "right": 5.0, "middle": 20.0}, TIMESTEP), names)
+    limits = {tuple(cfg.target_names_expr): cfg.effort_limit for cfg in names["ACTUATORS"]}
+    assert limits == {("left", "middle"): 20.0, ("right",): 5.0}
+    assert {cfg.stiffness for cfg in names["ACTUATORS"]} == {30.0}
+
+
 def test_untold_values_are_marked() -> None:
     told, untold = (actuators_source([leg("FR", share)], {}, TIMESTEP) for share in (0.1, 0.5))
     assert "not told" not in told

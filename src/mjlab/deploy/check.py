@@ -46,7 +46,7 @@ TOLERANCES = {
     "next sensors": 1e-4,
     "free steps": 1e-3,
 }
-"""Largest difference by stage, in causal order, as a fraction of the range of the values."""
+"""Largest difference by stage, in causal order, as a fraction of the range of the values; for rates, of the period."""
 _CHAINS = (
     ("rates",),
     ("sensors",),
@@ -377,7 +377,8 @@ def compare(evidence: Evidence, values: dict[tuple[str, str], np.ndarray]) -> li
             expected = _expected(evidence, stage, name) if there == stage else None
             if expected is not None and expected.shape[1]:
                 labels = _labels(evidence, name, expected.shape[1])
-                comparisons.append(Comparison(stage, name, expected, got, labels))
+                bound = TOLERANCES[stage] * float(expected[0, 0]) if stage == "rates" else None
+                comparisons.append(Comparison(stage, name, expected, got, labels, bound))
     return comparisons
 
 

@@ -135,9 +135,9 @@ class Contract:
             "version": VERSION,
             "source": dict(source),
             "rates": {
-                "physics_dt": shortest(env.physics_dt),
+                "physics_dt": env.physics_dt,
                 "decimation": env.cfg.decimation,
-                "step_dt": shortest(env.step_dt),
+                "step_dt": env.step_dt,
             },
             "robot": {
                 "entity": self.subject.robot,

@@ -66,12 +66,14 @@ def check_answers(folder: Path, path: Path) -> Report:
     """Return the report of a program's answers to `golden.csv`, with its `step` if rows are missing.
 
     Raises:
-        UserError: the table has no answers, or more rows than the trace.
+        UserError: the table has no answers, rows beyond the trace, or only some rows and no column `step`.
     """
     evidence, table = Evidence(folder), CsvTable(path)
     count = len(evidence.first)
-    rows = table.columns.get("step", np.arange(len(next(iter(table.columns.values())))))
-    rows = rows.astype(int)
+    length = len(next(iter(table.columns.values())))
+    if "step" not in table.columns and length != count:
+        raise UserError(f"{path}: expected a column step, or all {count} rows, got {length} rows.")
+    rows = table.columns.get("step", np.arange(count)).astype(int)
     if rows.min() < 0 or rows.max() >= count:
         raise UserError(f"{path} step: expected 0 to {count - 1}, got up to {rows.max()}.")
     values = {}
@@ -175,14 +177,14 @@ def check_log(folder: Path, path: Path) -> Report:
 
 def _raw(evidence: Evidence, table: CsvTable) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return measurements and commands of a log by name in the trace, and the missing ones."""
-    found, missing = {}, []
+    found, missing, root = {}, [], evidence.contract["robot"]["root_body"]
     for entry in evidence.contract["measurements"]:
         name, source = entry["name"], entry["source"]
         joints = evidence.joint_names if name in ("joint_pos", "joint_vel") else None
         labels = joints or [str(k) for k in range(entry["size"])]
         values = table.group(f"measurement.{name.replace('/', '.')}", labels)
         if values is None:
-            values = table.group(*_plain_name(name, source, labels))
+            values = table.group(*_plain_name(name, source, labels, root))
         if values is None:
             missing.append(f"measurement {name}")
             values = np.full((len(table.columns["time"]), entry["size"]), np.nan)
@@ -198,9 +200,11 @@ def _raw(evidence: Evidence, table: CsvTable) -> tuple[dict[str, np.ndarray], li
     return found, missing
 
 
-def _plain_name(name: str, source: Mapping[str, Any], labels: list[str]) -> tuple[str, list[str]]:
+def _plain_name(
+    name: str, source: Mapping[str, Any], labels: list[str], root: str
+) -> tuple[str, list[str]]:
     """Return the shorter name of a measurement, and the labels of its columns."""
-    if source["kind"] == "sensor" and source["type"] == "gyro":
+    if source.get("type") == "gyro" and source["body"] == root:
         return "gyroscope", list("xyz")
     if name == "root_quat":
         return "quaternion", list("wxyz")

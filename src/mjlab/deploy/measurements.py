@@ -371,6 +371,8 @@ def sensor(subject: Subject, sensor_name: str) -> Measurement:
         }
         if not kind.startswith("frame"):
             frame = f"site {model.site(site).name}"
+    elif int(element.objtype[0]) in (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY)):
+        source["body"] = model.body(int(element.objid[0])).name
     entity, _, short = sensor_name.rpartition("/")
     reason = _MEASURED.get(kind)
     return Measurement(

@@ -7,6 +7,8 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from mjlab.deploy.unitree import UnknownToUnitreeError, motor_map
+
 _TEMPLATE = Path(__file__).parent / "files" / "README.md.txt"
 
 
@@ -52,6 +54,7 @@ def readme(contract: Mapping[str, Any], notes: Sequence[str]) -> str:
         heading=_HEADING if any(c["kind"] == "motion" for c in contract["commands"]) else "",
         commands=_commands(contract["commands"]),
         **_loops(contract),
+        **_unitree([joint["name"] for joint in contract["joints"]]),
         notes=f"\n## Notes\n\n{listed}\n" if listed else "\n",
     )
 
@@ -62,7 +65,7 @@ def _origin(contract: Mapping[str, Any], one: Mapping[str, Any]) -> str:
     kind = source.get("type") if source["kind"] == "sensor" else source["kind"]
     if one["name"] in ("joint_pos", "joint_vel"):
         return one["name"]
-    if source.get("body", root) == root or source["kind"] == "sensor":
+    if source.get("body") == root:
         fields = {
             "body_quat": "quaternion",
             "framequat": "quaternion",
@@ -84,6 +87,7 @@ _CPP = {
     "quaternion": "{turn[3], turn[0], turn[1], turn[2]}",
     "gyroscope": "{rate[0], rate[1], rate[2]}",
 }
+_GO2_MOTORS = 12
 _NAN_NOTE = " Replace each NaN by the measurement of the line: until then, the robot is damped."
 
 
@@ -123,6 +127,29 @@ def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
 _ROBOT = """# Kinematics of the robot, for measurements that follow from joints and root.
 robot = Simulation(policy.contract, mujoco.MjModel.from_xml_path("robot/robot.xml"))
 """
+
+
+def _unitree(names: Sequence[str]) -> dict[str, str]:
+    """Return the parts of the loop for Unitree's SDK that depend on the robot."""
+    parts = {
+        "motors": "range(len(policy.names))",
+        "motors_note": "in the order of Unitree's messages",
+        "message": "unitree_hg",
+        "message_note": "  # Go2: unitree_go.",
+        "head_py": 'cmd.mode_pr, cmd.mode_machine = 0, received["state"].mode_machine',
+    }
+    try:
+        motors = motor_map(names)
+    except UnknownToUnitreeError:
+        note = "here joint k drives motor k: replace it by that of your robot"
+        return parts | {"motors_note": note}
+    if motors != list(range(len(names))):
+        parts["motors"] = str(motors)
+    parts["message_note"] = ""
+    if len(motors) == _GO2_MOTORS:
+        parts["message"] = "unitree_go"
+        parts["head_py"] = "cmd.head, cmd.level_flag = [0xFE, 0xEF], 0xFF"
+    return parts
 
 
 def _components(commands: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

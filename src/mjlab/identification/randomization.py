@@ -55,12 +55,9 @@ def actuators_source(
         low, high = _lags(limb.delay, timestep)
         for drive in limb.drives:
             values = {kind: number(e.value) for kind, e in drive.parameters.items()}
-            limit = effort_limit.get(drive.joints[0])
             fields = {
-                "target_names_expr": tuple_source(drive.joints, 27),
                 "stiffness": values["kp"],
                 "damping": values["kd"],
-                "effort_limit": repr(limit),
                 "armature": values["armature"],
                 "frictionloss": values["friction"],
                 "viscous_damping": values["damping"],
@@ -69,15 +66,30 @@ def actuators_source(
                 "delay_hold_prob": 1.0,
             }
             untold = {_FIELDS[kind] for kind, e in drive.parameters.items() if not e.is_known}
-            lines.append("    BuiltinPositionActuatorCfg(")
-            for name, value in fields.items():
-                line = _indented(f"{name}={value},", 8)
-                lines.append(commented(line, _NOT_TOLD if name in untold else ""))
-            lines.append("    ),")
+            for limit, joints in _by_limit(drive.joints, effort_limit).items():
+                own = {
+                    "target_names_expr": tuple_source(joints, 27),
+                    "effort_limit": repr(limit),
+                }
+                lines.append("    BuiltinPositionActuatorCfg(")
+                for name, value in {**own, **fields}.items():
+                    line = _indented(f"{name}={value},", 8)
+                    lines.append(commented(line, _NOT_TOLD if name in untold else ""))
+                lines.append("    ),")
     if others:
         lines.append("    # Joints that the log leaves out.")
         lines += [_indented(f"{_config_source(cfg)},", 4) for cfg in others]
     return "\n".join([*lines, ")"])
+
+
+def _by_limit(
+    joints: Sequence[str], effort_limit: dict[str, float]
+) -> dict[float | None, list[str]]:
+    """Return the joints of each effort limit; None: without one."""
+    found: dict[float | None, list[str]] = {}
+    for joint in joints:
+        found.setdefault(effort_limit.get(joint), []).append(joint)
+    return found
 
 
 def removal_source(joints: Sequence[str]) -> str:

@@ -174,18 +174,19 @@ class Keys:
     STEPS = {265: (0, 1), 264: (0, -1), 263: (1, 1), 262: (1, -1), 81: (2, 1), 69: (2, -1)}
 
     def __init__(self, command):
-        """Start with a zero command; `command` is an entry of the contract."""
+        """Start at zero, a pose without turn, or mid-range; `command` is an entry of the contract."""
         components = command["components"] or [{"range": None}] * command["size"]
         ranges = [component["range"] or (-1.0, 1.0) for component in components]
         self.low, self.high = np.array(ranges).T
         middle = (self.low + self.high) / 2
         self.value = np.where((self.low <= 0) & (self.high >= 0), 0.0, middle)
         self.value[3:4] = 1.0 if command["size"] == 7 else self.value[3:4]
+        self.start = self.value.copy()
 
     def press(self, key):
-        """Change the command: arrows, Q and E by a tenth of the range, backspace to zero."""
+        """Change the command: arrows, Q and E by a tenth of the range, backspace to the start."""
         if key == 259:
-            self.value[:] = 0.0
+            self.value[:] = self.start
         if key in self.STEPS and self.STEPS[key][0] < len(self.value):
             k, sign = self.STEPS[key]
             moved = self.value[k] + sign * 0.1 * (self.high[k] - self.low[k])
@@ -224,7 +225,9 @@ def main():
     """Play the policy, in the viewer or without."""
     parser = argparse.ArgumentParser(description="Run the policy of this folder in plain MuJoCo.")
     parser.add_argument("--seconds", type=float, help="duration without a window (s)")
-    parser.add_argument("--command", type=float, nargs="*", help="constant command")
+    parser.add_argument(
+        "--command", type=float, nargs="*", help="constant command, the first of the contract"
+    )
     options = parser.parse_args()
     policy = Policy.load(HERE)
     simulation = Simulation(policy.contract, load_model(HERE))
@@ -232,12 +235,15 @@ def main():
     if traced:
         raise SystemExit(f"Measure these yourself in Simulation.measure: {', '.join(traced)}.")
     given = [command for command in policy.contract["commands"] if command["kind"] == "given"]
-    keys = Keys(given[0]) if given else None
-    if keys is not None and options.command:
-        keys.value[:] = options.command
+    keys = [Keys(command) for command in given]
+    if options.command:
+        size = len(keys[0].value) if keys else 0
+        if len(options.command) != size:
+            parser.error(f"--command: expected {size} numbers, got {len(options.command)}")
+        keys[0].value[:] = options.command
 
     def command():
-        return None if keys is None else keys.value
+        return {entry["name"]: key.value for entry, key in zip(given, keys, strict=True)}
 
     begin(simulation)
     if options.seconds is not None:
@@ -247,7 +253,7 @@ def main():
         raise SystemExit(0 if stands else 1)
     import mujoco.viewer
 
-    on_key = keys.press if keys is not None else None
+    on_key = keys[0].press if keys else None
     with mujoco.viewer.launch_passive(
         simulation.model, simulation.data, key_callback=on_key
     ) as viewer:
