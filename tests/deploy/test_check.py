@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,20 @@ def test_limits_of_geared_actuators_are_torques(bundle):
     evidence.model.actuator_gear[:, 0] *= 10.0
     evidence.trace["actuator_force"] = evidence.trace["actuator_force"] / 10.0
     assert (fitness_warnings(evidence), undecided(evidence)) == before
+
+
+def test_modules_beside_a_program_are_found(folder, tmp_path):
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    for place, sign in ((folder, "-"), (other, "")):
+        (place / "my_terms.py").write_text(f"def gravity(up):\n    return {sign}up\n")
+        program = place / "runtime.py"
+        edit_program(program, "import numpy as np", "import my_terms\nimport numpy as np")
+        edit_program(program, "-rotation(i[0])[2]", "my_terms.gravity(rotation(i[0])[2])")
+    before = list(sys.path)
+    assert check_bundle(folder).is_passed
+    assert check_bundle(other).causes == ["opposite sign"]
+    assert sys.path == before
+    assert "my_terms" not in sys.modules
 
 
 def test_program_that_raises_is_named(folder):

@@ -30,6 +30,15 @@ def test_command_prints_and_exits(tmp_path, capsys):
     command([str(folder), "--log", str(folder / "golden.csv")], "check-deploy")
     command([str(folder), "--answers", str(folder / "golden.csv")], "check-deploy")
     assert capsys.readouterr().out.count("PASSED") == 2
+    # A passport is of the bundle, whatever a log says.
+    log, passport = tmp_path / "log.csv", tmp_path / "passport.html"
+    table = (folder / "golden.csv").read_text()
+    log.write_text(table.replace(",action.0,action.1,", ",action.1,action.0,"))
+    flags = ["--stress", "--episodes", "1", "--seconds", "0.02", "--output", str(passport)]
+    with pytest.raises(SystemExit):
+        command([str(folder), "--log", str(log), *flags], "check-deploy")
+    assert "FAILED" in capsys.readouterr().out
+    assert "Check: passed" in passport.read_text()
 
 
 def test_folder_without_contract(tmp_path):

@@ -78,8 +78,12 @@ class Contract:
             env: Environment as evaluated, without randomization.
             policy: ONNX file.
             nominal: Settings that `env` lacks, because it is nominal.
+
+        Raises:
+            ValueError: actions drive two entities, or terms of an input share a name.
         """
         self.subject = Subject(env, robot_of(env.cfg))
+        _check_entity(env, self.subject.robot)
         self.policy, self.nominal = policy, nominal
         self.inputs, self.groups = _network_inputs(policy)
         self.terms: dict[tuple[str, str], Term] = {}
@@ -88,6 +92,11 @@ class Contract:
         for name, groups in self.groups.items():
             for group in groups:
                 for term in manager.active_terms[group]:
+                    if (name, term) in self.terms:
+                        raise ValueError(
+                            f"Observation term {term!r}: expected it in one of the groups "
+                            f"{', '.join(groups)}, got it in several; rename it in {group!r}."
+                        )
                     found = describe(self.subject, term, manager.get_term_cfg(group, term))
                     found = self._with_own_names(term, found)
                     self.terms[name, term] = found
@@ -405,6 +414,16 @@ def _laws(actuator: Actuator) -> tuple[str, ...]:
 
 
 # Actions and limits.
+
+
+def _check_entity(env: ManagerBasedRlEnv, robot: str) -> None:
+    for name in env.action_manager.active_terms:
+        entity = env.action_manager.get_term(name).cfg.entity_name
+        if entity != robot:
+            raise ValueError(
+                f"Action {name!r} entity_name: expected {robot!r} for all actions of a deployed policy, "
+                f"got {entity!r}; use one entity with the joints of both."
+            )
 
 
 def _actions(env: ManagerBasedRlEnv) -> list[dict[str, Any]]:

@@ -69,18 +69,25 @@ class Programs:
 
 
 def _imported(folder: Path, name: str) -> ModuleType:
+    folder = folder.resolve()
     path = folder / f"{name}.py"
     spec: Any = importlib.util.spec_from_file_location(
         name, path if path.exists() else FILES / path.name
     )
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look their module up while they are made.
-    earlier = sys.modules.get(name)
+    earlier, known = sys.modules.get(name), set(sys.modules)
     sys.modules[name] = module
+    # Modules of the user beside the program, which another folder may have, too.
+    sys.path.insert(0, str(folder))
     try:
         spec.loader.exec_module(module)
     finally:
-        del sys.modules[name]
+        sys.path.remove(str(folder))
+        for other in set(sys.modules) - known:
+            if Path(getattr(sys.modules[other], "__file__", None) or "").parent == folder:
+                del sys.modules[other]
+        sys.modules.pop(name, None)
         if earlier is not None:
             sys.modules[name] = earlier
     return module

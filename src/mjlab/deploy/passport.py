@@ -62,12 +62,13 @@ def write_passport(
         f"<tr><th>{escaped(key)}</th><td>{escaped(str(value))}</td></tr>"
         for key, value in facts.items()
     ]
-    equal = sum(one.is_equal for one in report.comparisons)
+    compared = [one for one in report.comparisons if one.num_rows]
+    equal = sum(one.is_equal for one in compared)
     result = "passed" if report.is_passed else "FAILED"
     parts = [
         f"<h1>{escaped(str(contract['source']['task']))}</h1>",
         f"<table>{''.join(rows)}</table>",
-        f"<h2>Check: {result}</h2><p>{equal} of {len(report.comparisons)} values are those of training.</p>",
+        f"<h2>Check: {result}</h2><p>{equal} of {len(compared)} values are those of training.</p>",
         _listed([str(finding) for finding in report.findings]),
         "<h2>For a robot</h2>",
         _listed(report.warnings or ["No warnings."]),

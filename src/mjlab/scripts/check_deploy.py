@@ -45,7 +45,9 @@ def command(argv: list[str], prog: str) -> None:
     report = _report(Path(target), cfg)
     print(json.dumps(report.as_dict(), indent=2) if cfg.json else report)
     if cfg.stress:
-        _stress(Path(target), report, cfg)
+        # A passport is of the bundle, not of a log.
+        is_of_bundle = cfg.log is None and cfg.answers is None
+        _stress(Path(target), report if is_of_bundle else check_bundle(Path(target)), cfg)
     if not report.is_passed or (cfg.strict and report.warnings):
         raise SystemExit(1)
 

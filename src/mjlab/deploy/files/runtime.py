@@ -117,8 +117,7 @@ class Policy:
         self._entries = {entry["name"]: entry for entry in contract["measurements"]}
         self._turns = {n for n, entry in self._entries.items() if entry.get("is_quaternion")}
         self._entries |= {f"command/{name}": entry for name, entry in self._commands.items()}
-        for command in self._motions:
-            self.motion = dict(np.load(Path(folder) / command["file"]))
+        self.motion = next((dict(np.load(Path(folder) / c["file"])) for c in self._motions), {})
         self.values, self.action = {}, np.zeros(contract["policy"]["size"], np.float32)
         self.reset()
 
