@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import mujoco
 import numpy as np
@@ -120,6 +121,27 @@ def test_warnings_are_of_the_trace(evidence):
     warnings = " ".join(fitness_warnings(evidence))
     assert "target_step" in warnings
     assert "target_high" in warnings
+
+
+def test_tilt_beyond_the_limit_is_warned_of(evidence):
+    before = fitness_warnings(evidence)
+    assert "tilt" not in " ".join(before)
+    angle = 0.5 * np.linspace(0.0, 1.5, len(evidence.first))
+    tilts = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], axis=1)
+    evidence.trace["measurement/root_quat"] = tilts
+    (text,) = set(fitness_warnings(evidence)) - set(before)
+    assert "golden trace tilts the robot by 1.5 rad" in text
+
+
+def test_tilt_of_a_motion_is_warned_of(bundle, tmp_path):
+    folder = shutil.copytree(bundle("Mjlab-Tracking-Flat-Unitree-G1"), tmp_path / "bundle")
+    motion = dict(np.load(folder / "motion.npz"))
+    assert "reference motion" not in " ".join(fitness_warnings(Evidence(folder)))
+    motion["body_quat_w"][7, 0] = np.cos(0.65), np.sin(0.65), 0.0, 0.0
+    np.savez(folder / "motion.npz", **motion)
+    assert "reference motion tilts the robot by 1.3 rad" in " ".join(
+        fitness_warnings(Evidence(folder))
+    )
 
 
 def test_unmeasured_inputs_are_warned_of(bundle):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjlab.deploy.evidence import Evidence
+from mjlab.deploy.evidence import Evidence, rotations
 
 # Share of the steps at a limit that is worth a warning.
 _OFTEN = 0.01
@@ -17,7 +17,7 @@ def fitness_warnings(evidence: Evidence) -> list[str]:
         f"Robots do not measure {one['measurement']}, which {one['term']} needs ({one['why']})."
         for one in contract["unmeasured"]
     ]
-    return warnings + _torques(evidence) + _speeds(evidence) + _targets(evidence)
+    return warnings + _torques(evidence) + _speeds(evidence) + _targets(evidence) + _tilts(evidence)
 
 
 def _torques(evidence: Evidence) -> list[str]:
@@ -52,6 +52,30 @@ def _targets(evidence: Evidence) -> list[str]:
     for what, over in shares.items():
         found = dict(zip(names, over.mean(axis=0), strict=True))
         texts += _worst(found, what, "targets", least=0.0)
+    return texts
+
+
+def _tilts(evidence: Evidence) -> list[str]:
+    """Return a sentence if the trace, or the reference motion, tilts the robot beyond the limit."""
+    contract = evidence.contract
+    limit, name = contract["limits"]["tilt"], contract["limits"]["tilt_from"]
+    if limit is None or name is None:
+        return []
+    quats = {"golden trace": evidence.values(name)}
+    (source,) = [one["source"] for one in contract["measurements"] if one["name"] == name]
+    for command in contract["commands"]:
+        if command["kind"] == "motion":
+            bodies = np.load(evidence.folder / command["file"])["body_quat_w"]
+            body = command["bodies"].index(source["body"].rpartition("/")[2])
+            quats["reference motion"] = bodies[:, body]
+    texts = []
+    for what, turns in quats.items():
+        tilt = float(np.arccos(np.clip(rotations(turns)[:, 2, 2], -1.0, 1.0)).max())
+        if tilt > limit:
+            texts.append(
+                f"The {what} tilts the robot by {tilt:.3g} rad; beyond limits.tilt, {limit:.3g}, it is "
+                "damped."
+            )
     return texts
 
 

@@ -23,13 +23,15 @@ from typing import Any
 
 import numpy as np
 
-from mjlab.deploy.check import Comparison, Report, compare, find_causes
+from mjlab.deploy.check import TOLERANCES, Comparison, Report, compare, find_causes
 from mjlab.deploy.evidence import Evidence
 from mjlab.utils.csv_table import CsvTable
 from mjlab.utils.errors import UserError
 
 _ANSWERS = {"obs": "input/obs", "action": "action", "target": "target"}
 _STAGES = {"input/obs": "vector", "action": "action", "target": "target"}
+TOLERANCE = TOLERANCES["vector"]
+"""Largest difference that is none, as a fraction of the range of the values."""
 # Gaps above this multiple of the period are counted as missed steps.
 _MISSED = 1.5
 # Relative difference of another control rate.
@@ -62,7 +64,7 @@ class Answers:
         return self.values[k].astype(np.float32) if self.known[k].all() else None
 
 
-def check_answers(folder: Path, path: Path) -> Report:
+def check_answers(folder: Path, path: Path, tolerance: float = TOLERANCE) -> Report:
     """Return the report of a program's answers to `golden.csv`, with its `step` if rows are missing.
 
     Raises:
@@ -81,7 +83,7 @@ def check_answers(folder: Path, path: Path) -> Report:
         shape = (count, answers.values.shape[1])
         values[name] = Answers(np.zeros(shape), np.zeros(shape, bool))
         values[name].values[rows], values[name].known[rows] = answers.values, answers.known
-    return _report(evidence, values, [], [])
+    return _report(evidence, values, [], [], tolerance)
 
 
 def _answers(evidence: Evidence, table: CsvTable) -> dict[str, Answers]:
@@ -115,6 +117,7 @@ def _report(
     answers: Mapping[str, Answers],
     timing: list[Comparison],
     undecided: list[str],
+    tolerance: float,
 ) -> Report:
     """Return the report on answers; those that a table leaves empty are not compared."""
     found = {(_STAGES[name], name): value for name, value in answers.items()}
@@ -125,27 +128,28 @@ def _report(
                 found["history", f"term/obs/{term}"] = part
     compared = compare(evidence, {key: value.values for key, value in found.items()})
     known = {name: value.known for (_, name), value in found.items()}
-    comparisons = timing + [_where_known(one, known[one.name]) for one in compared]
+    comparisons = timing + [_where_known(one, known[one.name], tolerance) for one in compared]
     report = Report(comparisons, undecided=undecided)
     if not report.is_passed:
         report.findings = find_causes(evidence, comparisons, {})
     return report
 
 
-def _where_known(one: Comparison, known: np.ndarray) -> Comparison:
+def _where_known(one: Comparison, known: np.ndarray, tolerance: float) -> Comparison:
     """Leave out what the table does not say."""
     if one.got.shape != one.expected.shape:
         return one
     known = known & np.isfinite(one.expected)
-    return replace(
+    one = replace(
         one, expected=np.where(known, one.expected, np.nan), got=np.where(known, one.got, 0.0)
     )
+    return replace(one, bound=tolerance * one.span)
 
 
 # Logs.
 
 
-def check_log(folder: Path, path: Path) -> Report:
+def check_log(folder: Path, path: Path, tolerance: float = TOLERANCE) -> Report:
     """Return the report of a log: terms, vector, action and target recomputed from its raw columns.
 
     Raises:
@@ -169,7 +173,7 @@ def check_log(folder: Path, path: Path) -> Report:
         "sensors, torque, state and what is read when: raw columns are taken as they are, and a log has "
         "no true state."
     )
-    report = replace(_report(evidence, answers, period, notes), notes=sentences)
+    report = replace(_report(evidence, answers, period, notes, tolerance), notes=sentences)
     if not any(one.num_rows for one in report.comparisons if one.stage != "rates"):
         raise UserError(f"{path}: expected measurements to compute answers from, got none.")
     return report

@@ -360,31 +360,49 @@ def sensor(subject: Subject, sensor_name: str) -> Measurement:
     element = model.sensor(sensor_name)
     kind = mujoco.mjtSensor(int(element.type[0])).name.removeprefix("mjSENS_").lower()
     source: dict[str, Any] = {"kind": "sensor", "sensor": sensor_name, "type": kind}
+    objtype, index = int(element.objtype[0]), int(element.objid[0])
+    if body := _body_of(model, objtype, index):
+        source["body"] = body
     frame = "world"
-    if int(element.objtype[0]) == int(mujoco.mjtObj.mjOBJ_SITE):
-        site = int(element.objid[0])
+    if objtype == int(mujoco.mjtObj.mjOBJ_SITE):
         source |= {
-            "site": model.site(site).name,
-            "body": model.body(int(model.site_bodyid[site])).name,
-            "site_pos": model.site_pos[site].tolist(),
-            "site_quat": model.site_quat[site].tolist(),
+            "site": model.site(index).name,
+            "site_pos": model.site_pos[index].tolist(),
+            "site_quat": model.site_quat[index].tolist(),
         }
         if not kind.startswith("frame"):
-            frame = f"site {model.site(site).name}"
-    elif int(element.objtype[0]) in (int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtObj.mjOBJ_XBODY)):
-        source["body"] = model.body(int(element.objid[0])).name
+            frame = f"site {model.site(index).name}"
+    reftype, reference = int(element.reftype[0]), int(element.refid[0])
+    if reference >= 0:
+        word = mujoco.mjtObj(reftype).name.removeprefix("mjOBJ_").lower().removeprefix("x")
+        frame = f"{word} {getattr(model, word)(reference).name}"
     entity, _, short = sensor_name.rpartition("/")
+    bodies = (body, _body_of(model, reftype, reference))
+    owners = {one.rpartition("/")[0] for one in bodies if "/" in one} or {entity}
     reason = _MEASURED.get(kind)
+    availability, why = ("measured", reason) if reason else ("estimated", f"{kind}: {_ESTIMATED}")
+    if owners - {"", subject.robot}:
+        availability, why = "external", _EXTERNAL
     return Measurement(
         subject.name(entity or subject.robot, short),
         (int(element.dim[0]),),
         _UNITS.get(kind, ""),
         frame,
-        "measured" if reason else "estimated",
-        reason or f"{kind}: {_ESTIMATED}",
+        availability,
+        why,
         source,
         lambda env: env.scene[sensor_name].data,
     )
+
+
+def _body_of(model: mujoco.MjModel, objtype: int, index: int) -> str:
+    """Return the name of the body of a sensor's object; empty for objects without one."""
+    kinds = mujoco.mjtObj
+    if index >= 0 and objtype == int(kinds.mjOBJ_SITE):
+        index = int(model.site_bodyid[index])
+    elif index < 0 or objtype not in (int(kinds.mjOBJ_BODY), int(kinds.mjOBJ_XBODY)):
+        return ""
+    return model.body(index).name
 
 
 def traced(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mjlab.cli.flags import parse_flags
 from mjlab.deploy.check import Report, check_bundle
-from mjlab.deploy.logs import check_answers, check_log
+from mjlab.deploy.logs import TOLERANCE, check_answers, check_log
 from mjlab.utils.errors import UserError
 from mjlab.utils.ranges import Count, Positive
 from mjlab.utils.screen import shown
@@ -24,6 +24,9 @@ class CheckDeployConfig:
     columns."""
     answers: str | None = None
     """Answers of another program to `golden.csv` (CSV) to compare instead."""
+    tolerance: Positive = TOLERANCE
+    """Largest difference that is none in a log or in answers, as a fraction of the range of the values;
+    1e-4 for logs with 5 decimals."""
     strict: bool = False
     """Exit with status 1 after warnings, too."""
     stress: bool = False
@@ -56,9 +59,9 @@ def _report(folder: Path, cfg: CheckDeployConfig) -> Report:
     if cfg.log is not None and cfg.answers is not None:
         raise UserError("check-deploy: expected --log or --answers, got both; use two calls.")
     if cfg.log is not None:
-        return check_log(folder, Path(cfg.log))
+        return check_log(folder, Path(cfg.log), cfg.tolerance)
     if cfg.answers is not None:
-        return check_answers(folder, Path(cfg.answers))
+        return check_answers(folder, Path(cfg.answers), cfg.tolerance)
     return check_bundle(folder)
 
 
