@@ -56,6 +56,8 @@ _OTHERS = {
     "task",
     "aside",
 }
+# `simulate.py` of a bundle, and programs that read one.
+_OTHERS |= {"command", "manifest", "onnx", "yaml"}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 
