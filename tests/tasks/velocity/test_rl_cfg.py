@@ -49,6 +49,15 @@ def test_penalties_are_eased_and_nothing_else(task, gait):
 
 
 @pytest.mark.parametrize("task", [task for task in TASKS if "Go1" in task])
+def test_given_bounds_hold_on_all_ground(task):
+    bounds = {"lin_vel_error": 0.3, "failure_rate": 0.1}
+    env_cfg, rl_cfg = load_env_cfg(task), load_rl_cfg(task)
+    profile = ppo.cpu_with_gait(((0, 3), (1, 2)), minimum_height=0.1, solved_below=bounds)
+    profile.easing(env_cfg, rl_cfg)
+    assert rl_cfg.evaluation.solved_below == bounds
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if "Go1" in task])
 def test_the_gait_of_the_go1_is_a_trot(task):
     cfg = load_env_cfg(task, profile="cpu")
     (sensor,) = [s for s in cfg.scene.sensors if s.name == "feet_ground_contact"]
