@@ -22,7 +22,7 @@ def test_equal_outcomes_have_an_interval_about_zero():
 
 
 def test_difference_is_of_pairs():
-    """Rates of 50 % differ by nothing, whoever succeeds; 30 more failures show."""
+    """Zero for equal rates, whichever episodes succeed; negative with more failures in MuJoCo."""
     half = [True, False] * 30
     assert difference_of_success(half, half[::-1])[0] == 0.0
     by, low, high = difference_of_success([True] * 60, half)

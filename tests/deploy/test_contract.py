@@ -1,4 +1,4 @@
-"""What a contract cannot describe is refused."""
+"""Configs that a contract cannot describe."""
 
 from __future__ import annotations
 

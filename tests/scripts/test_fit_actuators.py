@@ -123,22 +123,23 @@ def test_joints_that_the_log_leaves_out_keep_their_actuators(printed) -> None:
     assert motor.gear == 3.0
 
 
-def test_file_keeps_its_other_actuators(printed, folder: Path) -> None:
+def write_driven_arm(folder: Path) -> None:
+    """Write `driven.xml`, whose two hinges have actuators."""
     spec = link_spec(joints=2)
     for name in ("hinge0", "hinge1"):
         spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     spec.compile()
     (folder / "driven.xml").write_text(spec.to_xml())
+
+
+def test_file_keeps_its_other_actuators(printed, folder: Path) -> None:
+    write_driven_arm(folder)
     _, (_, other), _ = printed("driven.xml", "--stiffness", "25", "--damping", "1")
     assert (type(other), other.target_names_expr) == (XmlActuatorCfg, ("hinge1",))
 
 
 def test_fitted_joints_have_one_actuator(printed, folder: Path) -> None:
-    spec = link_spec(joints=2)
-    for name in ("hinge0", "hinge1"):
-        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    spec.compile()
-    (folder / "driven.xml").write_text(spec.to_xml())
+    write_driven_arm(folder)
     _, actuators, out = printed("driven.xml", "--stiffness", "25", "--damping", "1")
     names: dict = {}
     source = out[out.index("from mjlab.actuator") :]

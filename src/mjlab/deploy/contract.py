@@ -38,7 +38,7 @@ from mjlab.envs.mdp.actions import (
     JointPositionAction,
     JointVelocityAction,
 )
-from mjlab.rl.exporter_utils import joint_gains, shortest
+from mjlab.rl.exporter_utils import joint_actuators, joint_gains, shortest
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
@@ -322,15 +322,9 @@ def _joints(subject: Subject) -> list[dict[str, Any]]:
 
 def _gears(entity: Entity, model: mujoco.MjModel) -> dict[str, float]:
     """Return the gear of each actuated joint: motion of the actuator per motion of the joint."""
-    gears = {}
-    for actuator in entity.actuators:
-        if str(getattr(actuator.transmission_type, "value", "joint")) != "joint":
-            continue
-        elements = actuator.global_element_ids.tolist()
-        for k, name in enumerate(actuator.target_names):
-            element = elements[k * len(elements) // len(actuator.target_names)]
-            gears[name] = float(model.actuator_gear[element, 0])
-    return gears
+    return {
+        name: float(model.actuator_gear[element, 0]) for name, _, element in joint_actuators(entity)
+    }
 
 
 def _gains(entity: Entity, model: mujoco.MjModel) -> dict[str, tuple[float, float]]:

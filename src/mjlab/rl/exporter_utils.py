@@ -44,7 +44,7 @@ import io
 import logging
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -250,21 +250,28 @@ def joint_gains(entity: Entity, model: Any) -> dict[str, tuple[float, float]]:
     """
     gains: dict[str, tuple[float, float]] = {}
     affine = 1  # mujoco.mjtBias.mjBIAS_AFFINE
+    for name, actuator, element in joint_actuators(entity):
+        # The bias of a position or velocity servo is -kp l - kd l'.
+        has_gains = int(model.actuator_biastype[element]) == affine
+        bias = model.actuator_biasprm[element] if has_gains else np.zeros(3)
+        # The gains of a PD law computed outside MuJoCo are in the config, not in the model.
+        kp = getattr(actuator.cfg, "stiffness", 0.0 - bias[1])
+        kd = getattr(actuator.cfg, "damping", 0.0 - bias[2])
+        gains[name] = float(kp), float(kd)
+    return gains
+
+
+def joint_actuators(entity: Entity) -> Iterator[tuple[str, Any, int]]:
+    """Yield each actuated joint, its actuator, and the first element of the model that drives it.
+
+    Elements of one joint follow each other; the first holds gains and gear.
+    """
     for actuator in entity.actuators:
         if str(getattr(actuator.transmission_type, "value", "joint")) != "joint":
             continue
         elements = actuator.global_element_ids.tolist()
         for k, name in enumerate(actuator.target_names):
-            # Elements of one target follow each other; the first holds the gains.
-            element = elements[k * len(elements) // len(actuator.target_names)]
-            # The bias of a position or velocity servo is -kp l - kd l'.
-            has_gains = int(model.actuator_biastype[element]) == affine
-            bias = model.actuator_biasprm[element] if has_gains else np.zeros(3)
-            # The gains of a PD law computed outside MuJoCo are in the config, not in the model.
-            kp = getattr(actuator.cfg, "stiffness", 0.0 - bias[1])
-            kd = getattr(actuator.cfg, "damping", 0.0 - bias[2])
-            gains[name] = float(kp), float(kd)
-    return gains
+            yield name, actuator, elements[k * len(elements) // len(actuator.target_names)]
 
 
 def _joint_metadata(env: ManagerBasedRlEnv, entity: Entity) -> Metadata:

@@ -338,7 +338,8 @@ def orientation_command_error_tanh(
 def goal_joint_deviation_l1(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Sum of the distances of joints from their positions at the goal (rad or m).
 
-    For joints that can turn by 2 pi or more, the shorter way. Leads around joint limits and out of postures from which the goal is out of reach.
+    For joints that can turn by 2 pi or more, the shorter way. Leads around joint limits and out of postures
+    from which the goal is out of reach.
 
     Raises:
         TypeError: the command is not a `UniformPoseCommand`.

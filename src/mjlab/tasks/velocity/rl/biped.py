@@ -243,65 +243,51 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> None:
 def _gait_rewards(env_cfg: ManagerBasedRlEnvCfg, robot: Biped) -> dict[str, RewardTermCfg]:
     """Return the rewards of the gait. They replace those of the task; its penalties stay."""
     size, speed, turn = robot.time**2, robot.time, 1.0 / robot.time
-    # Narrow kernels give no gradient at first, wide ones too little in the end.
-    linear = {
-        name: RewardTermCfg(
-            func=mdp.track_linear_velocity,
-            weight=weight,
-            params={"std": std * speed, "command_name": "twist"},
+    # Narrow kernels give no gradient at first, wide ones too little in the end. Of the yaw rate alone: rolling
+    # and pitching with the steps hides how much a trunk sways.
+    tracking = {
+        name: RewardTermCfg(func=func, weight=weight, params={"std": std, "command_name": "twist"})
+        for name, func, weight, std in (
+            (_LINEAR, mdp.track_linear_velocity, 4.0, 0.5 * speed),
+            ("linear_wide", mdp.track_linear_velocity, 3.0, 1.0 * speed),
+            ("linear_narrow", mdp.track_linear_velocity, 3.0, 0.25 * speed),
+            ("yaw", mdp.track_ang_vel_z_exp, 4.0, 0.5 * turn),
+            ("yaw_narrow", mdp.track_ang_vel_z_exp, 3.0, 0.25 * turn),
         )
-        for name, weight, std in (
-            (_LINEAR, 4.0, 0.5),
-            ("linear_wide", 3.0, 1.0),
-            ("linear_narrow", 3.0, 0.25),
-        )
-    }
-    # Of the yaw rate alone: rolling and pitching with the steps hides how much a trunk sways.
-    yaw = {
-        name: RewardTermCfg(
-            func=mdp.track_ang_vel_z_exp,
-            weight=weight,
-            params={"std": std * turn, "command_name": "twist"},
-        )
-        for name, weight, std in (("yaw", 4.0, 0.5), ("yaw_narrow", 3.0, 0.25))
     }
     frames = get_sensor(env_cfg, "foot_height_scan").frame
-    rewards = (
-        linear
-        | yaw
-        | {
-            "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
-            "feet": RewardTermCfg(
-                func=mdp.feet_height_by_phase,
-                weight=5.0,
-                params={
-                    "height_sensor_name": "foot_height_scan",
-                    "swing_height": 0.09 * size,
-                    "variance": 0.005 * size**2,
-                    "offsets": tuple(0.0 if foot.name == robot.feet[0] else 0.5 for foot in frames),
-                },
-            ),
-            "height": RewardTermCfg(
-                func=mdp.root_height_l2,
-                weight=-50.0 / size**2,
-                params={"target_height": robot.height, "asset_cfg": robot.soles},
-            ),
-            "apart": RewardTermCfg(
-                func=mdp.feet_apart_l2,
-                weight=-100.0 / size**2,
-                params={"distance": robot.feet_distance, "asset_cfg": robot.soles},
-            ),
-            "rolling": RewardTermCfg(
-                func=mdp.body_angular_velocity_penalty, weight=-0.5 * robot.time**2
-            ),
-            "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
-            "deviation": RewardTermCfg(
-                func=mdp.weighted_joint_deviation,
-                weight=-0.25,
-                params={"weights": dict(robot.pose)},
-            ),
-        }
-    )
+    rewards = tracking | {
+        "alive": RewardTermCfg(func=envs_mdp.is_alive, weight=4.0),
+        "feet": RewardTermCfg(
+            func=mdp.feet_height_by_phase,
+            weight=5.0,
+            params={
+                "height_sensor_name": "foot_height_scan",
+                "swing_height": 0.09 * size,
+                "variance": 0.005 * size**2,
+                "offsets": tuple(0.0 if foot.name == robot.feet[0] else 0.5 for foot in frames),
+            },
+        ),
+        "height": RewardTermCfg(
+            func=mdp.root_height_l2,
+            weight=-50.0 / size**2,
+            params={"target_height": robot.height, "asset_cfg": robot.soles},
+        ),
+        "apart": RewardTermCfg(
+            func=mdp.feet_apart_l2,
+            weight=-100.0 / size**2,
+            params={"distance": robot.feet_distance, "asset_cfg": robot.soles},
+        ),
+        "rolling": RewardTermCfg(
+            func=mdp.body_angular_velocity_penalty, weight=-0.5 * robot.time**2
+        ),
+        "tilt": RewardTermCfg(func=envs_mdp.flat_orientation_l2, weight=-5.0),
+        "deviation": RewardTermCfg(
+            func=mdp.weighted_joint_deviation,
+            weight=-0.25,
+            params={"weights": dict(robot.pose)},
+        ),
+    }
     if robot.has_ankles:
         rewards["soles"] = RewardTermCfg(
             func=mdp.feet_tilt, weight=-2.5, params={"asset_cfg": robot.soles}
