@@ -405,6 +405,6 @@ def test_unknown_term_is_named_and_can_be_added(bundle):
 
 
 def test_runtime_is_short():
-    from mjlab.deploy.bundle import FILES
+    from mjlab.deploy.evidence import FILES
 
     assert len((FILES / "runtime.py").read_text().splitlines()) < 300

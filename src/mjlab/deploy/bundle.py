@@ -18,6 +18,7 @@ import numpy as np
 
 from mjlab.deploy.contract import Contract
 from mjlab.deploy.efferent import write_manifest
+from mjlab.deploy.evidence import FILES
 from mjlab.deploy.golden import record, write_csv
 from mjlab.deploy.readme import readme
 from mjlab.deploy.unitree import phase_note, write_unitree
@@ -27,8 +28,6 @@ from mjlab.scene import Scene, SceneCfg
 if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
 
-FILES = Path(__file__).parent / "files"
-"""Folder of the programs that every bundle contains."""
 PROGRAMS = ("runtime.py", "runtime.hpp", "simulate.py")
 """Programs copied into every bundle."""
 
@@ -74,8 +73,7 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
     write_csv(folder / "golden.csv", content, arrays)
     _write_motion(contract, folder)
     for name in PROGRAMS:
-        if (FILES / name).exists():
-            shutil.copyfile(FILES / name, folder / name)
+        shutil.copyfile(FILES / name, folder / name)
     write_manifest(content, folder)
     notes = _notes(content)
     if (why := write_unitree(content, folder)) is not None:
