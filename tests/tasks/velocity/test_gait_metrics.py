@@ -40,6 +40,10 @@ def test_gait_metrics_agree_with_what_they_are_made_of(make_env):
     slip = values["foot_slip"]
     assert (slip >= torch.where(touches, slowest, 0.0) - 1e-6).all()
     assert (slip <= fastest + 1e-6).all()
+    soles = env.scene["foot_height_scan"].data.heights
+    assert (values["foot_clearance"][:, None] >= soles).all()
+    vertical = robot.data.root_link_vel_w[:, 2].abs()
+    torch.testing.assert_close(values["trunk_bobbing"], vertical)
 
 
 def test_the_action_rate_does_not_depend_on_the_scale_of_actions(make_env):

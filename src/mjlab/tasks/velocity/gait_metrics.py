@@ -1,4 +1,5 @@
-"""Gait metrics of evaluations: torque, power, slip and smoothness, independent of the action scale.
+"""Gait metrics of evaluations: torque, power, slip, clearance, bobbing and smoothness, independent of the
+action scale.
 
 Evaluated between environment steps; forces and contacts are those of the last physics substep.
 """
@@ -86,11 +87,23 @@ def foot_slip(env: ManagerBasedRlEnv) -> torch.Tensor:
     return (speed * in_contact).sum(dim=1) / in_contact.sum(dim=1).clamp(min=1)
 
 
+def foot_clearance(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """Return the maximum height of the feet above the ground (m), (num_envs,). Dragging feet have about 0."""
+    return env.scene[_HEIGHTS].data.heights.amax(dim=1)
+
+
+def trunk_bobbing(env: ManagerBasedRlEnv) -> torch.Tensor:
+    """Return the vertical speed |v_z| of the root link (m/s), (num_envs,)."""
+    return env.scene[_ROBOT].data.root_link_lin_vel_w[:, 2].abs()
+
+
 GAIT_METRICS = {
     "joint_torque": joint_torque,
     "torque_share": torque_share,
     "mechanical_power": mechanical_power,
     "action_rate": action_rate,
     "foot_slip": foot_slip,
+    "foot_clearance": foot_clearance,
+    "trunk_bobbing": trunk_bobbing,
 }
 """Gait metrics by their names in evaluations."""
