@@ -16,13 +16,16 @@ from mjlab.own_robot.guess import Guess
 
 REFERENCE_HEIGHT = {2: 0.76, 4: 0.28}
 """Height of the trunk of the G1 and Go1, by number of feet, which are commanded 1 m/s (m)."""
+TURNING = {2: 1.0, 4: 0.5}
+"""Commanded yaw rate at these heights (rad/s). Two legs sway by 0.3 rad/s with their steps, which hides turns
+of 0.5 rad/s; 1 rad/s is that of published humanoid tasks (MuJoCo Playground's T1 and G1)."""
 STRIDE = {2: 0.23, 4: 0.36}
 """Travel of a foot ahead of and behind its place in the standing pose, as a share of the height: 0.17 m of
 the G1, 0.10 m of the Go1, at 1 m/s."""
 LIFT = {2: 0.13, 4: 0.36}
 """Height of a swinging foot, as a share of the trunk's: 0.1 m of both."""
 TURN = 0.2
-"""Yaw of a foot ahead of and behind the standing pose (rad): 0.5 rad/s for 0.4 s."""
+"""Yaw of a foot ahead of and behind the standing pose (rad): 0.5 rad/s for 0.4 s, 1 rad/s for 0.2 s."""
 SPREAD = 0.8
 """Tolerance of a leg joint, a standard deviation, as a share of the largest excursion."""
 MIN_TOLERANCE, MAX_TOLERANCE = 0.1, 0.6
@@ -33,9 +36,10 @@ REST_TOLERANCE = 0.15
 
 def command_ranges(height: float, feet: int) -> Guess[dict[str, tuple[float, float]]]:
     """Return the ranges of velocity commands at the Froude number of the Go1 or G1."""
-    reference = REFERENCE_HEIGHT[2 if feet == 2 else 4]
+    legs = 2 if feet == 2 else 4
+    reference = REFERENCE_HEIGHT[legs]
     speed = float(np.sqrt(max(height, 1e-3) / reference))
-    turn = 0.5 / speed
+    turn = TURNING[legs] / speed
     ranges = {
         "lin_vel_x": (-speed, speed),
         "lin_vel_y": (-speed, speed),
