@@ -1,6 +1,6 @@
 // Run runtime.hpp on a table of measurements; prints one line of JSON for each row.
 //
-//     replay BUNDLE LAYERS.json TABLE.csv [limits|hand-over|hand-over-reset]
+//     replay BUNDLE LAYERS.json TABLE.csv [aligned|limits|hand-over|hand-over-reset]
 //
 // The table has the columns of golden.csv. The network is a list of layers, as plain loops. Memory, if
 // the contract has it, counts steps and is added to the actions.
@@ -95,7 +95,7 @@ int main(int count, char** arguments) {
     return half;
   };
   try {
-    mjlab::Policy policy(folder, network, mode != "");
+    mjlab::Policy policy(folder, network, mode != "" && mode != "aligned");
     std::map<size_t, size_t> motions;
     for (const json& episode : policy.contract()["golden"]["episodes"])
       motions[episode["row"]] = episode["motion"];
@@ -106,15 +106,17 @@ int main(int count, char** arguments) {
     for (size_t row = 0; std::getline(table, line); ++row) {
       const std::vector<std::string> cells = split(line);
       mjlab::Values values;
+      bool is_first = false;
       for (size_t k = 0; k < names.size(); ++k) {
         const std::string stem = names[k].substr(0, names[k].rfind('.'));
         if (names[k] == "time") values.time = std::stod(cells[k]);
-        if (names[k] == "first" && cells[k] == "1") policy.reset(motions[row]);
+        if (names[k] == "first") is_first = cells[k] == "1";
         if (stem.rfind("measurement.", 0) == 0)
           values[stem.substr(12)].push_back(std::stod(cells[k]));
         if (stem.rfind("command.", 0) == 0)
           values["command/" + stem.substr(8)].push_back(std::stod(cells[k]));
       }
+      if (is_first) policy.reset(motions[row], mode == "aligned" ? values : mjlab::Values{});
       const bool was_ready = policy.is_ready();
       if (was_ready && mode == "hand-over-reset") policy.reset();
       const bool hands_over = mode.rfind("hand-over", 0) == 0 && !was_ready;

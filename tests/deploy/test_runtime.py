@@ -310,6 +310,40 @@ def test_hand_over_is_to_the_first_pose_of_the_motion(bundle):
     np.testing.assert_allclose(last.position, policy.motion["joint_pos"][30])
 
 
+def turned(quat: np.ndarray) -> np.ndarray:
+    """Return an orientation turned by 90 degrees to the left."""
+    w, x, y, z = quat
+    return np.sqrt(0.5) * np.array((w - z, x - y, y + x, z + w))
+
+
+def observed(folder: Path, turn: Any, move: Any, is_aligned: bool = True) -> np.ndarray:
+    """Return the observations of a robot whose orientations and places are changed, (K, n)."""
+    policy = load_program(folder, "runtime").Policy.load(folder, limits=False)
+    changes = {one["name"]: one["source"]["kind"] for one in policy.contract["measurements"]}
+    changes = {name: {"body_quat": turn, "body_pos": move}.get(k) for name, k in changes.items()}
+    trace, rows = arrays_of(folder), []
+    for k in range(20):
+        measured, command = row_of(policy, trace, k)
+        measured |= {name: change(measured[name]) for name, change in changes.items() if change}
+        if k == 0:
+            policy.reset(measurements=measured if is_aligned else None)
+        policy.step(measured, command)
+        rows.append(policy.inputs["obs"][0].copy())
+    return np.array(rows)
+
+
+def test_motion_is_turned_and_moved_to_the_robot(bundle):
+    folder = bundle("Mjlab-Tracking-Flat-Unitree-G1")
+
+    def move(place: np.ndarray) -> np.ndarray:
+        return np.array((2.0 - place[1], 1.0 + place[0], place[2]))
+
+    before = observed(folder, np.array, np.array)
+    np.testing.assert_allclose(observed(folder, turned, move), before, atol=1e-5)
+    # Else the motion has another heading than the robot.
+    assert np.abs(observed(folder, turned, move, is_aligned=False) - before).max() > 0.5
+
+
 def test_hand_over_after_a_fault_begins_at_the_measured_pose(robot):
     policy, measured, _ = robot
     policy.hand_over({**measured, "time": 0.0}, seconds=0.1)

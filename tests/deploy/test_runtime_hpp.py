@@ -114,6 +114,33 @@ def test_answers_are_those_of_training(bundle, replay, name):
         assert np.abs(got - expected).max(initial=0.0) / scale < TOLERANCE, key
 
 
+def test_motion_is_turned_to_the_robot(bundle, replay, tmp_path):
+    folder = bundle("Mjlab-Tracking-Flat-Unitree-G1")
+    measurements = json.loads((folder / "contract.json").read_text())["measurements"]
+    with (folder / "golden.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        for name in (one["name"] for one in measurements if one["is_quaternion"]):
+            keys = [f"measurement.{name}.{k}" for k in range(4)]
+            w, x, y, z = (float(row[key]) for key in keys)
+            # By 90 degrees to the left.
+            turned = np.sqrt(0.5) * np.array((w - z, x - y, y + x, z + w))
+            row.update(zip(keys, turned, strict=True))
+        for name in (one["name"] for one in measurements if one["source"]["kind"] == "body_pos"):
+            keys = [f"measurement.{name}.{k}" for k in (0, 1)]
+            x, y = (float(row[key]) for key in keys)
+            row.update(zip(keys, (2.0 - y, 1.0 + x), strict=True))
+    table = tmp_path / "turned.csv"
+    with table.open("w") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    runs = [replay(folder, path, "aligned") for path in (folder / "golden.csv", table)]
+    before, after = (np.array([row["inputs"]["obs"] for row in run]) for run in runs)
+    np.testing.assert_allclose(after, before, atol=1e-5)
+    assert np.abs(replay(folder, table)[0]["inputs"]["obs"] - before[0]).max() > 0.5
+
+
 def test_motor_commands_are_those_of_the_contract(bundle, replay):
     folder = bundle("go1")
     joints = json.loads((folder / "contract.json").read_text())["joints"]

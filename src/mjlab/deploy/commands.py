@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjlab.deploy.measurements import Subject, joint_unit
+from mjlab.deploy.measurements import Subject, body_pos, body_quat, joint_unit
 
 if TYPE_CHECKING:
     from mjlab.managers import CommandTerm
@@ -92,6 +92,8 @@ def _motion(subject: Subject, term: Any) -> dict[str, Any]:
         ],
         "bodies": list(entity.body_names),
         "anchor": cfg.anchor_body_name,
+        "anchor_pos": body_pos(subject, cfg.entity_name, cfg.anchor_body_name).name,
+        "anchor_quat": body_quat(subject, cfg.entity_name, cfg.anchor_body_name).name,
         "anchor_index": list(entity.body_names).index(cfg.anchor_body_name),
     }
 

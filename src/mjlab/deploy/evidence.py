@@ -297,7 +297,7 @@ class Evidence:
         inputs = [self.values(name).astype(float) for name in names]
         if change is not None:
             inputs = [change(name, values) for name, values in zip(names, inputs, strict=True)]
-        arrays = {key: self.originals.runtime.arrayed(term[key]) for key in ("offset", "scale")}
+        arrays = {k: term[k] and np.array(term[k]) for k in ("offset", "scale")}
         entry = {**term, **arrays}
         rows = [np.ravel(formula(list(row), entry)) for row in zip(*inputs, strict=True)]
         return np.array(rows)

@@ -14,10 +14,9 @@ _TEMPLATE = Path(__file__).parent / "files" / "README.md.txt"
 
 _HEADING = """
 
-The reference motion has a heading in the world, and an IMU starts with any. When `hand_over` is done, turn
-all further orientations by the difference of yaw, once computed: left-multiply them by (cos d/2, 0, 0,
-sin d/2), with d = yaw(`body_quat_w[0, anchor_index]` of `motion.npz`) - yaw(measured), and
-yaw(w, x, y, z) = atan2(2 (w z + x y), 1 - 2 (y y + z z))."""
+The reference motion has a heading in the world, and an IMU starts with any: `reset` with the measurements
+after the hand-over turns the motion about the vertical to the robot (and moves it over the ground, if the
+place of the robot is measured). Without them the robot would turn to the motion at once."""
 
 
 def readme(contract: Mapping[str, Any], notes: Sequence[str]) -> str:

@@ -170,7 +170,7 @@ def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) ->
         starts = np.flatnonzero(evidence.first)
         start = int(starts[seed % len(starts)])
         simulation.set_state(**evidence.state(start))
-        policy.reset(motion=evidence.motion(start))
+        policy.reset(evidence.motion(start), simulation.measure())
     rates, data = contract["rates"], simulation.data
     delay = _delay(setting.latency, rates["physics_dt"])
     limits, root = contract["limits"], model.body(contract["robot"]["root_body"]).id

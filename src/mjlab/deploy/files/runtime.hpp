@@ -3,7 +3,7 @@
 //     mjlab::Policy policy(".", network);       // README.md has a network by onnxruntime
 //     while (!policy.is_ready())                // from a standing pose to the first of the policy
 //       send(policy.hand_over(measure()));      // then wait until the period is over
-//     policy.reset();
+//     policy.reset(0, measure());
 //     while (true) send(policy.step(measure(), command));
 //
 // `measure()` returns the time (s, monotonic) and all measurements that contract.json lists.
@@ -232,6 +232,31 @@ inline std::map<std::string, Array> read_npz(const std::filesystem::path& path) 
   return arrays;
 }
 
+/// Path of a motion's anchor: places (T, 3) and quaternions (T, 4).
+struct Path {
+  std::vector<Vector> places, turns;
+
+  /// Turn and move it over the ground: frame `t` gets the heading of `turn`, and the place.
+  void align(size_t t, const Vector& place, const Vector& turn) {
+    const auto crossed = [](const Vector& q) { return Vector{-q[3], -q[2], q[1], q[0]}; };
+    const auto dot = [&turn](const Vector& q) {
+      return std::inner_product(q.begin(), q.end(), turn.begin(), 0.0);
+    };
+    const double half = std::atan2(dot(crossed(turns.at(t))), dot(turns.at(t)));
+    const double cosine = std::cos(half), sine = std::sin(half);
+    const Matrix back = rotation({cosine, 0.0, 0.0, -sine});
+    const Vector from = turned_back(back, places.at(t));
+    for (Vector& p : places) {
+      p = turned_back(back, p);
+      for (size_t k = 0; k < 2; ++k) p[k] += place.at(k) - from[k];
+    }
+    for (Vector& q : turns) {
+      const Vector other = crossed(q);
+      for (size_t k = 0; k < 4; ++k) q[k] = cosine * q[k] + sine * other[k];
+    }
+  }
+};
+
 /// Policy with its contract, memory, clocks and limits. After a measurement that is stale, not
 /// finite or beyond the limits, all steps damp until `reset`.
 class Policy {
@@ -268,16 +293,14 @@ class Policy {
     reset();
   }
 
-  /// Start an episode, of one of the motions in motion tracking: clear memory, clocks, faults.
-  void reset(size_t motion = 0) {
+  /// Clear memory, clocks and faults. A motion begins where the robot is, if it is measured.
+  void reset(size_t motion = 0, const Values& measurements = {}) {
     sent_ = std::exchange(handed_, {});  // The first jump is that from the last of the hand-over.
     episode_ = Episode{};
-    episode_.motion = motion;
     std::fill(action_.begin(), action_.end(), 0.0f);
     for (size_t k : memory_) std::fill(inputs_[k].data.begin(), inputs_[k].data.end(), 0.0f);
     for (const auto& [key, entry] : commands_["motion"]) {
-      const size_t first = entry["motions"].at(motion)["start"], frame = entry["start_frame"];
-      default_ = motion_.at("joint_pos").row(first + frame - 1, 0, names_.size());
+      begin_motion(entry, motion, measurements);
     }
     for (const auto& [key, entry] : commands_["gait_clock"])
       episode_.clocks[key].first = entry["start"];
@@ -374,8 +397,8 @@ class Policy {
     bool is_first = true, is_ready = false;
     std::optional<std::pair<double, Vector>> begin;  // Time and pose at the start of the hand-over.
     std::map<std::string, std::pair<float, float>> clocks;  // Phase and amplitude.
-    size_t motion = 0;
-    std::optional<size_t> frame;
+    size_t frame = 0, last = 0;  // Of the motion.
+    Path path;
   };
 
   static size_t product(const std::vector<size_t>& shape, size_t first = 0) {
@@ -498,7 +521,7 @@ class Policy {
       check_size(key, found(values, key), entry["size"]);
     }
     for (const auto& [key, entry] : commands_["gait_clock"]) values[key] = tick(key, entry, values);
-    for (const auto& [key, entry] : commands_["motion"]) play(key, entry, values);
+    for (const auto& [key, entry] : commands_["motion"]) play(key, values);
   }
 
   /// Return (A sin, A cos) of a gait clock, after advancing it; float, as in training.
@@ -522,18 +545,33 @@ class Policy {
     return {amplitude * std::sin(angle), amplitude * std::cos(angle)};
   }
 
+  /// Go to the frame before the first observed one; turn and move the motion to the robot.
+  void begin_motion(const json& entry, size_t motion, const Values& measurements) {
+    const json& part = entry["motions"].at(motion);
+    const size_t start = part["start"], length = part["length"], offset = entry["start_frame"];
+    const size_t t = episode_.frame = start + offset - 1, body = entry["anchor_index"];
+    episode_.last = start + length - 1;
+    default_ = motion_.at("joint_pos").row(t, 0, names_.size());
+    Path& path = episode_.path;
+    for (size_t k = 0; k < motion_.at("body_pos_w").rows; ++k) {
+      path.places.push_back(motion_.at("body_pos_w").row(k, 3 * body, 3));
+      path.turns.push_back(motion_.at("body_quat_w").row(k, 4 * body, 4));
+    }
+    const auto measured = [&](const char* name, const Vector& otherwise) {
+      const auto value = measurements.find(entry.value(name, ""));
+      return value == measurements.end() ? otherwise : value->second;
+    };
+    path.align(t, measured("anchor_pos", path.places[t]), measured("anchor_quat", path.turns[t]));
+  }
+
   /// Add the next frame of the motion; its last frame is held.
-  void play(const std::string& key, const json& entry, Values& values) {
-    const json& motion = entry["motions"].at(episode_.motion);
-    const size_t first = motion["start"], length = motion["length"], body = entry["anchor_index"];
-    const size_t begin = first + entry["start_frame"].get<size_t>();
-    const size_t t = std::min(episode_.frame ? *episode_.frame + 1 : begin, first + length - 1);
-    episode_.frame = t;
+  void play(const std::string& key, Values& values) {
+    const size_t t = episode_.frame = std::min(episode_.frame + 1, episode_.last);
     Vector& reference = values[key] = motion_.at("joint_pos").row(t, 0, names_.size());
     const Vector speed = motion_.at("joint_vel").row(t, 0, names_.size());
     reference.insert(reference.end(), speed.begin(), speed.end());
-    values[key + "/anchor_pos"] = motion_.at("body_pos_w").row(t, 3 * body, 3);
-    values[key + "/anchor_quat"] = motion_.at("body_quat_w").row(t, 4 * body, 4);
+    values[key + "/anchor_pos"] = episode_.path.places[t];
+    values[key + "/anchor_quat"] = episode_.path.turns[t];
     for (Input& input : inputs_)
       if (input.name == "time_step") input.data[0] = static_cast<float>(t);
   }

@@ -3,7 +3,7 @@
     policy = Policy.load(".")
     while not policy.is_ready:             # from a standing pose to the first pose of the policy
         send(policy.hand_over(measure()))  # then wait until the period is over
-    policy.reset()
+    policy.reset(measurements=measure())
     while True:
         send(policy.step(measure(), command))
 
@@ -33,18 +33,11 @@ class Targets:
     reason: str = ""
 
 
-def arrayed(value):
-    """Return lists as arrays, and other values unchanged."""
-    return np.array(value) if isinstance(value, list) else value
-
-
 def rotation(q):
     """Return the matrix of a unit quaternion (w, x, y, z)."""
     w, x, y, z = q
-    first = (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w))
-    second = (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w))
-    third = (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
-    return np.array((first, second, third))
+    cross = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0)))
+    return np.eye(3) + 2 * (w * cross + cross @ cross)
 
 
 def reading(inputs, term):
@@ -73,7 +66,6 @@ TERMS = {
     "gravity": lambda i, term: -rotation(i[0])[2],
     "position_in_frame": lambda i, term: rotation(i[2]).T @ (i[0] - i[1]),
     "vector_in_frame": lambda i, term: rotation(i[1]).T @ i[0],
-    # Two columns of the relative rotation matrix, row by row.
     "orientation_in_frame": lambda i, term: (rotation(i[1]).T @ rotation(i[0]))[:, :2].ravel(),
     "pose_error": pose_error,
     # A term of your own; its inputs are the measurements that contract.json lists for it:
@@ -100,11 +92,10 @@ class Policy:
             raise ValueError("contract.json: expected schema mjlab-contract, version 1.")
         self.contract, self.network, self._limited, self._handed = contract, network, limits, None
         self.period, joints = contract["rates"]["step_dt"], contract["joints"]
-        self.names = [joint["name"] for joint in joints]
-        keys = ("kp", "kd", "default_pos")
+        self.names, keys = [joint["name"] for joint in joints], ("kp", "kd", "default_pos")
         self.kp, self.kd, self.default = (np.array([j[key] for j in joints]) for key in keys)
-        self.limits = {k: arrayed(v) for k, v in contract["limits"].items()}
-        self._clip, inputs = contract["policy"]["clip"], contract["policy"]["inputs"]
+        self.limits, self._clip = contract["limits"], contract["policy"]["clip"]
+        inputs = contract["policy"]["inputs"]
         self.inputs = {entry["name"]: np.zeros(entry["shape"], np.float32) for entry in inputs}
         self._memory = {e["output"]: e["name"] for e in inputs if e["kind"] == "memory"}
         self._outputs = [contract["policy"]["output"], *self._memory]
@@ -127,37 +118,49 @@ class Policy:
         self.formulas[key] = formula or TERMS.get(term["function"])
         if self.formulas[key] is None:
             raise ValueError(f"Term {term['name']!r}: add {term['function']!r} to TERMS.")
-        term |= {key: arrayed(term[key]) for key in ("offset", "scale")}
+        term |= {k: term[k] and np.array(term[k]) for k in ("offset", "scale")}
         term["inputs"] = ["last_action"] if term["kind"] == "last_action" else term["inputs"]
         place = (0, *(slice(None),) * observation["axis"], slice(term["start"], term["stop"]))
         slot = self.inputs[observation["input"]][place]
-        history = term["size"] if term["history"]["length"] else 0
-        return key, term, slot, history
+        return key, term, slot, term["size"] if term["history"]["length"] else 0
 
     def _action(self, action):
         """Return an action term with arrays and the places of its joints."""
         if action["kind"] == "custom":
             raise ValueError(f"Action {action['name']!r} is a {action['class']}: compute it here.")
-        action |= {k: arrayed(action.get(k)) for k in ("scale", "offset", "open", "closed")}
+        keys = action.keys() & {"scale", "offset", "open", "closed"}
+        action |= {key: np.array(action[key]) for key in keys}
         action["field"] = action["kind"].rpartition("_")[2]  # position, velocity or effort
         clip = action.get("clip") or [[None, None]] * len(action["joints"])
         action["low"], action["high"] = np.array(clip, float).T  # None: NaN, which fmin ignores.
         action["index"] = [self.names.index(name) for name in action["joints"]]
         return action
 
-    def reset(self, motion=0):
-        """Start an episode, in motion tracking of a motion: clear memory, clocks and faults."""
-        self.reason, self._time, self._repeated, self._is_first = "", None, 0, True
-        self.is_ready, self._start, self._motion, self.frame = False, None, motion, None
+    def reset(self, motion=0, measurements=None):
+        """Clear memory, clocks and faults. A motion begins where the robot is, if it is measured."""
+        self.reason, self._time, self._repeated, self._is_first = "", np.nan, 0, True
+        self.is_ready, self._start, self._clocks = False, None, {}  # Phase and amplitude by clock.
         # The first jump of targets is that from the last of the hand-over.
         self.action, self._sent, self._handed = np.zeros_like(self.action), self._handed, None
-        for command in self._motions:
-            frame = command["motions"][motion]["start"] + command["start_frame"] - 1
-            self.default = self.motion["joint_pos"][frame].astype(float)
+        for entry in self._motions:
+            start, length = (entry["motions"][motion][key] for key in ("start", "length"))
+            self.frame, self._last = start + entry["start_frame"] - 1, start + length - 1
+            self.default = self.motion["joint_pos"][self.frame].astype(float)
+            self._anchor = self._aligned(entry, self.frame, measurements or {})
         for name in self._memory.values():
             self.inputs[name][:] = 0.0
-        starts = ((name, command.get("start", 0)) for name, command in self._commands.items())
-        self._clocks = {n: np.array((x, 0), "f4") for n, x in starts}  # Phase, amplitude.
+
+    def _aligned(self, entry, frame, robot):
+        """Return the path of the motion's anchor, turned and moved over the ground to the robot."""
+        data, anchor = self.motion, entry["anchor_index"]
+        places, turns = data["body_pos_w"][:, anchor], data["body_quat_w"][:, anchor]
+        place = robot.get(entry.get("anchor_pos"), places[frame])
+        turn = robot.get(entry.get("anchor_quat"), turns[frame])
+        crossed = turns[:, ::-1] * (-1, -1, 1, 1)  # Products of the unit z and each quaternion.
+        half = np.arctan2(crossed[frame] @ turn, turns[frame] @ turn)
+        cos, sin = np.cos(half), np.sin(half)
+        moved = places @ rotation((cos, 0, 0, sin)).T
+        return moved + (place - moved[frame]) * (1, 1, 0), cos * turns + sin * crossed
 
     def step(self, measurements, command=None):
         """Return the motor commands of a period; `command` is of the only given one, or a dict."""
@@ -189,12 +192,11 @@ class Policy:
 
     def hand_over(self, measurements, seconds=2.0, tolerance=0.3):
         """Move to the first pose in `seconds`; ready within `tolerance`: a Go1 sags by 0.23 rad."""
-        values, self._handed = self._checked(measurements), None
-        q, now = values["joint_pos"], float(measurements["time"])
+        q, self._handed = self._checked(measurements)["joint_pos"], None
         if self.reason:
             return self.damp(q)
-        begin, pose = self._start = self._start or (now, q)
-        share = min((now - begin) / seconds, 1.0)
+        begin, pose = self._start = self._start or (self._time, q)
+        share = min((self._time - begin) / seconds, 1.0)
         self.is_ready = share == 1.0 and bool(np.abs(q - self.default).max() < tolerance)
         to = self.commanded(pose + share * (self.default - pose))
         self._handed = np.concatenate([getattr(to, a["field"])[a["index"]] for a in self._actions])
@@ -207,8 +209,8 @@ class Policy:
 
     def commanded(self, position):
         """Return commands of joint positions, with the gains of the contract."""
-        zero = np.zeros(len(self.names))
-        return Targets(self.names, position, zero, zero.copy(), self.kp, self.kd, self.period)
+        velocity, effort = np.zeros((2, len(self.names)))
+        return Targets(self.names, position, velocity, effort, self.kp, self.kd, self.period)
 
     def _sized(self, name, value):
         """Return a measurement or command as an array; raise ValueError for a wrong size."""
@@ -223,7 +225,7 @@ class Policy:
         limits, last, self._time = self.limits, self._time, float(measurements["time"])
         if self.reason or not self._limited:
             return values
-        gap = self.period if last is None else self._time - last
+        gap = self.period if np.isnan(last) else self._time - last
         self._repeated = self._repeated + 1 if gap <= 0 else 0
         age = max(gap, self._repeated * self.period)
         if not age <= limits["max_age"]:
@@ -250,14 +252,15 @@ class Policy:
             if entry["kind"] == "gait_clock":
                 values[f"command/{name}"] = self._clock(entry, values)
             elif entry["kind"] == "motion":
-                self._play(f"command/{name}", entry, values)
+                self._play(f"command/{name}", values)
 
     def _clock(self, entry, values):
         """Return (A sin, A cos) of a gait clock, after advancing it; float32, as in training."""
-        clock, fade, stands, f32 = self._clocks[entry["name"]], entry["fade_s"], False, np.float32
-        if entry["velocity_command"] is not None:
-            x, y, yaw = values[f"command/{entry['velocity_command']}"]
-            stands = np.hypot(x, y) + abs(yaw) < entry["standing_threshold"]
+        fade, f32 = entry["fade_s"], np.float32
+        clock = self._clocks.setdefault(entry["name"], np.array((entry["start"], 0), f32))
+        # Without a velocity command, it never stands.
+        x, y, yaw = values.get(f"command/{entry['velocity_command']}", (np.inf, 0, 0))
+        stands = np.hypot(x, y) + abs(yaw) < entry["standing_threshold"]
         if not self._is_first:
             clock[0] = np.fmod(clock[0] + f32(entry["frequency"] * self.period), f32(1))
             change = f32(-self.period if stands else self.period) / f32(fade or 1.0)
@@ -266,14 +269,11 @@ class Policy:
         phase = clock[0] * f32(2 * np.pi)
         return np.array((amplitude * np.sin(phase), amplitude * np.cos(phase)))
 
-    def _play(self, key, entry, values):
+    def _play(self, key, values):
         """Add the next frame of the motion; its last frame is held."""
-        motion, data, anchor = entry["motions"][self._motion], self.motion, entry["anchor_index"]
-        ahead = motion["start"] + entry["start_frame"] if self.frame is None else self.frame + 1
-        self.frame = t = min(ahead, motion["start"] + motion["length"] - 1)
-        values[key] = np.concatenate((data["joint_pos"][t], data["joint_vel"][t]))
-        values[f"{key}/anchor_pos"] = data["body_pos_w"][t, anchor]
-        values[f"{key}/anchor_quat"] = data["body_quat_w"][t, anchor]
+        self.frame = t = min(self.frame + 1, self._last)
+        values[key] = np.concatenate([self.motion[k][t] for k in ("joint_pos", "joint_vel")])
+        values[f"{key}/anchor_pos"], values[f"{key}/anchor_quat"] = (x[t] for x in self._anchor)
         if "time_step" in self.inputs:
             self.inputs["time_step"][:] = t
 
@@ -291,7 +291,7 @@ class Policy:
         if self._limited:
             sent = sent.clip(self.limits["target_low"], self.limits["target_high"])
             if self._sent is not None:
-                step = self.limits["target_step"]
+                step = np.array(self.limits["target_step"])
                 sent = sent.clip(self._sent - step, self._sent + step)
         self._sent, commands = sent, self.commanded(self.default.copy())
         for a in self._actions:

@@ -196,7 +196,7 @@ class Keys:
 
 def play(policy, simulation, command, seconds, viewer=None):
     """Play for `seconds`; return False if the policy ended in damping."""
-    policy.reset()
+    policy.reset(measurements=simulation.measure())
     start, targets = time.perf_counter(), None
     for k in range(round(seconds / policy.period)):
         targets = policy.step(simulation.measure(), command())
