@@ -115,8 +115,8 @@ CLIPS = {
         lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
     ),
 }  # fmt: skip
-# Packages that `mjlab new-robot` writes, installed: trunk and standing height (m).
-_OWN_ROBOTS = {
+# Packages that `mjlab new-robot` writes, installed: trunk and standing height (m), of four and two legs.
+_QUADRUPEDS = {
     "Aliengo": ("base", 0.337),
     "Mini-Cheetah": ("base", 0.317),
     "B2": ("base", 0.467),
@@ -124,14 +124,26 @@ _OWN_ROBOTS = {
     "Hyqreal2": ("base", 0.494),
     "Go2": ("base", 0.288),  # docs/images/own_robot.webp
 }
-for _title, (_trunk, _height) in _OWN_ROBOTS.items():
-    _speed = 0.8 * (_height / 0.28) ** 0.5
-    CLIPS[f"own_{_title.lower().replace('-', '_')}"] = Clip(
-        f"Velocity-Flat-{_title}", "cpu",
-        command={"lin_vel_x": (_speed, _speed), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
-        start=2.0, seconds=2.0, body=f"robot/{_trunk}", lookat=(0.0, 0.0, 0.5 * _height),
-        distance=6.0 * _height, azimuth=125.0,
-    )  # fmt: skip
+_BIPEDS = {
+    "T1": ("Trunk", 0.665),
+    "H1": ("pelvis", 0.990),
+    "Berkeley-Humanoid": ("torso", 0.518),
+}
+
+
+# Height commanded 1 m/s (m); height of the whole robot and distance of the camera over that of the trunk.
+for _robots, _reference, _whole, _distance in (
+    (_QUADRUPEDS, 0.28, 1.0, 6.0),
+    (_BIPEDS, 0.76, 1.7, 4.5),
+):
+    for _title, (_trunk, _height) in _robots.items():
+        _speed = 0.8 * (_height / _reference) ** 0.5
+        CLIPS[f"own_{_title.lower().replace('-', '_')}"] = Clip(
+            f"Velocity-Flat-{_title}", "cpu",
+            command={"lin_vel_x": (_speed, _speed), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
+            start=2.0, seconds=2.0, body=f"robot/{_trunk}",
+            lookat=(0.0, 0.0, 0.5 * _whole * _height), distance=_distance * _height, azimuth=125.0,
+        )  # fmt: skip
 
 
 @dataclass
