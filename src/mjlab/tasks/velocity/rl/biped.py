@@ -104,7 +104,7 @@ def cpu_with_stepping(
     solved_below: dict[str, float],
     trigger_below: dict[str, float] | None = None,
     num_episodes: int = 60,
-    first_iteration: int = 100,
+    first_iteration: int = 80,
     min_interval: int = 10,
     mirror: str | None = MIRROR,
 ) -> Profile:
@@ -118,8 +118,8 @@ def cpu_with_stepping(
         trigger_below: Training errors below which an evaluation starts. None: a tenth above `solved_below`,
             as errors are with exploration and harder pushes.
         num_episodes: Episodes of an evaluation.
-        first_iteration: First iteration with an evaluation. Of three seeds of the G1, none is within its
-            bounds before iteration 103, and evaluations would take more than a tenth of the time.
+        first_iteration: First iteration with an evaluation. Before iteration 80, pushes and commands are
+            those of an easy start.
         min_interval: Iterations between evaluations. One costs two iterations.
         mirror: Symmetry augmentation function. None for a robot without left and right.
     """

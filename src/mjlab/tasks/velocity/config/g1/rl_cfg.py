@@ -65,6 +65,9 @@ cpu = cpu_with_stepping(
     ease=_simplify_contacts,
     trigger_below={"lin_vel_error": 0.385, "ang_vel_error": 0.56},
     solved_below={"lin_vel_error": 0.35, "ang_vel_error": 0.45, "failure_rate": 0.2},
+    # None of three seeds was within these bounds before iteration 103, and evaluations that fail would take
+    # more than a tenth of the time.
+    first_iteration=100,
 )
 """The `cpu` profile of all tasks: training stops once four of five episodes last 20 s, with the task's
 pushes, and tracking errors are small."""
