@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -91,3 +91,46 @@ def row_of(policy: Any, trace: dict[str, np.ndarray], k: int) -> tuple[dict, dic
     measured["time"] = float(trace["time"][k])
     given = [entry["name"] for entry in contract["commands"] if entry["kind"] == "given"]
     return measured, {name: trace[f"command/{name}"][k] for name in given}
+
+
+# Parity with the training environment.
+
+TOLERANCE = 1e-5
+"""Largest difference, as a fraction of the range of a term."""
+
+
+def arrays_of(folder: Path) -> dict[str, np.ndarray]:
+    """Return the golden trace of a bundle."""
+    return dict(np.load(folder / "golden.npz"))
+
+
+def differences(got: Any, expected: np.ndarray, spans: np.ndarray) -> float:
+    """Return the largest difference in units of the range of the whole term."""
+    return float(np.abs(np.asarray(got) - expected).max(initial=0.0) / max(np.ptp(spans), 1e-3))
+
+
+def worst_differences(
+    folder: Path, formulas: Mapping[str, Callable[..., Any]] = MappingProxyType({})
+) -> dict[str, float]:
+    """Return the largest difference of each array that the runtime computes, over the whole trace.
+
+    `formulas` are those of custom terms, by `module:function`.
+    """
+    runtime = load_program(folder, "runtime")
+    runtime.TERMS.update(formulas)
+    policy = runtime.Policy.load(folder, limits=False)
+    trace = arrays_of(folder)
+    motions = {one["row"]: one["motion"] for one in policy.contract["golden"]["episodes"]}
+    worst: dict[str, float] = {}
+    for k in range(len(trace["time"])):
+        if trace["first"][k]:
+            policy.reset(motion=motions[k])
+        policy.step(*row_of(policy, trace, k))
+        pairs = {f"raw/{i}/{term}": value for (i, term), value in policy.values.items()}
+        pairs |= {f"input/{i}": value[0] for i, value in policy.inputs.items()}
+        pairs |= {"action": policy.action, "target": policy.target}
+        for key, value in pairs.items():
+            if key in trace:
+                found = differences(value, trace[key][k], trace[key])
+                worst[key] = max(worst.get(key, 0.0), found)
+    return worst

