@@ -151,6 +151,45 @@ def test_missing_columns_are_named(log_of):
     assert report.is_passed
 
 
+@pytest.mark.parametrize("gap", ["", "nan"])
+def test_gaps_are_skipped(bundle, tmp_path, gap):
+    folder, path = bundle("g1"), tmp_path / "log.csv"
+    columns = golden(folder)
+    for name in part(columns, 0, 15):
+        columns[name] = 0.3 * columns[name]
+    header, *rows = written(path, columns).read_text().splitlines()
+    names = list(columns)
+    for k in (9, 20):
+        cells = rows[k].split(",")
+        for j, name in enumerate(names):
+            if name.startswith("measurement."):
+                cells[j] = gap
+        rows[k] = ",".join(cells)
+    path.write_text("\n".join([header, *rows]))
+    report = check_log(folder, path)
+    assert report.causes == ["another scale"]
+    (note,) = [note for note in report.notes if note.startswith("gaps: 2 rows")]
+    # Histories of five steps hold each gap.
+    assert "10 rows" in note
+    assert {one.num_rows for one in report.comparisons if one.stage == "vector"} == {len(rows) - 10}
+
+
+def test_log_that_begins_within_an_episode(bundle, tmp_path):
+    folder, path = bundle("g1"), tmp_path / "log.csv"
+    columns = {name: values[7:40] for name, values in golden(folder).items()}
+    assert not check_log(
+        folder, written(path, {**columns, "first": columns["step"] == 7})
+    ).is_passed
+    del columns["first"]
+    report = check_log(folder, written(path, columns))
+    assert report.is_passed, str(report)
+    assert any(note.startswith("no column first") for note in report.notes)
+    # The clock counts from the start of the episode.
+    assert any(note.startswith("gait: not compared") for note in report.notes)
+    compared = [one for one in report.comparisons if one.name == "term/obs/gait"]
+    assert [one.num_rows for one in compared] == [0]
+
+
 @pytest.mark.parametrize("kept", [("time",), ("time", "measurement"), ("time", "target")])
 def test_log_that_decides_nothing_is_refused(log_of, kept):
     def drop(columns: Columns) -> None:

@@ -502,7 +502,9 @@ def _as_vector(
 
 
 def _difference(one: Comparison) -> Difference | None:
-    if one.expected.shape != one.got.shape or not np.isfinite(one.got).all():
+    if one.expected.shape != one.got.shape:
+        return None
+    if not np.isfinite(one.got[np.isfinite(one.expected)]).all():
         return None
     return Difference(one.stage, one.name, one.expected, one.got, one.tolerance)
 

@@ -3,7 +3,7 @@
 Both are tables (CSV) with the columns of `golden.csv`:
 
     time                                   s, monotonic
-    first                                  1 where an episode begins; without it, the first row
+    first                                  1 where an episode begins; without it, the log begins anywhere
     motion                                 motion of the episode; without it, that of the golden trace where
                                            there is a column step, else 0
     measurement.<name>.<k or joint>        raw measurements; also `quaternion.<w, x, y, z>`,
@@ -160,10 +160,14 @@ def check_log(folder: Path, path: Path, tolerance: float = TOLERANCE) -> Report:
         raise UserError(f"{path}: expected a column time (s).")
     raw, missing = _raw(bundle, table)
     answers = _answers(bundle, table)
+    gaps = _gaps(raw)
+    raw = {name: _held(values, gaps) for name, values in raw.items()}
     trace = _recomputed(bundle, table, raw, answers)
     evidence = Evidence(folder, trace)
     period, sentences = _timing(bundle, table.columns["time"], trace["first"])
     sentences += _lags(bundle, raw, answers)
+    answers, unknown = _comparable(evidence, gaps, "first" in table.columns, answers)
+    sentences += unknown
     notes = [
         f"{name}: not in the log; what is computed from it is not compared." for name in missing
     ]
@@ -213,6 +217,61 @@ def _plain_name(
     if name == "root_quat":
         return "quaternion", list("wxyz")
     return {"joint_pos": "position", "joint_vel": "velocity"}.get(name, name), labels
+
+
+def _gaps(raw: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the rows that lack a value of a measurement or command that the log has, (K,)."""
+    known = [np.isfinite(values.reshape(len(values), -1)).all(axis=1) for values in raw.values()]
+    there = [rows for rows in known if rows.any()]
+    return ~np.all(there, axis=0) if there else np.zeros(len(known[0]), bool)
+
+
+def _held(values: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+    """Return `values` with those of gaps replaced by the last before, or the first of all."""
+    kept = np.flatnonzero(~gaps)
+    if not kept.size:
+        return values
+    rows = np.searchsorted(kept, np.arange(len(values)), side="right") - 1
+    return values[kept[np.maximum(rows, 0)]]
+
+
+def _comparable(
+    evidence: Evidence, gaps: np.ndarray, has_starts: bool, answers: Mapping[str, Answers]
+) -> tuple[dict[str, Answers], list[str]]:
+    """Return the answers that a log decides about, and a sentence on what else it has.
+
+    Left out are gaps, and histories that hold one; without a column `first`, histories before they are full,
+    and what counts from the start of an episode: clocks, motions and memory.
+    """
+    sentences, contract = [], evidence.contract
+    longest = max(1, *(term["history"]["length"] for term in evidence.terms.values()))
+    hidden = np.convolve(gaps, np.ones(longest))[: len(gaps)] > 0
+    if gaps.any():
+        sentences.append(
+            f"gaps: {gaps.sum()} rows lack a measurement or command; {hidden.sum()} rows are not compared, "
+            "as their histories hold them."
+        )
+    counted = [f"command/{one['name']}" for one in contract["commands"] if one["kind"] != "given"]
+    if not has_starts:
+        hidden[:longest] = True
+        sentences.append(
+            "no column first: the log may begin within an episode. Rows are compared from "
+            f"{longest} on, when histories are full."
+        )
+    known = {name: value.known & ~hidden[:, None] for name, value in answers.items()}
+    memory = [one for one in contract["policy"]["inputs"] if one["kind"] == "memory"]
+    if not has_starts and counted:
+        for (place, name), term in evidence.terms.items():
+            if place == "obs" and any(one.startswith(tuple(counted)) for one in term["inputs"]):
+                sentences.append(
+                    f"{name}: not compared, as it counts from the start of an episode."
+                )
+                if "input/obs" in known:
+                    known["input/obs"][:, term["start"] : term["stop"]] = False
+    if not has_starts and "action" in known and (memory or counted and "input/obs" not in answers):
+        sentences.append("action: not compared, as it depends on the start of the episode.")
+        known["action"][:] = False
+    return {name: replace(value, known=known[name]) for name, value in answers.items()}, sentences
 
 
 def _recomputed(

@@ -13,6 +13,13 @@ import numpy as np
 
 from mjlab.deploy.evidence import Difference, Evidence, flat, rotations
 
+
+def _known(d: Difference) -> tuple[np.ndarray, np.ndarray]:
+    """Return expected and found values of the rows that are known; what is fitted, is fitted to them."""
+    rows = np.isfinite(d.expected).all(axis=1)
+    return d.expected[rows], d.got[rows]
+
+
 # Rates.
 
 
@@ -51,26 +58,28 @@ def degrees(d: Difference, evidence: Evidence) -> np.ndarray:
 
 def one_scale(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Return the values times the factor that fits best."""
-    e = d.expected
+    e, g = _known(d)
     square = (e * e).sum()
-    return None if square == 0.0 else (e * d.got).sum() / square * e
+    return None if square == 0.0 else (e * g).sum() / square * d.expected
 
 
 def some_signs(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Return the values with opposite sign of some components."""
-    signs = np.where((d.expected * d.got).sum(axis=0) < 0.0, -1.0, 1.0)
+    e, g = _known(d)
+    signs = np.where((e * g).sum(axis=0) < 0.0, -1.0, 1.0)
     return None if d.expected.shape[1] == 1 else signs * d.expected
 
 
 def scales(d: Difference, evidence: Evidence) -> np.ndarray:
     """Return the values times the factor of each component that fits best."""
-    square = np.maximum((d.expected**2).sum(axis=0), 1e-30)
-    return (d.expected * d.got).sum(axis=0) / square * d.expected
+    e, g = _known(d)
+    return (e * g).sum(axis=0) / np.maximum((e * e).sum(axis=0), 1e-30) * d.expected
 
 
 def offsets(d: Difference, evidence: Evidence) -> np.ndarray:
     """Return the values plus a constant for each component."""
-    return d.expected + np.median(d.got - d.expected, axis=0)
+    e, g = _known(d)
+    return d.expected + np.median(g - e, axis=0)
 
 
 def order(d: Difference, evidence: Evidence) -> np.ndarray | None:
@@ -83,14 +92,14 @@ def order(d: Difference, evidence: Evidence) -> np.ndarray | None:
     read = evidence.evaluate({**term, "offset": None})
     if read is None:
         return explained
-    offset = np.median(read - d.expected, axis=0)
+    offset = np.nanmedian(read - d.expected, axis=0)
     other = _reordered(read, d.got + offset) - offset
-    return min((explained, other), key=lambda one: np.abs(one - d.got).max())
+    return min((explained, other), key=lambda one: np.nanmax(np.abs(one - d.got)))
 
 
 def _reordered(expected: np.ndarray, got: np.ndarray) -> np.ndarray:
     """Return the columns of `expected` in the order that resembles `got`."""
-    distance = ((got[:, :, None] - expected[:, None, :]) ** 2).sum(axis=0)  # (n, n)
+    distance = np.nansum((got[:, :, None] - expected[:, None, :]) ** 2, axis=0)  # (n, n)
     # Greedy, closest pair first; equal components keep their places.
     distance -= 1e-12 * np.eye(len(distance))
     source = np.full(len(distance), -1)
@@ -105,21 +114,24 @@ def turned(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Return vectors turned by the constant rotation that fits best."""
     if d.expected.shape[1] != 3:
         return None
-    u, _, v = np.linalg.svd(d.got.T @ d.expected)
+    e, g = _known(d)
+    u, _, v = np.linalg.svd(g.T @ e)
     rotation = u @ np.diag((1.0, 1.0, np.linalg.det(u @ v))) @ v
     return d.expected @ rotation.T
 
 
 def bounded(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Return the values between one lowest and one highest value."""
-    low, high = d.got.min(), d.got.max()
+    _, g = _known(d)
+    low, high = g.min(), g.max()
     inside = (d.expected > low) & (d.expected < high)
     return d.expected.clip(low, high) if inside.mean() > 0.1 else None
 
 
 def bounded_each(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Return the values between the lowest and highest value of each component."""
-    low, high = d.got.min(axis=0), d.got.max(axis=0)
+    _, g = _known(d)
+    low, high = g.min(axis=0), g.max(axis=0)
     inside = (d.expected > low) & (d.expected < high)
     return d.expected.clip(low, high) if inside.mean() > 0.1 else None
 
@@ -310,7 +322,7 @@ def _clip(d: Difference, evidence: Evidence) -> _Clip | None:
     if found is None or raw is None:
         return None
     newest, raw = found[0], flat(raw).astype(float)
-    inside = (newest > newest.min()) & (newest < newest.max()) & (np.abs(raw) > 1e-6)
+    inside = (newest > np.nanmin(newest)) & (newest < np.nanmax(newest)) & (np.abs(raw) > 1e-6)
     ratio = np.where(inside, newest / np.where(inside, raw, 1.0), np.nan)
     if not inside.any(axis=0).all():
         return None
@@ -364,7 +376,7 @@ def term_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
     explained, place, left = [], 0, dict(parts)
     while left:
         fits = {
-            name: np.abs(d.got[:, place : place + part.shape[1]] - part).max()
+            name: np.nanmax(np.abs(d.got[:, place : place + part.shape[1]] - part))
             for name, part in left.items()
             if place + part.shape[1] <= d.got.shape[1]
         }
@@ -464,17 +476,19 @@ def _scale_and_offset(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
 def target_scale(d: Difference, evidence: Evidence) -> np.ndarray | None:
     """Return targets with one other action scale for all joints."""
     _, offset = _scale_and_offset(evidence)
-    moved = d.expected - offset
-    square = (moved * moved).sum()
-    return None if square == 0.0 else offset + (moved * (d.got - offset)).sum() / square * moved
+    e, g = _known(d)
+    square = ((e - offset) ** 2).sum()
+    if square == 0.0:
+        return None
+    return offset + ((e - offset) * (g - offset)).sum() / square * (d.expected - offset)
 
 
 def target_scales(d: Difference, evidence: Evidence) -> np.ndarray:
     """Return targets with another action scale of some joints."""
     _, offset = _scale_and_offset(evidence)
-    moved = d.expected - offset
-    square = np.maximum((moved * moved).sum(axis=0), 1e-30)
-    return offset + (moved * (d.got - offset)).sum(axis=0) / square * moved
+    e, g = _known(d)
+    square = np.maximum(((e - offset) ** 2).sum(axis=0), 1e-30)
+    return offset + ((e - offset) * (g - offset)).sum(axis=0) / square * (d.expected - offset)
 
 
 def no_offset(d: Difference, evidence: Evidence) -> np.ndarray:
@@ -503,5 +517,5 @@ def target_not_clipped(d: Difference, evidence: Evidence) -> np.ndarray | None:
             raw = action[:, entry["start"] : entry["stop"]]
             part = slice(entry["target_start"], entry["target_stop"])
             free[:, part] = raw * entry["scale"] + entry["offset"]
-    low, high = d.expected.min(axis=0), d.expected.max(axis=0)
-    return free if np.abs(free.clip(low, high) - d.expected).max() <= d.tolerance else None
+    low, high = np.nanmin(d.expected, axis=0), np.nanmax(d.expected, axis=0)
+    return free if np.nanmax(np.abs(free.clip(low, high) - d.expected)) <= d.tolerance else None
