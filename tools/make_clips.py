@@ -126,7 +126,7 @@ _QUADRUPEDS = {
 }
 _BIPEDS = {
     "T1": ("Trunk", 0.665),
-    "H1": ("pelvis", 0.990),
+    "H1": ("pelvis", 0.99),
     "Berkeley-Humanoid": ("torso", 0.518),
 }
 
