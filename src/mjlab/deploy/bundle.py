@@ -78,7 +78,7 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
     notes = _notes(content)
     if (why := write_unitree(content, folder)) is not None:
         notes.append(why)
-    elif (folder / "params").exists():
+    else:
         if _is_go1(env):
             notes.append("A Go1 speaks unitree_legged_sdk (UDP), which Unitree's programs do not.")
         if (note := phase_note(content)) is not None:

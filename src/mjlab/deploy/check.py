@@ -565,11 +565,35 @@ def undecided(evidence: Evidence) -> list[str]:
     ]
     if known and all(x.min() >= low and x.max() <= high for x, low, high in known):
         texts.append("targets clipped to the joint ranges: no target is beyond them.")
+    texts += _delays(contract)
     if not evidence.has_physics:
         texts.append(
             "torque, state and later: an actuator has a law that `simulate.py` does not know."
         )
     texts += _attitude(evidence)
+    return texts
+
+
+def _delays(contract: Mapping[str, Any]) -> list[str]:
+    """Return a sentence on each kind of delay that training had, and the trace does not."""
+    actuators = [tuple(one["delay"]) for one in contract["actuators"] if any(one["delay"])]
+    terms = [
+        term["name"]
+        for one in contract["observations"]
+        for term in one["terms"]
+        if any(term["delay"])
+    ]
+    texts = []
+    if actuators:
+        low, high = min(one[0] for one in actuators), max(one[1] for one in actuators)
+        texts.append(
+            f"delays of {len(actuators)} of {len(contract['actuators'])} actuators, {low} to {high} "
+            "physics steps in training: the trace and the programs have none, as a robot has its own."
+        )
+    if terms:
+        texts.append(
+            f"delays of {', '.join(terms)}: training had them; the trace and the programs do not."
+        )
     return texts
 
 

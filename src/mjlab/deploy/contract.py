@@ -289,7 +289,7 @@ def _network_inputs(policy: Path) -> tuple[list[dict[str, Any]], dict[str, list[
 
 def _joints(subject: Subject) -> list[dict[str, Any]]:
     entity, model = subject.entity, subject.model
-    gains, limits = _gains(entity, model), _efforts(entity, model)
+    gains, limits, speeds = _gains(entity, model), _efforts(entity, model), _speeds(entity)
     data = entity.data
     entries = []
     for k, (name, full) in enumerate(
@@ -309,6 +309,7 @@ def _joints(subject: Subject) -> list[dict[str, Any]]:
                 "default_vel": shortest(data.default_joint_vel[0, k]),
                 "range": joint.range.tolist() if joint.limited[0] else None,
                 "effort": limits.get(name),
+                "speed": speeds.get(name),
                 "kp": kp,
                 "kd": kd,
                 "armature": float(model.dof_armature[dof]),
@@ -345,6 +346,16 @@ def _efforts(entity: Entity, model: mujoco.MjModel) -> dict[str, float | None]:
             element = elements[k * len(elements) // len(actuator.target_names)]
             found[name] = _effort(actuator, element, model)
     return found
+
+
+def _speeds(entity: Entity) -> dict[str, float]:
+    """Return the largest speed of the motor of each joint, of actuators whose config has one."""
+    limits = {
+        name: getattr(actuator.cfg, "velocity_limit", None)
+        for actuator in entity.actuators
+        for name in actuator.target_names
+    }
+    return {name: float(limit) for name, limit in limits.items() if isinstance(limit, int | float)}
 
 
 def _effort(actuator: Actuator, element: int, model: mujoco.MjModel) -> float | None:
@@ -509,7 +520,8 @@ def _limits(
         "target_high": high,
         "target_step": step,
         "joint_speed": [
-            _SLIDE_SPEED if joint["type"] == "slide" else _HINGE_SPEED for joint in joints
+            joint["speed"] or (_SLIDE_SPEED if joint["type"] == "slide" else _HINGE_SPEED)
+            for joint in joints
         ],
         "tilt": min([_TILT, *fell]) if has_tilt else None,
         "max_age": shortest(_MAX_AGE_STEPS * subject.env.step_dt),

@@ -223,7 +223,8 @@ def _gaps(raw: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the rows that lack a value of a measurement or command that the log has, (K,)."""
     known = [np.isfinite(values.reshape(len(values), -1)).all(axis=1) for values in raw.values()]
     there = [rows for rows in known if rows.any()]
-    return ~np.all(there, axis=0) if there else np.zeros(len(known[0]), bool)
+    count = len(next(iter(raw.values())))
+    return ~np.all(there, axis=0) if there else np.zeros(count, bool)
 
 
 def _held(values: np.ndarray, gaps: np.ndarray) -> np.ndarray:

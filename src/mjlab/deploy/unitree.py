@@ -28,7 +28,7 @@ _ARM = (
 )
 MOTORS: dict[str, tuple[str, ...]] = {
     "Go1, Go2": tuple(f"{leg}_{joint}" for leg in _LEGS for joint in ("hip", "thigh", "calf")),
-    "G1": (
+    "G1 (29 joints)": (
         *(f"{side}_{joint}" for side in _SIDES for joint in _LEG),
         *("waist_yaw", "waist_roll", "waist_pitch"),
         *(f"{side}_{joint}" for side in _SIDES for joint in _ARM),
@@ -45,16 +45,11 @@ class UnknownToUnitreeError(ValueError):
 
 
 def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
-    """Write `params/deploy.yaml` and `exported/policy.onnx` for a robot in `MOTORS`.
-
-    Returns the reason if the robot is one, and the files are not written; else None.
-    """
-    if not has_motors(contract):
-        return None
+    """Write `params/deploy.yaml` and `exported/policy.onnx`; return the reason if they are not."""
     try:
         content = deploy_settings(contract)
     except UnknownToUnitreeError as error:
-        return f"No deploy.yaml for Unitree's programs: {error}"
+        return f"No params/deploy.yaml for Unitree's programs: {error}"
     for name in ("params", "exported"):
         (folder / name).mkdir(exist_ok=True)
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
@@ -73,12 +68,6 @@ def phase_note(contract: Mapping[str, Any]) -> str | None:
         "Unitree's programs give a gait phase two control steps ahead of training's, and newer versions zeros "
         "for commands shorter than 0.1: `runtime.py` gives that of training."
     )
-
-
-def has_motors(contract: Mapping[str, Any]) -> bool:
-    """Return True if the joints are those of a robot in `MOTORS`."""
-    names = sorted(joint["name"].removesuffix("_joint") for joint in contract["joints"])
-    return any(names == sorted(motors) for motors in MOTORS.values())
 
 
 def deploy_settings(contract: Mapping[str, Any]) -> dict[str, Any]:
@@ -115,7 +104,9 @@ def motor_map(names: Sequence[str]) -> list[int]:
     for motors in MOTORS.values():
         if sorted(short) == sorted(motors):
             return [motors.index(name) for name in short]
-    raise UnknownToUnitreeError(f"no motor map for these joints; known: {'; '.join(MOTORS)}.")
+    raise UnknownToUnitreeError(
+        f"the motors of these joints are not known; known: {', '.join(MOTORS)}."
+    )
 
 
 # Terms.

@@ -260,7 +260,7 @@ class Policy:
         clock = self._clocks.setdefault(entry["name"], np.array((entry["start"], 0), f32))
         # Without a velocity command, it never stands.
         x, y, yaw = values.get(f"command/{entry['velocity_command']}", (np.inf, 0, 0))
-        stands = np.hypot(x, y) + abs(yaw) < entry["standing_threshold"]
+        stands = np.hypot(x, y) + abs(yaw) < entry.get("standing_threshold", 0)
         if not self._is_first:
             clock[0] = np.fmod(clock[0] + f32(entry["frequency"] * self.period), f32(1))
             change = f32(-self.period if stands else self.period) / f32(fade or 1.0)
