@@ -35,9 +35,11 @@ class Targets:
 
 def rotation(q):
     """Return the matrix of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = q
-    cross = np.array(((0, -z, y), (z, 0, -x), (-y, x, 0)))
-    return np.eye(3) + 2 * (w * cross + cross @ cross)
+    w, x, y, z = map(float, q)
+    first = (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w))
+    second = (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w))
+    third = (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))
+    return np.array((first, second, third))
 
 
 def reading(inputs, term):
@@ -50,9 +52,8 @@ def reading(inputs, term):
 def pose_error(inputs, term):
     """Return translation and rotation vector from a pose to the commanded pose."""
     place, (w, x, y, z), goal = inputs
-    # Matrix of the product with the conjugate quaternion from the right.
-    right = np.array(((w, x, y, z), (-x, w, -z, y), (-y, z, w, -x), (-z, -y, x, w)))
-    turn = right @ goal[3:]
+    times_conjugate = np.array(((w, x, y, z), (-x, w, -z, y), (-y, z, w, -x), (-z, -y, x, w)))
+    turn = times_conjugate @ goal[3:]
     turn = -turn if turn[0] < 0 else turn
     sine = np.linalg.norm(turn[1:])
     ratio = 2 * np.arctan2(sine, turn[0]) / sine if sine > 1e-9 else 2.0
@@ -68,8 +69,7 @@ TERMS = {
     "vector_in_frame": lambda i, term: rotation(i[1]).T @ i[0],
     "orientation_in_frame": lambda i, term: (rotation(i[1]).T @ rotation(i[0]))[:, :2].ravel(),
     "pose_error": pose_error,
-    # A term of your own; its inputs are the measurements that contract.json lists for it:
-    # "my_package.mdp:wheel_speed": lambda inputs, term: ...
+    # A term of your own: "my_package.mdp:wheel_speed": lambda inputs, term: ...
 }
 
 
@@ -94,8 +94,9 @@ class Policy:
         self.period, joints = contract["rates"]["step_dt"], contract["joints"]
         self.names, keys = [joint["name"] for joint in joints], ("kp", "kd", "default_pos")
         self.kp, self.kd, self.default = (np.array([j[key] for j in joints]) for key in keys)
-        self.limits, self._clip = contract["limits"], contract["policy"]["clip"]
-        inputs = contract["policy"]["inputs"]
+        lists = {k: np.array(v) for k, v in contract["limits"].items() if isinstance(v, list)}
+        self.limits = {**contract["limits"], **lists}
+        self._clip, inputs = contract["policy"]["clip"], contract["policy"]["inputs"]
         self.inputs = {entry["name"]: np.zeros(entry["shape"], np.float32) for entry in inputs}
         self._memory = {e["output"]: e["name"] for e in inputs if e["kind"] == "memory"}
         self._outputs = [contract["policy"]["output"], *self._memory]
@@ -258,7 +259,6 @@ class Policy:
         """Return (A sin, A cos) of a gait clock, after advancing it; float32, as in training."""
         fade, f32 = entry["fade_s"], np.float32
         clock = self._clocks.setdefault(entry["name"], np.array((entry["start"], 0), f32))
-        # Without a velocity command, it never stands.
         x, y, yaw = values.get(f"command/{entry['velocity_command']}", (np.inf, 0, 0))
         stands = np.hypot(x, y) + abs(yaw) < entry.get("standing_threshold", 0)
         if not self._is_first:
@@ -291,7 +291,7 @@ class Policy:
         if self._limited:
             sent = sent.clip(self.limits["target_low"], self.limits["target_high"])
             if self._sent is not None:
-                step = np.array(self.limits["target_step"])
+                step = self.limits["target_step"]
                 sent = sent.clip(self._sent - step, self._sent + step)
         self._sent, commands = sent, self.commanded(self.default.copy())
         for a in self._actions:
