@@ -25,14 +25,13 @@ from mjlab.cli.policy_flags import env_cfg_of, find_checkpoint, parse_policy_fla
 from mjlab.deploy.evidence import Programs, rotations
 from mjlab.deploy.golden import STATE
 from mjlab.deploy.nominal import nominal_cfg
+from mjlab.deploy.stress import has_fallen
 from mjlab.deploy.usual_terms import is_velocity
 from mjlab.managers import TerminationTermCfg
 from mjlab.rl.exporter_utils import OnnxPolicy
 from mjlab.runs.policy import agent_cfg_of, make_env
 from mjlab.scripts.deploy import DeployConfig, policy_of, run_deploy
 
-LOWEST = 0.5
-"""Height of the root that is a fall, as a share of its initial height."""
 NORMAL = 1.96
 """Half-width of a 95 % interval, in standard errors."""
 
@@ -65,8 +64,7 @@ class Judge:
         """Find the root."""
         joint = int(model.body(contract["robot"]["root_body"]).jntadr[0])
         self.qpos, self.qvel = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        self.lowest = LOWEST * contract["robot"]["initial_height"]
-        self.least_upright = math.cos(contract["limits"]["tilt"])
+        self.contract = contract
 
     def root(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         """Return height, quaternion and linear velocity (world axes) of the root, (..., 8)."""
@@ -76,7 +74,7 @@ class Judge:
     def outcome(self, roots: np.ndarray, command: np.ndarray) -> Outcome:
         """Return the outcome of an episode with these roots (T, 8) and velocity commands (T, 3)."""
         matrices = rotations(roots[:, 1:5])
-        if (matrices[:, 2, 2] < self.least_upright).any() or (roots[:, 0] < self.lowest).any():
+        if has_fallen(self.contract, roots[:, 0], matrices[:, 2, 2]).any():
             return Outcome(False, math.nan)
         measured = np.einsum("tji,tj->ti", matrices, roots[:, 5:])[:, :2]
         return Outcome(True, float(np.linalg.norm(measured - command[:, :2], axis=1).mean()))

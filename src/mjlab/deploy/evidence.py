@@ -7,7 +7,7 @@ package writes, so that an edited program is compared with an unedited one.
 from __future__ import annotations
 
 import copy
-import importlib.util
+import importlib
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -57,40 +57,26 @@ class Programs:
     @classmethod
     def load(cls, folder: Path) -> Programs:
         """Import the programs of `folder`; the originals for those that it lacks."""
-        runtime = _imported(folder, "runtime")
-        earlier = sys.modules.get("runtime")
-        sys.modules["runtime"] = runtime
-        try:
-            return cls(runtime, _imported(folder, "simulate"))
-        finally:
-            del sys.modules["runtime"]
-            if earlier is not None:
-                sys.modules["runtime"] = earlier
+        return cls(*_imported(folder, "runtime", "simulate"))
 
 
-def _imported(folder: Path, name: str) -> ModuleType:
-    folder = folder.resolve()
-    path = folder / f"{name}.py"
-    spec: Any = importlib.util.spec_from_file_location(
-        name, path if path.exists() else FILES / path.name
-    )
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up while they are made.
-    earlier, known = sys.modules.get(name), set(sys.modules)
-    sys.modules[name] = module
-    # Modules of the user beside the program, which another folder may have, too.
-    sys.path.insert(0, str(folder))
+def _imported(folder: Path, *names: str) -> list[ModuleType]:
+    """Import programs of `folder`, with the modules of its user beside them.
+
+    They are forgotten afterwards, because other folders have modules of the same names.
+    """
+    folders = [str(folder.resolve()), str(FILES)]
+    earlier = {name: sys.modules.pop(name) for name in names if name in sys.modules}
+    sys.path[:0] = folders
+    importlib.invalidate_caches()
     try:
-        spec.loader.exec_module(module)
+        return [importlib.import_module(name) for name in names]
     finally:
-        sys.path.remove(str(folder))
-        for other in set(sys.modules) - known:
-            if Path(getattr(sys.modules[other], "__file__", None) or "").parent == folder:
-                del sys.modules[other]
-        sys.modules.pop(name, None)
-        if earlier is not None:
-            sys.modules[name] = earlier
-    return module
+        del sys.path[: len(folders)]
+        for name, module in list(sys.modules.items()):
+            if str(Path(getattr(module, "__file__", None) or "").parent) in folders:
+                del sys.modules[name]
+        sys.modules.update(earlier)
 
 
 class Evidence:
@@ -134,7 +120,8 @@ class Evidence:
         if all(one["kind"] in known or one["function"] in known for one in self.terms.values()):
             return
         try:
-            added = getattr(_imported(self.folder, "runtime"), "TERMS", {})
+            (runtime,) = _imported(self.folder, "runtime")
+            added = getattr(runtime, "TERMS", {})
         except Exception as error:
             raise UserError(
                 f"{self.folder}/runtime.py raises {type(error).__name__}: {error}"

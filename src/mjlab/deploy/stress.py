@@ -173,8 +173,7 @@ def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) ->
         policy.reset(evidence.motion(start), simulation.measure())
     rates, data = contract["rates"], simulation.data
     delay = _delay(setting.latency, rates["physics_dt"])
-    limits, root = contract["limits"], model.body(contract["robot"]["root_body"]).id
-    lowest = _LOWEST * contract["robot"]["initial_height"]
+    root = model.body(contract["robot"]["root_body"]).id
     held, waiting, step = policy.commanded(policy.default.copy()), [], 0
     command: dict[str, np.ndarray] = {}
     for k in range(round(seconds / policy.period)):
@@ -190,10 +189,21 @@ def succeeds(evidence: Evidence, setting: Setting, seed: int, seconds: float) ->
             mujoco.mj_step(model, data)
             step += 1
         mujoco.mj_forward(model, data)
-        upright = data.xmat[root].reshape(3, 3)[2, 2]
-        if upright < math.cos(limits["tilt"]) or data.xpos[root, 2] < lowest:
+        if has_fallen(contract, data.xpos[root, 2], data.xmat[root].reshape(3, 3)[2, 2]):
             return False
     return True
+
+
+def has_fallen(contract: Mapping[str, Any], height: Any, upright: Any) -> Any:
+    """Return True where a robot is too low or too tilted.
+
+    Args:
+        contract: Contract.
+        height: Height of the root (m), a number or an array.
+        upright: Vertical component of the root's z axis.
+    """
+    is_tilted = upright < math.cos(contract["limits"]["tilt"])
+    return is_tilted | (height < _LOWEST * contract["robot"]["initial_height"])
 
 
 def push(
