@@ -104,6 +104,24 @@ def test_same_seed_gives_the_same_weights(variant):
     assert_same_bits(*results)
 
 
+def test_the_average_of_the_policy_slows_down_with_the_learning_rates():
+    runner = make_runner(policy_average=0.5, learning_rate_factor=((0, 1.0), (15, 1.0), (16, 0.0)))
+    runner.learn(2)
+    moving = [p.clone() for p in runner.alg.get_policy().parameters()]
+    runner.learn(4)
+    held = [p.clone() for p in runner.alg.get_policy().parameters()]
+    learned = [p.clone() for p in runner.alg.actor.parameters()]
+    runner.learn(6)
+    now = list(runner.alg.get_policy().parameters())
+    assert not all(torch.equal(*pair) for pair in zip(moving, held, strict=True))
+    # At a factor of 0 neither moves, although they differ.
+    assert all(torch.equal(*pair) for pair in zip(held, now, strict=True))
+    assert all(
+        torch.equal(*pair) for pair in zip(learned, runner.alg.actor.parameters(), strict=True)
+    )
+    assert not all(torch.equal(*pair) for pair in zip(learned, held, strict=True))
+
+
 def test_a_reversed_range_of_alpha_raises():
     with pytest.raises(ValueError, match="alpha_range: expected low <= high"):
         make_runner(alpha_range=(1.0, 0.1))

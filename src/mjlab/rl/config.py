@@ -176,7 +176,9 @@ class RslRlSacAlgorithmCfg:
     (environment step, weight), interpolated linearly."""
     policy_average: Annotated[float, Range(0.0, 1.0, "(]")] = 1.0
     """Averaging coefficient per environment step, from the learned weights to those of the acting
-    policy; 1: no averaging. An averaged policy falls less often than the newest one."""
+    policy, times `learning_rate_factor` where that is below 1; 1: no averaging. An averaged policy
+    falls less often than the newest one: with 0.02 throughout, 3 and 20 % of a G1's episodes ended in
+    a fall ten iterations apart."""
     noise_hold: Count = 1
     """Maximum number of steps an environment keeps its exploration noise; 1: resample every step."""
     symmetry_cfg: dict[str, Any] | None = None

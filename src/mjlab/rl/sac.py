@@ -202,10 +202,13 @@ class SAC:
             if self._reward_scale is not None:
                 self._reward_scale.update(rewards, dones, together=self._multi_gpu is not None)
             # Average the parameters of the acting policy; copy its observation statistics.
+            newest = self.cfg.policy_average
+            if newest < 1.0:  # An average over as many changes, however small they become.
+                newest *= min(self._rate_factor.at(self._num_steps), 1.0)
             for own, learned in zip(
                 self._policy.parameters(), self.actor.parameters(), strict=True
             ):
-                own.lerp_(learned, self.cfg.policy_average)
+                own.lerp_(learned, newest)
             for own, learned in zip(self._policy.buffers(), self.actor.buffers(), strict=True):
                 own.copy_(learned)
         self._num_steps += 1
