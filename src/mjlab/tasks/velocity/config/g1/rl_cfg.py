@@ -75,10 +75,11 @@ pushes, and tracking errors are small."""
 cpu_long = cpu_with_stepping(
     _G1,
     ease=_simplify_contacts,
-    trigger_below={"lin_vel_error": 0.34, "ang_vel_error": 0.42},
+    # Exploring, and with harder pushes, the error is a fifth above that of evaluations.
+    trigger_below={"lin_vel_error": 0.36, "ang_vel_error": 0.42},
     solved_below={"lin_vel_error": 0.3, "ang_vel_error": 0.3, "failure_rate": 0.05},
     num_episodes=100,
-    first_iteration=160,
-    min_interval=20,
+    first_iteration=110,
+    min_interval=15,
 )
 """The `cpu-long` profile of the flat tasks: `cpu`, until one episode of twenty falls."""
