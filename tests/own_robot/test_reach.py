@@ -27,9 +27,11 @@ def test_home_is_bent_and_free_of_contact(report):
     geo.set_pose(model, data, report.joint_pos.value)
     mujoco.mj_collision(model, data)
     assert data.ncon == 0
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, jacobian, None, model.body(hand.link).id)
+    jacobian = np.zeros((6, model.nv))
+    mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], model.body(hand.link).id)
     dofs = [model.jnt_dofadr[model.joint(j).id] for j in hand.joints]
+    assert np.linalg.svd(jacobian[:3, dofs], compute_uv=False)[-1] > 0.05
+    # No two axes of the wrist are parallel: the hand can turn about all axes.
     assert np.linalg.svd(jacobian[:, dofs], compute_uv=False)[-1] > 0.05
 
 

@@ -15,6 +15,8 @@ HANGING = 0.1
 """Depth of a geom below the base at `qpos0` from which on an arm hangs (m)."""
 STAND_CLEARANCE = 0.1
 """Distance of a hanging arm to the ground (m)."""
+TURN_LENGTH = 0.15
+"""Displacement of the hand that counts as a turn of 1 rad (m/rad): the goals' tolerances, 5 cm and 0.35 rad."""
 HOME_DRAWS = 400
 """Number of poses among which an arm's home is searched."""
 
@@ -65,8 +67,9 @@ def _searched_home(
 ) -> dict[str, float]:
     """Return the pose closest to the middle of the ranges among those that are dexterous.
 
-    Dexterity is the smallest singular value of the Jacobian of the hand's position: 0 for a stretched
-    arm. At least 70 % of the largest of all draws is asked for; then joints return to the middle one by one.
+    Dexterity is the smallest singular value of the hand's Jacobian, of rotations times `TURN_LENGTH`: 0 for a
+    stretched arm, and for a wrist with two parallel axes. At least 70 % of the largest of all draws is asked
+    for; then joints return to the middle one by one.
     """
     rng, data = np.random.default_rng(0), mujoco.MjData(model)
     hangs = stand_height(model, anatomy) > 0.0
@@ -82,7 +85,7 @@ def _searched_home(
         return middle
     hand, mirror = anatomy.hands.value[0], anatomy.mirror.value
     dofs = [int(model.jnt_dofadr[model.joint(name).id]) for name in hand.joints]
-    link, jacobian = model.body(hand.link).id, np.zeros((3, model.nv))
+    link, jacobian = model.body(hand.link).id, np.zeros((6, model.nv))
     geoms = [model.geom(name).id for name in anatomy.colliding.value]
     # Poses of an arm on the ground stay above it.
     floor = -np.inf if hangs else -0.01
@@ -95,7 +98,8 @@ def _searched_home(
         if not is_free(data):
             return pose, 0.0, False
         point = data.xpos[link] + data.xmat[link].reshape(3, 3) @ np.array(hand.position)
-        mujoco.mj_jac(model, data, jacobian, None, point, link)
+        mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], point, link)
+        jacobian[3:] *= TURN_LENGTH
         dexterity = float(np.linalg.svd(jacobian[:, dofs], compute_uv=False)[-1])
         return pose, dexterity, geo.lowest_height(model, data, geoms) > floor
 
