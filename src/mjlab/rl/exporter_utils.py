@@ -33,6 +33,7 @@ Commands generated on the robot, such as the gait clock, export their parameters
 | clock_starts | initial phases c (strides) of the clock; empty: any |
 | pose_command | command name of the pose command: position, quaternion (w, x, y, z), root frame |
 | pose_frame | type and name of the frame that the command moves |
+| pose_reference_quat | of the two signs of the command's quaternion, the one closer to this |
 
 The policy observes (A sin(2 pi c), A cos(2 pi c)).
 """

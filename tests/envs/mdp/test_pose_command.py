@@ -19,6 +19,7 @@ from mjlab.utils.lab_api.math import (
     quat_apply,
     quat_box_plus,
     quat_error_magnitude,
+    quat_from_euler_xyz,
     quat_inv,
     quat_mul,
     random_orientation,
@@ -53,6 +54,31 @@ ARM_XML = """
   </worldbody>
 </mujoco>
 """
+# Three parallel hinges: the elbow can bend both ways to the same pose.
+FLIPPING_XML = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="base" pos="0 0 .5">
+      <geom size=".02" contype="0" conaffinity="0"/>
+      <body name="upper">
+        <joint name="shoulder" axis="0 1 0" range="-6.28 6.28"/>
+        <geom type="capsule" size=".02" fromto="0 0 0 0 0 .3" contype="0" conaffinity="0"/>
+        <body name="fore" pos="0 0 .3">
+          <joint name="elbow" axis="0 1 0" range="-3.1 3.1"/>
+          <geom type="capsule" size=".02" fromto="0 0 0 0 0 .3" contype="0" conaffinity="0"/>
+          <body name="hand" pos="0 0 .3">
+            <joint name="wrist" axis="0 1 0" range="-6.28 6.28"/>
+            <geom size=".03" contype="0" conaffinity="0"/>
+            <site name="grasp" pos="0 0 .1"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+HOME = {"shoulder": 0.6, "elbow": 1.2, "wrist": math.pi - 1.8}
 RANGES = UniformPoseCommandCfg.Ranges(
     pos_x=(0.1, 0.2), pos_y=(-0.3, 0.3), pos_z=(0.4, 0.4), yaw=(-math.pi, math.pi)
 )
@@ -142,16 +168,41 @@ def test_goals_are_reached_at_their_joint_positions(make_world: Any) -> None:
         mdp.goal_joint_deviation_l1(arm, "hand")
 
 
-def test_joints_that_can_turn_go_the_shorter_way() -> None:
+def test_hinges_turn_by_a_quarter_from_home() -> None:
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><compiler angle="radian"/><worldbody><body>
         <joint range="-6.3 6.3"/><joint axis="0 1 0"/><joint axis="1 0 0" range="-1 1"/>
-        <geom size="0.1"/></body></worldbody></mujoco>"""
+        <joint type="slide" range="-5 5"/><geom size="0.1"/></body></worldbody></mujoco>"""
     )
-    low, high, turns = joint_bounds(model, np.arange(3), 0.8, np.array([3.0, 1.0, 0.0]))
-    np.testing.assert_allclose(low, [3.0 - math.pi, 1.0 - math.pi, -0.8])
-    np.testing.assert_allclose(high, [5.04, 1.0 + math.pi, 0.8])
-    assert turns.tolist() == [True, True, False]
+    quarter = 0.5 * math.pi
+    low, high = joint_bounds(model, np.arange(4), 0.8, np.array([4.0, 1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(low, [4.0 - quarter, 1.0 - quarter, -0.8, -4.0])
+    np.testing.assert_allclose(high, [5.04, 1.0 + quarter, 0.8, 4.0])
+
+
+def test_joint_positions_at_goals_follow_from_home(make_world: Any) -> None:
+    """Goals that differ little have joint positions that differ little, though an elbow could flip."""
+    robot = make_world(FLIPPING_XML, init_state=EntityCfg.InitialStateCfg(joint_pos=HOME))
+    term = make_term(robot, num_goals=200)
+    home = torch.tensor([HOME[name] for name in ("shoulder", "elbow", "wrist")])
+    model, data = robot.sim.mj_model, mujoco.MjData(robot.sim.mj_model)
+    for goal, joint_pos in zip(term.goals, term.goals_joint_pos, strict=True):
+        data.qpos[:] = joint_pos.numpy()
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(data.site("grasp").xpos, goal[:3], atol=0.02)
+    # Bent one way, as at home: of the positions drawn, a seventh are bent the other way.
+    is_bent = (term.goals_joint_pos[:, 1] > 0.0).float().mean()
+    assert is_bent > 0.95
+    assert (term.goals_joint_pos - home).abs().max() < 2.0
+
+
+def test_quaternions_of_goals_are_near_that_of_home(make_world: Any) -> None:
+    term = make_term(make_world(FLIPPING_XML, init_state=EntityCfg.InitialStateCfg(joint_pos=HOME)))
+    # At home the hand points down: w = 0.
+    reference = quat_from_euler_xyz(*torch.tensor([0.0, math.pi, 0.0]))
+    dots = term.goals[:, 3:] @ reference
+    assert (dots >= -1e-3).all() or (dots <= 1e-3).all()
+    assert term.goals[:, 3].min() < -0.1 < 0.1 < term.goals[:, 3].max()
 
 
 def candidates(goal: np.ndarray, site_quat: np.ndarray) -> list[np.ndarray]:
@@ -309,4 +360,5 @@ def test_the_exported_frame(make_world: Any) -> None:
     assert term.export_metadata("hand") == {
         "pose_command": "hand",
         "pose_frame": "site robot/grasp",
+        "pose_reference_quat": [1.0, 0.0, 0.0, 0.0],
     }

@@ -11,7 +11,7 @@ import torch
 from mjlab.compat import suggests_fields
 from mjlab.envs.mdp.frames import Frame, FrameType
 from mjlab.envs.mdp.pose_panel import PosePanel
-from mjlab.envs.mdp.reachable_poses import draw_reachable_poses
+from mjlab.envs.mdp.reachable_poses import draw_reachable_poses, quat_near
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.utils.errors import WrongTypeError, check_count, check_in_range
 from mjlab.utils.lab_api.math import (
@@ -20,10 +20,8 @@ from mjlab.utils.lab_api.math import (
     matrix_from_quat,
     quat_error_magnitude,
     quat_from_euler_xyz,
-    quat_unique,
     sample_ranges,
     subtract_frame_transforms,
-    wrap_to_pi,
 )
 
 if TYPE_CHECKING:
@@ -87,7 +85,8 @@ class UniformPoseCommandCfg(CommandTermCfg):
     positions drawn at random, without contact."""
 
     joint_range_fraction: float = 0.8
-    """Middle part of the joint ranges from which goals are drawn if `ranges` is None, in (0, 1]."""
+    """Middle part of the joint ranges from which goals are drawn if `ranges` is None, in (0, 1]. Hinges are at most
+    a quarter turn from their default positions."""
 
     num_goals: int = 2048
     """Number of goals drawn if `ranges` is None, once, when the term is built."""
@@ -104,7 +103,10 @@ class UniformPoseCommandCfg(CommandTermCfg):
 
 
 class UniformPoseCommand(CommandTerm):
-    """Goal pose of a frame in the root frame of its entity, (N, 7): position, quaternion with w >= 0.
+    """Goal pose of a frame in the root frame of its entity, (N, 7): position, quaternion.
+
+    Of the two signs of a quaternion, the one closer to the frame's default orientation; with `ranges`,
+    w >= 0.
 
     Metrics at the end of the last step: `position_error` (m) and `orientation_error` (rad). Means over
     the goals of the episode, each counted at its end, 0 before the first: `end_position_error` (m),
@@ -116,11 +118,11 @@ class UniformPoseCommand(CommandTerm):
         pose_command_b: (N, 7) goal in the root frame.
         frame: The commanded frame.
         goals: (number of goals, 7) reachable poses in the root frame; None with `ranges`.
-        goals_joint_pos: (number of goals, joints) joint positions at which they were found (rad or m).
+        goals_joint_pos: (number of goals, joints) joint positions at these poses (rad or m).
         joint_ids: (joints,) columns of these joints in the entity's joint data.
-        turns: (joints,) True for joints that can turn by 2 pi or more.
-        goal_joint_pos: (N, joints) joint positions at which the goal was found (rad or m), zeros with
-            `ranges`. The same pose may be reached at others.
+        goal_joint_pos: (N, joints) joint positions at the goal (rad or m), zeros with `ranges`. The same pose
+            may be reached at others.
+        goals_torque, goal_torque: Torques that hold the joints there against gravity (N m or N).
         goal_age: (N,) time since the goal was sampled (s).
         num_ended: (N,) number of goals of the episode that ended, without the current one.
     """
@@ -135,8 +137,9 @@ class UniformPoseCommand(CommandTerm):
         self._entity: Entity = env.scene[cfg.entity_name]
         self.frame = Frame(env.sim, self._entity, cfg.entity_name, cfg.frame_type, cfg.frame_name)
         self._panel: PosePanel | None = None
+        self._reference_quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=self.device)
         self.goals: torch.Tensor | None = None
-        self.goals_joint_pos = torch.empty(0, 0, device=self.device)
+        self.goals_joint_pos = self.goals_torque = torch.empty(0, 0, device=self.device)
         if cfg.ranges is None:
             check_in_range(
                 "UniformPoseCommandCfg.joint_range_fraction", cfg.joint_range_fraction, 0, 1
@@ -145,7 +148,8 @@ class UniformPoseCommand(CommandTerm):
             found = draw_reachable_poses(
                 env, self._entity, self.frame, cfg.num_goals, cfg.joint_range_fraction
             )
-            self.goals, self.goals_joint_pos, self.joint_ids, self.turns = found
+            self.goals, self.goals_joint_pos, self.joint_ids = found[:3]
+            self.goals_torque, self._reference_quat = found[3:]
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(*shape, self.num_envs, dtype=torch.float32, device=self.device)
@@ -153,6 +157,7 @@ class UniformPoseCommand(CommandTerm):
         self.pose_command_b = zeros(7).T.contiguous()
         self.pose_command_b[:, 3] = 1.0
         self.goal_joint_pos = zeros(self.goals_joint_pos.shape[1]).T.contiguous()
+        self.goal_torque = torch.zeros_like(self.goal_joint_pos)
         self.goal_age, self.num_ended = zeros(), zeros()
         self._end_sums = zeros(3)
         self.metrics = {
@@ -181,11 +186,12 @@ class UniformPoseCommand(CommandTerm):
         )
 
     def export_metadata(self, name: str) -> dict[str, list | str | float]:
-        """Return the commanded frame under the keys of `mjlab.rl.exporter_utils`."""
+        """Return the commanded frame and the sign of quaternions under the keys of `mjlab.rl.exporter_utils`."""
         cfg = self.cfg
         return {
             "pose_command": name,
             "pose_frame": f"{cfg.frame_type} {cfg.entity_name}/{cfg.frame_name}",
+            "pose_reference_quat": self._reference_quat.tolist(),
         }
 
     def errors(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -235,6 +241,7 @@ class UniformPoseCommand(CommandTerm):
             picks = torch.randint(len(self.goals), (len(env_ids),), device=self.device)
             self.pose_command_b[env_ids] = self.goals[picks]
             self.goal_joint_pos[env_ids] = self.goals_joint_pos[picks]
+            self.goal_torque[env_ids] = self.goals_torque[picks]
 
     def _follow(self, panel: PosePanel) -> None:
         """Move a goal that the user holds to the panel's handle, else the handle to the goal."""
@@ -248,7 +255,7 @@ class UniformPoseCommand(CommandTerm):
         position, quat = subtract_frame_transforms(
             root.root_link_pos_w[index], root.root_link_quat_w[index], pose[:3], pose[3:]
         )
-        self.pose_command_b[index] = torch.cat((position, quat_unique(quat)))
+        self.pose_command_b[index] = torch.cat((position, quat_near(quat, self._reference_quat)))
         # Do not resample the goal.
         self.time_left[index] = self.cfg.resampling_time_range[1]
 
@@ -259,7 +266,7 @@ class UniformPoseCommand(CommandTerm):
         bounds = (r.pos_x, r.pos_y, r.pos_z, r.roll, r.pitch, r.yaw)
         drawn = sample_ranges(bounds, count, self.device)
         quat = quat_from_euler_xyz(drawn[:, 3], drawn[:, 4], drawn[:, 5])
-        return torch.cat((drawn[:, :3], quat_unique(quat)), dim=1)
+        return torch.cat((drawn[:, :3], quat_near(quat, self._reference_quat)), dim=1)
 
     def _is_counted(self) -> torch.Tensor:
         return self.goal_age >= _COUNTED_PART * self.cfg.resampling_time_range[0]
@@ -338,22 +345,26 @@ def orientation_command_error_tanh(
 def goal_joint_deviation_l1(env: ManagerBasedRlEnv, command_name: str) -> torch.Tensor:
     """Sum of the distances of joints from their positions at the goal (rad or m).
 
-    For joints that can turn by 2 pi or more, the shorter way. Leads around joint limits and out of postures
-    from which the goal is out of reach.
+    Leads around joint limits and out of postures from which the goal is out of reach.
 
     Raises:
         TypeError: the command is not a `UniformPoseCommand`.
         ValueError: it has `ranges`, so the joint positions at its goals are unknown.
     """
+    command = reachable_pose_command(env, command_name)
+    joint_pos = env.scene[command.cfg.entity_name].data.joint_pos[:, command.joint_ids]
+    return (joint_pos - command.goal_joint_pos).abs().sum(dim=1)
+
+
+def reachable_pose_command(env: ManagerBasedRlEnv, command_name: str) -> UniformPoseCommand:
+    """Return a pose command whose joint positions at goals are known."""
     command = pose_command(env, command_name)
     if command.goals is None:
         raise ValueError(
-            f"goal_joint_deviation_l1 command_name: expected a command without ranges, got "
-            f"{command_name!r}; remove the reward, or the ranges."
+            f"Command {command_name!r}: expected one without ranges, whose joint positions at goals are known; "
+            "remove the term, or the ranges."
         )
-    joint_pos = env.scene[command.cfg.entity_name].data.joint_pos[:, command.joint_ids]
-    deviation = joint_pos - command.goal_joint_pos
-    return torch.where(command.turns, wrap_to_pi(deviation), deviation).abs().sum(dim=1)
+    return command
 
 
 def pose_command(env: ManagerBasedRlEnv, command_name: str) -> UniformPoseCommand:
