@@ -110,7 +110,7 @@ _EVENTS: dict[str, EventTermCfg] = {
 }
 
 # The wide rewards lead to the goal, the narrow ones to within centimeters and a tenth of a radian. Without
-# that of the joints, policies stop at joint limits: 82 instead of 88 % of the YAM's goals.
+# that of the joints, policies stop at joint limits: 82 instead of 88 % of the YAM's goals, with PPO.
 _REWARDS: dict[str, RewardTermCfg] = {
     "position": RewardTermCfg(
         func=mdp.position_command_error, weight=-4.0, params={"command_name": _COMMAND}
