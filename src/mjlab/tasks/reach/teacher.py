@@ -20,7 +20,8 @@ class goal_joint_action:
     """Action whose joint targets q* + t / k hold the hand at its goal, (N, A).
 
     With the joint positions q* at the goal, the torques t that hold them against gravity, and the stiffness
-    k: without t / k, the Panda's hand sags by 4 cm. Joints without a position servo have target q*.
+    k. At the YAM's shoulder and elbow, t / k is 0.12 rad in the mean over its goals; without, 2 of 16 goals are
+    reached. Joints without a position servo have target q*.
 
     Params:
         command_name: Pose command with goals that can be reached.
