@@ -145,9 +145,11 @@ for _robots, _reference, _whole, _distance in (
             lookat=(0.0, 0.0, 0.5 * _whole * _height), distance=_distance * _height, azimuth=125.0,
         )  # fmt: skip
 
-CLIPS["own_ur5e"] = Clip(
-    "Reach-Ur5e", lookat=(0.1, 0.0, 0.5), distance=3.0, azimuth=140.0, seconds=4.0, speed=2.0
-)
+for _title, _height, _distance in (("Ur5e", 0.5, 3.0), ("Openarm", 0.4, 2.2)):
+    CLIPS[f"own_{_title.lower()}"] = Clip(
+        f"Reach-{_title}", lookat=(0.1, 0.0, _height), distance=_distance, azimuth=140.0, seconds=4.0,
+        speed=2.0,
+    )  # fmt: skip
 
 
 @dataclass
