@@ -412,7 +412,7 @@ PLANTS = (
     Plant("no joint damping", "odd", model("dof_damping", lambda x: 0.0 * x), "other joint damping"),
     Plant("no joint friction", "odd", model("dof_frictionloss", lambda x: 0.0 * x), "other joint friction"),
     Plant("no effort limit", "odd", joints("effort", lambda limits: [None] * len(limits)), "other effort limit"),
-    Plant("no effort limit, never reached", "g1", joints("effort", lambda limits: [None] * len(limits)), UNDECIDABLE),
+    Plant("no effort limit of a wrist, never reached", "g1", joints("effort", lambda limits: [*limits[:-1], None]), UNDECIDABLE),
     Plant("gains of the scene, with a gear", "geared", model("actuator_gainprm", lambda x: 0.8 * x), "other gains"),
 )  # fmt: skip
 """Numbered list of mistakes of deployments, as users reported them."""
