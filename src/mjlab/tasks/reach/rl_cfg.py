@@ -1,6 +1,6 @@
 """PPO settings, evaluation and `cpu` profile, with SAC, of the reach tasks.
 
-A task is solved if 92 % of the goals are reached: within 5 cm and 0.35 rad at the end of the time for
+A task is solved if 91 % of the goals are reached: within 5 cm and 0.35 rad at the end of the time for
 the goal.
 """
 
@@ -142,9 +142,9 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOffPolicyRunnerCfg) -> Non
     # 384 goals. An evaluation takes as long as five iterations.
     evaluation = rl_cfg.evaluation
     evaluation.num_episodes = 128
-    evaluation.first_iteration, evaluation.min_interval = _FIRST_EVALUATION, 20
+    evaluation.first_iteration, evaluation.min_interval = _FIRST_EVALUATION, 15
     # Of new goals a little less is reached: a UR5e that stopped at 90.6 % reached 88.8 % (87.0 to 90.7).
-    evaluation.solved_above = {"goals_reached": 0.92}
+    evaluation.solved_above = {"goals_reached": 0.91}
 
 
 cpu = Profile(_set_policy, _ease)
