@@ -113,6 +113,19 @@ def within(values: torch.Tensor, bounds: tuple[float, float]) -> torch.Tensor:
     return (values >= bounds[0]) & (values < bounds[1])
 
 
+def open_policy(
+    task: str, path: Path, profile: str | None, cfg: ManagerBasedRlEnvCfg
+) -> tuple[Any, Any]:
+    """Return the environments of `cfg`, with the curricula of a checkpoint, and the policy in `path`."""
+    checkpoint = Checkpoint(path)
+    env = make_env(task, cfg, "cpu", agent=agent_cfg_of(task, checkpoint, profile))
+    policy = load_policy(task, env, checkpoint, "cpu", profile)
+    # Exported policies have no curricula.
+    if path.suffix != ".onnx" and (curricula := curricula_of(checkpoint.content)) is not None:
+        load_curricula(env, curricula)
+    return env, policy
+
+
 def measure(task: str, path: Path, profile: str | None, num_falls: int, minutes: float) -> Falls:
     """Play episodes of `task` until `num_falls` falls, at most `minutes` of simulated time.
 
@@ -121,13 +134,8 @@ def measure(task: str, path: Path, profile: str | None, num_falls: int, minutes:
     cfg = load_env_cfg(task, profile=profile, evaluate=True)
     cfg.scene.num_envs, cfg.seed = NUM_ENVS, SEED
     push_age = time_pushes(cfg)
-    checkpoint = Checkpoint(path)
-    wrapped = make_env(task, cfg, "cpu", agent=agent_cfg_of(task, checkpoint, profile))
-    policy = load_policy(task, wrapped, checkpoint, "cpu", profile)
+    wrapped, policy = open_policy(task, path, profile, cfg)
     env = wrapped.unwrapped
-    curricula = curricula_of(checkpoint.content)
-    if curricula is not None:
-        load_curricula(wrapped, curricula)
     terrain = env.scene.terrain
     if terrain is not None and terrain.terrain_levels is not None:
         terrain.spread_levels()

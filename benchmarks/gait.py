@@ -11,12 +11,11 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "src")]
+sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
 
-from mjlab.rl.checkpoint import curricula_of  # noqa: E402
-from mjlab.rl.evaluation import EvaluationResult, evaluate_policy, load_curricula  # noqa: E402
-from mjlab.runs import Checkpoint, load_policy, make_env  # noqa: E402
-from mjlab.runs.policy import agent_cfg_of  # noqa: E402
+from falls import open_policy  # noqa: E402
+
+from mjlab.rl.evaluation import EvaluationResult, evaluate_policy  # noqa: E402
 from mjlab.tasks.registry import load_env_cfg  # noqa: E402
 from mjlab.tasks.velocity.gait_metrics import GAIT_METRICS  # noqa: E402
 from mjlab.tasks.velocity.rl.ppo import TRACKING_ERRORS  # noqa: E402
@@ -30,11 +29,7 @@ def measure(task: str, path: Path, profile: str | None, episodes: int) -> Evalua
     """Return the result of a policy over `episodes` episodes."""
     cfg = load_env_cfg(task, profile=profile, evaluate=True)
     cfg.scene.num_envs, cfg.seed = episodes, SEED
-    checkpoint = Checkpoint(path)
-    env = make_env(task, cfg, "cpu", agent=agent_cfg_of(task, checkpoint, profile))
-    policy = load_policy(task, env, checkpoint, "cpu", profile)
-    if path.suffix != ".onnx" and (curricula := curricula_of(checkpoint.content)) is not None:
-        load_curricula(env, curricula)
+    env, policy = open_policy(task, path, profile, cfg)
     result = evaluate_policy(env, policy, metrics=METRICS, seed=SEED)
     env.close()
     return result
