@@ -18,7 +18,6 @@ import numpy as np
 from mjlab.actuator import IdealPdActuator
 from mjlab.actuator.actuator import DirectActuator
 from mjlab.deploy.commands import command_entry
-from mjlab.deploy.measurable import why_unmeasured
 from mjlab.deploy.measurements import (
     Measurement,
     Subject,
@@ -31,7 +30,7 @@ from mjlab.deploy.measurements import (
     shape_of,
 )
 from mjlab.deploy.nominal import Nominal, robot_of
-from mjlab.deploy.terms import Term, describe
+from mjlab.deploy.terms import Term, describe, unmeasured
 from mjlab.envs.mdp.actions import (
     BinaryJointPositionAction,
     JointEffortAction,
@@ -241,20 +240,10 @@ class Contract:
         return root if root in quats else next(iter(quats), None)
 
     def _unmeasured(self) -> list[dict[str, str]]:
-        entries = []
-        for name, groups in self.groups.items():
-            for group in groups:
-                for term in self.subject.env.observation_manager.active_terms[group]:
-                    entries += self._unmeasured_by(group, term, self.terms[name, term])
-        return entries
-
-    def _unmeasured_by(self, group: str, term: str, found: Term) -> list[dict[str, str]]:
-        cfg = self.subject.env.observation_manager.get_term_cfg(group, term)
-        why = why_unmeasured(cfg, self.subject.model)
         return [
-            {"term": term, "measurement": one.name, "why": why or one.why}
-            for one in found.inputs
-            if isinstance(one, Measurement) and one.availability not in ("measured", "computed")
+            {"term": name, "measurement": one.name, "why": one.why}
+            for (_, name), term in self.terms.items()
+            for one in unmeasured(term)
         ]
 
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import torch
 
+from mjlab.deploy import availability
+from mjlab.deploy.availability import Availability, Reason
 from mjlab.utils.lab_api.math import subtract_frame_transforms
 from mjlab.utils.random import preserved_rng
 from mjlab.utils.state import changes_undone, is_stateful
@@ -24,14 +26,6 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.envs.mdp.frames import Frame
     from mjlab.managers import ObservationTermCfg
-
-Availability = Literal["measured", "computed", "estimated", "external", "none"]
-"""Origin on a robot: encoders and IMU; kinematics from these; a state estimator; perception, such as
-cameras; none."""
-
-_ESTIMATED = "robots do not measure it; it needs a state estimator"
-_EXTERNAL = "it needs perception, such as a camera or motion capture"
-_ROOTED = "kinematics of the joint positions"
 
 
 @dataclass(frozen=True)
@@ -90,6 +84,12 @@ class Subject:
         return self.env.scene[self.robot]
 
     @property
+    def is_fixed(self) -> bool:
+        """True if the base of the robot does not move."""
+        entity = self.env.scene.entities.get(self.robot)
+        return entity is not None and entity.is_fixed_base
+
+    @property
     def model(self) -> mujoco.MjModel:
         """Compiled model of the scene."""
         return self.env.sim.mj_model
@@ -126,8 +126,7 @@ def _of_joints(subject: Subject, entity_name: str, kind: str, per: str) -> Measu
         (entity.num_joints,),
         joint_unit(entity) + per,
         "",
-        "measured" if is_robot else "external",
-        "encoders" if is_robot else _EXTERNAL,
+        *(availability.ENCODERS if is_robot else availability.OBJECT),
         {"kind": kind, "joints": scene_joints(subject, entity)},
         lambda env: getattr(env.scene[entity_name].data, kind),
     )
@@ -148,7 +147,7 @@ def root_quat(subject: Subject, entity_name: str) -> Measurement:
         (4,),
         "",
         "world",
-        *_of_root_orientation(subject, entity_name),
+        *_of_root(subject, entity_name, availability.IMU),
         {"kind": "body_quat", "body": _root(subject, entity_name)},
         lambda env: env.scene[entity_name].data.root_link_quat_w,
     )
@@ -156,15 +155,12 @@ def root_quat(subject: Subject, entity_name: str) -> Measurement:
 
 def root_pos(subject: Subject, entity_name: str) -> Measurement:
     """Position of the root."""
-    fixed = entity_name == subject.robot and subject.entity.is_fixed_base
-    why = _ESTIMATED if entity_name == subject.robot else _EXTERNAL
     return Measurement(
         subject.name(entity_name, "root_pos"),
         (3,),
         "m",
         "world",
-        "computed" if fixed else "estimated" if entity_name == subject.robot else "external",
-        "fixed base" if fixed else why,
+        *_of_root(subject, entity_name, availability.POSITION),
         {"kind": "body_pos", "body": _root(subject, entity_name)},
         lambda env: env.scene[entity_name].data.root_link_pos_w,
     )
@@ -177,8 +173,7 @@ def root_lin_vel_b(subject: Subject, entity_name: str) -> Measurement:
         (3,),
         "m/s",
         "root",
-        "estimated" if entity_name == subject.robot else "external",
-        _ESTIMATED if entity_name == subject.robot else _EXTERNAL,
+        *_of_root(subject, entity_name, availability.VELOCITY),
         {"kind": "body_lin_vel_b", "body": _root(subject, entity_name)},
         lambda env: env.scene[entity_name].data.root_link_lin_vel_b,
     )
@@ -186,14 +181,12 @@ def root_lin_vel_b(subject: Subject, entity_name: str) -> Measurement:
 
 def root_ang_vel_b(subject: Subject, entity_name: str) -> Measurement:
     """Angular velocity of the root, in the root frame."""
-    is_robot = entity_name == subject.robot
     return Measurement(
         subject.name(entity_name, "root_ang_vel_b"),
         (3,),
         "rad/s",
         "root",
-        "measured" if is_robot else "external",
-        "gyroscope, turned to the axes of the root" if is_robot else _EXTERNAL,
+        *_of_root(subject, entity_name, availability.GYROSCOPE),
         {"kind": "body_ang_vel_b", "body": _root(subject, entity_name)},
         lambda env: env.scene[entity_name].data.root_link_ang_vel_b,
     )
@@ -209,8 +202,7 @@ def body_quat(subject: Subject, entity_name: str, body: str) -> Measurement:
         (4,),
         "",
         "world",
-        "computed",
-        f"an IMU on the body, or that of the root and the {_ROOTED} between",
+        *_of_orientation(subject, entity_name),
         {"kind": "body_quat", "body": _full(subject, entity_name, body)},
         lambda env: env.scene[entity_name].data.body_link_quat_w[:, index],
     )
@@ -227,7 +219,7 @@ def body_pos(subject: Subject, entity_name: str, body: str) -> Measurement:
         (3,),
         "m",
         "world",
-        *_of_position(subject, entity_name),
+        *_of_pose(subject, entity_name, availability.POSITION),
         {"kind": "body_pos", "body": _full(subject, entity_name, body)},
         lambda env: env.scene[entity_name].data.body_link_pos_w[:, index],
     )
@@ -244,7 +236,7 @@ def site_pos(subject: Subject, entity_name: str, site: str) -> Measurement:
         (3,),
         "m",
         "world",
-        *_of_position(subject, entity_name),
+        *_of_pose(subject, entity_name, availability.POSITION),
         {"kind": "site_pos", "site": _full(subject, entity_name, site)},
         lambda env: env.scene[entity_name].data.site_pos_w[:, index],
     )
@@ -258,8 +250,7 @@ def site_quat(subject: Subject, entity_name: str, site: str) -> Measurement:
         (4,),
         "",
         "world",
-        "computed",
-        _ROOTED,
+        *_of_orientation(subject, entity_name),
         {"kind": "site_quat", "site": _full(subject, entity_name, site)},
         lambda env: env.scene[entity_name].data.site_quat_w[:, index],
     )
@@ -273,7 +264,7 @@ def site_lin_vel_w(subject: Subject, entity_name: str, site: str) -> Measurement
         (3,),
         "m/s",
         "world",
-        *_of_position(subject, entity_name),
+        *_of_pose(subject, entity_name, availability.VELOCITY),
         {"kind": "site_lin_vel_w", "site": _full(subject, entity_name, site)},
         lambda env: env.scene[entity_name].data.site_lin_vel_w[:, index],
     )
@@ -299,8 +290,7 @@ def frame_pose_b(
             (3,),
             "m",
             "root",
-            "computed",
-            _ROOTED,
+            *_of_orientation(subject, entity_name),
             {"kind": "frame_pos_b", **source},
             lambda env: pose(env)[0],
         ),
@@ -309,8 +299,7 @@ def frame_pose_b(
             (4,),
             "",
             "root",
-            "computed",
-            _ROOTED,
+            *_of_orientation(subject, entity_name),
             {"kind": "frame_quat_b", **source},
             lambda env: pose(env)[1],
         ),
@@ -332,25 +321,6 @@ _UNITS = {
     "jointpos": "rad or m",
     "jointvel": "rad/s or m/s",
     "touch": "N",
-}
-_MEASURED = {
-    "gyro": "gyroscope",
-    "accelerometer": "accelerometer",
-    "framequat": "IMU",
-    "framexaxis": "orientation of the IMU",
-    "frameyaxis": "orientation of the IMU",
-    "framezaxis": "orientation of the IMU",
-    "frameangvel": "gyroscope, turned to these axes",
-    "magnetometer": "magnetometer",
-    "force": "force sensor",
-    "torque": "torque sensor",
-    "touch": "touch sensor",
-    "jointpos": "encoders",
-    "jointvel": "encoders",
-    "actuatorpos": "encoders",
-    "actuatorvel": "encoders",
-    "jointactuatorfrc": "motor currents",
-    "actuatorfrc": "motor currents",
 }
 
 
@@ -378,18 +348,15 @@ def sensor(subject: Subject, sensor_name: str) -> Measurement:
         frame = f"{word} {getattr(model, word)(reference).name}"
     entity, _, short = sensor_name.rpartition("/")
     bodies = (body, _body_of(model, reftype, reference))
-    owners = {one.rpartition("/")[0] for one in bodies if "/" in one} or {entity}
-    reason = _MEASURED.get(kind)
-    availability, why = ("measured", reason) if reason else ("estimated", f"{kind}: {_ESTIMATED}")
-    if owners - {"", subject.robot}:
-        availability, why = "external", _EXTERNAL
+    owners = [one.rpartition("/")[0] for one in bodies if "/" in one]
+    is_own = {*(owners or [entity])} <= {"", subject.robot}
+    is_relative = owners == [subject.robot] * 2 or subject.is_fixed
     return Measurement(
         subject.name(entity or subject.robot, short),
         (int(element.dim[0]),),
         _UNITS.get(kind, ""),
         frame,
-        availability,
-        why,
+        *availability.of_sensor(kind, is_own, is_relative),
         source,
         lambda env: env.scene[sensor_name].data,
     )
@@ -398,19 +365,21 @@ def sensor(subject: Subject, sensor_name: str) -> Measurement:
 def _body_of(model: mujoco.MjModel, objtype: int, index: int) -> str:
     """Return the name of the body of a sensor's object; empty for objects without one."""
     kinds = mujoco.mjtObj
-    if index >= 0 and objtype == int(kinds.mjOBJ_SITE):
-        index = int(model.site_bodyid[index])
-    elif index < 0 or objtype not in (int(kinds.mjOBJ_BODY), int(kinds.mjOBJ_XBODY)):
-        return ""
-    return model.body(index).name
+    bodies = {
+        kinds.mjOBJ_SITE: model.site_bodyid,
+        kinds.mjOBJ_GEOM: model.geom_bodyid,
+        kinds.mjOBJ_CAMERA: model.cam_bodyid,
+        kinds.mjOBJ_BODY: range(model.nbody),
+        kinds.mjOBJ_XBODY: range(model.nbody),
+    }.get(mujoco.mjtObj(objtype))
+    return "" if index < 0 or bodies is None else model.body(int(bodies[index])).name
 
 
 def traced(
     subject: Subject,
     name: str,
     unit: str,
-    why: str,
-    availability: Availability,
+    reason: Reason,
     cfg: ObservationTermCfg,
 ) -> Measurement:
     """Value of a term that no kinematics gives, such as scans, images and contacts."""
@@ -420,7 +389,7 @@ def traced(
         "params": plain(dict(cfg.params)),
     }
     shape = shape_of(subject.env, cfg)
-    return Measurement(name, shape, unit, "", availability, why, source, None, cfg)
+    return Measurement(name, shape, unit, "", *reason, source, None, cfg)
 
 
 def shape_of(env: ManagerBasedRlEnv, cfg: ObservationTermCfg) -> tuple[int, ...]:
@@ -460,15 +429,20 @@ def _full(subject: Subject, entity_name: str, name: str) -> str:
     return f"{entity_name}/{name}"
 
 
-def _of_root_orientation(subject: Subject, entity_name: str) -> tuple[Availability, str]:
+def _of_root(subject: Subject, entity_name: str, reason: Reason) -> Reason:
+    """Return the availability of a quantity of the root: `reason` for a robot that moves freely."""
     if entity_name != subject.robot:
-        return "external", _EXTERNAL
-    return ("computed", "fixed base") if subject.entity.is_fixed_base else ("measured", "IMU")
+        return availability.OBJECT
+    return availability.FIXED_BASE if subject.is_fixed else reason
 
 
-def _of_position(subject: Subject, entity_name: str) -> tuple[Availability, str]:
+def _of_pose(subject: Subject, entity_name: str, reason: Reason) -> Reason:
+    """Return the availability of a quantity of a body or site: `reason` for a robot that moves freely."""
     if entity_name != subject.robot:
-        return "external", _EXTERNAL
-    if subject.entity.is_fixed_base:
-        return "computed", _ROOTED
-    return "estimated", _ESTIMATED
+        return availability.OBJECT
+    return availability.KINEMATICS if subject.is_fixed else reason
+
+
+def _of_orientation(subject: Subject, entity_name: str) -> Reason:
+    """Return the availability of the orientation of a body or site, or of its pose in the root frame."""
+    return _of_pose(subject, entity_name, availability.KINEMATICS)

@@ -17,12 +17,17 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from mjlab.deploy import availability as av
 from mjlab.deploy import measurements as m
+from mjlab.deploy.availability import Reason
 from mjlab.deploy.measurements import Measurement, Subject, name_of
+from mjlab.deploy.nominal import robot_of
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.rl.exporter_utils import shortest
+from mjlab.utils.tables import Table
 
 if TYPE_CHECKING:
+    from mjlab.envs import ManagerBasedRlEnv
     from mjlab.managers import ObservationTermCfg
 
 Params = Mapping[str, Any]
@@ -53,9 +58,27 @@ def describe(subject: Subject, name: str, cfg: ObservationTermCfg) -> Term:
     row = TERMS.get(name_of(cfg.func))
     if row is not None:
         return row(subject, cfg)
-    why = f"{name_of(cfg.func)} is not known to the runtime"
-    value = m.traced(subject, f"term/{name}", "", why, "none", cfg)
-    return Term("custom", (value,))
+    function = name_of(cfg.func)
+    reason = _NAMES.get(function.rpartition(":")[2], ("unknown", f"value of {function}"))
+    return Term("custom", (m.traced(subject, f"term/{name}", "", reason, cfg),))
+
+
+def unmeasured(term: Term) -> list[Measurement]:
+    """Return the measurements of a term that a robot lacks."""
+    found = [one for one in term.inputs if isinstance(one, Measurement)]
+    return [one for one in found if one.availability in av.UNMEASURED]
+
+
+def unmeasured_table(env: ManagerBasedRlEnv) -> Table:
+    """Return the observation terms that a robot cannot measure: group, term and reason."""
+    manager, subject = env.observation_manager, Subject(env, robot_of(env.cfg))
+    rows = []
+    for group, terms in manager.active_terms.items():
+        for name in terms:
+            lacking = unmeasured(describe(subject, name, manager.get_term_cfg(group, name)))
+            if lacking:
+                rows.append((group, name, "; ".join(dict.fromkeys(one.why for one in lacking))))
+    return Table("unmeasured", ("group", "term", "reason"), rows, note="not measured by a robot")
 
 
 Row = Callable[[Subject, "ObservationTermCfg"], Term]
@@ -146,13 +169,13 @@ def _pose_error(subject: Subject, cfg: ObservationTermCfg) -> Term:
     return Term("pose_error", (*pose, f"command/{name}"), unit="m, rad", frame="root")
 
 
-def _traced(unit: str, why: str, availability: m.Availability = "external") -> Row:
+def _traced(unit: str, reason: Reason) -> Row:
     """Return the row of a term whose whole value is one measurement, named after sensor and function."""
 
     def row(subject: Subject, cfg: ObservationTermCfg) -> Term:
         quantity = name_of(cfg.func).rpartition(":")[2].removeprefix("camera_")
         name = f"{cfg.params['sensor_name']}_{quantity}"
-        value = m.traced(subject, name, unit, why, availability, cfg)
+        value = m.traced(subject, name, unit, reason, cfg)
         return Term("reading", (value,), unit=unit)
 
     return row
@@ -223,22 +246,35 @@ TERMS: dict[str, Row] = {
     f"{_MDP}:last_action": _last_action,
     f"{_MDP}:generated_commands": _command,
     f"{_MDP}:builtin_sensor": _sensor,
-    f"{_MDP}:height_scan": _traced("m", "heights above the ground, from an elevation map"),
+    f"{_MDP}:height_scan": _traced("m", av.SCAN),
     "mjlab.envs.mdp.pose_command:pose_command_error": _pose_error,
     "mjlab.tasks.cartpole.cartpole_env_cfg:pole_angle_cos_sin": _joint_cos_sin,
-    f"{_WALK}:foot_height": _traced("m", "heights of the feet above the ground", "estimated"),
-    f"{_WALK}:foot_air_time": _traced("s", "times of foot contacts", "estimated"),
-    f"{_WALK}:foot_contact": _traced("", "contact sensors of the feet", "estimated"),
-    f"{_WALK}:foot_contact_forces": _traced("", "forces of the feet", "estimated"),
+    f"{_WALK}:foot_height": _traced("m", av.HEIGHT),
+    f"{_WALK}:foot_air_time": _traced("s", av.CONTACT),
+    f"{_WALK}:foot_contact": _traced("", av.CONTACT),
+    f"{_WALK}:foot_contact_forces": _traced("", av.CONTACT),
     f"{_TRACK}:motion_anchor_pos_b": _anchor_pos,
     f"{_TRACK}:motion_anchor_ori_b": _anchor_ori,
     f"{_LIFT}:ee_to_object_distance": _hand_to_object,
     f"{_LIFT}:object_to_goal_distance": _object_to_goal,
     f"{_LIFT}:target_position": _hand_to_goal,
     f"{_LIFT}:ee_velocity": _hand_velocity,
-    f"{_LIFT}:camera_rgb": _traced("", "a camera", "measured"),
-    f"{_LIFT}:camera_depth": _traced("", "a camera", "measured"),
-    f"{_LIFT}:camera_segmentation": _traced("", "a camera"),
-    f"{_LIFT}:camera_target_cube_mask": _traced("", "a camera"),
+    f"{_LIFT}:camera_rgb": _traced("", av.CAMERA),
+    f"{_LIFT}:camera_depth": _traced("", av.CAMERA),
+    f"{_LIFT}:camera_segmentation": _traced("", av.SEGMENTATION),
+    f"{_LIFT}:camera_target_cube_mask": _traced("", av.SEGMENTATION),
 }
 """Rows by `module:function`."""
+_NAMES: dict[str, Reason] = {
+    "base_lin_vel": av.VELOCITY,
+    "root_lin_vel_b": av.VELOCITY,
+    "root_lin_vel_w": av.VELOCITY,
+    "base_pos_z": av.POSITION,
+    "root_pos_w": av.POSITION,
+    "height_scan": av.SCAN,
+    "foot_height": av.HEIGHT,
+    "foot_air_time": av.CONTACT,
+    "foot_contact": av.CONTACT,
+    "foot_contact_forces": av.CONTACT,
+}
+"""Availability by name of functions without a row: packages give functions of one meaning one name."""

@@ -14,7 +14,7 @@ from mjlab.cli.flags import (
     previewed,
     with_task_options,
 )
-from mjlab.deploy.measurable import unmeasured_table
+from mjlab.deploy.terms import unmeasured_table
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.errors import BadCallError
