@@ -155,7 +155,7 @@ def train(task: str, flags: list[str], seed: int, log_root: str, episodes: int) 
         RuntimeError: a command failed.
     """
     begin = time.perf_counter()
-    command = [sys.executable, "-m", "mjlab.scripts.train", task, *flags, "--device", "cpu"]
+    command = [sys.executable, "-m", "mjlab.cli.main", "train", task, *flags, "--device", "cpu"]
     command += ["--agent.seed", str(seed), "--log-root", log_root]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     iterations, seconds, output = None, 0.0, []

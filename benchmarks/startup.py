@@ -28,9 +28,9 @@ def first_iteration() -> float:
     times = []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(REPEATS):
-            command = [sys.executable, "-u", "-m", "mjlab.scripts.train", "Mjlab-Cartpole-Swingup"]
-            command += ["--num-envs", "512", "--device", "cpu", "--log-root", folder]
-            command += ["--agent.max-iterations", "1"]
+            command = [sys.executable, "-u", "-m", "mjlab.cli.main", "train"]
+            command += ["Mjlab-Cartpole-Swingup", "--num-envs", "512", "--device", "cpu"]
+            command += ["--log-root", folder, "--agent.max-iterations", "1"]
             begin = time.perf_counter()
             process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
             assert process.stdout is not None

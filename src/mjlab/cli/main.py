@@ -7,7 +7,6 @@ imported before a command runs, so that `--help` and a mistyped task name answer
 from __future__ import annotations
 
 import atexit
-import importlib
 import io
 import logging
 import os
@@ -21,6 +20,7 @@ from pathlib import Path
 
 from mjlab.cli import LOADS_AS_MODULE, prepare_threads
 from mjlab.utils.errors import BadCallError, MjlabError, UserError, check_exists
+from mjlab.utils.lazy import import_to_stay
 from mjlab.utils.logging import shorten
 from mjlab.utils.processes import OtherProcessError
 from mjlab.utils.signals import Interrupted, end_by_interrupt
@@ -442,7 +442,7 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
     module = command.module or f"mjlab.scripts.{command.name.replace('-', '_')}"
     was_changed = end_by_interrupt(True)
     try:
-        implementation = importlib.import_module(module)
+        implementation = import_to_stay(module)
     finally:
         if was_changed:
             end_by_interrupt(False)

