@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -759,3 +761,20 @@ def test_wrenches_take_float64(double):
     found = entity.data.body_external_force
     assert found.dtype == torch.float32
     np.testing.assert_array_equal(found.numpy(), force)
+
+
+def test_environments_need_no_compiler() -> None:
+    # Its import takes 1 s.
+    code = (
+        "import sys, torch\n"
+        "from mjlab.envs import ManagerBasedRlEnv\n"
+        "from mjlab.tasks.registry import load_env_cfg\n"
+        "cfg = load_env_cfg('Mjlab-Cartpole-Swingup')\n"
+        "cfg.observations['actor'].terms['cart_vel'].scale = 0.5\n"
+        "env = ManagerBasedRlEnv(cfg, device='cpu')\n"
+        "env.reset()\n"
+        "env.step(torch.zeros(1, 1))\n"
+        "loaded = [name for name in ('torch._dynamo', 'sympy') if name in sys.modules]\n"
+        "assert not loaded, loaded\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

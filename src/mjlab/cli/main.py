@@ -7,6 +7,7 @@ imported before a command runs, so that `--help` and a mistyped task name answer
 from __future__ import annotations
 
 import atexit
+import gc
 import io
 import logging
 import os
@@ -527,6 +528,8 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         sys.unraisablehook = previous
         # Before the callbacks that modules registered in the meantime.
         atexit.register(end_by_interrupt, True)
+        # Python would search all objects for garbage as it ends, which took 0.8 s.
+        atexit.register(gc.freeze)
 
 
 def _end_without_threads(error: sys.UnraisableHookArgs) -> None:

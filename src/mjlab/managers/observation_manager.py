@@ -382,7 +382,7 @@ class ObservationGroup:
         if cfg.concatenate_terms:
             shapes = {key: term.shape for key, term in terms.items()}
             try:
-                parts = [torch.empty(shape, device="meta") for shape in shapes.values()]
+                parts = [torch.empty(shape) for shape in shapes.values()]
                 self.shape = tuple(torch.cat(parts, dim=dim).shape)
             except (IndexError, RuntimeError) as error:
                 raise ValueError(
@@ -626,15 +626,13 @@ def scale_tensor(name: str, scale: Any, raw_shape: torch.Size, device: str) -> t
     tensor = scale if is_tensor else torch.tensor(scale, dtype=torch.float32, device=device)
     try:
         # The scale must not expand the observation.
-        fits = torch.broadcast_shapes(tensor.shape, raw_shape) == raw_shape
-    except RuntimeError:
-        fits = False
-    if not fits:
+        tensor.expand(raw_shape)
+    except RuntimeError as error:
         raise ValueError(
             f"{name} scale: expected one number, or one for each of the {raw_shape[-1]} components "
             f"of the last axis of the term's value {tuple(raw_shape)}, got shape "
             f"{tuple(tensor.shape)}."
-        )
+        ) from error
     return tensor
 
 

@@ -126,8 +126,7 @@ def train_until_stopped(
             # What a program of a package says counts as a package's config.
             check_flags(cfg, typed_values(flags or []))
         if flags is not None:
-            # torch imports its compiler with the first optimizer.
-            import_to_stay("torch._dynamo")
+            # Imports rsl_rl, and torch's compiler.
             import_to_stay("mjlab.rl.runner")
         return _train(task, cfg, flags, device, rank, output)
 
