@@ -10,7 +10,13 @@ import numpy as np
 import torch
 
 from mjlab.envs.mdp.actions.differential_ik import damped_least_squares
-from mjlab.utils.lab_api.math import compute_pose_error, quat_from_matrix
+from mjlab.utils.lab_api.math import (
+    compute_pose_error,
+    quat_apply,
+    quat_from_angle_axis,
+    quat_from_matrix,
+    quat_mul,
+)
 from mjlab.utils.mujoco import moving_dofs
 
 if TYPE_CHECKING:
@@ -72,29 +78,26 @@ def draw_reachable_poses(
     """
     model = env.sim.mj_model
     data = mujoco.MjData(model)
-    home = default_qpos(env)
+    data.qpos[:] = default_qpos(env)
     columns = _joints_of(model, entity, frame.body)
     joints = entity.indexing.joint_ids.cpu().numpy()[columns]
     adr = model.jnt_qposadr[joints]
-    low, high = joint_bounds(model, joints, fraction, home[adr])
     bodies = np.zeros(model.nbody, dtype=bool)
     bodies[entity.indexing.body_ids.cpu().numpy()] = True
-    data.qpos[:] = home
     allowed = _touching(model, data, bodies)
-    root = entity.indexing.root_body_id
+    chain = _Chain(data, entity.indexing.root_body_id, frame, joints)
+    low, high = joint_bounds(model, joints, fraction, data.qpos[adr])
+    inside = joint_bounds(model, joints, 0.5 * (1.0 + fraction), data.qpos[adr], _SOLUTION_TURN)
     # From torch's generator, which the seed of the run governs.
     seed = int(torch.randint(2**31, (1,)))
     rng = np.random.default_rng(seed)
-    # The first row is the default pose.
-    poses, positions = np.empty((count + 1, 12)), np.empty((count, len(joints)))
-    poses[0] = _pose_in_root(data, root, frame)
+    positions = np.empty((count, len(joints)))
     found = 0
     for _ in range(_MAX_DRAWS * count):
         data.qpos[adr] = rng.uniform(low, high)
         if _touching(model, data, bodies) <= allowed:
             positions[found] = data.qpos[adr]
             found += 1
-            poses[found] = _pose_in_root(data, root, frame)
             if found == count:
                 break
     else:
@@ -102,28 +105,24 @@ def draw_reachable_poses(
             f"Reachable poses: expected {count} joint positions without contact in "
             f"{_MAX_DRAWS * count} draws, got {found}; set ranges, or change joint_range_fraction."
         )
-    rotation = torch.as_tensor(poses[:, 3:]).view(-1, 3, 3)
-    position, quat = torch.as_tensor(poses[:, :3]), quat_from_matrix(rotation)
-    drawn = torch.cat((position[1:], quat_near(quat[1:], quat[0])), dim=1)
-    data.qpos[:] = home
-    inside = joint_bounds(model, joints, 0.5 * (1.0 + fraction), home[adr], _SOLUTION_TURN)
-    near, is_found = _solve_from_home(data, root, frame, joints, drawn, inside)
-    for index in np.flatnonzero(is_found):
-        data.qpos[adr] = near[index]
-        if _touching(model, data, bodies) <= allowed:
-            positions[index] = near[index]
+    position, quat, _ = chain.forward(torch.as_tensor(positions))
+    goals = torch.cat((position, quat_near(quat, chain.home_quat)), dim=1)
+    near, is_found = _solve_from_home(chain, goals, inside)
     torques = np.empty_like(positions)
-    for index, joint_pos in enumerate(positions):
-        data.qpos[adr] = joint_pos
+    for index, is_near in enumerate(is_found):
+        data.qpos[adr] = near[index]
+        if is_near and _touching(model, data, bodies) <= allowed:
+            positions[index] = near[index]
+        data.qpos[adr] = positions[index]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         torques[index] = (data.qfrc_bias - data.qfrc_passive)[model.jnt_dofadr[joints]]
     return ReachablePoses(
-        drawn.to(env.device, torch.float32),
+        goals.to(env.device, torch.float32),
         torch.as_tensor(positions, dtype=torch.float32, device=env.device),
         torch.as_tensor(columns, device=env.device),
         torch.as_tensor(torques, dtype=torch.float32, device=env.device),
-        quat[0].to(env.device, torch.float32),
+        chain.home_quat.to(env.device, torch.float32),
     )
 
 
@@ -136,28 +135,77 @@ def quat_near(quat: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
     return torch.where((quat * reference).sum(dim=-1, keepdim=True) < 0.0, -quat, quat)
 
 
+class _Chain:
+    """Kinematics of a frame that joints move, in the frame of a root body, for many joint positions at once.
+
+    By the product of exponentials: each joint turns or shifts all that it carries about its axis in the
+    default pose.
+    """
+
+    def __init__(self, data: mujoco.MjData, root: int, frame: Frame, joints: np.ndarray) -> None:
+        """Read axes, anchors and the frame's pose from `data`, in the default pose."""
+        model = data.model
+        positions, rotations = {
+            "body": (data.xpos, data.xmat),
+            "site": (data.site_xpos, data.site_xmat),
+            "geom": (data.geom_xpos, data.geom_xmat),
+        }[frame.frame_type]
+        base = torch.tensor(data.xmat[root]).view(3, 3)
+        origin = torch.tensor(data.xpos[root])
+
+        def in_root(points: np.ndarray) -> torch.Tensor:
+            return (torch.tensor(points) - origin) @ base
+
+        self.home = torch.tensor(data.qpos[model.jnt_qposadr[joints]])
+        self.home_pos = in_root(positions[frame.element])
+        self.home_quat = quat_from_matrix(
+            base.T @ torch.tensor(rotations[frame.element]).view(3, 3)
+        )
+        self._axes = torch.tensor(data.xaxis[joints]) @ base
+        self._anchors = in_root(data.xanchor[joints])
+        self._is_hinge = (model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE).tolist()
+
+    def forward(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return position, (N, 3), quaternion, (N, 4), and Jacobian, (N, 6, joints), at `q`, (N, joints)."""
+        size = (len(q), 3)
+        # Motion of the links so far from the default pose: a point x moves to turn x + shift.
+        turn, shift = torch.eye(1, 4, dtype=q.dtype).repeat(len(q), 1), q.new_zeros(size)
+        axes, anchors = [], []
+        for column, motion in enumerate((q - self.home).T):
+            axis, anchor = self._axes[column].expand(size), self._anchors[column].expand(size)
+            axes.append(quat_apply(turn, axis))
+            anchors.append(quat_apply(turn, anchor) + shift)
+            if self._is_hinge[column]:
+                turn = quat_mul(turn, quat_from_angle_axis(motion, axis))
+                shift = anchors[-1] - quat_apply(turn, anchor)
+            else:
+                shift = shift + motion.unsqueeze(1) * axes[-1]
+        position = quat_apply(turn, self.home_pos.expand(size)) + shift
+        columns = [
+            torch.cat((torch.linalg.cross(axis, position - anchor), axis), dim=1)
+            if is_hinge
+            else torch.cat((axis, torch.zeros_like(axis)), dim=1)
+            for axis, anchor, is_hinge in zip(axes, anchors, self._is_hinge, strict=True)
+        ]
+        quat = quat_mul(turn, self.home_quat.expand(len(q), 4))
+        return position, quat, torch.stack(columns, dim=2)
+
+
 def _solve_from_home(
-    data: mujoco.MjData,
-    root: int,
-    frame: Frame,
-    joints: np.ndarray,
-    goals: torch.Tensor,
-    bounds: tuple[np.ndarray, np.ndarray],
+    chain: _Chain, goals: torch.Tensor, bounds: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return joint positions at goals, (count, joints), and True where they were found, (count,).
 
-    Damped least squares from the positions in `data`, with joints that would pass a bound held there. An arm
+    Damped least squares from the default pose, with joints that would pass a bound held there. An arm
     has up to eight joint positions per pose, with a redundant joint infinitely many: a policy cannot learn
     which one was drawn.
     """
-    model = data.model
-    adr, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    home = torch.as_tensor(data.qpos[adr])
     low, high = (torch.as_tensor(bound) for bound in bounds)
     weights = torch.tensor([1.0] * 3 + [_TURN_LENGTH] * 3, dtype=torch.float64).unsqueeze(1)
-    q = home.repeat(len(goals), 1)
+    q = chain.home.repeat(len(goals), 1)
     for step in range(_IK_STEPS + 1):
-        error, jacobian = _linearize(data, root, frame, adr, dofs, q, goals)
+        position, quat, jacobian = chain.forward(q)
+        error = torch.cat(compute_pose_error(position, quat, goals[:, :3], goals[:, 3:]), dim=1)
         if step == _IK_STEPS:
             break
         pull = _HOME_PULL if step < _IK_STEPS / 2 else 0.0
@@ -165,40 +213,13 @@ def _solve_from_home(
         is_free = torch.ones_like(q, dtype=torch.bool)
         for _ in range(2):
             rows = weights * jacobian * is_free.unsqueeze(1)
-            toward = pull * (home - q) * is_free
+            toward = pull * (chain.home - q) * is_free
             dq = damped_least_squares(rows, weights[:, 0] * error, stiffness, toward)
             dq *= _MAX_STEP / dq.abs().amax(dim=1, keepdim=True).clamp(min=_MAX_STEP)
             is_free &= (q + dq >= low) & (q + dq <= high)
         q = torch.clamp(q + dq, low, high)
     is_found = (error[:, :3].norm(dim=1) < _FOUND[0]) & (error[:, 3:].norm(dim=1) < _FOUND[1])
     return q.numpy(), is_found.numpy()
-
-
-def _linearize(
-    data: mujoco.MjData,
-    root: int,
-    frame: Frame,
-    adr: np.ndarray,
-    dofs: np.ndarray,
-    q: torch.Tensor,
-    goals: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the displacement to each goal, (count, 6), and the Jacobian, (count, 6, joints), in the root frame."""
-    model, count = data.model, len(q)
-    poses, jacobians = np.empty((count, 12)), np.empty((count, 6, len(adr)))
-    full = np.empty((6, model.nv))
-    for index, positions in enumerate(q.numpy()):
-        data.qpos[adr] = positions
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        poses[index] = _pose_in_root(data, root, frame)
-        base = data.xmat[root].reshape(3, 3)
-        point = data.xpos[root] + base @ poses[index, :3]
-        mujoco.mj_jac(model, data, full[:3], full[3:], point, frame.body)
-        jacobians[index] = (base.T @ full.reshape(2, 3, -1)[:, :, dofs]).reshape(6, -1)
-    quat = quat_from_matrix(torch.as_tensor(poses[:, 3:]).view(-1, 3, 3))
-    error = compute_pose_error(torch.as_tensor(poses[:, :3]), quat, goals[:, :3], goals[:, 3:])
-    return torch.cat(error, dim=1), torch.as_tensor(jacobians)
 
 
 def default_qpos(env: ManagerBasedRlEnv) -> np.ndarray:
@@ -260,16 +281,3 @@ def _touching(
     contacts = data.contact
     ours = bodies[model.geom_bodyid[contacts.geom]].any(axis=1) & (contacts.dist < 0.0)
     return {(one, other) for one, other in contacts.geom[ours].tolist()}
-
-
-def _pose_in_root(data: mujoco.MjData, root: int, frame: Frame) -> np.ndarray:
-    """Return position and rotation matrix of a frame in the frame of the root body, (12,)."""
-    positions, rotations = {
-        "body": (data.xpos, data.xmat),
-        "site": (data.site_xpos, data.site_xmat),
-        "geom": (data.geom_xpos, data.geom_xmat),
-    }[frame.frame_type]
-    base = data.xmat[root].reshape(3, 3)
-    position = base.T @ (positions[frame.element] - data.xpos[root])
-    rotation = base.T @ rotations[frame.element].reshape(3, 3)
-    return np.concatenate((position, rotation.ravel()))
