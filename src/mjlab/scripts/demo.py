@@ -48,6 +48,8 @@ def demo_cfg(demo: Demo) -> PlayConfig:
         # Rays would distract from the robot.
         if isinstance(sensor, RayCastSensorCfg):
             sensor.debug_vis = False
+    # The policies were trained at the task's first command ranges; `play` has those of its last stage.
+    env.commands["twist"] = load_env_cfg(demo.task, profile=demo.profile).commands["twist"]
     return PlayConfig(
         env=env,
         profile=demo.profile,
