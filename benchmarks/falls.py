@@ -102,8 +102,9 @@ def time_pushes(cfg: ManagerBasedRlEnvCfg) -> torch.Tensor | None:
 
 def foot_friction(env: Any) -> torch.Tensor:
     """Return the sliding friction of the feet of each environment, (NUM_ENVS,). Feet share it."""
+    event = next(term for name, term in env.cfg.events.items() if name.startswith("foot_friction"))
     robot = env.scene["robot"]
-    feet, _ = robot.find_geoms(r".*foot\d*_collision")
+    feet, _ = robot.find_geoms(event.params["asset_cfg"].geom_names)
     geom = robot.indexing.geom_ids[feet[0]]
     return env.sim.model.geom_friction[:, geom, 0].expand(NUM_ENVS)
 

@@ -151,8 +151,7 @@ class RslRlSacAlgorithmCfg:
     learning_rate_factor: Annotated[tuple[tuple[int, float], ...], Range(0.0, ends="[)")] = (
         (0, 1.0),
     )
-    """Factor of both learning rates: points (environment step, factor), interpolated linearly. With
-    smaller rates in the end, policies fall equally often from one evaluation to the next."""
+    """Factor of both learning rates: points (environment step, factor), interpolated linearly."""
     weight_decay: Weight = 1e-3
     """Weight decay (AdamW)."""
     init_alpha: Positive = 1e-3
@@ -177,8 +176,7 @@ class RslRlSacAlgorithmCfg:
     policy_average: Annotated[float, Range(0.0, 1.0, "(]")] = 1.0
     """Averaging coefficient per environment step, from the learned weights to those of the acting
     policy, times `learning_rate_factor` where that is below 1; 1: no averaging. An averaged policy
-    falls less often than the newest one: with 0.02 throughout, 3 and 20 % of a G1's episodes ended in
-    a fall ten iterations apart."""
+    falls less often than the newest one."""
     noise_hold: Count = 1
     """Maximum number of steps an environment keeps its exploration noise; 1: resample every step."""
     symmetry_cfg: dict[str, Any] | None = None

@@ -203,7 +203,8 @@ class SAC:
                 self._reward_scale.update(rewards, dones, together=self._multi_gpu is not None)
             # Average the parameters of the acting policy; copy its observation statistics.
             newest = self.cfg.policy_average
-            if newest < 1.0:  # An average over as many changes, however small they become.
+            if newest < 1.0:
+                # At smaller rates, weights move less per step: average over more steps.
                 newest *= min(self._rate_factor.at(self._num_steps), 1.0)
             for own, learned in zip(
                 self._policy.parameters(), self.actor.parameters(), strict=True

@@ -301,12 +301,8 @@ class feet_tilt:
             )
         self._up = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float32, device=env.device)
         # World z in each foot frame, in the default pose with an upright root, (feet, 3).
-        model = env.sim.mj_model
-        data = mujoco.MjData(model)
         asset: Entity = env.scene[asset_cfg.name]
-        addresses = model.jnt_qposadr[asset.indexing.joint_ids.tolist()]
-        data.qpos[addresses] = asset.data.default_joint_pos[0].tolist()
-        mujoco.mj_kinematics(model, data)
+        data = default_pose(env.sim.mj_model, asset)
         if asset_cfg.site_names:
             matrices = data.site_xmat[
                 asset.indexing.site_ids[columns_of(asset_cfg, "site", env)].cpu()
@@ -365,3 +361,13 @@ def feet_apart_l2(
     feet = data.site_pos_w[:, columns_of(asset_cfg, "site", env)]
     apart = quat_apply_inverse(data.root_link_quat_w, feet[:, 0] - feet[:, 1])[:, 1]
     return (distance - apart).clamp_(min=0.0).square_()
+
+
+def default_pose(model: mujoco.MjModel, asset: Entity) -> mujoco.MjData:
+    """Return kinematics and centers of mass of a robot in its default pose."""
+    data = mujoco.MjData(model)
+    addresses = model.jnt_qposadr[asset.indexing.joint_ids.tolist()]
+    data.qpos[addresses] = asset.data.default_joint_pos[0].tolist()
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    return data

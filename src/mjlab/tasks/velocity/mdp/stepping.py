@@ -18,14 +18,13 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 import torch
 
 from mjlab.envs.mdp.actions import JointPositionAction
 from mjlab.managers.scene_entity_config import SceneEntityCfg, columns_of
 from mjlab.rl.exporter_utils import joint_gains
-from mjlab.tasks.velocity.mdp.gait import require_gait_clock
+from mjlab.tasks.velocity.mdp.gait import default_pose, require_gait_clock
 from mjlab.utils.errors import check_exists
 from mjlab.utils.lab_api.math import quat_apply, quat_apply_inverse
 from mjlab.utils.leg_kinematics import Leg, LegTable, find_legs
@@ -131,7 +130,7 @@ class stepping_action:
         asset_cfg: SceneEntityCfg = params["asset_cfg"]
         asset: Entity = env.scene[asset_cfg.name]
         model, root = env.sim.mj_model, int(asset.indexing.root_body_id)
-        pose = _default_pose(model, asset)
+        pose = default_pose(model, asset)
         soles = asset.indexing.site_ids[columns_of(asset_cfg, "site", env)].tolist()
         legs = find_legs(model, pose, root, soles)
         self._length = 0.5 * (legs[0].length + legs[1].length)
@@ -298,13 +297,3 @@ class _SteppingLeg:
         ahead = torch.hypot(x, z)
         bend = torch.acos((torch.hypot(ahead, y) / self._length).clamp(max=1.0))
         return torch.stack((torch.atan2(x, -z), torch.atan2(y, ahead), bend), dim=1)
-
-
-def _default_pose(model: mujoco.MjModel, asset: Entity) -> mujoco.MjData:
-    """Return kinematics and centers of mass of a robot in its default pose."""
-    data = mujoco.MjData(model)
-    addresses = model.jnt_qposadr[asset.indexing.joint_ids.tolist()]
-    data.qpos[addresses] = asset.data.default_joint_pos[0].tolist()
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    return data
