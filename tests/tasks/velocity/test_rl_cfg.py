@@ -34,7 +34,9 @@ def test_penalties_are_eased_and_nothing_else(task, gait):
     """A gait and the yaw rate are rewarded; where the gait is unknown, a reward for air time fades out."""
     table, rl_cfg = load_env_cfg(task), load_rl_cfg(task)
     env_cfg = load_env_cfg(task)
-    profile = ppo.cpu if gait is None else ppo.cpu_with_gait(gait, minimum_height=0.1)
+    profile = (
+        ppo.cpu_without_gait() if gait is None else ppo.cpu_with_gait(gait, minimum_height=0.1)
+    )
     profile.easing(env_cfg, rl_cfg)
     added = set() if gait is None else {"gait", "yaw"}
     assert env_cfg.rewards.keys() - table.rewards.keys() == added
@@ -95,6 +97,26 @@ def test_exploring_errors_trigger_before_the_bound(task):
         cfg = load_rl_cfg(task, profile=profile).evaluation
         for name, limit in cfg.trigger_below.items():
             assert cfg.solved_below[name] < limit
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if "Rough" in task])
+def test_levels_are_all_used_and_kept_until_robots_walk(task):
+    for profile in list_profiles(task):
+        cfg = load_env_cfg(task, profile=profile)
+        params = cfg.curriculum["terrain_levels"].params
+        assert cfg.scene.terrain.max_init_terrain_level is None
+        assert params["use_elapsed_time"]
+        assert params["first_step"] * cfg.scene.num_envs >= 390_000
+        registered = load_env_cfg(task, profile=profile, evaluate=True)
+        assert registered.scene.terrain == load_env_cfg(task).scene.terrain
+
+
+def test_a_student_is_judged_as_its_teacher():
+    task = "Mjlab-Velocity-Rough-Unitree-Go1"
+    teacher, student = (
+        load_rl_cfg(task, profile=profile).evaluation for profile in ("cpu", "blind")
+    )
+    assert student == teacher
 
 
 @pytest.mark.parametrize("terrain", ["Flat", "Rough"])

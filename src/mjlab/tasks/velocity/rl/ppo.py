@@ -7,7 +7,7 @@ has the experiments):
 
 - `cpu_with_gait`, the profile of the Go1, rewards stances in which half of the feet swing. This rhythm halves
   the samples: without it, robots first learn to stand through pushes, then to walk, and fall for much longer.
-- `cpu`, the profile of other robots, rewards air time instead, and lets the reward fade out.
+- `cpu_without_gait`, the profile of other robots, rewards air time instead, and lets the reward fade out.
 - Penalties start at a fraction of their size and grow; penalties that make the robot lift its feet grow
   faster. Pushes grow, too.
 - Contacts have pyramidal friction cones, without torsional and rolling friction. This halves the time of
@@ -62,7 +62,7 @@ _EASED_SAMPLES = 6_000_000
 # Robots that drag their feet fall at each change of command, so these penalties grow faster.
 _LIFTING = ("foot_clearance", "foot_swing_height")
 _LIFTING_EASED_SAMPLES = 2_000_000
-# Until then, robots learn to walk; changed before, levels would all be the lowest.
+# Until then, robots learn to walk.
 _UNCHANGED_LEVELS_SAMPLES = 400_000
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 """Symmetry augmentation function of robots with left and right."""
@@ -232,9 +232,7 @@ def cpu_with_gait(
             evaluation.trigger_below = {name: 1.4 * limit for name, limit in lin_vel.items()}
             if solved_below is None:
                 evaluation.solved_below["failure_rate"] *= 2.0
-            if (levels := env_cfg.curriculum.get("terrain_levels")) is not None:
-                first_step = _UNCHANGED_LEVELS_SAMPLES // _NUM_ENVS
-                levels.params.update(use_elapsed_time=True, first_step=first_step)
+            keep_levels(env_cfg, _UNCHANGED_LEVELS_SAMPLES)
 
     return cpu_profile(
         ease,
@@ -250,8 +248,18 @@ def cpu_with_gait(
     )
 
 
-cpu = cpu_without_gait()
-"""The `cpu` profile of robots of unknown gait."""
+def keep_levels(env_cfg: ManagerBasedRlEnvCfg, samples: int) -> None:
+    """Start on all terrain levels and keep them for `samples` environment steps, in place; then count the
+    elapsed time.
+
+    Changed before robots walk, levels would all be the lowest; and evaluations are on all of them. Call it
+    after the number of environments is set. Without the curriculum `terrain_levels`, nothing changes.
+    """
+    terrain, levels = env_cfg.scene.terrain, env_cfg.curriculum.get("terrain_levels")
+    if terrain is None or levels is None:
+        return
+    terrain.max_init_terrain_level = None
+    levels.params.update(use_elapsed_time=True, first_step=samples // env_cfg.scene.num_envs)
 
 
 def _is_flat(env_cfg: ManagerBasedRlEnvCfg) -> bool:
@@ -259,20 +267,20 @@ def _is_flat(env_cfg: ManagerBasedRlEnvCfg) -> bool:
     return terrain is not None and terrain.terrain_type == "plane"
 
 
-def _add_student(
-    env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg
-) -> RslRlBaseRunnerCfg:
-    """Add a blind student to `cpu`, and return the distillation config."""
-    cpu.policy(env_cfg, rl_cfg)
-    student = copy.deepcopy(env_cfg.observations["actor"])
-    del student.terms[_SCAN]
-    student.history_length = BLIND_HISTORY
-    env_cfg.observations[_STUDENT] = student
-    rl_cfg.num_steps_per_env = _BLIND_STEPS
-    cfg = with_learner(rl_cfg, "distillation")
-    cfg.obs_groups["student"] = (_STUDENT,)
-    return cfg
+def with_blind_student(teacher: Profile) -> Profile:
+    """Return the `blind` profile of a robot whose teacher is trained under the profile `teacher`."""
 
+    def add_student(
+        env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg
+    ) -> RslRlBaseRunnerCfg:
+        teacher.policy(env_cfg, rl_cfg)
+        student = copy.deepcopy(env_cfg.observations["actor"])
+        del student.terms[_SCAN]
+        student.history_length = BLIND_HISTORY
+        env_cfg.observations[_STUDENT] = student
+        rl_cfg.num_steps_per_env = _BLIND_STEPS
+        cfg = with_learner(rl_cfg, "distillation")
+        cfg.obs_groups["student"] = (_STUDENT,)
+        return cfg
 
-blind = Profile(_add_student, cpu.easing)
-"""The `blind` profile: `cpu`, with a student instead."""
+    return Profile(add_student, teacher.easing)

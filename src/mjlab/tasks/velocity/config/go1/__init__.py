@@ -35,7 +35,7 @@ for _terrain in ("Flat", "Rough"):
         if _terrain == "Flat":
             _profiles["cpu-long"] = f"{_RL_CFG}:cpu_long"
         elif not _suffix:
-            _profiles["blind"] = "mjlab.tasks.velocity.rl.ppo:blind"
+            _profiles["blind"] = f"{_RL_CFG}:blind"
         _env_cfg = f"unitree_go1_{_terrain}{_suffix}_env_cfg".lower().replace("-", "_")
         register_mjlab_task(
             task_id=f"Mjlab-Velocity-{_terrain}-Unitree-Go1{_suffix}",

@@ -5,7 +5,11 @@ from __future__ import annotations
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlOnPolicyRunnerCfg
 from mjlab.tasks.registry import Profile
-from mjlab.tasks.velocity.rl.ppo import cpu_with_gait, velocity_ppo_runner_cfg
+from mjlab.tasks.velocity.rl.ppo import (
+    cpu_with_gait,
+    velocity_ppo_runner_cfg,
+    with_blind_student,
+)
 
 
 def unitree_go1_ppo_runner_cfg() -> RslRlOnPolicyRunnerCfg:
@@ -31,3 +35,6 @@ def _ease_long(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> Non
 
 cpu_long = Profile(cpu.policy, _ease_long)
 """The `cpu-long` profile of the flat tasks: `cpu`, until robots hardly fall."""
+
+blind = with_blind_student(cpu)
+"""The `blind` profile of the rough task: a student without height scan, of a teacher trained under `cpu`."""
