@@ -2,8 +2,9 @@
 //
 //     replay BUNDLE LAYERS.json TABLE.csv [aligned|limits|hand-over|hand-over-reset]
 //
-// The table has the columns of golden.csv. The network is a list of layers, as plain loops. Memory, if
-// the contract has it, counts steps and is added to the actions.
+// The table has the columns of golden.csv. The network is lists of layers, as plain loops: those of each
+// input, and those of all their answers side by side. Memory, if the contract has it, counts steps and is
+// added to the actions.
 #include <iostream>
 #include <sstream>
 
@@ -15,9 +16,52 @@ using Floats = std::vector<float>;
 struct Layer {
   std::string kind;
   Floats weight, bias;
+  std::vector<int> shape;  // Of a convolution: channels in, side of the kernel, stride, padding.
 };
 
+/// Return the convolution of square images.
+Floats convolution(const Layer& layer, const Floats& x) {
+  const int in = layer.shape.at(0), side = layer.shape.at(1), stride = layer.shape.at(2),
+            pad = layer.shape.at(3), size = static_cast<int>(std::lround(std::sqrt(x.size() / in))),
+            count = (size + 2 * pad - side) / stride + 1;
+  Floats y;
+  for (size_t out = 0; out < layer.bias.size(); ++out)
+    for (int row = 0; row < count; ++row)
+      for (int column = 0; column < count; ++column) {
+        double sum = layer.bias[out];
+        for (int k = 0; k < in * side * side; ++k) {
+          const int i = row * stride - pad + k / side % side, j = column * stride - pad + k % side;
+          const int channel = k / side / side, from = (channel * size + i) * size + j;
+          if (i >= 0 && i < size && j >= 0 && j < size)
+            sum += layer.weight.at(out * in * side * side + k) * x.at(from);
+        }
+        y.push_back(static_cast<float>(sum));
+      }
+  return y;
+}
+
+/// Return the mean place of each image, of the rows (`weight`) and columns (`bias`) of its pixels.
+Floats mean_places(const Layer& layer, const Floats& x) {
+  const size_t count = layer.weight.size();
+  Floats y;
+  for (size_t begin = 0; begin < x.size(); begin += count) {
+    const float largest = *std::max_element(&x[begin], &x[begin] + count);
+    double total = 0.0, row = 0.0, column = 0.0;
+    for (size_t k = 0; k < count; ++k) {
+      const double share = std::exp(x[begin + k] - largest);
+      total += share;
+      row += share * layer.weight[k];
+      column += share * layer.bias[k];
+    }
+    y.push_back(static_cast<float>(row / total));
+    y.push_back(static_cast<float>(column / total));
+  }
+  return y;
+}
+
 Floats answer(const Layer& layer, const Floats& x) {
+  if (layer.kind == "convolution") return convolution(layer, x);
+  if (layer.kind == "mean_places") return mean_places(layer, x);
   const size_t size = layer.kind == "linear" || layer.kind == "first" ? layer.bias.size() : x.size();
   Floats y(size);
   double mean = 0.0, variance = 0.0;
@@ -74,13 +118,23 @@ void print(const mjlab::Policy& policy, const mjlab::Targets& targets) {
 
 int main(int count, char** arguments) {
   const std::string folder = arguments[1], mode = count > 4 ? arguments[4] : "";
-  std::vector<Layer> layers;
-  for (const json& layer : read_json(arguments[2]))
-    layers.push_back({layer["kind"], layer["weight"], layer["bias"]});
+  std::map<std::string, std::vector<Layer>> layers;
+  const json lists = read_json(arguments[2]);
+  for (const auto& [name, list] : lists.items()) {
+    std::vector<Layer>& chain = layers[name];
+    for (const json& layer : list)
+      chain.push_back({layer["kind"], layer["weight"], layer["bias"], layer["shape"]});
+  }
   const auto network = [&layers](const std::vector<std::string>& outputs,
                                  const std::vector<mjlab::Input>& inputs) {
-    Floats action = inputs[0].data;
-    for (const Layer& layer : layers) action = answer(layer, action);
+    Floats action;
+    for (const mjlab::Input& input : inputs) {
+      if (!layers.count(input.name)) continue;
+      Floats found = input.data;
+      for (const Layer& layer : layers.at(input.name)) found = answer(layer, found);
+      action.insert(action.end(), found.begin(), found.end());
+    }
+    for (const Layer& layer : layers.at("actions")) action = answer(layer, action);
     std::vector<Floats> answers = {action};
     for (size_t k = 1; k < outputs.size(); ++k) {
       answers.push_back(inputs[k].data);

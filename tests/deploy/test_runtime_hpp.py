@@ -35,17 +35,30 @@ def program(tmp_path_factory) -> Path:
     return program
 
 
-def layers_of(path: Path) -> list[dict[str, Any]]:
-    """Return the layers from the network input to the actions."""
+def network_of(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return the layers of each input, and `actions`, those of all their answers side by side."""
     graph = onnx.load(str(path)).graph
     weights = {one.name: onnx.numpy_helper.to_array(one) for one in graph.initializer}
     for node in graph.node:
         if node.op_type == "Constant":
-            weights[node.output[0]] = onnx.helper.get_attribute_value(node.attribute[0])
-    layers, value = [], "obs"
+            constant = onnx.helper.get_attribute_value(node.attribute[0])
+            weights[node.output[0]] = onnx.numpy_helper.to_array(constant)
+    found, joint = {}, ""
+    for one in graph.input:
+        if one.name != "time_step":
+            found[one.name], joint = layers_from(one.name, graph, weights)
+    is_over = joint == graph.output[0].name
+    return {**found, "actions": [] if is_over else layers_from(joint, graph, weights)[0]}
+
+
+def layers_from(value: str, graph: Any, weights: Row) -> tuple[list[Row], str]:
+    """Return the layers from a value to the actions, or to where answers are joined; and the value there."""
+    layers = []
     while value != graph.output[0].name:
         node = next(n for n in graph.node if value in n.input)
-        arrays = [weights[name] for name in node.input if name in weights]
+        if node.op_type == "Concat":
+            return layers, node.output[0]
+        arrays, shape = [weights[name] for name in node.input if name in weights], []
         kind = {
             "Sub": "normalize",
             "Gemm": "linear",
@@ -54,6 +67,8 @@ def layers_of(path: Path) -> list[dict[str, Any]]:
             "Sigmoid": "silu",
             "Slice": "first",
             "Tanh": "tanh",
+            "Conv": "convolution",
+            "Shape": "mean_places",
         }[node.op_type]
         if kind == "normalize":
             # The quotient follows the difference.
@@ -63,12 +78,18 @@ def layers_of(path: Path) -> list[dict[str, Any]]:
             # The product with its argument follows the sigmoid.
             node = next(n for n in graph.node if node.output[0] in n.input)
         if kind == "first":
-            size = onnx.numpy_helper.to_array(arrays[1])[0]
-            arrays = [np.zeros(0), np.zeros(size)]
+            arrays = [np.zeros(0), np.zeros(arrays[1][0])]
+        if kind == "convolution":
+            options = {one.name: onnx.helper.get_attribute_value(one) for one in node.attribute}
+            shape = [*arrays[0].shape[1:3], options["strides"][0], options["pads"][0]]
+        if kind == "mean_places":
+            # A softmax of the pixels, and the products with their rows and columns, until all are flat.
+            arrays = [weights[name] for name in weights if name.endswith((".rows", ".columns"))]
+            node = next(n for n in graph.node if n.op_type == "Flatten")
         weight, bias = (np.ravel(x).tolist() for x in (*arrays, (), ())[:2])
-        layers.append({"kind": kind, "weight": weight, "bias": bias})
+        layers.append({"kind": kind, "weight": weight, "bias": bias, "shape": shape})
         value = node.output[0]
-    return layers
+    return layers, value
 
 
 @pytest.fixture
@@ -76,8 +97,8 @@ def replay(program, tmp_path) -> Callable[..., list[Row]]:
     """Return a function that runs the policy of a bundle on a table."""
 
     def run(folder: Path, table: Path, mode: str = "", layers: Any = None) -> list[Row]:
-        layers = layers_of(folder / "policy.onnx") if layers is None else layers
-        (tmp_path / "layers.json").write_text(json.dumps(layers))
+        network = network_of(folder / "policy.onnx") if layers is None else layers
+        (tmp_path / "layers.json").write_text(json.dumps(network))
         command = [program, folder, tmp_path / "layers.json", table, mode]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
@@ -85,6 +106,21 @@ def replay(program, tmp_path) -> Callable[..., list[Row]]:
         return [json.loads(line) for line in done.stdout.splitlines()]
 
     return run
+
+
+def with_images(folder: Path, trace: dict[str, np.ndarray], table: Path) -> Path:
+    """Write the golden table with the images of the trace, which are too wide for it."""
+    with (folder / "golden.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name in (key for key in trace if key.startswith("measurement/") and trace[key].ndim > 2):
+        for row, image in zip(rows, trace[name], strict=True):
+            place = name.replace("/", ".")
+            row.update({f"{place}.{k}": str(pixel) for k, pixel in enumerate(image.ravel())})
+    with table.open("w") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    return table
 
 
 @pytest.mark.parametrize(
@@ -96,14 +132,16 @@ def replay(program, tmp_path) -> Callable[..., list[Row]]:
         "Mjlab-Lift-Cube-Yam",
         "Mjlab-Reach-Yam",
         "Mjlab-Tracking-Flat-Unitree-G1",
+        "Mjlab-Velocity-Rough-Unitree-Go1",
+        "Mjlab-Lift-Cube-Yam-Depth",
     ],
 )
-def test_answers_are_those_of_training(bundle, replay, name):
+def test_answers_are_those_of_training(bundle, replay, tmp_path, name):
     folder = bundle(name)
     trace = dict(np.load(folder / "golden.npz"))
-    rows = replay(folder, folder / "golden.csv")
+    rows = replay(folder, with_images(folder, trace, tmp_path / "table.csv"))
     assert len(rows) == len(trace["time"])
-    keys = {key for key in trace if key.startswith("raw/")} | {"input/obs", "action", "target"}
+    keys = {key for key in trace if key.startswith(("raw/", "input/"))} | {"action", "target"}
     assert len(keys) > 3
     for key in keys:
         kind, _, term = key.partition("/")
@@ -175,8 +213,10 @@ class Robot:
                 writer.writerow({**self.first, "time": 0.02 * k, "first": int(k == 0), **row})
         size = len(self.contract["joints"])
         inputs = self.contract["observations"][0]["shape"][0]
-        layer = {"kind": "linear", "weight": [0.0] * size * inputs, "bias": [action] * size}
-        return self._replay(self.folder, self.folder / "table.csv", mode, [layer])
+        weight, bias = [0.0] * size * inputs, [action] * size
+        layer = {"kind": "linear", "weight": weight, "bias": bias, "shape": []}
+        layers = {"obs": [], "actions": [layer]}
+        return self._replay(self.folder, self.folder / "table.csv", mode, layers)
 
 
 @pytest.fixture
