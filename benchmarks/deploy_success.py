@@ -1,8 +1,9 @@
 """Success of a deployed policy in plain MuJoCo against its environment: same starts, same commands.
 
 The environment, without noise, pushes, delays and randomization, records starts and commands. The bundle's
-`runtime.py` and `simulate.py` then play the same episodes with `mj_step`. An episode succeeds if the robot
-neither tilts by more than `limits.tilt` nor sinks below half of its initial height.
+`runtime.py` and `simulate.py` then play the same episodes with `mj_step`. One rule judges the states of both
+(`deploy_judges.py`): a walker does not fall; an arm has its hand, or the object, at the goal in the last
+step; a robot that tracks a motion is not ended by a failure of its task.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from deploy_judges import Judge, Outcome, Start, judge_of
 
 from mjlab.cli.policy_flags import env_cfg_of, find_checkpoint, parse_policy_flags
-from mjlab.deploy.evidence import Programs, rotations
+from mjlab.deploy.evidence import Programs
 from mjlab.deploy.golden import STATE
 from mjlab.deploy.nominal import nominal_cfg
-from mjlab.deploy.stress import has_fallen
 from mjlab.deploy.usual_terms import is_velocity
 from mjlab.managers import TerminationTermCfg
 from mjlab.rl.exporter_utils import OnnxPolicy
@@ -40,95 +41,85 @@ NORMAL = 1.96
 class Episodes:
     """Episodes of the environment."""
 
-    states: list[dict[str, np.ndarray]]
-    """State at the start of each episode, by field."""
+    starts: list[Start]
+    """Start of each episode."""
+    steps: int
+    """Control steps T of an episode."""
     commands: dict[str, np.ndarray]
     """Given commands by name, (T, N, size)."""
     outcomes: list[Outcome]
     """Outcome of each episode."""
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of an episode."""
-
-    succeeds: bool
-    error: float
-    """Mean difference of the horizontal velocity from the command (m/s); NaN after a fall."""
+    def command(self, k: int) -> dict[str, np.ndarray]:
+        """Return the given commands of episode `k`, (T, size)."""
+        return {name: values[:, k] for name, values in self.commands.items()}
 
 
-class Judge:
-    """Judge of episodes by the motion of the root."""
-
-    def __init__(self, contract: dict[str, Any], model: mujoco.MjModel) -> None:
-        """Find the root."""
-        joint = int(model.body(contract["robot"]["root_body"]).jntadr[0])
-        self.qpos, self.qvel = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        self.contract = contract
-
-    def root(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """Return height, quaternion and linear velocity (world axes) of the root, (..., 8)."""
-        place, speed = qpos[..., self.qpos : self.qpos + 7], qvel[..., self.qvel : self.qvel + 3]
-        return np.concatenate((place[..., 2:], speed), axis=-1)
-
-    def outcome(self, roots: np.ndarray, command: np.ndarray) -> Outcome:
-        """Return the outcome of an episode with these roots (T, 8) and velocity commands (T, 3)."""
-        matrices = rotations(roots[:, 1:5])
-        if has_fallen(self.contract, roots[:, 0], matrices[:, 2, 2]).any():
-            return Outcome(False, math.nan)
-        measured = np.einsum("tji,tj->ti", matrices, roots[:, 5:])[:, :2]
-        return Outcome(True, float(np.linalg.norm(measured - command[:, :2], axis=1).mean()))
-
-
-def given_names(contract: dict[str, Any]) -> list[str]:
-    """Return the names of the given commands, that of the velocity first."""
-    given = [one for one in contract["commands"] if one["kind"] == "given"]
-    return [one["name"] for one in sorted(given, key=is_velocity, reverse=True)]
-
-
-def in_environment(env: Any, contract: dict[str, Any], policy: OnnxPolicy, steps: int) -> Episodes:
+def in_environment(
+    env: Any, contract: dict[str, Any], policy: OnnxPolicy, judge: Judge, steps: int
+) -> Episodes:
     """Play one episode in each environment."""
-    names = given_names(contract)
-    judge, host = Judge(contract, env.sim.mj_model), mujoco.MjData(env.sim.mj_model)
+    names = [one["name"] for one in contract["commands"] if one["kind"] == "given"]
     commands: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    roots, states = [], []
-    clip = contract["policy"]["clip"]
+    states, clip = [], contract["policy"]["clip"]
     with env.curricula_held(), torch.no_grad():
         observations, _ = env.reset()
         policy.reset()
-        for k in range(env.num_envs):
-            env.sim.copy_to_host(k, host)
-            states.append({field: np.array(getattr(host, field)) for field in STATE})
+        starts = starts_of(env)
         for _ in range(steps):
             for name in names:
                 commands[name].append(env.command_manager.get_command(name).cpu().numpy().copy())
             action = policy(observations)
             observations, *_ = env.step(action if clip is None else action.clamp(-clip, clip))
-            qpos, qvel = (x.cpu().double().numpy() for x in (env.sim.data.qpos, env.sim.data.qvel))
-            roots.append(judge.root(qpos, qvel))
+            # Copies: these are views of simulation memory.
+            states.append(
+                [x.cpu().double().numpy() for x in (env.sim.data.qpos, env.sim.data.qvel)]
+            )
+    qpos, qvel = (np.array([row[field] for row in states]) for field in (0, 1))
     stacked = {name: np.array(rows) for name, rows in commands.items()}
-    first, moved = stacked[names[0]], np.array(roots)
-    outcomes = [judge.outcome(moved[:, k], first[:, k]) for k in range(env.num_envs)]
-    return Episodes(states, stacked, outcomes)
+    episodes = Episodes(starts, steps, stacked, [])
+    for k, start in enumerate(starts):
+        outcome = judge.outcome(start, qpos[:, k], qvel[:, k], episodes.command(k))
+        episodes.outcomes.append(outcome)
+    return episodes
 
 
-def in_mujoco(bundle: Path, episodes: Episodes) -> list[Outcome]:
+def starts_of(env: Any) -> list[Start]:
+    """Return the starts of all environments, after their reset."""
+    host, starts = mujoco.MjData(env.sim.mj_model), []
+    terms = map(env.command_manager.get_term, env.command_manager.active_terms)
+    motion = next((term for term in terms if hasattr(term, "motion_ids")), None)
+    for k in range(env.num_envs):
+        env.sim.copy_to_host(k, host)
+        state = {field: np.array(getattr(host, field)) for field in STATE}
+        if motion is None:
+            starts.append(Start(state))
+            continue
+        index, t = int(motion.motion_ids[k]), int(motion.time_steps[k])
+        first, length = int(motion.motion.starts[index]), int(motion.motion.lengths[index])
+        starts.append(Start(state, index, first + t, length - 1 - t))
+    return starts
+
+
+def in_mujoco(bundle: Path, episodes: Episodes, judge: Judge) -> list[Outcome]:
     """Play the same episodes by the programs of the bundle."""
     programs = Programs.load(bundle)
     policy = programs.runtime.Policy.load(bundle)
     simulation = programs.simulate.Simulation(policy.contract, programs.simulate.load_model(bundle))
-    judge, outcomes = Judge(policy.contract, simulation.model), []
-    first = next(iter(episodes.commands.values()))
-    for k, state in enumerate(episodes.states):
+    outcomes = []
+    for k, start in enumerate(episodes.starts):
         simulation.reset()
-        simulation.set_state(**state)
-        policy.reset()
-        roots = []
-        for t in range(len(first)):
-            command = {name: values[t, k] for name, values in episodes.commands.items()}
+        simulation.set_state(**start.state)
+        policy.reset(start.motion)
+        # Of a motion: the step goes to the next frame.
+        policy.frame = start.frame - 1
+        commands, states = episodes.command(k), []
+        for t in range(min(episodes.steps, start.length)):
+            command = {name: values[t] for name, values in commands.items()}
             simulation.apply(policy.step(simulation.measure(), command))
-            roots.append(judge.root(simulation.data.qpos, simulation.data.qvel))
-        outcomes.append(judge.outcome(np.array(roots), first[:, k]))
+            states.append((simulation.data.qpos.copy(), simulation.data.qvel.copy()))
+        qpos, qvel = (np.array([row[field] for row in states]) for field in (0, 1))
+        outcomes.append(judge.outcome(start, qpos, qvel, commands))
     return outcomes
 
 
@@ -145,7 +136,7 @@ def difference_of_success(one: list[bool], other: list[bool]) -> tuple[float, fl
     return float(np.mean(other) - np.mean(one)), shift - spread, shift + spread
 
 
-def show(episodes: Episodes, played: list[Outcome]) -> None:
+def show(episodes: Episodes, played: list[Outcome], quantity: str) -> None:
     """Print success rates, mean errors, and their paired differences."""
     pairs = list(zip(episodes.outcomes, played, strict=True))
     success = [a.succeeds for a, _ in pairs], [b.succeeds for _, b in pairs]
@@ -153,12 +144,13 @@ def show(episodes: Episodes, played: list[Outcome]) -> None:
     print(f"success in the environment {rates[0]:.1f} %, in plain MuJoCo {rates[1]:.1f} %")
     by, low, high = (100.0 * x for x in difference_of_success(*success))
     print(f"paired difference {by:+.1f} points, 95 % interval {low:+.1f} to {high:+.1f}")
-    errors = np.array([(a.error, b.error) for a, b in pairs if a.succeeds and b.succeeds])
+    errors = np.array([(a.error, b.error) for a, b in pairs])
+    errors = errors[np.isfinite(errors).all(axis=1)]
     if len(errors) > 1:
         change = errors[:, 1] - errors[:, 0]
         half = NORMAL * change.std(ddof=1) / math.sqrt(len(change))
         print(
-            f"velocity error {errors[:, 0].mean():.4f} and {errors[:, 1].mean():.4f} m/s; paired "
+            f"{quantity} {errors[:, 0].mean():.4f} and {errors[:, 1].mean():.4f}; paired "
             f"difference {change.mean():+.5f}, 95 % interval {change.mean() - half:+.5f} to "
             f"{change.mean() + half:+.5f}"
         )
@@ -180,20 +172,26 @@ def main() -> None:
         if options.bundle is None:
             run_deploy(task, cfg)
         contract = json.loads((bundle / "contract.json").read_text(encoding="utf-8"))
-        if not any(map(is_velocity, contract["commands"])):
-            raise SystemExit("Expected a policy with a velocity command.")
-        start = time.perf_counter()
-        env = nominal_env(task, cfg, options.pairs, options.seconds)
-        steps = round(options.seconds / contract["rates"]["step_dt"])
+        start, seconds = time.perf_counter(), longest(contract, options.seconds)
+        env = nominal_env(task, cfg, options.pairs, seconds)
+        judge = judge_of(env.unwrapped, contract, bundle)
+        steps = round(seconds / contract["rates"]["step_dt"])
         policy = OnnxPolicy(bundle / contract["policy"]["file"], num_envs=options.pairs)
-        episodes = in_environment(env.unwrapped, contract, policy, steps)
+        episodes = in_environment(env.unwrapped, contract, policy, judge, steps)
         env.close()
         played_from = time.perf_counter()
-        played = in_mujoco(bundle, episodes)
+        played = in_mujoco(bundle, episodes, judge)
     ended = time.perf_counter()
-    print(f"{task}: {options.pairs} pairs of {options.seconds:g} s, ", end="")
+    print(f"{task}: {options.pairs} pairs of {seconds:g} s, ", end="")
     print(f"{played_from - start:.0f} s and {ended - played_from:.0f} s")
-    show(episodes, played)
+    show(episodes, played, judge.quantity)
+
+
+def longest(contract: dict[str, Any], seconds: float) -> float:
+    """Return the duration of an episode: goals, and objects placed with them, do not change within one."""
+    goals = [one for one in contract["commands"] if one["kind"] == "given" and not is_velocity(one)]
+    step_dt = contract["rates"]["step_dt"]
+    return min([seconds, *(one["resampling_s"][0] - step_dt for one in goals)])
 
 
 def nominal_env(task: str, cfg: DeployConfig, pairs: int, seconds: float) -> Any:
@@ -204,10 +202,15 @@ def nominal_env(task: str, cfg: DeployConfig, pairs: int, seconds: float) -> Any
     nominal, lacks = nominal_cfg(evaluated, agent.clip_actions)
     del nominal.events["deployment_start"]
     for name, seconds_range in lacks.resampling.items():
-        nominal.commands[name].resampling_time_range = seconds_range
+        command: Any = nominal.commands[name]
+        command.resampling_time_range = seconds_range
+        if hasattr(command, "sampling_mode"):
+            command.sampling_mode = "uniform"
     # Falls are judged by the same rule on both sides.
     over = {name: term for name, term in nominal.terminations.items() if _is_time_out(term)}
     nominal.terminations, nominal.episode_length_s = over, seconds + 1.0
+    # Motions are where they are, and so are the robots that track them.
+    nominal.scene.env_spacing = 0.0
     nominal.scene.num_envs, nominal.seed = pairs, 1 if cfg.seed is None else cfg.seed
     return make_env(task, nominal, "cpu", agent=dataclasses.replace(agent))
 
