@@ -173,8 +173,6 @@ def check_legs(report: RobotReport, truth: dict[str, Any], questions: set[str]) 
     soles = {foot.link: sorted(foot.sole) for foot in anatomy.feet.value}
     expected = {link: sorted(geoms) for link, geoms in truth["feet"].items()}
     yield "soles", soles == expected, str(soles)
-    sites = [bool(foot.site) for foot in anatomy.feet.value]
-    yield "foot sites", bool(sites) and all(s == truth["sites"] for s in sites), str(sites)
     asked = "imu_site" in questions
     if truth["imu"] == "asked":
         yield "imu", None if asked else False, str(anatomy.imu_site.value)

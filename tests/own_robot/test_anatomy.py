@@ -29,6 +29,18 @@ def test_feet_from_front_left_to_rear_right(legs):
     assert anatomy.trunk.value == "trunk"
 
 
+@pytest.mark.parametrize("legs", [4, 6])
+def test_feet_of_a_row_need_not_be_level(legs):
+    spec = legged_spec(legs)
+    for number in range(legs):
+        row, side = divmod(number, 2)
+        # As CAD has it, 0.1 mm; feet apart by a tenth of the trunk too.
+        for shift in (1e-4, 0.03):
+            spec.body(f"{'ab'[side]}{row}_hip").pos[0] += shift * (-1) ** number
+    links = [foot.link for foot in anatomy_of(spec).feet.value]
+    assert links == [f"{side}{row}_calf" for row in range(legs // 2) for side in "ab"]
+
+
 def test_sole_is_the_lowest_geom():
     calf = anatomy_of(legged_spec(4)).feet.value[0]
     assert calf.sole == ("a0_calf_collision2",)
@@ -93,7 +105,9 @@ def test_stock_robots():
     go1, g1, yam = (
         anatomy_of(mujoco.MjSpec.from_file(str(file))) for file in (GO1_XML, G1_XML, YAM_XML)
     )
-    assert [foot.site for foot in go1.feet.value] == ["FL", "FR", "RL", "RR"]
+    assert [foot.sole for foot in go1.feet.value] == [
+        (f"{foot}_foot_collision",) for foot in ("FL", "FR", "RL", "RR")
+    ]
     assert g1.imu_site.value == "imu_in_pelvis"
     assert g1.upright.value == "torso_link"
     (hand,) = yam.hands.value

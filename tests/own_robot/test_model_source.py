@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import keyword
 import subprocess
 import sys
 import types
@@ -13,7 +14,7 @@ import pytest
 from legged import legged_spec
 from small_robots import arm_spec, write_archive, write_quadruped, write_urdf
 
-from mjlab.own_robot.model_source import load_model, model_file, name_elements
+from mjlab.own_robot.model_source import identifier, load_model, model_file, name_elements
 from mjlab.own_robot.report import describe_robot
 
 ROBOT = "<mujoco><worldbody><body><geom name='g' size='.1'/></body></worldbody></mujoco>"
@@ -167,3 +168,11 @@ def test_base_of_a_urdf_is_asked(tmp_path):
     fixed = describe_robot(str(path), {"floating_base": "false"})
     assert fixed.anatomy.kind.value != "legged"
     assert "floating_base" not in {question.key for question in fixed.questions}
+
+
+@pytest.mark.parametrize("name", ["2legs", "class", "My Robot-3", "..."])
+def test_identifier_is_a_python_name(name: str) -> None:
+    found = identifier(name)
+    assert found.isidentifier()
+    assert not keyword.iskeyword(found)
+    assert identifier(found).strip("_") == found.strip("_")

@@ -6,7 +6,10 @@ import importlib
 import pkgutil
 import runpy
 import sys
+import tomllib
+import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -275,7 +278,7 @@ def test_edits_are_kept(tmp_path: Path) -> None:
     assert (folder / ROBOT).read_text() == "# mine\n"
 
 
-def test_other_folders_are_refused(tmp_path: Path) -> None:
+def test_other_folders_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match="--output"):
         read_record(tmp_path)
@@ -311,6 +314,24 @@ def test_other_oddities_of_a_file(tmp_path: Path, imported) -> None:
     assert len(soles) == 4
     assert model.geom_conaffinity[soles].all()
     assert not model.geom_contype.any()
+
+
+def test_names_with_spaces_and_quotes(tmp_path: Path, imported) -> None:
+    path = write_quadruped(tmp_path / "model")
+    text = path.read_text().replace('"trunk"', "'the \"big\" trunk'").replace("_calf", "_ca\\lf")
+    path.write_text(text.replace("_", " "))
+    package = Package("dog", "velocity", describe_robot(str(path)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SyntaxWarning)
+        model = imported(written(tmp_path / "p", package), "dog.robot").get_robot_cfg().build()
+    assert model.compile().nu == 12
+
+
+@pytest.mark.parametrize(("name", "distribution"), [("_2legs", "2legs"), ("class_", "class")])
+def test_name_of_the_distribution(tmp_path: Path, name: str, distribution: str) -> None:
+    package = replace(quadruped(tmp_path / "model"), name=name)
+    project = tomllib.loads(package.files("", tmp_path)["pyproject.toml"].decode())["project"]
+    assert project["name"] == distribution
 
 
 def test_rotated_imu_is_replaced(tmp_path: Path, imported) -> None:

@@ -51,9 +51,16 @@ def test_lines_of_a_urdf(urdf: str) -> None:
     assert f"{urdf}:4" in found["initial pose outside the limits"]
 
 
-def test_a_floating_urdf_starts_in_the_ground(urdf: str) -> None:
-    assert "initial pose in the ground" not in faults(check(urdf))
-    assert "initial pose in the ground" in faults(check(urdf, CheckConfig(floating_base=True)))
+def test_cures_of_a_urdf_are_in_the_config(urdf: str) -> None:
+    found = {finding.fault: finding for finding in check(urdf, CheckConfig(floating_base=True))}
+    assert "initial pose in the ground" not in found
+    assert "config" in found["zero armature"].cure
+    assert "<joint>" not in found["zero armature"].cure
+
+
+def test_places_are_relative_to_the_working_folder(urdf: str, monkeypatch) -> None:
+    monkeypatch.chdir(Path(urdf).parent)
+    assert faults(check(urdf))["absurd inertia"] == ("arm.urdf:8",)
 
 
 def test_stock_tasks_have_the_documented_findings_only() -> None:

@@ -21,8 +21,8 @@ SOLE_DEPTH = 0.01
 """Distance above the lowest point of a foot within which a geom is part of the sole (m)."""
 FOOT_BAND = 0.05
 """Height of the lowest points of feet above the lowest of them, as a share of the trunk's height."""
-
-
+ROW_GAP = 0.25
+"""Distance of two rows of feet, front to rear, as a share of that of the first and the last row."""
 ANKLE_SHARE = 0.15
 """Distance of an ankle's joint to the foot, as a share of the leg's length."""
 
@@ -35,8 +35,6 @@ class Foot:
     """Body of the foot."""
     sole: tuple[str, ...]
     """Geoms that touch the ground."""
-    site: str | None
-    """Site on the foot; None if there is none."""
     position: tuple[float, float, float]
     """Middle of the sole in the frame of the body (m)."""
     normal: tuple[float, float, float]
@@ -224,17 +222,23 @@ def _feet(model: mujoco.MjModel, trunk: int) -> tuple[Foot, ...]:
     data.qpos[:] = pose
     mujoco.mj_kinematics(model, data)
     frame, origin = data.xmat[trunk].reshape(3, 3), data.xpos[trunk].copy()
-    placed = [
-        (foot, (data.xpos[link] - origin) @ frame) for foot, link in zip(level, links, strict=True)
-    ]
-    return tuple(foot for foot, _ in sorted(placed, key=lambda item: _row_order(item[1], placed)))
+    places = np.array([(data.xpos[link] - origin) @ frame for link in links])
+    return tuple(level[foot] for foot in _in_rows(places))
 
 
-def _row_order(position: np.ndarray, feet: list) -> tuple[float, float]:
-    """Order feet front to rear in rows, left to right in a row."""
-    spread = max(float(np.ptp([p[0] for _, p in feet])), 1e-6)
-    row = round(3.0 * float(position[0]) / spread) if spread > 0.05 else 0
-    return -row, -float(position[1])
+def _in_rows(places: np.ndarray) -> list[int]:
+    """Return the order of feet: rows front to rear, left to right in a row.
+
+    Args:
+        places: Feet in the frame of the trunk, (F, 3).
+    """
+    order = np.argsort(-places[:, 0])
+    ahead = places[order, 0]
+    # A row ends at a gap; two feet are one row.
+    gap = max(ROW_GAP * float(np.ptp(ahead)), 0.05)
+    ends = np.flatnonzero(-np.diff(ahead) > gap) + 1 if len(places) > 2 else []
+    rows = np.split(order, ends)
+    return [int(foot) for row in rows for foot in sorted(row, key=lambda f: -places[f, 1])]
 
 
 def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
@@ -247,12 +251,9 @@ def _foot(model: mujoco.MjModel, data: mujoco.MjData, link: int) -> Foot:
     middle = np.array([*(0.5 * (low + high))[:2], lowest])
     local = data.xmat[link].reshape(3, 3).T @ (middle - data.xpos[link])
     normal = data.xmat[link].reshape(3, 3)[2]
-    sites = [s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == link]
-    sites.sort(key=lambda s: float(np.linalg.norm(data.site_xpos[s] - middle)))
     return Foot(
         link=model.body(link).name,
         sole=tuple(model.geom(g).name for g in sole),
-        site=model.site(sites[0]).name or None if sites else None,
         position=(float(local[0]), float(local[1]), float(local[2])),
         normal=(float(normal[0]), float(normal[1]), float(normal[2])),
         size=(float(high[0] - low[0]), float(high[1] - low[1])),

@@ -116,13 +116,14 @@ def _zero_armature(subject: Subject) -> Iterator[Finding]:
         if name in candidates and armature[name] == 0.0 and measures.is_hinge(model, name)
     ]
     if found:
+        where = "in the actuator's config" + ("" if subject.is_urdf else " or in <joint>")
         yield Finding(
             "zero armature",
             f"{_joints(found)} without rotor inertia",
             subject.joint_places(found),
             "The rotor of a geared motor often has more inertia at the joint than the link: without it, "
             "light links need a smaller time step, and the policy learns on another robot.",
-            "Write armature = rotor inertia x gear ratio² (kg m²), in <joint> or in the actuator's config.",
+            f"Write armature = rotor inertia x gear ratio² (kg m²), {where}.",
         )
 
 
@@ -363,7 +364,8 @@ def _outside_limits(subject: Subject) -> Iterator[Finding]:
 def _ground(subject: Subject) -> Iterator[Finding]:
     model, data = subject.model, subject.data
     free = geo.free_joint(model)
-    if free is None:
+    # A URDF has no initial height.
+    if free is None or subject.is_urdf:
         return
     root = int(model.jnt_bodyid[free])
     gap = geo.lowest_height(model, data, measures.own_geoms(subject)) - measures.level_of_ground(
@@ -495,7 +497,8 @@ def _soles(subject: Subject) -> Iterator[Finding]:
             "With equal priority, MuJoCo takes the larger friction of foot and ground: a foot of 0.3 on "
             "ground of 1.0 has 1.0. With priority and condim 1, feet have no friction at all."
         )
-        cure = 'Give the soles priority="1" and condim="3", in the file or by CollisionCfg.'
+        where = "by CollisionCfg" if subject.is_urdf else "in the file or by CollisionCfg"
+        cure = f'Give the soles priority="1" and condim="3", {where}.'
     yield Finding(
         "soles whose friction cannot be randomized",
         f"{counted(len(found), 'geom')} of the feet, {what}",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import importlib
+import keyword
 import re
 import shutil
 import tempfile
@@ -76,8 +77,11 @@ def load_model(source: str, *, floating_base: bool = False) -> RobotModel:
 
 
 def identifier(name: str) -> str:
-    """Return a name as lower-case letters, digits and underscores."""
-    return re.sub(r"\W+", "_", name.lower()).strip("_") or "robot"
+    """Return a name as a Python name of lower-case letters, digits and underscores."""
+    word = re.sub(r"\W+", "_", name.lower()).strip("_") or "robot"
+    if keyword.iskeyword(word):
+        return f"{word}_"
+    return word if word.isidentifier() else f"_{word}"
 
 
 def model_file(path: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +69,7 @@ class Package:
             }
         text = {
             "pyproject.toml": template("pyproject.toml").substitute(
-                names, distribution=self.name.replace("_", "-")
+                names, distribution=self.name.strip("_").replace("_", "-")
             ),
             f"{module}/__init__.py": template(f"{kind}_init.py").substitute(names),
             f"{module}/robot.py": robot_source(report, title, model),
@@ -89,33 +90,36 @@ class Package:
         if kind != "legged":
             return template(f"{kind}_test.py").substitute(names)
         has_two = len(self.report.anatomy.feet.value) == 2
-        reason = "Two legs may fall soon without a policy." if has_two else "Legs yield a little."
+        reason = "Two legs fall soon without a policy." if has_two else "Legs yield a little."
         return template("legged_test.py").substitute(
             names,
             seconds=0.4 if has_two else 2.0,
-            seconds_name="a_moment" if has_two else "two_seconds",
+            test_name="falls_late" if has_two else "stands_for_two_seconds",
+            what="falls no sooner than after 0.4 s" if has_two else "stands",
             seconds_reason=reason,
         )
 
     def _readme(self, command: str, folder: Path) -> str:
         module = f"src/{self.name}"
+        has_two = self.task == "velocity" and len(self.report.anatomy.feet.value) == 2
+        stands = "falls no sooner than after 0.4 s" if has_two else "stands"
         contents = {
             f"{module}/robot.py": "initial pose, motors, parts: each value with its reason",
             f"{module}/model/": "the model file and its meshes",
             f"{module}/__init__.py": "registration of the tasks",
-            f"tests/test_{self.name}.py": "stands, and its tasks can be stepped (`uv run pytest`)",
+            f"tests/test_{self.name}.py": f"{stands}, and its tasks can be stepped (`uv run pytest`)",
         }
         if self.tasks:
             contents[f"{module}/task.py"] = "commands, rewards, terminations, profile for a CPU"
         questions = questions_table(self.report)
         asked = ["", "## Questions", "", questions.markdown()] if questions.rows else []
-        if self.task == "velocity" and len(self.report.anatomy.feet.value) == 2:
+        if has_two:
             asked += ["", _TWO_LEGS]
         return template("README.md").substitute(
             title=self.title,
             command=command,
             contents="\n".join(f"| `{file}` | {what} |" for file, what in contents.items()),
-            folder=folder.as_posix(),
+            folder=shlex.quote(folder.as_posix()),
             run="\n".join(self.commands()),
             values=values_table(self.report).markdown(),
             questions="\n".join(asked),
@@ -139,12 +143,13 @@ class Package:
 _TWO_LEGS = """\
 ## Two legs
 
-The profile `cpu` is that of the G1. No other biped has been trained to walk with it yet: take it for
-a start, not a recipe.
+The profile `cpu` is that of the G1. An H1, a T1 and a Berkeley Humanoid walk with it as written; others
+may need other gains.
 
 A controller that steps in place teaches the policy of the profile `cpu` at first (`stepping_action`).
-The observation group `teacher` has its action, and `mdp.SteppingGains` its gains: `gains=` of
-`BIPED` in `task.py`. If robots drift, change `lead`; if they fall sideways, `step_sideways`."""
+The observation group `teacher` has its action, and `mdp.SteppingGains` its gains, which follow from
+height and mass. To set them, add `gains=mdp.SteppingGains(...)` to `BIPED` in `task.py`. If robots drift,
+change `lead`; if they fall sideways, `step_sideways`."""
 
 
 def values_table(report: RobotReport) -> Table:

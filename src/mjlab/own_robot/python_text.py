@@ -92,10 +92,11 @@ def pattern(names: Iterable[str], among: Iterable[str]) -> str:
 def _common_end(names: list[str]) -> str:
     """Return the longest common end that begins with a separator or a capital letter."""
     end = names[0]
-    while end and not (re.match(r"[_\-./A-Z]", end) and all(n.endswith(end) for n in names)):
+    while end and not (re.match(r"[_\-./ A-Z]", end) and all(n.endswith(end) for n in names)):
         end = end[1:]
     return end
 
 
 def _escaped(name: str) -> str:
-    return re.sub(r"([^\w-])", r"\\\1", name)
+    # Spaces and hyphens have no meaning outside of classes, and are read more easily as they are.
+    return re.sub(r"([^\w\s-])", r"\\\1", name)

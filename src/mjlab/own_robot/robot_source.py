@@ -16,6 +16,7 @@ from mjlab.own_robot.python_text import (
     comment_lines,
     commented,
     dict_source,
+    literal,
     number,
     pattern,
     tuple_source,
@@ -151,7 +152,7 @@ def reason_lines(what: str, guess: Guess) -> list[str]:
 
 def _parts(report: RobotReport) -> list[str]:
     anatomy = report.anatomy
-    lines = [commented(f'TRUNK = "{anatomy.trunk.value}"', anatomy.trunk.rule)]
+    lines = [commented(f"TRUNK = {literal(anatomy.trunk.value)}", anatomy.trunk.rule)]
     if anatomy.colliding.source == "rule":
         lines += [
             *reason_lines("Geoms that collide", anatomy.colliding),
@@ -159,9 +160,9 @@ def _parts(report: RobotReport) -> list[str]:
         ]
     if anatomy.kind.value != "legged":
         return lines + _arm_parts(report)
-    lines.append(commented(f'UPRIGHT = "{anatomy.upright.value}"', anatomy.upright.rule))
+    lines.append(commented(f"UPRIGHT = {literal(anatomy.upright.value)}", anatomy.upright.rule))
     imu, reason = imu_site(report)
-    lines.append(commented(f'IMU = "{imu}"', reason))
+    lines.append(commented(f"IMU = {literal(imu)}", reason))
     feet, names = feet_in_model_order(report), foot_names(report)
     soles = [name for foot in feet for name in foot.sole]
     _, contacts = foot_contacts(report)
@@ -170,7 +171,7 @@ def _parts(report: RobotReport) -> list[str]:
         "# Sites that `get_spec` adds: body, and middle of the sole in its frame.",
         "FOOT_SITES = {",
         *(
-            f'    "{name}": ("{foot.link}", {tuple(round(x, 4) + 0.0 for x in foot.position)}),'
+            f"    {literal(name)}: ({literal(foot.link)}, {_rounded(foot.position)}),"
             for name, foot in zip(names, feet, strict=True)
         ),
         "}",
@@ -191,7 +192,7 @@ def _arm_parts(report: RobotReport) -> list[str]:
         others = ", ".join(other.link for other in report.anatomy.hands.value[1:])
         lines += comment_lines(f"Of several hands, the first; the others are on {others}.")
     lines += [
-        commented(f'HAND = "{site}"', f"site: {reason}"),
+        commented(f"HAND = {literal(site)}", f"site: {reason}"),
         commented(f"ARM = {tuple_source(hand.joints, 6)}", "joints from the base to the hand")
         if len(hand.joints) < 4
         else f"ARM = {tuple_source(hand.joints, 6)}",
@@ -264,14 +265,19 @@ def _motors(report: RobotReport, joints: tuple[str, ...]) -> tuple[list[str], li
                 groups.setdefault((role[0], *key), []).append(joint)
     lines = []
     for (_, *values), names in groups.items():
-        target = f'"{pattern(names, report.joint_pos.value)}",'
+        target = literal(pattern(names, report.joint_pos.value))
         lines += [
             "    BuiltinPositionActuatorCfg(",
-            f"        target_names_expr=({target}),",
+            f"        target_names_expr=({target},),",
             *(f"        {field}={value}," for field, value in zip(fields, values, strict=True)),
             "    ),",
         ]
     return reasons, lines
+
+
+def _rounded(position: tuple[float, float, float]) -> tuple[float, ...]:
+    """Return a position with four decimals, without -0.0."""
+    return tuple(round(x, 4) + 0.0 for x in position)
 
 
 def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
@@ -307,10 +313,9 @@ def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
         return lines + _legged_spec(report)
     if report.anatomy.hands.value and report.anatomy.hands.value[0].site is None:
         hand = report.anatomy.hands.value[0]
-        position = tuple(round(x, 4) + 0.0 for x in hand.position)
         lines += [
             *comment_lines(f"The grasp: {report.anatomy.hands.rule}."),
-            f'spec.body("{hand.link}").add_site(name=HAND, pos={position})',
+            f"spec.body({literal(hand.link)}).add_site(name=HAND, pos={_rounded(hand.position)})",
         ]
     return lines
 
@@ -412,7 +417,7 @@ def _legged_spec(report: RobotReport) -> list[str]:
     for name in _shared_bodies(report):
         lines += [
             "# Fixed to the world: all environments would share it.",
-            f'spec.delete(spec.body("{name}"))',
+            f"spec.delete(spec.body({literal(name)}))",
         ]
     lines.append("# Sensors that the task reads.")
     for name, (kind, object_type, owner) in sensors.items():

@@ -37,6 +37,12 @@ _KINDS = {
 _LISTS = {"body": "bodies", "joint": "joints", "geom": "geoms", "site": "sites"}
 
 
+def shown(file: Path) -> Path:
+    """Return a path relative to the working folder if the file is below it."""
+    here = Path.cwd()
+    return file.relative_to(here) if file.is_relative_to(here) else file
+
+
 @dataclass(frozen=True)
 class Line:
     """Line of a file."""
@@ -47,7 +53,7 @@ class Line:
     """Line number, from 1."""
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.number}"
+        return f"{shown(self.file)}:{self.number}"
 
 
 @dataclass

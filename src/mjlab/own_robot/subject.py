@@ -13,7 +13,7 @@ from mjlab.own_robot import geometry as geo
 from mjlab.own_robot.anatomy import Anatomy, actuated_joint, find_anatomy
 from mjlab.own_robot.gains import file_effort, servo_stiffness
 from mjlab.own_robot.model_source import name_elements
-from mjlab.own_robot.source_lines import SourceLines, element_path
+from mjlab.own_robot.source_lines import SourceLines, element_path, shown
 
 
 @dataclass
@@ -79,7 +79,7 @@ class Subject:
         """Return file and line of an element outside of bodies; the file if it has none."""
         if self.lines is None:
             return tag
-        return str(self.lines.of_tag(tag, attribute) or self.lines.path)
+        return str(self.lines.of_tag(tag, attribute) or shown(self.lines.path))
 
     def joint_places(self, joints: Iterable[str]) -> tuple[str, ...]:
         """Return the places of joints."""

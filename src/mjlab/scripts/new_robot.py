@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import keyword
 import os
 import shlex
 import shutil
@@ -118,7 +119,7 @@ def _setting(text: str) -> tuple[str, str]:
 
 def _check_name(name: str, folder: Path) -> None:
     """Raise `UserError` for a name that is none, or that of another module."""
-    if not name.isidentifier():
+    if not name.isidentifier() or keyword.iskeyword(name):
         raise UserError(
             f"--name {name!r}: expected a Python name; use e.g. --name {identifier(name)}."
         )
@@ -210,7 +211,7 @@ def _summary(package: Package, folder: Path, kept: list[str]) -> str:
         )
     if package.report.questions:
         lines.append("Answer questions with --set KEY=VALUE, or edit the values.")
-    lines += ["Next:", f"    uv pip install -e {folder}"]
+    lines += ["Next:", f"    uv pip install -e {shlex.quote(str(folder))}"]
     return "\n".join([*lines, *(f"    {line}" for line in package.commands())])
 
 
