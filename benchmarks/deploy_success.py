@@ -28,7 +28,6 @@ from mjlab.deploy.evidence import Programs
 from mjlab.deploy.golden import STATE
 from mjlab.deploy.nominal import nominal_cfg
 from mjlab.deploy.usual_terms import is_velocity
-from mjlab.managers import TerminationTermCfg
 from mjlab.rl.exporter_utils import OnnxPolicy
 from mjlab.runs.policy import agent_cfg_of, make_env
 from mjlab.scripts.deploy import DeployConfig, policy_of, run_deploy
@@ -173,7 +172,7 @@ def main() -> None:
             run_deploy(task, cfg)
         contract = json.loads((bundle / "contract.json").read_text(encoding="utf-8"))
         start, seconds = time.perf_counter(), longest(contract, options.seconds)
-        env = nominal_env(task, cfg, options.pairs, seconds)
+        env = nominal_env(task, cfg, options.pairs)
         judge = judge_of(env.unwrapped, contract, bundle)
         steps = round(seconds / contract["rates"]["step_dt"])
         policy = OnnxPolicy(bundle / contract["policy"]["file"], num_envs=options.pairs)
@@ -194,8 +193,11 @@ def longest(contract: dict[str, Any], seconds: float) -> float:
     return min([seconds, *(one["resampling_s"][0] - step_dt for one in goals)])
 
 
-def nominal_env(task: str, cfg: DeployConfig, pairs: int, seconds: float) -> Any:
-    """Return the nominal environments, with the starts and the changes of commands of the task."""
+def nominal_env(task: str, cfg: DeployConfig, pairs: int) -> Any:
+    """Return the nominal environments, with the starts and the changes of commands of the task.
+
+    Their episodes do not end.
+    """
     checkpoint = find_checkpoint(task, cfg)
     evaluated = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
     agent = agent_cfg_of(task, checkpoint, cfg.profile)
@@ -206,17 +208,12 @@ def nominal_env(task: str, cfg: DeployConfig, pairs: int, seconds: float) -> Any
         command.resampling_time_range = seconds_range
         if hasattr(command, "sampling_mode"):
             command.sampling_mode = "uniform"
-    # Falls are judged by the same rule on both sides.
-    over = {name: term for name, term in nominal.terminations.items() if _is_time_out(term)}
-    nominal.terminations, nominal.episode_length_s = over, seconds + 1.0
+    # One rule judges both sides.
+    nominal.terminations = {}
     # Motions are where they are, and so are the robots that track them.
     nominal.scene.env_spacing = 0.0
     nominal.scene.num_envs, nominal.seed = pairs, 1 if cfg.seed is None else cfg.seed
     return make_env(task, nominal, "cpu", agent=dataclasses.replace(agent))
-
-
-def _is_time_out(term: TerminationTermCfg | None) -> bool:
-    return term is not None and term.time_out
 
 
 if __name__ == "__main__":

@@ -282,6 +282,24 @@ def test_hand_over_is_to_the_first_pose_of_the_motion(bundle):
     np.testing.assert_allclose(last.position, policy.motion["joint_pos"][30])
 
 
+def test_motion_is_a_motion_file(bundle):
+    """In the fields that other controllers of motions read, of the joints of the contract."""
+    folder = bundle("Mjlab-Tracking-Flat-Unitree-G1")
+    contract = json.loads((folder / "contract.json").read_text())
+    motion = np.load(folder / "motion.npz")
+    joints, bodies = len(contract["joints"]), len(contract["commands"][0]["bodies"])
+    count = contract["commands"][0]["num_frames"]
+    shapes = {name: motion[name].shape for name in motion if not name.endswith("names")}
+    assert shapes == {
+        "fps": (1,),
+        **dict.fromkeys(("joint_pos", "joint_vel"), (count, joints)),
+        **dict.fromkeys(("body_pos_w", "body_lin_vel_w", "body_ang_vel_w"), (count, bodies, 3)),
+        "body_quat_w": (count, bodies, 4),
+    }
+    assert motion["fps"][0] == pytest.approx(1.0 / contract["rates"]["step_dt"])
+    assert motion["joint_names"].tolist() == [joint["name"] for joint in contract["joints"]]
+
+
 def turned(quat: np.ndarray) -> np.ndarray:
     """Return an orientation turned by 90 degrees to the left."""
     w, x, y, z = quat
