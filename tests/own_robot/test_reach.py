@@ -54,6 +54,10 @@ def test_hanging_arm_has_a_stand():
 def test_answered_home():
     settings = {"pose.joint1": "0.5", "pose.joint2": "0.6"}
     report = describe_robot(RobotModel(arm_spec(), "crane", "crane", None, None), settings)
-    assert report.joint_pos.source == "set"
     assert report.joint_pos.value["joint1"] == 0.5
-    assert "pose" not in {question.key for question in report.questions}
+    (question,) = [question for question in report.questions if question.key == "pose"]
+    # The value in use answers the question as it is printed.
+    crane = RobotModel(arm_spec(), "crane", "crane", None, None)
+    answered = describe_robot(crane, {"pose": question.used})
+    assert answered.joint_pos.value == pytest.approx(report.joint_pos.value)
+    assert "pose" not in {question.key for question in answered.questions}

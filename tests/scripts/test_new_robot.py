@@ -14,12 +14,6 @@ from small_robots import write_archive, write_quadruped
 from mjlab.scripts import new_robot
 
 
-@pytest.fixture(autouse=True)
-def no_registration(monkeypatch) -> None:
-    """Keep the tasks of this process as they are: the command imports the package that it writes."""
-    monkeypatch.setattr("mjlab.tasks.registry.register_mjlab_task", lambda **task: None)
-
-
 @pytest.fixture
 def model(tmp_path: Path) -> str:
     return str(write_quadruped(tmp_path / "model"))
@@ -99,6 +93,11 @@ def test_edits_survive_a_second_run(run, model: str, folder: Path) -> None:
     assert robot.read_text() == mine
     assert "stiffness=33.0" in robot.with_name("robot.py.new").read_text()
     assert "src/dog/robot.py" in outcome.out
+    # The task fits the robot that is kept.
+    task = robot.with_name("task.py").read_text()
+    outcome = run("new_robot", model, "--output", str(folder), "--set", "root_height=0.4")
+    assert robot.with_name("task.py").read_text() == task
+    assert "Not in force" in outcome.out
 
 
 def test_questions_on_a_terminal(run, model: str, folder: Path, monkeypatch) -> None:
@@ -162,3 +161,33 @@ def test_install_calls_uv(run, model: str, folder: Path, monkeypatch) -> None:
     ((*_, flag, target),) = called
     assert (flag, target) == ("-e", str(folder))
     assert sys.executable in called[0]
+
+
+def test_module_of_the_working_folder(run, tmp_path: Path, monkeypatch) -> None:
+    spec = 'import mujoco\ndef spec():\n    return mujoco.MjSpec.from_file("model/dog.xml")\n'
+    (tmp_path / "dogs_here.py").write_text(spec)
+    write_quadruped(tmp_path / "model")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(tmp_path))])
+    outcome = run("new_robot", "dogs_here:spec", "--name", "hound", "--output", "a folder")
+    assert outcome.status == 0, outcome.err
+    assert "pip install -e 'a folder'" in outcome.out
+    assert "module" in run("new_robot", "no_such_module:spec", "--name", "hound").message
+
+
+def test_several_floating_bases(run, model: str, folder: Path) -> None:
+    path = Path(model)
+    other = '<body name="other"><freejoint/><geom size="0.1"/></body></worldbody>'
+    path.write_text(path.read_text().replace("</worldbody>", other))
+    outcome = run("new_robot", model, "--output", str(folder))
+    assert "several floating bases" in outcome.message
+    assert "FL_calf" in outcome.out
+    assert not folder.exists()
+
+
+def test_task_is_remembered(run, model: str, tmp_path: Path, folder: Path) -> None:
+    run("new_robot", model, "--output", str(folder), "--task", "bare")
+    assert run("new_robot", model, "--output", str(folder)).status == 0
+    assert not (folder / "src" / "dog" / "task.py").exists()
+    other = str(write_quadruped(tmp_path / "other"))
+    assert "--output" in run("new_robot", other, "--output", str(folder)).message

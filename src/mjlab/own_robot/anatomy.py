@@ -125,7 +125,12 @@ def find_anatomy(model: mujoco.MjModel, *, kind: Kind | None = None) -> Anatomy:
         legs=Guess(legs, "joints from the trunk to a foot"),
         front=_front(model, legs, feet),
         upright=_upright(model, trunk, legs),
-        hands=Guess(hands, "last link before the finger joints"),
+        hands=Guess(
+            hands,
+            "last link before the finger joints"
+            if any(hand.gripper for hand in hands)
+            else "last link of the arm",
+        ),
         mirror=Guess(
             mirror if has_sides else {}, "axis and moved mass mirrored, same depth and range"
         ),
@@ -152,6 +157,16 @@ def _slides_freely(model: mujoco.MjModel, link: int) -> bool:
     """Return True for a link that two slides of its own move against the world, as of planar walkers."""
     slides = [j for j in geo.link_joints(model, link) if model.jnt_type[j] == geo.SLIDE]
     return geo.parent_link(model, link) == 0 and len(slides) >= 2
+
+
+def fixed_legs(model: mujoco.MjModel) -> int:
+    """Return the number of legs below a fixed base: ends that are lowest in a pose, without fingers."""
+    base = model.body(_trunk(model, None, 0).value).id
+    if model.body_weldid[base] != 0:
+        return 0
+    links = [model.body(foot.link).id for foot in _feet(model, base)]
+    fingers = finger_joints(model)
+    return sum(not fingers & set(geo.chain_joints(model, link, base)) for link in links)
 
 
 def _trunk(model: mujoco.MjModel, free: int | None, trunk: int) -> Guess[str]:

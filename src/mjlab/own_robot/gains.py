@@ -252,11 +252,15 @@ def find_gains(
             else:
                 wanted = own[name]
         stiffness[name] = min(wanted, cap[name])
-    groups = like_joints(anatomy, list(joint_pos))
+    groups = like_joints(anatomy, list(joint_pos), answers)
     stiffness = _alike(stiffness, groups) | answers
     rule = (
         "servo of the file, or effort per rad and static torque per 0.14 rad, at most (0.5/dt)^2 I"
+        if legged
+        else f"servo of the file, or effort per {ARM_ERROR:g} rad, at most (0.5/dt)^2 I"
     )
+    if sway:
+        rule += f"; hips {SWAY_MARGIN:g} m g h / legs or more"
     if stand_ins:
         rule += f"; servo of the file below {STAND_IN:g} of that, overridden: {_some(stand_ins)}"
     questions = []
@@ -286,7 +290,7 @@ def find_gains(
                 stiffened(stiffness, 1.15**step, ceiling, set(anatomy.leg_joints) - answers.keys())
                 for step in range(MAX_ROUNDS)
             )
-            found = _first_that_stands(free, anatomy, joint_pos, height, trials, inertia)
+            found = _first_that_stands(free, anatomy, joint_pos, height, trials, inertia, groups)
             if found is None:
                 text = "stiffness of the legs: other bodies than the feet touch the ground"
                 most = f"up to {1.15 ** (MAX_ROUNDS - 1):.2g} times as stiff, or as the time step allows"
@@ -329,6 +333,7 @@ def _first_that_stands(
     height: float,
     trials: Iterable[dict[str, float]],
     inertia: dict[str, float],
+    groups: list[tuple[str, ...]],
 ) -> dict[str, float] | None:
     """Return the first stiffness with which the robot stands on its feet alone; None if none does.
 
@@ -336,7 +341,6 @@ def _first_that_stands(
     give way by 0.22 rad, so that its thighs touch the ground.
     """
     fallen = {model.body(name).id for name in anatomy.fall_bodies.value}
-    groups = like_joints(anatomy, list(joint_pos))
     for trial in trials:
         set_gains(model, trial, _alike(_damping(trial, inertia, legged=True), groups))
         if not _touches(model, fallen, joint_pos, height + DROP):
@@ -374,8 +378,13 @@ def _sway_stiffness(model: mujoco.MjModel, anatomy: Anatomy, height: float) -> d
     return {name: smallest for leg in legs for name in leg.joints[:2]}
 
 
-def like_joints(anatomy: Anatomy, joints: list[str]) -> list[tuple[str, ...]]:
-    """Return the groups of joints with the same gains: those of like legs, and mirror images."""
+def like_joints(
+    anatomy: Anatomy, joints: list[str], answers: dict[str, float]
+) -> list[tuple[str, ...]]:
+    """Return the groups of joints with the same gains: those of like legs, and mirror images.
+
+    Joints with different answers of the user are not alike.
+    """
     groups: dict[tuple[object, ...], list[str]] = {}
     legs = {
         name: (len(leg.joints), index)
@@ -384,7 +393,8 @@ def like_joints(anatomy: Anatomy, joints: list[str]) -> list[tuple[str, ...]]:
     }
     for name in joints:
         partner, _ = anatomy.mirror.value.get(name, (name, 1.0))
-        groups.setdefault(legs.get(name, tuple(sorted((name, partner)))), []).append(name)
+        role = legs.get(name, tuple(sorted((name, partner))))
+        groups.setdefault((role, answers.get(name)), []).append(name)
     return [tuple(group) for group in groups.values()]
 
 

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import shlex
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from mjlab.own_robot.guess import Guess
 from mjlab.own_robot.model_files import copy_model
 from mjlab.own_robot.python_text import number
 from mjlab.own_robot.report import RobotReport
-from mjlab.own_robot.robot_source import by_pattern, robot_source, shared
+from mjlab.own_robot.rewriting import Task
+from mjlab.own_robot.robot_source import by_pattern, imu_site, robot_source, shared
 from mjlab.own_robot.task_source import reach_source, tracking_source, velocity_source
 from mjlab.own_robot.templates import template
 from mjlab.utils.tables import Table
-
-Task = Literal["velocity", "reach", "tracking", "bare"]
 
 
 @dataclass(frozen=True)
@@ -160,13 +158,14 @@ def values_table(report: RobotReport) -> Table:
         "trunk": (anatomy.trunk.value, anatomy.trunk),
     }
     if anatomy.feet.value:
+        imu, reason = imu_site(report)
         soles = [name for foot in anatomy.feet.value for name in foot.sole]
         parts |= {
             "feet": ([foot.link for foot in anatomy.feet.value], anatomy.feet),
             "soles": (soles, anatomy.feet),
             "front": ("x" if anatomy.front.value > 0 else "-x", anatomy.front),
             "kept upright": (anatomy.upright.value, anatomy.upright),
-            "IMU": (anatomy.imu_site.value or "(trunk's origin)", anatomy.imu_site),
+            "IMU": (imu, replace(anatomy.imu_site, rule=reason)),
         }
     if anatomy.hands.value:
         parts["hands"] = ([hand.link for hand in anatomy.hands.value], anatomy.hands)
@@ -181,7 +180,9 @@ def values_table(report: RobotReport) -> Table:
         ("damping", report.damping),
         ("action_scale", report.action_scale),
     ):
-        values = guess.value if name in ("pose", "armature") else shared(guess.value, report)
+        is_shared = name not in ("pose", "armature")
+        answers = report.answers[name]
+        values = shared(guess.value, report, answers) if is_shared else guess.value
         parts[name] = (by_pattern(values, report), guess)
     if anatomy.kind.value == "legged":
         tolerance = by_pattern(shared(report.pose_tolerance.value, report), report)

@@ -45,10 +45,11 @@ def arm_home(
     pose = _searched_home(model, anatomy, is_free, answers)
     pose = {name: round(position, 3) + 0.0 for name, position in pose.items()}
     rule = "no keyframe: close to the middle of the ranges, bent for dexterity"
-    if answers:
-        return Guess(pose, rule, "set"), []
+    if pose.keys() <= answers.keys():
+        return Guess(pose, "as set", "set"), []
     used = ", ".join(f"{position:g}" for position in pose.values())
-    return Guess(pose, rule, "asked"), [Question("pose", "home of the arm: no keyframe", used)]
+    text = f"home of the arm, joint by joint ({', '.join(pose)}): no keyframe"
+    return Guess(pose, rule, "asked"), [Question("pose", text, used)]
 
 
 def stand_height(model: mujoco.MjModel, anatomy: Anatomy) -> float:

@@ -5,26 +5,19 @@ from __future__ import annotations
 import dataclasses
 import re
 from dataclasses import dataclass
-from typing import cast, get_args
 
 import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry as geo
-from mjlab.own_robot.anatomy import Anatomy, Kind, find_anatomy
+from mjlab.own_robot.anatomy import Anatomy, find_anatomy, fixed_legs
 from mjlab.own_robot.gains import effort_limits, find_gains, rotor_inertias
 from mjlab.own_robot.gait import command_ranges, pose_tolerance
 from mjlab.own_robot.guess import Guess, Question
 from mjlab.own_robot.model_source import RobotModel, load_model, name_elements
 from mjlab.own_robot.posture import Posture, find_posture
 from mjlab.own_robot.reach import arm_home, stand_height
-from mjlab.utils.errors import UnknownNameError, check_one_of
-from mjlab.utils.string import suggest
-
-PER_JOINT = ("pose", "effort", "armature", "stiffness", "damping", "action_scale")
-"""Settings of one joint (`effort.FL_knee`), joints by pattern, or all joints (`effort`)."""
-SETTINGS = ("kind", "floating_base", "front", "imu_site", "root_height", *PER_JOINT)
-"""Names of settings."""
+from mjlab.own_robot.settings import PER_JOINT, Answers, parse_settings
 
 
 @dataclass(frozen=True)
@@ -58,6 +51,8 @@ class RobotReport:
     """Deviation of each joint from the initial pose that walking needs (rad)."""
     commands: Guess[dict[str, tuple[float, float]]]
     """Ranges of velocity commands (`lin_vel_x`, `lin_vel_y` in m/s, `ang_vel_z` in rad/s)."""
+    answers: dict[str, dict[str, float]]
+    """Answers of the user by setting of `PER_JOINT`, and by joint."""
     questions: tuple[Question, ...]
 
 
@@ -66,24 +61,24 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
 
     Args:
         source: Model, or source of one as of `load_model`.
-        settings: Answers by setting: a name of `SETTINGS`, for those of joints followed by a dot and
+        settings: Answers by setting: a name of `settings.SETTINGS`, for those of joints followed by a dot and
             a joint or pattern: `{"armature": "0.01", "pose.FL_knee": "-1.8"}`.
 
     Raises:
         UnknownNameError: unknown setting, or a pattern that matches no joint.
         ValueError: setting with a value that it does not have.
     """
-    settings = settings or {}
-    for key in settings:
-        if key.partition(".")[0] not in SETTINGS:
-            raise UnknownNameError(f"Unknown setting {key!r}; {suggest(key, SETTINGS)}")
+    given = parse_settings(settings or {})
     questions: list[Question] = []
-    model = _load(source, settings, questions) if isinstance(source, str) else source
+    model = load_model(source) if isinstance(source, str) else source
     spec = model.spec.copy()
     name_elements(spec)
     compiled = spec.compile()
-    anatomy = _find_anatomy(compiled, settings, questions)
-    answers = {name: _answers(name, settings, compiled) for name in PER_JOINT}
+    if _is_floating(model, compiled, given, questions):
+        compiled = _add_free_joint(spec, compiled)
+    anatomy = _find_anatomy(compiled, given, questions)
+    joints = [compiled.joint(j).name for j in geo.joint_ids(compiled)]
+    answers = {name: given.joint_values(name, joints) for name in PER_JOINT}
     legged, is_arm = anatomy.kind.value == "legged", anatomy.kind.value == "arm"
     posture = find_posture(compiled, anatomy, answers["pose"]) if legged else None
     if posture is not None:
@@ -95,8 +90,8 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         stand = stand_height(compiled, anatomy)
         height = Guess(stand, "on a stand: the arm hangs" if stand else "base on the ground")
         size = _reach(compiled)
-    if "root_height" in settings:
-        height = Guess(float(settings["root_height"]), "as set", "set")
+    if given.root_height is not None:
+        height = Guess(given.root_height, "as set", "set")
     effort, asked = effort_limits(compiled, size, _main_joints(anatomy), answers["effort"])
     questions += asked
     armature, asked = rotor_inertias(compiled, effort.value, is_arm, answers["armature"])
@@ -130,50 +125,70 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         action_scale=_answered(scale, answers["action_scale"]),
         pose_tolerance=pose_tolerance(compiled, anatomy, pose, height.value),
         commands=commands if legged else Guess({}, "no legs"),
+        answers=answers,
         questions=tuple(questions),
     )
 
 
-def _load(source: str, settings: dict[str, str], questions: list[Question]) -> RobotModel:
-    """Return the model of a source; of a URDF with the free joint that its names of joints suggest."""
-    if "floating_base" in settings:
-        floating = settings["floating_base"].lower() in ("true", "1", "yes")
-        return load_model(source, floating_base=floating)
-    model = load_model(source)
-    if not model.is_urdf or any(joint.type == geo.FREE for joint in model.spec.joints):
-        return model
-    legs = [
-        j.name for j in model.spec.joints if re.search("hip|knee|ankle|calf|thigh", j.name.lower())
-    ]
-    text = "a URDF has no free joint: true for a robot with legs or wheels, false for an arm"
+def _is_floating(
+    model: RobotModel, compiled: mujoco.MjModel, given: Answers, questions: list[Question]
+) -> bool:
+    """Return True if the robot needs a free joint that its file does not have; ask if it may."""
+    if any(joint.type == geo.FREE for joint in model.spec.joints):
+        if given.floating_base is False:
+            raise ValueError("Setting floating_base=false: the model file has a free joint.")
+        return False
+    if given.kind == "legged" and given.floating_base is False:
+        raise ValueError("Setting kind=legged: expected floating_base=true, got false.")
+    if given.floating_base is not None or given.kind == "legged":
+        return given.floating_base is not False
+    named = [j.name for j in model.spec.joints if re.search(_LEG_NAMES, j.name.lower())]
+    legs = fixed_legs(compiled)
+    if not model.is_urdf and legs < 2:
+        return False
+    text = "the file has no free joint: true for a robot with legs or wheels, false for an arm"
     reason = (
-        f"true, because of joint {legs[0]!r}" if legs else "false, no joint is named like a leg's"
+        f"true, because of joint {named[0]!r}" if named else "false, no joint is named like a leg's"
     )
     questions.append(Question("floating_base", text, reason))
-    return load_model(source, floating_base=True) if legs else model
+    return bool(named)
 
 
-def _find_anatomy(
-    compiled: mujoco.MjModel, settings: dict[str, str], questions: list[Question]
-) -> Anatomy:
+_LEG_NAMES = "hip|knee|ankle|calf|thigh|(?<![a-z])(haa|hfe|kfe)(?![a-z])"
+
+
+def _add_free_joint(spec: mujoco.MjSpec, fixed: mujoco.MjModel) -> mujoco.MjModel:
+    """Let the trunk of a robot with a fixed base float, and compile it; keyframes start in its place."""
+    body = fixed.body(find_anatomy(fixed).trunk.value).id
+    spec.bodies[body].add_freejoint()
+    for key in spec.keys:
+        key.qpos = [*fixed.body_pos[body], *fixed.body_quat[body], *fixed.key_qpos[key.id]]
+        key.qvel = [0.0] * (fixed.nv + 6)
+    name_elements(spec)
+    return spec.compile()
+
+
+def _find_anatomy(compiled: mujoco.MjModel, given: Answers, questions: list[Question]) -> Anatomy:
     """Return the parts of the robot with answers, and ask what is doubtful."""
-    kind = settings.get("kind")
-    if kind is not None:
-        check_one_of("Setting kind", kind, get_args(Kind))
-    anatomy = find_anatomy(compiled, kind=cast("Kind | None", kind))
-    if "imu_site" in settings:
-        site = settings["imu_site"]
-        sites = [compiled.site(i).name for i in range(compiled.nsite)]
-        check_one_of("Setting imu_site", site, ["trunk", *sites])
-        guess: Guess[str | None] = Guess(None if site == "trunk" else site, "as set", "set")
-        anatomy = dataclasses.replace(anatomy, imu_site=guess)
-    elif anatomy.kind.value == "legged" and anatomy.imu_site.source == "asked":
+    anatomy = find_anatomy(compiled, kind=given.kind)
+    kind = anatomy.kind.value
+    for needing, parts, what in (
+        ("legged", anatomy.feet.value, "2, 4 or 6 ends that are lowest in a standing pose"),
+        ("arm", anatomy.hands.value, "an arm of three or more joints"),
+    ):
+        if kind == needing and not parts:
+            raise ValueError(f"Setting kind={kind}: expected {what}, found none.")
+    for name, answer in (("front", given.front), ("imu_site", given.imu_site)):
+        if answer is not None and kind != "legged":
+            raise ValueError(f"Setting {name}: expected a robot of kind legged, found {kind}.")
+    if given.imu_site is not None:
+        imu = _answered_imu(compiled, anatomy, given.imu_site)
+        anatomy = dataclasses.replace(anatomy, imu_site=imu)
+    elif kind == "legged" and anatomy.imu_site.source == "asked":
         text = "site of the IMU: no gyro and no site named imu"
         questions.append(Question("imu_site", text, "trunk, its origin"))
-    if "front" in settings:
-        check_one_of("Setting front", settings["front"], ["x", "-x"])
-        front = Guess(1.0 if settings["front"] == "x" else -1.0, "as set", "set")
-        anatomy = dataclasses.replace(anatomy, front=front)
+    if given.front is not None:
+        anatomy = dataclasses.replace(anatomy, front=Guess(given.front, "as set", "set"))
     elif anatomy.front.source == "asked":
         text = (
             "front of the robot: the toes point along -x of the trunk, and forward of the task is x"
@@ -182,27 +197,28 @@ def _find_anatomy(
     return anatomy
 
 
-def _answered(guess: Guess[dict[str, float]], answers: dict[str, float]) -> Guess[dict[str, float]]:
-    return Guess(guess.value | answers, "as set", "set") if answers else guess
-
-
-def _answers(name: str, settings: dict[str, str], model: mujoco.MjModel) -> dict[str, float]:
-    """Return the answers to a setting by joint.
+def _answered_imu(compiled: mujoco.MjModel, anatomy: Anatomy, site: str) -> Guess[str | None]:
+    """Return the answer to the IMU's site, which mirror images expect on the trunk with its axes.
 
     Raises:
-        UnknownNameError: a pattern matches no joint.
+        ValueError: no such site.
     """
-    joints = [model.joint(j).name for j in geo.joint_ids(model)]
-    answers: dict[str, float] = {}
-    for key, value in settings.items():
-        setting, _, pattern = key.partition(".")
-        if setting != name:
-            continue
-        matches = [joint for joint in joints if re.fullmatch(pattern or ".*", joint)]
-        if not matches:
-            raise UnknownNameError(f"Setting {key!r}: no such joint; {suggest(pattern, joints)}")
-        answers |= dict.fromkeys(matches, float(value))
-    return answers
+    trunk = compiled.body(anatomy.trunk.value).id
+    sites = [
+        compiled.site(i).name
+        for i in range(compiled.nsite)
+        if compiled.site_bodyid[i] == trunk and abs(abs(compiled.site_quat[i, 0]) - 1.0) < 1e-6
+    ]
+    if site not in ("trunk", *sites):
+        raise ValueError(
+            f"Setting imu_site={site}: expected a site on the trunk, {anatomy.trunk.value!r}, with its "
+            f"axes: one of {['trunk', *sites]}; trunk is its origin."
+        )
+    return Guess(None if site == "trunk" else site, "as set", "set")
+
+
+def _answered(guess: Guess[dict[str, float]], answers: dict[str, float]) -> Guess[dict[str, float]]:
+    return Guess(guess.value | answers, "as set", "set") if answers else guess
 
 
 def _main_joints(anatomy: Anatomy) -> tuple[str, ...]:

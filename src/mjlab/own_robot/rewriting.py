@@ -10,11 +10,13 @@ import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from mjlab.utils.errors import UserError
 from mjlab.utils.os import write_atomically
 
 RECORD = "new_robot.json"
+Task = Literal["velocity", "reach", "tracking", "bare"]
 
 
 @dataclass
@@ -23,7 +25,7 @@ class Record:
 
     model: str = ""
     """Model, as given to the command."""
-    task: str | None = None
+    task: Task | None = None
     """Task, as given to the command."""
     settings: dict[str, str] = field(default_factory=dict)
     """Answers of the user, by key."""
@@ -57,12 +59,17 @@ def write_files(folder: Path, files: dict[str, bytes], record: Record) -> list[s
         record: Record to write; its files are those of the last time, and are updated.
     """
     kept = []
+    edited = {name for name, content in files.items() if _is_edited(folder, name, content, record)}
+    if any(name.endswith("/robot.py") for name in edited):
+        # A task of other values than those of the kept robot would not fit it.
+        edited |= {
+            name
+            for name, content in files.items()
+            if name.endswith("/task.py") and _differs(folder / name, content)
+        }
     for name, content in files.items():
         path = folder / name
-        if path.is_file() and _hash(path.read_bytes()) not in (
-            record.files.get(name),
-            _hash(content),
-        ):
+        if name in edited:
             kept.append(name)
             path = path.with_name(path.name + ".new")
         else:
@@ -71,6 +78,16 @@ def write_files(folder: Path, files: dict[str, bytes], record: Record) -> list[s
     text = json.dumps(vars(record), indent=2, ensure_ascii=False) + "\n"
     write_atomically(folder / RECORD, text.encode())
     return kept
+
+
+def _is_edited(folder: Path, name: str, content: bytes, record: Record) -> bool:
+    """Return True if a user's edits of a file are neither those of the record nor the new content."""
+    path = folder / name
+    return _differs(path, content) and _hash(path.read_bytes()) != record.files.get(name)
+
+
+def _differs(path: Path, content: bytes) -> bool:
+    return path.is_file() and path.read_bytes() != content
 
 
 def _hash(content: bytes) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import mujoco
@@ -12,6 +12,7 @@ from mjlab.own_robot import geometry
 from mjlab.own_robot.anatomy import Foot
 from mjlab.own_robot.findings import soft_soles
 from mjlab.own_robot.guess import Guess
+from mjlab.own_robot.model_source import name_elements
 from mjlab.own_robot.python_text import (
     comment_lines,
     commented,
@@ -45,7 +46,11 @@ def robot_source(report: RobotReport, title: str, model: Path) -> str:
     if is_urdf:
         imports.append("from mjlab.utils.urdf import read_urdf")
     motor_reasons, motors = _motors(report, joints)
-    scale = shared({name: report.action_scale.value[name] for name in joints}, report)
+    scale = shared(
+        {name: report.action_scale.value[name] for name in joints},
+        report,
+        report.answers["action_scale"],
+    )
     return template("robot.py").substitute(
         title=title,
         imports="".join(f"{line}\n" for line in imports),
@@ -119,16 +124,20 @@ def roles(report: RobotReport) -> list[tuple[str, ...]]:
     return groups
 
 
-def shared(values: Mapping[str, float], report: RobotReport) -> dict[str, float]:
+def shared(
+    values: Mapping[str, float], report: RobotReport, answers: Collection[str] = ()
+) -> dict[str, float]:
     """Return values that joints of the same role share: the largest, if it is near the smallest.
 
     Masses and rotor inertias that were identified for each joint separately differ from leg to leg.
+    Joints of `answers` keep the value that the user gave.
     """
     result = dict(values)
     for role in roles(report):
-        found = [values[name] for name in role if name in values]
+        names = [name for name in role if name in values and name not in answers]
+        found = [values[name] for name in names]
         if found and max(found) < 1.5 * min(found):
-            result |= dict.fromkeys((name for name in role if name in values), max(found))
+            result |= dict.fromkeys(names, max(found))
     return result
 
 
@@ -250,18 +259,21 @@ def _motors(report: RobotReport, joints: tuple[str, ...]) -> tuple[list[str], li
         "armature": report.armature,
     }
     reasons = [line for name, guess in fields.items() for line in reason_lines(name, guess)]
-    if report.armature.source == "file":
+    if report.armature.source == "file" and not report.answers["armature"]:
         # What the file has stays as it is.
         del fields["armature"]
-    values_of = {
-        name: shared(guess.value, report) if name in ("stiffness", "damping") else guess.value
-        for name, guess in fields.items()
-    }
+    settings = {name: "effort" if name == "effort_limit" else name for name in fields}
     groups: dict[tuple[str, ...], list[str]] = {}
     for role in roles(report):
         for joint in role:
             if joint in joints:
-                key = tuple(number(values[joint], 3) for values in values_of.values())
+                key = tuple(
+                    # Answers as they were given.
+                    repr(guess.value[joint])
+                    if joint in report.answers[settings[name]]
+                    else number(guess.value[joint], 3)
+                    for name, guess in fields.items()
+                )
                 groups.setdefault((role[0], *key), []).append(joint)
     lines = []
     for (_, *values), names in groups.items():
@@ -294,6 +306,8 @@ def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
         lines += [*comment_lines(f"The file leaves {len(unnamed)} elements unnamed: {shown}."),
                   "name_elements(spec)"]  # fmt: skip
     lines += _removals(report, spec) + _physics(spec)
+    if not is_urdf and len(report.spec.joints) > len(spec.joints):
+        lines += ["# The file has a fixed base.", "spec.body(TRUNK).add_freejoint()"]
     if any(g.group == _RAY_GROUP for b in spec.bodies[1:] for g in b.geoms):
         has_visuals = any(not (g.contype or g.conaffinity) for g in spec.geoms)
         group = f"{_COLLISION_GROUP} if geom.contype or geom.conaffinity else {_VISUAL_GROUP}"
@@ -436,7 +450,4 @@ def _legged_spec(report: RobotReport) -> list[str]:
 
 def _unnamed(report: RobotReport) -> list[str]:
     """Return the names that `name_elements` gives."""
-    spec = report.model.spec
-    old = {(type(e), e.name) for e in (*spec.bodies, *spec.joints, *spec.geoms)}
-    new = report.spec
-    return [e.name for e in (*new.bodies, *new.joints, *new.geoms) if (type(e), e.name) not in old]
+    return name_elements(report.model.spec.copy())

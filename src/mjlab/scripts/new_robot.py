@@ -11,8 +11,10 @@ import subprocess
 import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated
 
+import mujoco
 import tyro
 
 from mjlab.cli.flags import parse_own_flags
@@ -20,9 +22,9 @@ from mjlab.cli.help import requested_topic
 from mjlab.cli.main import run_alias
 from mjlab.own_robot.guess import Question
 from mjlab.own_robot.model_source import identifier, load_model, model_file
-from mjlab.own_robot.package import Package, Task, questions_table, values_table
+from mjlab.own_robot.package import Package, questions_table, values_table
 from mjlab.own_robot.report import RobotReport, describe_robot
-from mjlab.own_robot.rewriting import read_record, write_files
+from mjlab.own_robot.rewriting import RECORD, Task, read_record, write_files
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.string import suggest
 from mjlab.utils.tables import WIDTH, tables_text
@@ -68,6 +70,9 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
         UserError: no robot at `source`, an unknown setting, or a folder with other files.
     """
     answers = dict(_setting(text) for text in cfg.set)
+    if os.getcwd() not in sys.path:
+        # As `python -m` does: modules in the working folder can be imported.
+        sys.path.append(os.getcwd())
     path = Path(source).expanduser()
     # An archive is unpacked once.
     file = str(model_file(path)) if path.exists() else source
@@ -75,9 +80,14 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
     folder = Path(cfg.output or name).expanduser()
     _check_name(name, folder)
     record = read_record(folder)
+    _check_model(source, record.model, folder)
+    cfg = replace(cfg, task=cfg.task or record.task)
     # A later run keeps the answers of earlier ones.
     settings = record.settings | answers
-    report = describe_robot(file, settings)
+    try:
+        report = describe_robot(file, settings)
+    except ModuleNotFoundError as error:
+        raise UserError(str(error)) from error
     if report.questions and not answers and on_terminal():
         settings |= _ask(report.questions)
         report = describe_robot(file, settings)
@@ -89,10 +99,13 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
         )
     if cfg.motion is not None and not cfg.motion.is_file():
         raise UserError(f"--motion {cfg.motion}: no such file.")
-    files = package.files(_command_line(source, cfg, settings), folder)
-    kept = write_files(folder, files, replace(record, model=source, settings=settings))
     tables = [values_table(report), questions_table(report)]
     print(tables_text([table for table in tables if table.rows], WIDTH))
+    _check_bases(report)
+    files = package.files(_command_line(source, cfg, settings), folder)
+    kept = write_files(
+        folder, files, replace(record, model=source, task=cfg.task, settings=settings)
+    )
     print(_findings(package, folder))
     print(_summary(package, folder, kept))
     if cfg.install:
@@ -101,9 +114,6 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
 
 
 def _model_name(source: str) -> str:
-    if os.getcwd() not in sys.path:
-        # As `python -m` does: modules in the working folder can be imported.
-        sys.path.append(os.getcwd())
     try:
         return load_model(source).name
     except ModuleNotFoundError as error:
@@ -115,6 +125,15 @@ def _setting(text: str) -> tuple[str, str]:
     if not (key and equals and value):
         raise BadCallError(f"--set {text!r}: expected KEY=VALUE, such as armature=0.01.")
     return key, value
+
+
+def _check_model(source: str, recorded: str, folder: Path) -> None:
+    """Raise `UserError` for a folder with the package of another model."""
+    if recorded and Path(source).resolve() != Path(recorded).resolve():
+        raise UserError(
+            f"--output {folder}: expected the package of {source}, got that of {recorded}; use another "
+            f'folder, or if the model has moved, change "model" in {folder / RECORD}.'
+        )
 
 
 def _check_name(name: str, folder: Path) -> None:
@@ -149,6 +168,17 @@ def _check_task(task: Task, report: RobotReport) -> None:
             )
 
 
+def _check_bases(report: RobotReport) -> None:
+    """Raise `UserError` for a file with several floating bases: a package is of one robot."""
+    free = [joint for joint in report.spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    if len(free) > 1:
+        names = ", ".join(repr(joint.parent.name) for joint in free)
+        raise UserError(
+            f"several floating bases: expected one robot, got bodies {names} with free joints; delete "
+            "the others from the file. Nothing was written."
+        )
+
+
 def on_terminal() -> bool:
     """Return True if a person can answer."""
     return sys.stdin.isatty() and sys.stdout.isatty()
@@ -179,7 +209,10 @@ def _findings(package: Package, folder: Path) -> str:
     """Return what `mjlab check` finds in the robot as written, or as edited by the user."""
     from mjlab.scripts.check import check_entity, check_task, report
 
-    sys.path.insert(0, str(folder.resolve() / "src"))
+    # Without `__init__.py`, which would register the tasks in this process.
+    module = ModuleType(package.name)
+    module.__path__ = [str(folder.resolve() / "src" / package.name)]
+    sys.modules[package.name] = module
     importlib.invalidate_caches()
     try:
         robot = importlib.import_module(f"{package.name}.robot")
@@ -191,7 +224,6 @@ def _findings(package: Package, folder: Path) -> str:
                 task.flat_env_cfg() if package.task == "velocity" else task.env_cfg()
             )
     finally:
-        del sys.path[0]
         # A later run in this process reads the files again.
         for module in [m for m in sys.modules if m.partition(".")[0] == package.name]:
             del sys.modules[module]
@@ -203,6 +235,10 @@ def _summary(package: Package, folder: Path, kept: list[str]) -> str:
     if kept:
         lines.append(
             f"Edited by you, and kept: {', '.join(kept)}. The new ones: FILE.new beside them."
+        )
+    if any(name.endswith("/robot.py") for name in kept):
+        lines.append(
+            "Not in force: values above that differ from robot.py, which is yours. Merge robot.py.new."
         )
     if package.report.anatomy.front.value < 0.0:
         lines.append(
