@@ -122,6 +122,24 @@ def test_task_stands_and_mirrors(tmp_path: Path, imported, terrain: str) -> None
     env.close()
 
 
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_feet_are_lifted_by_the_size_of_the_robot(tmp_path: Path, imported, size: float) -> None:
+    spec = legged_spec(4, size=size)
+    report = describe_robot(RobotModel(spec, "robot", "robot", None, None))
+    folder = written(tmp_path / "p", Package("dog", "velocity", report))
+    rewards = imported(folder, "dog.task").flat_env_cfg().rewards
+    for name in ("foot_clearance", "foot_swing_height"):
+        height = rewards[name].params["target_height"]
+        assert height == pytest.approx(0.36 * report.root_height.value, rel=0.05)
+
+
+def test_lines_are_no_longer_than_100(tmp_path: Path) -> None:
+    files = quadruped(tmp_path / "model").files("mjlab new-robot", tmp_path)
+    for name, content in files.items():
+        if name.endswith(".py"):
+            assert max(map(len, content.decode().splitlines())) <= 100
+
+
 def test_trunk_on_the_ground_is_a_fall(tmp_path: Path, imported) -> None:
     folder = written(tmp_path / "dog_package", quadruped(tmp_path / "model"))
     cfg = imported(folder, "dog.task").flat_env_cfg(play=True)

@@ -49,20 +49,25 @@ def command_ranges(height: float, feet: int) -> Guess[dict[str, tuple[float, flo
     return Guess(ranges, f"Froude number of the {model}: 1 m/s x sqrt(height / {reference} m)")
 
 
+def lift(height: float, feet: int) -> float:
+    """Return the height of a swinging foot (m), for a robot with its trunk at `height`."""
+    return LIFT[2 if feet == 2 else 4] * height
+
+
 def pose_tolerance(
     model: mujoco.MjModel, anatomy: Anatomy, joint_pos: dict[str, float], height: float
 ) -> Guess[dict[str, float]]:
     """Return the tolerance of each joint around the standing pose that strides need (rad)."""
     tolerance = dict.fromkeys(joint_pos, REST_TOLERANCE)
     feet = 2 if len(anatomy.feet.value) == 2 else 4
-    stride, lift = STRIDE[feet] * height, LIFT[feet] * height
+    stride, up = STRIDE[feet] * height, lift(height, feet)
     moves = np.array(
         [
             (stride, 0, 0, 0),
             (-stride, 0, 0, 0),
             (0, 0.5 * stride, 0, 0),
             (0, -0.5 * stride, 0, 0),
-            (0, 0, lift, 0),
+            (0, 0, up, 0),
             (0, 0, 0, TURN),
             (0, 0, 0, -TURN),
         ]
@@ -84,7 +89,7 @@ def pose_tolerance(
             tolerance[name] = tolerance[partner] = round(float(value), 2)
     return Guess(
         tolerance,
-        f"0.8 of what strides of {stride:.2f} m and lifts of {lift:.2f} m need; 0.15 rad elsewhere",
+        f"0.8 of what strides of {stride:.2f} m and lifts of {up:.2f} m need; 0.15 rad elsewhere",
     )
 
 

@@ -76,8 +76,9 @@ def free_joint(model: mujoco.MjModel) -> int | None:
 def colliding_geoms(model: mujoco.MjModel) -> list[int]:
     """Return the geoms of the robot that collide.
 
-    With a free joint, those of its tree; without, those of all bodies, the fixed base included. Geoms with contype or conaffinity; without any, those of contact pairs; without any, those of the
-    highest group, where files keep the collision geoms that a scene switches on.
+    These are the geoms with contype or conaffinity. If no geom has them, those of contact pairs; if there
+    are no pairs, those of the highest group, where files keep the geoms that a scene lets collide. A robot
+    with a free joint has the geoms of its tree; one with a fixed base, those of all bodies.
     """
     free = free_joint(model)
     root = 0 if free is None else model.body_rootid[model.jnt_bodyid[free]]

@@ -386,7 +386,7 @@ def _soft_soles(report: RobotReport) -> list[str]:
         return []
     softest = min(float(model.geom_solimp[g, 0]) for g in found)
     return [
-        f"    # Softer ones (impedance {number(softest)} in the file) slide without elliptic cones and impratio 100.",
+        f"    # Softer ones (impedance {number(softest)} in the file) need elliptic cones and impratio 100.",
         "    sole.solref, sole.solimp = (0.02, 1.0), (0.9, 0.95, 0.001, 0.5, 2.0)",
     ]
 
@@ -413,7 +413,7 @@ def _legged_spec(report: RobotReport) -> list[str]:
     lines = [
         "for name in SOLES:",
         "    sole = spec.geom(name)",
-        "    # Priority: the friction of the sole counts, not that of the ground. condim: there is friction.",
+        "    # Priority: the friction of the sole counts, not that of the ground. condim: with friction.",
         "    sole.priority, sole.condim = 1, 3",
         f"    sole.friction[0] = {SOLE_FRICTION}  # middle of the range of the event foot_friction",
         *_soft_soles(report),

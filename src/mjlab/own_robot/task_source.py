@@ -10,6 +10,7 @@ import numpy as np
 
 from mjlab.own_robot import geometry
 from mjlab.own_robot.anatomy import Leg
+from mjlab.own_robot.gait import lift
 from mjlab.own_robot.posture import pitch_joints, sole_points
 from mjlab.own_robot.python_text import comment_lines, dict_source, number, tuple_source
 from mjlab.own_robot.report import RobotReport
@@ -80,6 +81,7 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
         fallen=tuple_source(fallen.value, 9),
         contact_mode=f'"{mode}"',
         ray_radius=number(_sole_radius(report)),
+        swing_height=number(lift(report.root_height.value, num_feet), 2),
         gait=_gait(report),
     )
 
