@@ -199,7 +199,8 @@ def _has(config: object, path: list[str]) -> bool:
         return True
     name = path[0].replace("-", "_")
     if isinstance(config, dict):
-        return name in config and _has(config[name], path[1:])
+        # Without entries, a task names its own, such as the metrics of `trigger_below`.
+        return not config or (name in config and _has(config[name], path[1:]))
     if not is_dataclass(config) or name not in {field.name for field in fields(config)}:
         return False
     return _has(getattr(config, name), path[1:])

@@ -75,7 +75,7 @@ ATTRIBUTES: dict[str, dict[str, str]] = {
         "imu_lin_acc": "builtin_sensor of an accelerometer",
         # Rewards.
         "joint_vel_limits": "joint_velocity_hinge_penalty in mjlab.tasks.manipulation.mdp",
-        "applied_torque_limits": "joint_torques_l2; actuators clip at their effort_limit",
+        "applied_torque_limits": "joint_torques_l2, the nearest; actuators clip at their effort_limit",
         "contact_forces": "undesired_contacts, or soft_landing in mjlab.tasks.velocity.mdp",
         "track_lin_vel_xy_exp": f"track_linear_velocity {_VELOCITY}",
         "track_ang_vel_z_exp": f"track_ang_vel_z_exp {_VELOCITY}",
