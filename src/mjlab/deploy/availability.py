@@ -13,7 +13,7 @@ Availability = Literal["measured", "computed", "estimated", "external", "none", 
 cameras; none, as only the simulation knows it; that of a value of a custom term."""
 
 UNMEASURED: tuple[Availability, ...] = ("estimated", "external", "none")
-"""What a robot does not measure, nor compute from what it measures."""
+"""Availabilities of quantities that a robot neither measures nor computes from its measurements."""
 
 Reason = tuple[Availability, str]
 """Availability and its reason."""

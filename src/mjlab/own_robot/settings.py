@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import cast, get_args
+from typing import get_args
 
 from mjlab.own_robot.anatomy import Kind
 from mjlab.utils.errors import UnknownNameError
@@ -17,9 +17,14 @@ PER_JOINT = ("pose", "effort", "armature", "stiffness", "damping", "action_scale
 SETTINGS = ("kind", "floating_base", "front", "imu_site", "root_height", *PER_JOINT)
 """Names of settings."""
 
-_BOOLEANS = dict.fromkeys(("true", "yes", "y", "1"), True) | dict.fromkeys(
-    ("false", "no", "n", "0"), False
-)
+_OPTIONS: dict[str, dict[str, object]] = {
+    "kind": {kind: kind for kind in get_args(Kind)},
+    "floating_base": {
+        **dict.fromkeys(("true", "yes", "y", "1"), True),
+        **dict.fromkeys(("false", "no", "n", "0"), False),
+    },
+    "front": {"x": 1.0, "-x": -1.0},
+}
 _POSITIVE = ("effort", "stiffness", "action_scale")
 _NOT_NEGATIVE = ("armature", "damping")
 
@@ -100,12 +105,7 @@ def parse_settings(settings: Mapping[str, str]) -> Answers:
         elif name == "root_height":
             found[name] = _number(text, name, value)
         else:
-            options = {
-                "kind": {kind: kind for kind in get_args(Kind)},
-                "floating_base": _BOOLEANS,
-                "front": {"x": 1.0, "-x": -1.0},
-            }[name]
-            found[name] = _choice(text, value, cast("dict[str, object]", options))
+            found[name] = _choice(text, value, _OPTIONS[name])
     return Answers(of_joints=tuple(of_joints), **found)  # ty: ignore[invalid-argument-type]
 
 

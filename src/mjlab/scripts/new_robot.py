@@ -210,9 +210,9 @@ def _findings(package: Package, folder: Path) -> str:
     from mjlab.scripts.check import check_entity, check_task, report
 
     # Without `__init__.py`, which would register the tasks in this process.
-    module = ModuleType(package.name)
-    module.__path__ = [str(folder.resolve() / "src" / package.name)]
-    sys.modules[package.name] = module
+    written = ModuleType(package.name)
+    written.__path__ = [str(folder.resolve() / "src" / package.name)]
+    sys.modules[package.name] = written
     importlib.invalidate_caches()
     try:
         robot = importlib.import_module(f"{package.name}.robot")
