@@ -111,6 +111,9 @@ def test_task_stands_and_mirrors(tmp_path: Path, imported, terrain: str) -> None
     folder = written(tmp_path / "dog_package", quadruped(tmp_path / "model"))
     cfg = getattr(imported(folder, "dog.task"), f"{terrain}_env_cfg")(play=True)
     cfg.scene.num_envs = 2
+    # On the lowest level: one robot in a hundred slides off steep slopes within these steps.
+    cfg.scene.terrain.max_init_terrain_level = 0
+    cfg.events.pop("randomize_terrain", None)
     env = ManagerBasedRlEnv(cfg, device="cpu")
     observations, _ = env.reset()
     for _ in range(20):
