@@ -139,7 +139,7 @@ cpu = cpu_profile(
     desired_kl=0.05,
     max_iterations=500,
 )
-"""The `cpu` profile of both tasks. `docs/guides/learning.md` has the experiments."""
+"""The `cpu` profile of both tasks. `docs/guides/experiments.md` has the experiments."""
 
 
 # Task-specific MDP terms.

@@ -1,7 +1,7 @@
 """The `cpu` profile of bipeds: a humanoid learns to walk on two cores.
 
 PPO does not learn to walk in an hour, so the learner is SAC (`mjlab.rl.sac`), and the task is made easier to
-learn, not easier to pass. `docs/guides/learning.md` has the experiments, with the Unitree G1.
+learn, not easier to pass. `docs/guides/experiments.md` has the experiments, with the Unitree G1.
 
 - A textbook controller steps in place (`stepping_action`). The controller acts for the first 60 environment
   steps, and the policy imitates it, with decreasing weight, for the first 1,200 of about 3,000. Without

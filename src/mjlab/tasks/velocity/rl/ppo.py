@@ -2,7 +2,7 @@
 
 A few cores simulate about 10,000 environment steps per second, a hundredth of a GPU. With the task's settings
 and that budget, a robot stays in the local optimum of standing still, because first attempts to move cost more
-penalty than they earn. The profiles make the task easier to learn, not easier to pass (`docs/guides/learning.md`
+penalty than they earn. The profiles make the task easier to learn, not easier to pass (`docs/guides/experiments.md`
 has the experiments):
 
 - `cpu_with_gait`, the profile of the Go1, rewards stances in which half of the feet swing. This rhythm halves
