@@ -11,6 +11,7 @@ import pytest
 from commands import SMALL
 
 from mjlab.cli.flags import parse_flags
+from mjlab.runs.evaluation import read_evaluation
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.play import PlayConfig
 
@@ -182,6 +183,15 @@ def test_evaluation_prints_figures_for_machines_and_nothing_else(run, trained):
     low, high = figures["return_interval"]
     assert low <= figures["mean_return"] <= high
     assert figures["success_rate"] == 0.0
+
+
+def test_evaluation_is_written_for_pages(run, trained, tmp_path):
+    path = tmp_path / "evaluation.json"
+    flags = ("--json", "--log-root", str(trained.parents[1]), "--output", str(path))
+    outcome = run("evaluate", TASK, *SHORT, *flags)
+    assert outcome.status == 0, outcome.err
+    found = read_evaluation(path, TASK, trained / "model_1.pt")
+    assert found == json.loads(outcome.out)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -26,6 +27,7 @@ from mjlab.runs import Checkpoint
 from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_policy
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.logging import print_notice
+from mjlab.utils.os import replacing
 from mjlab.utils.ranges import Count, Seed, check_ranges
 from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
@@ -51,6 +53,9 @@ class EvaluateConfig(PolicyFlags):
     """Seed of the evaluation."""
     json: bool = field(default=False, metadata=shown("run"))
     """Print only JSON."""
+    output: str | None = field(default=None, metadata=shown("run", "FILE"))
+    """File for the JSON, such as `evaluation.json` in the folder of the run, for pages and cards of
+    the policy."""
 
 
 def command(argv: list[str], prog: str) -> None:
@@ -111,7 +116,11 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
         **result.to_dict(),
         "units": dict(solved.units),
     }
-    print(json.dumps(metrics, indent=2) if cfg.json else _table(metrics, failures))
+    text = json.dumps(metrics, indent=2)
+    print(text if cfg.json else _table(metrics, failures))
+    if cfg.output is not None:
+        with replacing(Path(cfg.output)) as file:
+            file.write(f"{text}\n".encode())
     return metrics
 
 
