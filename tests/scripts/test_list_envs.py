@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from mjlab.runs.reference import DATA, Reference, reference_path
 from mjlab.scripts.list_envs import list_environments
 from mjlab.tasks.registry import list_tasks
 
@@ -14,6 +15,16 @@ def test_all_tasks_are_listed_in_order(run):
     assert [line.split()[1] for line in outcome.out.splitlines()] == list_tasks()
     assert [line.split()[0] for line in outcome.out.splitlines()][:2] == ["1", "2"]
     assert list_tasks() == sorted(list_tasks())
+
+
+def test_tasks_with_solved_reference_runs_show_their_minutes(run):
+    lines = {line.split()[1]: line for line in run("list_envs").out.splitlines()}
+    for task, line in lines.items():
+        path = reference_path(DATA, task, "cpu")
+        minutes = Reference.load(path).usual_minutes if path.is_file() else None
+        assert ("min" in line.split()) == (minutes is not None)
+        assert minutes is None or f" {minutes:.1f} min" in line
+    assert Reference.load(reference_path(DATA, "Mjlab-Cartpole-Swingup", "cpu")).usual_minutes
 
 
 @pytest.mark.parametrize("keyword", ["swing", "SWING", "Swingup"])

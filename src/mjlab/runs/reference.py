@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -123,6 +124,13 @@ class Reference:
     def train_flags(self) -> list[str]:
         """Flags of `train` that reproduce a run, except the seed."""
         return [*(["--profile", self.profile] if self.profile else []), *self.flags]
+
+    @property
+    def usual_minutes(self) -> float | None:
+        """Median time of collecting and learning until solved (min). None if a seed was not solved."""
+        if not self.seeds or any(seed.run.ended != "solved" for seed in self.seeds):
+            return None
+        return statistics.median(seed.run.seconds for seed in self.seeds) / 60.0
 
     @property
     def standard_error(self) -> float:

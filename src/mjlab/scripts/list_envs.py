@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from mjlab.cli.main import run_alias
+from mjlab.utils.string import counted
 
 
 def list_environments(keyword: str | None = None) -> list[str]:
@@ -19,7 +20,8 @@ def list_environments(keyword: str | None = None) -> list[str]:
 def command(argv: list[str], prog: str) -> None:
     """Run `list-envs`: exits 0, or 1 if nothing matches."""
     parser = argparse.ArgumentParser(
-        prog=prog, description="List the registered tasks and their profiles."
+        prog=prog,
+        description="List the registered tasks, their profiles, and the minutes that training usually takes.",
     )
     parser.add_argument("--keyword", help="show only tasks whose name contains KEYWORD")
     args = parser.parse_args(argv)
@@ -32,8 +34,21 @@ def command(argv: list[str], prog: str) -> None:
     digits, width = len(str(len(names))), max(map(len, names))
     for number, name in enumerate(names, start=1):
         profiles = list_profiles(name)
-        shown = f"  (profiles: {', '.join(profiles)})" if profiles else ""
-        print(f"{number:>{digits}}  {name:<{width}}{shown}".rstrip())
+        shown = f"(profiles: {', '.join(profiles)})" if profiles else ""
+        print(f"{number:>{digits}}  {name:<{width}}  {shown}  {_usual_time(name)}".rstrip())
+
+
+def _usual_time(task: str) -> str:
+    """Return the time until reference runs on a CPU were solved, or an empty string."""
+    from mjlab.runs.reference import DATA, Reference, reference_path
+
+    path = reference_path(DATA, task, "cpu")
+    reference = Reference.load(path) if path.is_file() else None
+    if reference is None or reference.usual_minutes is None:
+        return ""
+    cores = reference.seeds[-1].machine["cores"]
+    profile = "" if reference.profile is None else f" with {reference.profile}"
+    return f"usually {reference.usual_minutes:.1f} min{profile} on {counted(cores, 'core')}"
 
 
 def main() -> None:
