@@ -9,7 +9,7 @@ help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 train:  ## Train the cartpole swing-up on this machine's CPU until it is solved.
-	$(UV) run train Mjlab-Cartpole-Swingup --profile cpu --device cpu --result-video True
+	$(UV) run mjlab train Mjlab-Cartpole-Swingup --profile cpu --device cpu --result-video True
 
 test:  ## Run the test suite.
 	$(DEV) pytest -n 2 -m "not slow and not robustness" tests

@@ -263,7 +263,7 @@ _HEAD = """# Reference runs
 
 Every stock task, trained under its `cpu` profile (without one, with its default settings and 512 environments), each
 seed until its evaluations solve the task, or until its time limit. `make reference` generates this page.
-[`uv run verify TASK`](../command_line.md#verify) trains one more seed and compares it with these.
+[`uv run mjlab verify TASK`](../command_line.md#verify) trains one more seed and compares it with these.
 
 - **Samples**: environment steps, over all environments. **Minutes**: rollouts and updates, without evaluations.
   These runs are evaluated from the start, more often than others, to record curves.
@@ -346,7 +346,7 @@ def _section(task: str, references: list[Reference]) -> str:
         cores = f"{newest.machine['cores']} cores ({newest.machine['processor']})"
         where = ", ".join(filter(None, (newest.machine["gpu"], cores)))
         lines += [
-            f"`train {shlex.join([task, *reference.train_flags])}`, on {where}, {libraries}:",
+            f"`uv run mjlab train {shlex.join([task, *reference.train_flags])}`, on {where}, {libraries}:",
             "",
             f"| seed | commit | ended | samples | minutes | steps/s | {' | '.join(map(_words, names))} |",
             f"|{' --- |' * (6 + len(names))}",

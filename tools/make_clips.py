@@ -3,7 +3,7 @@
 Animated WebP of 480 x 270 pixels at 25 frames per second, below 500 KB each. Clips of policies that do
 not ship with the package need the run folder of a training, for example
 
-    uv run train Mjlab-Lift-Cube-Yam --profile cpu
+    uv run mjlab train Mjlab-Lift-Cube-Yam --profile cpu
     uv run python tools/make_clips.py lift --run lift=logs/rsl_rl/yam_lift_cube/<time>
 """
 

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from mjlab.cli.main import ALIASES, COMMANDS
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in page.parts]
 
@@ -96,6 +98,23 @@ def test_commands_are_console_scripts(page: Path) -> None:
     commands = set(_COMMAND.findall(page.read_text(encoding="utf-8")))
     others = {"python", "tensorboard", "pytest", "ruff", "ty", "lint-imports", "sphinx-build"}
     assert commands <= {*scripts, *others}
+
+
+def test_commands_to_type_are_spelled_alike() -> None:
+    """`uv run mjlab X`, in pages and in what the package prints, not the scripts of earlier releases."""
+    scripts = "|".join({name.replace("_", "-") for name in ALIASES} | set(ALIASES))
+    script = re.compile(rf"uv run (--\S+ (?!python)\S+ )?({scripts})(?![\w.-])")
+    folders = ("docs", "src", "examples", "benchmarks", "tools")
+    files = [
+        p for f in folders for s in ("md", "py", "txt", "ipynb") for p in (ROOT / f).rglob(f"*.{s}")
+    ]
+    found = [str(path) for path in files if script.search(path.read_text(encoding="utf-8"))]
+    assert not found
+
+
+def test_examples_in_the_help_are_commands() -> None:
+    names = {command.name for command in COMMANDS}
+    assert {line.split()[0] for command in COMMANDS for line in command.examples} <= names
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_ids)

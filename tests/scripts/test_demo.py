@@ -56,7 +56,7 @@ def test_by_default_one_robot_is_shown_in_the_browser_of_this_machine(monkeypatc
 def test_help_is_short_and_loads_nothing(run):
     outcome = run("demo", "--help")
     assert outcome.status == 0
-    assert "uv run demo" in outcome.out
+    assert "uv run mjlab demo" in outcome.out
 
 
 @pytest.mark.parametrize("name", demo.DEMOS)

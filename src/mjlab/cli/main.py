@@ -56,7 +56,7 @@ class Command:
     details: str = ""
     """Text of `--help`. Without `details` and `argument`, the function handles `--help`."""
     examples: tuple[str, ...] = ()
-    """Command lines, without `uv run`."""
+    """Command lines, without `uv run mjlab`."""
     unknown_task_status: int = 1
     """Exit status for an unregistered task."""
     module: str = ""
@@ -67,11 +67,15 @@ class Command:
         words = (prog, self.argument, "[flags]")
         lines = [f"usage: {' '.join(filter(None, words))}", "", self.details or self.summary, ""]
         if self.examples:
-            lines += ["examples:", *(f"    uv run {example}" for example in self.examples), ""]
+            lines += [
+                "examples:",
+                *(f"    uv run mjlab {example}" for example in self.examples),
+                "",
+            ]
         if self.argument:
-            lines.append(f"`{prog} {self.argument} --help` shows its flags.")
+            lines.append(f"`uv run mjlab {self.name} {self.argument} --help` shows its flags.")
         if self.argument == "TASK":
-            lines.append("`mjlab list-envs` lists the tasks.")
+            lines.append("`uv run mjlab list-envs` lists the tasks.")
         return "\n".join(lines).rstrip()
 
 
@@ -114,8 +118,8 @@ iteration. All other flags are those of `train`.""",
 Train a task with several settings and seeds side by side, and compare them in a table and a
 plot. The same command continues an interrupted sweep. All other flags are those of `train`.""",
         examples=(
-            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-4,3e-4,1e-3 --seeds 3",
-            "mjlab sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-5..1e-2:log --trials 20",
+            "sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-4,3e-4,1e-3 --seeds 3",
+            "sweep Mjlab-Cartpole-Swingup --over agent.algorithm.learning-rate=1e-5..1e-2:log --trials 20",
         ),
     ),
     Command(
@@ -188,8 +192,8 @@ interval, and the success rate if the task defines success.""",
 List the runs of a task, the last started first: state, finished iterations, mean return of the
 last evaluation, size on disk, and settings that differ from the task.""",
         examples=(
-            "mjlab runs Mjlab-Cartpole-Swingup",
-            "mjlab runs Mjlab-Cartpole-Swingup --json",
+            "runs Mjlab-Cartpole-Swingup",
+            "runs Mjlab-Cartpole-Swingup --json",
         ),
     ),
     Command(
@@ -207,9 +211,9 @@ Print tables of a task: observations (and those that a robot cannot measure), ac
 rewards, terminations, events, curriculum, metrics, entities and sensors. Builds one environment on
 the CPU.""",
         examples=(
-            "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1",
-            "mjlab describe Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu --json",
-            "mjlab describe Mjlab-Cartpole-Swingup --env.rewards.smooth-reward.weight 2",
+            "describe Mjlab-Velocity-Flat-Unitree-Go1",
+            "describe Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu --json",
+            "describe Mjlab-Cartpole-Swingup --env.rewards.smooth-reward.weight 2",
         ),
     ),
     Command(
@@ -222,10 +226,10 @@ Show a model in the browser: joint and actuator sliders, geom groups, sites, con
 and frames. MODEL is a file (MJCF, URDF, MJB or a MuJoCo archive), a robot (g1, go1, yam, or
 module:function that returns an EntityCfg) or a task.""",
         examples=(
-            "mjlab view robot.xml",
-            "mjlab view robot.urdf",
-            "mjlab view go1",
-            "mjlab view Mjlab-Velocity-Rough-Unitree-Go1",
+            "view robot.xml",
+            "view robot.urdf",
+            "view go1",
+            "view Mjlab-Velocity-Rough-Unitree-Go1",
         ),
     ),
     Command(
@@ -238,9 +242,9 @@ Write a small package for a robot: model, initial pose, gains, task, registratio
 value with its reason. MODEL is an MJCF or URDF file, a folder or zip with one and its meshes,
 module:function that returns an MjSpec, or menagerie:NAME.""",
         examples=(
-            "mjlab new-robot robot.xml",
-            "mjlab new-robot robot.urdf --set floating_base=true --set armature=0.01",
-            "mjlab new-robot robots.zip --name rex --output ~/rex --install",
+            "new-robot robot.xml",
+            "new-robot robot.urdf --set floating_base=true --set armature=0.01",
+            "new-robot robots.zip --name rex --output ~/rex --install",
         ),
     ),
     Command(
@@ -255,9 +259,9 @@ initial pose, left and right. Each finding has file and line, the reason and the
 TARGET is a file (MJCF or URDF), a folder or zip archive with one, menagerie:NAME, a robot (g1,
 go1, yam, or module:function that returns an MjSpec or EntityCfg) or a task.""",
         examples=(
-            "mjlab check robot.xml",
-            "mjlab check robot.urdf --floating-base",
-            "mjlab check Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
+            "check robot.xml",
+            "check robot.urdf --floating-base",
+            "check Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
         ),
     ),
     Command(
@@ -271,9 +275,9 @@ Fit the drives of a robot that hangs by its base to a log of its joints, and pri
 the columns time, target.JOINT, measurement.joint_pos.JOINT and, if measured,
 measurement.joint_vel.JOINT and measurement.joint_torque.JOINT; or an NPZ.""",
         examples=(
-            "mjlab fit-actuators chirp.csv --robot go1",
-            "mjlab fit-actuators chirp.csv --robot my_robots:get_my_robot_cfg --more steps.csv",
-            "mjlab fit-actuators chirp.npz --robot robot.xml --stiffness 25 --damping 0.6",
+            "fit-actuators chirp.csv --robot go1",
+            "fit-actuators chirp.csv --robot my_robots:get_my_robot_cfg --more steps.csv",
+            "fit-actuators chirp.npz --robot robot.xml --stiffness 25 --damping 0.6",
         ),
     ),
     Command(
@@ -291,9 +295,9 @@ Convert a CSV of the retargeted LAFAN1 sets (one pose per line: root position, r
 y z w, all joint angles) to the .npz that motion tracking reads, or resample an .npz to another
 rate.""",
         examples=(
-            "mjlab csv-to-npz --input-file dance1_subject2.csv",
-            'mjlab csv-to-npz --input-file dance.csv --line-range "(120,720)" --output-file dance.npz --render True',
-            "mjlab csv-to-npz --input-file dance.csv --view True",
+            "csv-to-npz --input-file dance1_subject2.csv",
+            'csv-to-npz --input-file dance.csv --line-range "(120,720)" --output-file dance.npz --render True',
+            "csv-to-npz --input-file dance.csv --view True",
         ),
     ),
     Command(
@@ -304,8 +308,7 @@ rate.""",
         details="""\
 Write scene.xml and its assets, for MuJoCo's viewer and other programs.
 
-TARGET is the name of a task (`mjlab list-envs`), a robot (g1, go1, yam), or module:function, a
-function without arguments that returns an EntityCfg.""",
+TARGET is the name of a task, a robot (g1, go1, yam), or module:function, a function without arguments that returns an EntityCfg.""",
         examples=(
             "export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat",
             "export-scene g1 --zip",
@@ -323,8 +326,8 @@ Write a folder that runs a policy without this package and without torch: networ
 POLICY is the folder of a run, a checkpoint (.pt), an exported policy (.onnx) of a run, or a bundled
 policy (go1, g1).""",
         examples=(
-            "mjlab deploy go1 --output go1_bundle",
-            "mjlab deploy logs/rsl_rl/go1_velocity/2026-01-02_03-04-05",
+            "deploy go1 --output go1_bundle",
+            "deploy logs/rsl_rl/go1_velocity/2026-01-02_03-04-05",
         ),
     ),
     Command(
@@ -338,7 +341,7 @@ history, vector, action, target, torque, and the state after one control step.
 
 At a difference: first step, stage, component, and the likely cause if one explains it; exit status 1.
 BUNDLE is a folder that `mjlab deploy` wrote; its programs may have been edited.""",
-        examples=("mjlab check-deploy bundle", "mjlab check-deploy bundle --json"),
+        examples=("check-deploy bundle", "check-deploy bundle --json"),
     ),
     Command(
         "profile-env",
@@ -379,10 +382,10 @@ ALIASES = (
 _BY_NAME = {command.name: command for command in COMMANDS}
 
 _START_HERE = (
-    "start here mjlab demo",
-    "           mjlab train Mjlab-Cartpole-Swingup",
+    "start here uv run mjlab demo",
+    "           uv run mjlab train Mjlab-Cartpole-Swingup --profile cpu",
     "",
-    "`mjlab COMMAND --help` shows a command; `mjlab --version` prints the version.",
+    "`uv run mjlab COMMAND --help` shows a command, `--version` the version.",
 )
 
 

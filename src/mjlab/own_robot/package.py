@@ -132,9 +132,9 @@ class Package:
         return [
             view,
             f"uv run mjlab describe {task}",
-            f"uv run play {task} --agent zero",
-            f"uv run train {task} --profile cpu",
-            f"uv run play {task}",
+            f"uv run mjlab play {task} --agent zero",
+            f"uv run mjlab train {task} --profile cpu",
+            f"uv run mjlab play {task}",
         ]
 
 

@@ -1,4 +1,4 @@
-"""Check a bundle against its golden trace: `mjlab check-deploy FOLDER [flags]`."""
+"""Check a bundle against its golden trace: `uv run mjlab check-deploy FOLDER [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Convert joint angles to a reference motion: `mjlab csv-to-npz --input-file FILE`."""
+"""Convert joint angles to a reference motion: `uv run mjlab csv-to-npz --input-file FILE`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Play a bundled policy: `uv run demo`, `uv run demo g1`."""
+"""Play a bundled policy: `uv run mjlab demo`, `uv run mjlab demo g1`."""
 
 from __future__ import annotations
 

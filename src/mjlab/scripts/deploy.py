@@ -1,4 +1,4 @@
-"""Write what a robot needs to run a policy: `mjlab deploy RUN|CHECKPOINT [flags]`."""
+"""Write what a robot needs to run a policy: `uv run mjlab deploy RUN|CHECKPOINT [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluate a policy: `uv run evaluate TASK [flags]`."""
+"""Evaluate a policy: `uv run mjlab evaluate TASK [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Export the scene of a task, or a robot, as MuJoCo XML: `uv run export-scene TARGET [flags]`."""
+"""Export the scene of a task, or a robot, as MuJoCo XML: `uv run mjlab export-scene TARGET [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write a package for a robot of one's own: `mjlab new-robot MODEL [flags]`."""
+"""Write a package for a robot of one's own: `uv run mjlab new-robot MODEL [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Play a policy: `uv run play TASK [flags]`."""
+"""Play a policy: `uv run mjlab play TASK [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plot the mean over seeds: `uv run plot-seeds RUN ... [--group NAME RUN ...]`."""
+"""Plot the mean over seeds: `uv run mjlab plot-seeds RUN ... [--group NAME RUN ...]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Profile the environment step of a task: `uv run profile-env TASK [flags]`."""
+"""Profile the environment step of a task: `uv run mjlab profile-env TASK [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Train a task: `uv run train TASK [flags]`."""
+"""Train a task: `uv run mjlab train TASK [flags]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Train a task with several seeds: `uv run train-seeds TASK [--seeds N] [flags of train]`."""
+"""Train a task with several seeds: `uv run mjlab train-seeds TASK [--seeds N] [flags of train]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Verify an installation: train a seed and compare with a reference (`uv run verify TASK [flags]`)."""
+"""Verify an installation: train a seed and compare with a reference (`uv run mjlab verify TASK [flags]`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Show a model in the browser: `mjlab view robot.xml`, also URDF, a robot or a task."""
+"""Show a model in the browser: `uv run mjlab view robot.xml`, also URDF, a robot or a task."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Show terrains in the browser: `mjlab visualize-terrain pyramid_stairs`."""
+"""Show terrains in the browser: `uv run mjlab visualize-terrain pyramid_stairs`."""
 
 from __future__ import annotations
 

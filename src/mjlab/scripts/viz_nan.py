@@ -1,4 +1,4 @@
-"""Show the states that led to a NaN in the browser: `uv run viz-nan DUMP`."""
+"""Show the states that led to a NaN in the browser: `uv run mjlab viz-nan DUMP`."""
 
 from __future__ import annotations
 
