@@ -7,12 +7,15 @@ than the physics.
 The image-based tasks get nothing more; their learning speed has not been measured. In the
 state-based task, the reaching reward is so wide (0.2 m) that closed fingers on top of the cube get
 98 % of it, and the gripper takes half a second to open or to close. Training therefore adds a
-narrow reaching reward, reachable only with open fingers around the cube, and drops rolling and
-torsional friction. Evaluations, `evaluate` and `play` use neither.
+narrow reaching reward, reachable only with open fingers around the cube, and starts two of five
+goals with the cube in the hand: 86 % are lifted after 300 iterations, against 0 to 39 % without.
+Evaluations, `evaluate` and `play` use neither. Contacts stay as they are: without rolling and
+torsional friction, steps are twice as fast, but the cube turns and slips out of the hand.
 """
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -27,6 +30,7 @@ from mjlab.rl.config import (
     gaussian_distribution,
 )
 from mjlab.tasks.cpu_profile import cpu_profile
+from mjlab.tasks.manipulation import mdp
 
 _REACH, _NARROW_REACH = "lift", "lift_narrow"
 _NARROW_STD = 0.04
@@ -37,6 +41,10 @@ _SHARED: dict[str, Any] = {
     "save_interval": 200,
 }
 _COMMAND = "lift_height"
+# Finger joints that touch the cube, and that are a centimeter away from it (m).
+_FINGERS = {"left_finger": (0.02, 0.03), "right_finger": (-0.02, -0.03)}
+# Times between goals in training (s), for more starts: a policy that lifts needs 2 s.
+_TRAINING_TIMES = (3.0, 5.0)
 _CNN: dict[str, Any] = {
     "output_channels": [16, 32],
     "kernel_size": [5, 3],
@@ -139,14 +147,26 @@ is at its goal."""
 # Profiles.
 
 
-def _reward_narrow_reach(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+    """Reward a narrow reach, and start goals with the cube in the hand."""
     wide = env_cfg.rewards[_REACH]
     env_cfg.rewards[_NARROW_REACH] = RewardTermCfg(
         func=wide.func,
         weight=wide.weight,
         params={**wide.params, "reaching_std": _NARROW_STD},
     )
+    goal = env_cfg.commands[_COMMAND]
+    assert isinstance(goal, mdp.LiftingCommandCfg)
+    env_cfg.commands[_COMMAND] = mdp.GraspStartsLiftingCommandCfg(
+        **{field.name: getattr(goal, field.name) for field in fields(goal)},
+        robot_name="robot",
+        site_name="grasp_site",
+        fingers=_FINGERS,
+    )
+    env_cfg.commands[_COMMAND].resampling_time_range = _TRAINING_TIMES
     _evaluate(env_cfg, rl_cfg)
+    # After 150 iterations, 12 % are lifted.
+    rl_cfg.evaluation.first_iteration = 250
 
 
 def _evaluate(
@@ -155,13 +175,13 @@ def _evaluate(
     trigger_return: float | None = None,
 ) -> None:
     evaluation = rl_cfg.evaluation
-    evaluation.num_episodes = 256
-    evaluation.min_interval = 150
+    evaluation.num_episodes = 200
+    evaluation.min_interval = 50
     evaluation.solved_above = {"success_rate": 0.9}
     evaluation.trigger_return = trigger_return
 
 
-cpu = cpu_profile(_reward_narrow_reach, simple_contacts=True, **_SHARED)
+cpu = cpu_profile(_ease, **_SHARED)
 """Profile of the state-based task."""
 
 
