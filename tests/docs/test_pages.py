@@ -60,6 +60,7 @@ _OTHERS = {
 }
 # `simulate.py` of a bundle, and programs that read one.
 _OTHERS |= {"command", "manifest", "onnx", "yaml"}
+_OPTUNA = {"state", "study-name", "trial-number"}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
 
@@ -97,6 +98,7 @@ def test_commands_are_console_scripts(page: Path) -> None:
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     commands = set(_COMMAND.findall(page.read_text(encoding="utf-8")))
     others = {"python", "tensorboard", "pytest", "ruff", "ty", "lint-imports", "sphinx-build"}
+    others |= {"optuna"}
     assert commands <= {*scripts, *others}
 
 
@@ -243,6 +245,7 @@ def test_flags_are_fields_of_the_commands() -> None:
         | _INSTALLERS
         | _OTHERS
         | _SLURM
+        | _OPTUNA
         | _flags_of_gpu()
         | _flags_of_sweep()
     )

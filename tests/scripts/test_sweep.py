@@ -5,14 +5,18 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import functools
 import os
 import re
 import shutil
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -507,10 +511,27 @@ def test_values_of_ranges_are_sampled(sweep, machine, folder):
     assert returns == sorted(returns, reverse=True)
 
 
-def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path):
-    study = f"sqlite:///{(folder / 'study.db').as_posix()}"
+@pytest.fixture
+def storage(request, folder, tmp_path) -> Iterator[str]:
+    """A storage that machines share: a database, a journal file or a proxy of a database."""
+    database = f"sqlite:///{(folder / 'study.db').as_posix()}"
+    if request.param == "proxy":
+        with socket.socket() as probe:
+            probe.bind(("localhost", 0))
+            port = probe.getsockname()[1]
+        served = optuna.storages.get_storage(database)
+        serve = functools.partial(optuna.storages.run_grpc_proxy_server, served, port=port)
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"grpc://localhost:{port}"
+    else:
+        yield database if request.param == "database" else str(tmp_path / "both.journal")
+
+
+@pytest.mark.filterwarnings("ignore:.*run_grpc_proxy_server is experimental")
+@pytest.mark.parametrize("storage", ["database", "journal", "proxy"], indirect=True)
+def test_machines_share_the_settings_of_a_study(sweep, machine, storage, tmp_path):
     first, second = (
-        (*LEARNING, "--storage", study, "--jobs", "1", "--folder", str(tmp_path / name / "both"))
+        (*LEARNING, "--storage", storage, "--jobs", "1", "--folder", str(tmp_path / name / "both"))
         for name in ("first", "second")
     )
     machine.interrupts_after = 1
@@ -526,6 +547,85 @@ def test_machines_share_the_settings_of_a_study(sweep, machine, folder, tmp_path
     assert [(row["learning-rate"], row["state"]) for row in rows] == [
         ("1e-3", "elsewhere"), ("1e-4", "finished"),
     ]  # fmt: skip
+
+
+def later(study: Path, minutes: float) -> None:
+    """Let time pass since the last heartbeats in a database."""
+    with contextlib.closing(sqlite3.connect(study, isolation_level=None)) as base:
+        base.execute(
+            f"UPDATE trial_heartbeats SET heartbeat = datetime(heartbeat, '-{minutes} minutes')"
+        )
+
+
+@pytest.mark.parametrize(("minutes", "returns"), [(5, False), (15, True)])
+def test_settings_of_a_machine_that_died_return(sweep, machine, folder, tmp_path, minutes, returns):
+    study = folder / "study.db"
+    flags = (*LEARNING, "--storage", f"sqlite:///{study.as_posix()}", "--jobs", "1", "--folder")
+    dead, alive = (str(tmp_path / name / "both") for name in ("dead", "alive"))
+    machine.interrupts_after = 1
+    assert sweep(*flags, dead).status == 130
+    machine.interrupts_after = 99
+    later(study, minutes)
+    assert sweep(*flags, alive).status == 0
+    trained = [flags_of(command)[f"--{RATE}"] for command in machine.commands[1:]]
+    assert sorted(trained) == (["1e-3", "1e-4"] if returns else ["1e-3"])
+    # The machine is repaired.
+    assert sweep(*flags, dead).status == 0
+    resumed = [command for command in machine.commands if "--agent.resume" in flags_of(command)]
+    assert len(resumed) == (0 if returns else 1)
+    states = {row["learning-rate"]: row["state"] for row in rows_of(Path(alive))}
+    assert states["1e-3"] == "finished"
+    assert states["1e-4"] == ("finished" if returns else "elsewhere, running")
+
+
+def test_a_machine_that_returns_in_time_keeps_its_settings(sweep, machine, folder, tmp_path):
+    study = folder / "study.db"
+    flags = (*LEARNING, "--storage", f"sqlite:///{study.as_posix()}", "--jobs", "1", "--folder")
+    mine = str(tmp_path / "mine" / "both")
+    machine.interrupts_after = 1
+    assert sweep(*flags, mine).status == 130
+    later(study, 15)
+    machine.interrupts_after = 99
+    assert sweep(*flags, mine).status == 0
+    assert "--agent.resume" in flags_of(machine.commands[1])
+    assert len(machine.commands) == 3
+
+
+@pytest.mark.parametrize("storage", ["journal"], indirect=True)
+def test_settings_of_lost_folders_are_trained_after_they_are_told_as_failed(
+    sweep, machine, storage, tmp_path
+):
+    flags = (*LEARNING, "--storage", storage, "--jobs", "1", "--folder")
+    lost, other = (str(tmp_path / name / "both") for name in ("lost", "other"))
+    machine.interrupts_after = 1
+    assert sweep(*flags, lost).status == 130
+    machine.interrupts_after = 99
+    journal = optuna.storages.journal.JournalFileBackend(storage)
+    study = optuna.load_study(study_name=None, storage=optuna.storages.JournalStorage(journal))
+    (trial,) = (one for one in study.trials if one.state.name == "RUNNING")
+    study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+    assert sweep(*flags, other).status == 0
+    assert [row["state"] for row in rows_of(Path(other))] == ["finished", "finished"]
+
+
+@pytest.mark.parametrize(
+    ("storage", "named"),
+    [
+        ("grpc://localhost:1", "run_grpc_proxy_server"),
+        ("{}/missing/both.journal", "journal file"),
+        ("{}/mine", "journal file"),
+        ("nosuch://user@host/database", "postgresql://"),
+    ],
+)
+def test_an_unusable_storage_is_named_with_the_cure(
+    sweep, machine, folder, tmp_path, monkeypatch, storage, named
+):
+    monkeypatch.setattr("mjlab.sweep.storage._PATIENCE_S", 0.1)
+    argv = ("--storage", storage.format(tmp_path), "--folder", str(folder))
+    message = sweep(*LEARNING, *argv).message
+    assert "--storage" in message
+    assert named in message
+    assert not machine.commands
 
 
 def test_a_sweep_runs_once_at_a_time_and_keeps_its_flags(sweep, machine, folder):
@@ -727,6 +827,35 @@ def test_runs_resume_with_iterations_left(monkeypatch, tmp_path):
     assert found is not None
     assert (found.path.parent.name, found.path.name) == ("2026-01-01_a_seed_1", "model_1.pt")
     assert sweep.last_checkpoint({"x": "2"}, 1) is None
+
+
+@pytest.mark.slow
+def test_a_killed_worker_of_a_journal_file_continues(tmp_path):
+    command = [sys.executable, "-m", "mjlab.cli.main", "sweep", TASK, "--device", "cpu"]
+    command += ["--over", f"{RATE}=1e-4,3e-4,1e-3", "--storage", str(tmp_path / "both.journal")]
+    command += ["--num-envs", "4", "--jobs", "1", "--env.sim.num-threads", "1"]
+    command += ["--agent.save-interval", "1", "--agent.max-iterations", "3"]
+    command += ["--agent.evaluation.num-episodes", "2", "--folder"]
+    folders = [tmp_path / name / "both" for name in ("killed", "other")]
+    killed, other = folders
+    first, second = (
+        subprocess.Popen([*command, str(folder)], stdout=subprocess.PIPE) for folder in folders
+    )
+    end = time.monotonic() + 120.0
+    while not list(killed.glob("runs/*/*/model_0.pt")) and time.monotonic() < end:
+        time.sleep(0.01)
+    first.kill()
+    first.communicate()
+    second.communicate(timeout=300.0)
+    assert second.returncode == 0
+    # As a machine that is started again.
+    assert subprocess.run([*command, str(killed)], timeout=300.0).returncode == 0
+    states = {row["learning-rate"]: row["state"] for row in rows_of(killed)}
+    assert sorted(states.values()) == ["elsewhere", "elsewhere", "finished"]
+    (setting,) = (name for name, state in states.items() if state == "finished")
+    *_, last = sorted((killed / "runs" / f"learning-rate={setting}").glob("*_seed_1/"))
+    assert len(Run(last).joined) == 2
+    assert Run(last).info["iterations"] == 3
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Train and compare settings of a task: `uv run mjlab sweep TASK --over FLAG=VALUES [flags of train]`.
 
-Optuna stores the settings ("trials") and their values in a database, suggests values of ranges, and shares
+Optuna stores the settings ("trials") and their values, suggests values of ranges, and shares
 trials between machines. Each seed of a setting is a process of `train`:
 
     logs/sweeps/<name>/
@@ -88,7 +88,8 @@ class SweepFlags:
     folder: str | None = None
     """Folder of the sweep. None: logs/sweeps/<task and flags>."""
     storage: str | None = None
-    """URL of a database shared by machines. None: SQLite file in the folder."""
+    """Shared by machines: URL of a database, grpc://HOST:PORT of Optuna's proxy, or path of its journal
+    file. None: SQLite file in the folder."""
     objective: str | None = None
     """TensorBoard tag to compare. None: last evaluation, else return; if settings change rewards, the
     success rate or metrics."""
@@ -106,9 +107,10 @@ def command(argv: list[str], prog: str) -> None:
     # Imports Optuna; flags are checked before.
     from mjlab.sweep.results import Comparison
     from mjlab.sweep.runs import Runs
-    from mjlab.sweep.study import DATABASE_ERRORS, Study, naming_database, only_process
+    from mjlab.sweep.storage import STORAGE_ERRORS, naming_storage
+    from mjlab.sweep.study import Study, only_process
 
-    with only_process(sweep.folder), naming_database(sweep, *DATABASE_ERRORS):
+    with only_process(sweep.folder), naming_storage(sweep, *STORAGE_ERRORS):
         study = Study(sweep)
         runs = Runs(sweep, study)
         runs.train()

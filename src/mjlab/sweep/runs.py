@@ -20,6 +20,7 @@ from mjlab.cli.resume import resume_flags
 from mjlab.cli.train_process import train_command
 from mjlab.rl.evaluation import Bound
 from mjlab.sweep.settings import Setting, Sweep, train_config, train_flags
+from mjlab.sweep.storage import storage_summary
 from mjlab.sweep.study import Study, TrainedRun, setting_of, trained_run
 from mjlab.utils.gpu import select_gpus
 from mjlab.utils.processes import CORES_VARIABLE, PARENT_VARIABLE, available_cores
@@ -102,6 +103,7 @@ class Runs:
                 while self._running:
                     time.sleep(_SECONDS_BETWEEN_LOOKS)
                     self._update()
+                    self._study.send_heartbeat()
                     if time.monotonic() > self._next_report:
                         self._next_report += time.monotonic() - self._begin
                         print(f"Running  {self.what_is_left()}", flush=True)
@@ -276,6 +278,8 @@ def _print_summary(sweep: Sweep, slots: list[dict[str, str]]) -> None:
     print(f"Sweep:   {settings} x {counted(sweep.seeds, 'seed')} of {sweep.task}")
     print(f"Runs:    {len(slots)} side by side with {each} each, in {sweep.folder}")
     print(f"Output:  {sweep.folder / 'runs' / '*' / 'seed_*.log'}")
+    if sweep.storage is not None:
+        print(f"Storage: {storage_summary(sweep.storage)}")
     objective = sweep.objective
     order = "lowest" if objective.minimize else "highest"
     print(f"Compare: {objective.reason or f'{objective.tag}, {order} first'}")

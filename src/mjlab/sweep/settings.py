@@ -117,7 +117,7 @@ class Sweep:
     folder: Path
     """Folder of the sweep."""
     storage: str | None
-    """URL of the database. None: SQLite file in the folder."""
+    """URL of a database or proxy, or path of a journal file. None: SQLite file in the folder."""
     objective: Objective = Objective()
     """Value to compare."""
 

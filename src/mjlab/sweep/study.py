@@ -9,6 +9,7 @@ import os
 import socket
 import sqlite3
 import statistics
+import time
 import uuid
 import warnings
 from collections.abc import Generator
@@ -17,34 +18,34 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import optuna
-import sqlalchemy.exc
 from optuna.distributions import (
     BaseDistribution,
     CategoricalDistribution,
     FloatDistribution,
     IntDistribution,
 )
+from optuna.storages import BaseStorage, RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from mjlab.runs import Run
 from mjlab.runs.reference import read_scalars_of_sessions
 from mjlab.sweep.objective import Objective
 from mjlab.sweep.settings import Axis, Setting, Sweep
-from mjlab.utils.errors import MjlabError, UserError
-from mjlab.utils.logging import first_line
+from mjlab.sweep.storage import (
+    HEARTBEAT_S,
+    STORAGE_ERRORS,
+    naming_storage,
+    open_storage,
+    without_experimental_warnings,
+)
+from mjlab.utils.errors import UserError
 from mjlab.utils.os import write_atomically
 from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
     from mjlab.rl.plot import Curve
 
-_FILE, _DATABASE = "sweep.json", "study.db"
-DATABASE_ERRORS = (optuna.exceptions.OptunaError, sqlalchemy.exc.SQLAlchemyError, sqlite3.Error)
-# SQLite's errors of files that are not damaged.
-_BLOCKED = (
-    sqlite3.SQLITE_PERM, sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM,
-    sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN,
-)  # fmt: skip
+_FILE = "sweep.json"
 # User attributes of trials.
 _SETTING, _OWNER = "setting", "folder"
 # Fraction of the iterations that the objective averages, unless it is that of evaluations.
@@ -78,38 +79,6 @@ def only_process(folder: Path) -> Generator[None]:
         yield
 
 
-@contextlib.contextmanager
-def naming_database(sweep: Sweep, *kinds: type[Exception]) -> Generator[None]:
-    """Turn errors of these kinds within the block into a `UserError` with the database and the cure."""
-    try:
-        yield
-    except (MjlabError, MemoryError):
-        raise
-    except kinds as error:
-        causes: list[BaseException] = [error]
-        while (cause := getattr(causes[-1], "orig", None) or causes[-1].__cause__) is not None:
-            causes.append(cause)
-        reason = first_line(causes[-1])
-        path = sweep.folder / _DATABASE
-        is_blocked = getattr(causes[-1], "sqlite_errorcode", 0) & 0xFF in _BLOCKED
-        if sweep.storage is not None:
-            text = (
-                f"--storage: cannot use the database: {reason}; use a URL such as "
-                "postgresql://user@host/database with its driver installed, or leave out --storage."
-            )
-        elif is_blocked and (path.is_file() or not os.path.lexists(path)):
-            text = (
-                f"{path}: cannot be read and written: {reason}; free it, or the disk, and "
-                "repeat the command, which continues the sweep."
-            )
-        else:
-            text = (
-                f"{path} is damaged ({reason}); delete it; the next call rebuilds it from the folders of the "
-                "runs."
-            )
-        raise UserError(text) from error
-
-
 class Study:
     """Optuna's study of a sweep: the settings to train here, and the values of all machines."""
 
@@ -124,9 +93,11 @@ class Study:
         self._owner = _check_definition(sweep)
         self._distributions = {axis.name: _distribution(axis) for axis in sweep.axes}
         self._failed_now = 0
-        # Optuna and its parsers raise many types of errors for a damaged database.
-        with naming_database(sweep, Exception):
-            self._study = _open(sweep)
+        self._next_heartbeat = -math.inf
+        # Optuna and its parsers raise many types of errors for a damaged storage.
+        with naming_storage(sweep, Exception):
+            self._storage = open_storage(sweep)
+            self._study = _open(sweep, self._storage)
             for trial in self.trials:
                 self._check(trial)
             self._enqueue_missing()
@@ -148,8 +119,12 @@ class Study:
 
     def next(self) -> FrozenTrial | None:
         """Return a new trial to train here, or None if the sweep has no more."""
+        self.send_heartbeat()
+        with without_experimental_warnings():
+            # Trials of machines that died are enqueued again. No effect without heartbeats.
+            optuna.storages.fail_stale_trials(self._study)
         while self._has_more():
-            trial = self._study.ask(self._distributions)
+            trial = self._ask()
             setting = {name: _text(value) for name, value in trial.params.items()}
             # In the order of --over.
             setting = {axis.name: setting[axis.name] for axis in self._sweep.axes}
@@ -160,8 +135,34 @@ class Study:
             if others:
                 self._study.tell(trial.number, state=TrialState.PRUNED)
                 continue
-            return next(one for one in self.trials if one.number == trial.number)
+            begun = next(one for one in self.trials if one.number == trial.number)
+            self._record_heartbeats([begun])
+            return begun
         return None
+
+    def send_heartbeat(self) -> None:
+        """Tell other machines once a minute that this one trains its trials, or will."""
+        if time.monotonic() > self._next_heartbeat:
+            self._next_heartbeat = time.monotonic() + HEARTBEAT_S
+            # Others wait for ten heartbeats, so that a database may pause.
+            with contextlib.suppress(*STORAGE_ERRORS):
+                self._record_heartbeats(self.own())
+
+    def _record_heartbeats(self, trials: list[FrozenTrial]) -> None:
+        """Record heartbeats of running trials. Optuna does so only within `optimize`, one trial a thread."""
+        storage = self._storage
+        if not isinstance(storage, RDBStorage) or storage.get_heartbeat_interval() is None:
+            return
+        study = storage.get_study_id_from_name(self._study.study_name)
+        for trial in trials:
+            if trial.state == TrialState.RUNNING:
+                number = storage.get_trial_id_from_study_id_trial_number(study, trial.number)
+                storage.record_heartbeat(number)
+
+    def _ask(self) -> optuna.Trial:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Heartbeat of storage is supposed")
+            return self._study.ask(self._distributions)
 
     def finish(self, trial: FrozenTrial) -> None:
         """Store the value of a trial, if it has no value yet: mean over seeds; failed if not finite.
@@ -278,9 +279,8 @@ def _mismatch(content: dict[str, Any], sweep: Sweep) -> str | None:
     return None
 
 
-def _open(sweep: Sweep) -> optuna.Study:
+def _open(sweep: Sweep, storage: BaseStorage) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    url = sweep.storage or f"sqlite:///{(sweep.folder / _DATABASE).as_posix()}"
     minimize = sweep.objective.minimize
     sampler: optuna.samplers.BaseSampler = optuna.samplers.RandomSampler()
     # Without a ranking, there are no good values to stay near.
@@ -290,7 +290,7 @@ def _open(sweep: Sweep) -> optuna.Study:
             # Running trials count as bad, so that samples next to them are not drawn.
             sampler = optuna.samplers.TPESampler(constant_liar=True)
     study = optuna.create_study(
-        storage=url,
+        storage=storage,
         # The runs can be compared by several objectives.
         study_name=f"{sweep.folder.resolve().name} {'-' if minimize else '+'}{sweep.objective.tag}",
         direction="minimize" if minimize else "maximize",
