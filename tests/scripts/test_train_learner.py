@@ -79,6 +79,13 @@ def test_unknown_learners_list_the_known(run, script):
     assert all(name in outcome.message for name in ("td3", "ppo", "sac", "distillation"))
 
 
+def test_the_start_says_how_far_sac_moves_joints(run, tmp_path):
+    flags = ["--num-envs", "2", "--device", "cpu", "--agent.max-iterations", "1"]
+    outcome = run("train", "Mjlab-Lift-Cube-Yam", *SAC, *flags, "--log-root", str(tmp_path))
+    (reach,) = (line for line in outcome.out.splitlines() if line.startswith("Reach:"))
+    assert "0.087 (left_finger) to 5.5 (joint6)" in reach
+
+
 def test_counts_of_sac_are_checked(run):
     outcome = run("train", TASK, "--learner", "sac", "--agent.algorithm.num-updates", "0")
     assert outcome.status == 1
