@@ -15,13 +15,14 @@ from rich.console import Console
 
 from mjlab.cli import display
 from mjlab.cli.display import TrainingDisplay, usual_iteration
-from mjlab.cli.results import next_commands
+from mjlab.cli.results import command_that_learns, next_commands
 from mjlab.cli.train_config import parse_train_flags
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.evaluation import EvaluationResult, MeanAndInterval
 from mjlab.rl.progress import ProgressCfg, sparkline
 from mjlab.rl.run_logger import IterationStats
 from mjlab.scripts.train import TrainConfig
+from mjlab.utils.processes import process_rank
 from mjlab.utils.string import clock, counted, duration
 
 SWINGUP = "Mjlab-Cartpole-Swingup"
@@ -295,21 +296,42 @@ def test_an_evaluation_that_confirms_has_failures_with_their_interval():
 def test_the_next_commands_name_the_folder_if_it_is_needed(flags, root, tmp_path):
     cfg = parse_train_flags(SWINGUP, flags, "train")
     commands = [shlex.split(line) for line in next_commands(SWINGUP, cfg, tmp_path, "solved")]
-    assert commands == [["uv", "run", name, SWINGUP, *root] for name in ("play", "evaluate")]
+    assert commands == [
+        ["uv", "run", "mjlab", name, SWINGUP, *root] for name in ("play", "evaluate")
+    ]
 
 
 def test_an_interrupted_run_is_resumed_without_its_settings(tmp_path):
     flags = ["--num-envs", "8", "--env.decimation", "2", "--device", "cpu", "--live", "True"]
     cfg = parse_train_flags(SWINGUP, flags, "train")
     resume, play, _ = map(shlex.split, next_commands(SWINGUP, cfg, tmp_path, "interrupted"))
+    program = ["uv", "run", "mjlab"]
     expected = ["train", SWINGUP, "--device", "cpu", "--agent.resume", "True"]
-    assert (resume, play) == (["uv", "run", *expected], ["uv", "run", "play", SWINGUP])
+    assert (resume, play) == ([*program, *expected], [*program, "play", SWINGUP])
 
 
 def test_the_next_commands_of_a_script_are_called_through_it(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "argv", ["examples/mine.py", "train", SWINGUP])
     play, _ = next_commands(SWINGUP, TrainConfig.from_task(SWINGUP), tmp_path, "solved")
     assert play == f"uv run python examples/mine.py play {SWINGUP}"
+
+
+@pytest.mark.parametrize(
+    ("flags", "device", "ended", "is_suggested"),
+    [
+        ([], "cpu", "finished", True),
+        ([], "cpu", "interrupted", True),
+        ([], "cpu", "solved", False),
+        ([], "cuda:0", "finished", False),
+        (["--num-envs", "8"], "cpu", "finished", False),
+        (["--profile", "cpu"], "cpu", "finished", False),
+    ],
+)
+def test_an_unsolved_default_run_names_settings_that_learn(flags, device, ended, is_suggested):
+    cfg = parse_train_flags(SWINGUP, flags, "train")
+    cfg.apply_short_forms(process_rank())
+    found = command_that_learns(SWINGUP, cfg, device, ended)
+    assert found == (f"uv run mjlab train {SWINGUP} --profile cpu" if is_suggested else None)
 
 
 @pytest.mark.parametrize(
@@ -323,7 +345,7 @@ def test_the_printed_commands_find_the_policy(trained, name):
     cfg = parse_train_flags(SWINGUP, ["--log-root", str(trained.parents[1])], "train")
     cfg.agent.experiment_name = name
     *_, line = next_commands(SWINGUP, cfg, trained, "finished")
-    _, _, script, *argv = shlex.split(line)
+    _, _, _, script, *argv = shlex.split(line)
     scored = run_script(script, *argv, "--num-episodes", "1", "--max-steps", "2", "--json", "True")
     assert scored.status == 0, scored.err
     assert json.loads(scored.out)["policy"] == str(trained / "model_1.pt")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 from commands import SMALL, TASK
 from matplotlib.figure import Figure
+
+from mjlab.cli.record import VideoCfg
 
 
 def test_the_curve_of_a_resumed_run_is_whole(run, tmp_path, monkeypatch):
@@ -42,3 +46,16 @@ def test_failures_beside_the_policy_are_warnings(run, tmp_path, monkeypatch):
 def fail_at_the_end(run_dir, **info):
     if "ended" in info:
         raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("flags", "size"),
+    [((), "640 x 360"), (("--env.viewer.width", "64", "--env.viewer.height", "48"), "64 x 48")],
+)
+def test_the_clip_of_a_result_is_announced(run, tmp_path, monkeypatch, flags, size):
+    monkeypatch.setattr("mjlab.cli.results.VideoCfg", partial(VideoCfg, length=2))
+    common = ("--log-root", str(tmp_path), "--agent.max-iterations", "1", "--result-video", "True")
+    outcome = run("train", TASK, *SMALL, *common, *flags)
+    assert outcome.status == 0, outcome.err
+    announced = outcome.out.index(f"Recording a clip: 2 frames of {size} pixels")
+    assert announced < outcome.out.index("Video:")

@@ -188,10 +188,16 @@ def parse_for_run(
     return _parsed(type(default), default, flags, prog)
 
 
+def profile_to_suggest(task: str, profile: str | None, device: str) -> str | None:
+    """Return the `cpu` profile if `task` has it and is trained on the CPU without a profile."""
+    is_of_use = profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task)
+    return CPU_PROFILE if is_of_use else None
+
+
 def suggest_profile(task: str, profile: str | None, device: str) -> None:
-    """Print a hint to the `cpu` profile when training on the CPU without a profile."""
-    if profile is None and device == "cpu" and CPU_PROFILE in list_profiles(task):
-        print_notice(f"`train {task} --profile {CPU_PROFILE}` has settings for a few cores.")
+    """Print a hint to the profile for this machine when training without a profile."""
+    if (name := profile_to_suggest(task, profile, device)) is not None:
+        print_notice(f"`train {task} --profile {name}` has settings for a few cores.")
 
 
 def report_untuned_learner(task: str, profile: str | None, learner: str) -> None:

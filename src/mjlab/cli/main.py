@@ -89,10 +89,10 @@ COMMANDS = (
 Train a policy, by PPO or, with --learner sac, by SAC. Checkpoints, curves and the exported
 policy go to logs/rsl_rl/<experiment>/<time>/.""",
         examples=(
+            "train Mjlab-Cartpole-Swingup --profile cpu",
             "train Mjlab-Cartpole-Swingup --num-envs 4096",
             "train Mjlab-Cartpole-Swingup --agent.algorithm.learning-rate 3e-4 --agent.seed 1",
             "train Mjlab-Cartpole-Swingup --agent.resume True",
-            "train Mjlab-Velocity-Flat-Unitree-Go1 --profile cpu",
             "train Mjlab-Velocity-Flat-Unitree-Go1 --learner sac --agent.algorithm.batch-size 1024",
         ),
     ),

@@ -12,6 +12,7 @@ import torch
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.runs import Checkpoint
 from mjlab.runs.policy import agent_cfg_of, make_env, make_policy
+from mjlab.utils.string import counted
 from mjlab.utils.wrappers.video_recorder import ClipWriter
 from mjlab.viewer.base import done_mask, reset_policy
 
@@ -66,6 +67,8 @@ def record_policy(
         writer = ClipWriter(
             folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
         )
+        size = f"{env_cfg.viewer.width} x {env_cfg.viewer.height} pixels"
+        print(f"Recording a clip: {counted(video.length, 'frame')} of {size} ...", flush=True)
         with torch.inference_mode():
             for _ in range(video.length):
                 reset_policy(policy, done_mask(env.step(policy(env.get_observations()))))

@@ -7,19 +7,21 @@ import os
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mjlab
-from mjlab.cli.flags import prepare_env_cfg
+from mjlab.cli.flags import prepare_env_cfg, profile_to_suggest
 from mjlab.cli.record import VideoCfg, record_policy
-from mjlab.runs import Run
+from mjlab.runs import Checkpoint, Run
 from mjlab.runs.reference import parts_of
 from mjlab.sim.divergence import mujoco_warnings
-from mjlab.tasks.registry import load_rl_cfg
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.logging import beside_results
 from mjlab.utils.os import files_in
 from mjlab.utils.string import counted
+from mjlab.viewer.viewer_config import ViewerConfig
 
 if TYPE_CHECKING:
     from mjlab.cli.train_config import TrainConfig
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from mjlab.utils.processes import ProcessRank
 
 _LOG_ROOT = "logs/rsl_rl"
+# Pixels of a clip of the result.
+_WIDTH, _HEIGHT = 640, 360
 
 
 def print_heading(task: str, cfg: TrainConfig, env: Any, rank: ProcessRank) -> None:
@@ -93,10 +97,7 @@ def write_results(
     checkpoint = run.newest
     if cfg.result_video and checkpoint is not None:
         with beside_results("video"):
-            env_cfg = run.cfg("play").env
-            prepare_env_cfg(task, cfg, env_cfg, checkpoint.path)
-            video = VideoCfg(profile=cfg.profile)
-            record_policy(task, env_cfg, checkpoint, run_dir / "videos", device, video)
+            _record_result(task, cfg, run, checkpoint, device)
     print(f"Saved in {_short(run_dir)}:")
     for pattern in ("model_*.pt", "*.onnx", "*.png", "videos/**/*.mp4"):
         files = sorted(files_in(run_dir, pattern), key=lambda path: path.stat().st_mtime)
@@ -105,6 +106,35 @@ def write_results(
     print("Next:")
     for line in next_commands(task, cfg, run_dir, ended):
         print(f"    {line}")
+    if (better := command_that_learns(task, cfg, device, ended)) is not None:
+        number = counted(cfg.env.scene.num_envs, "environment")
+        print(f"Settings for this machine (this run: defaults of the task, {number}):")
+        print(f"    {better}")
+
+
+def _record_result(
+    task: str, cfg: TrainConfig, run: Run, checkpoint: Checkpoint, device: str
+) -> None:
+    """Record a clip of the trained policy, large enough for a page unless the task sets a size."""
+    env_cfg = run.cfg("play").env
+    prepare_env_cfg(task, cfg, env_cfg, checkpoint.path)
+    size, default = env_cfg.viewer, ViewerConfig()
+    video = VideoCfg(profile=cfg.profile)
+    if (size.width, size.height) == (default.width, default.height):
+        video = replace(video, width=_WIDTH, height=_HEIGHT)
+    record_policy(task, env_cfg, checkpoint, run.folder / "videos", device, video)
+
+
+def command_that_learns(task: str, cfg: TrainConfig, device: str, ended: str | None) -> str | None:
+    """Return the command with the profile for this machine.
+
+    None: the task is solved, has no such profile, or a profile or number of environments was set.
+    """
+    profile = profile_to_suggest(task, cfg.profile, device)
+    is_default = cfg.env.scene.num_envs == load_env_cfg(task).scene.num_envs
+    if profile is None or ended == "solved" or not is_default:
+        return None
+    return _line(["train", task, "--profile", profile])
 
 
 def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None) -> list[str]:
@@ -128,15 +158,16 @@ def next_commands(task: str, cfg: TrainConfig, run_dir: Path, ended: str | None)
     commands = [["play", task, *flags], ["evaluate", task, *flags]]
     if ended == "interrupted":
         commands.insert(0, ["train", task, *resume, "--agent.resume", "True"])
-    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
-    return [join(["uv", "run", *_program(), *command]) for command in commands]
+    return [_line(command) for command in commands]
 
 
-def _program() -> list[str]:
-    """Return the words before the subcommand: the user's script, which may register the task."""
+def _line(command: list[str]) -> str:
+    """Return a command line, by the user's script if that was called: it may register the task."""
     script = Path(sys.argv[0])
     is_own = script.suffix == ".py" and Path(mjlab.__file__).parent not in script.resolve().parents
-    return ["python", sys.argv[0]] if is_own else []
+    program = ["python", sys.argv[0]] if is_own else ["mjlab"]
+    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
+    return join(["uv", "run", *program, *command])
 
 
 def _short(path: Path) -> Path:
