@@ -8,7 +8,9 @@ DEV := $(UV) run --group dev
 help:  ## Show this list.
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-train:  ## Train the cartpole swing-up on this machine's CPU until it is solved.
+# TORCH names a build of torch that is not the default: that without CUDA on Linux.
+train:  ## Train the cartpole swing-up on this machine's CPU; on Linux without a GPU: make train TORCH=cpu.
+	$(if $(TORCH),$(UV) run -q --no-project --python '>=3.11,<3.15' tools/torch_wheel.py $(TORCH))
 	$(UV) run mjlab train Mjlab-Cartpole-Swingup --profile cpu --device cpu --result-video True
 
 test:  ## Run the test suite.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -16,7 +17,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+VERSION = PROJECT["project"]["version"]
+# Tags of wheels for every Python and machine.
+_ANY = "py3-none-any"
 
 
 @pytest.fixture(scope="module")
@@ -86,13 +90,13 @@ def build_package(project: Path, folder: Path, requirement: str) -> Path:
     return build_wheel(project, folder)
 
 
-def stand_in(name: str, folder: Path) -> None:
-    """Write a wheel without files under the name and version of a distribution installed here."""
-    version = importlib.metadata.version(name)
+def stand_in(name: str, folder: Path, version: str | None = None, tags: str = _ANY) -> None:
+    """Write a wheel without files, by default with the version of the distribution installed here."""
+    version = version or importlib.metadata.version(name)
     stem = f"{name.replace('-', '_')}-{version}"
     metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
-    tag = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
-    with zipfile.ZipFile(folder / f"{stem}-py3-none-any.whl", "w") as wheel:
+    tag = f"Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: {tags}\n"
+    with zipfile.ZipFile(folder / f"{stem}-{tags}.whl", "w") as wheel:
         wheel.writestr(f"{stem}.dist-info/METADATA", metadata)
         wheel.writestr(f"{stem}.dist-info/WHEEL", tag)
         wheel.writestr(f"{stem}.dist-info/RECORD", "")
@@ -195,6 +199,53 @@ def test_a_project_takes_this_mjlab_for_all_its_packages(uv, wheels, tmp_path):
     text = (project / "uv.lock").read_text()
     assert f'source = {{ path = "../{wheel.name}" }}' in text
     assert f'version = "{VERSION}"' in text
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere, torch has no CUDA by default")
+def test_a_fetched_build_of_torch_is_kept(uv, tmp_path):
+    checkout, index, others = (tmp_path / name for name in ("checkout", "index", "others"))
+    for folder in (index, others, checkout / "wheels"):
+        folder.mkdir(parents=True)
+    settings = PROJECT["tool"]["uv"]
+    (pinned,) = (text for text in settings["constraint-dependencies"] if text.startswith("torch=="))
+    version = pinned.removeprefix("torch==")
+    stand_in("torch", index, version)
+    tag = "cp{}{}".format(*sys.version_info)
+    stand_in("torch", others, f"{version}+cpu", f"{tag}-{tag}-linux_{platform.machine()}")
+    (checkout / "pyproject.toml").write_text(
+        f"""[project]
+name = "project"
+version = "1"
+requires-python = "==3.{sys.version_info.minor}.*"
+dependencies = ["torch"]
+
+[tool.uv]
+find-links = {settings["find-links"]}
+constraint-dependencies = ["{pinned}"]
+"""
+    )
+    (checkout / "tools").mkdir()
+    shutil.copy(ROOT / "tools" / "torch_wheel.py", checkout / "tools")
+    offline = {"UV_OFFLINE": "1", "UV_NO_INDEX": "1", "UV_PYTHON": sys.executable, "UV": uv}
+    show = "import importlib.metadata as m; print(m.version('torch'))"
+
+    def installed() -> str:
+        """Return the torch of `uv run`, which finds the default build in the index only."""
+        command = (uv, "run", "python", "-c", show)
+        done = run(*command, cwd=checkout, **offline, UV_FIND_LINKS=str(index))
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    assert installed() == version
+    folders = f"{index},{others}"
+    for _ in range(2):
+        fetch = (sys.executable, "tools/torch_wheel.py", "cpu")
+        fetched = run(*fetch, cwd=checkout, **offline, UV_FIND_LINKS=folders)
+        assert fetched.returncode == 0, fetched.stderr
+        assert installed() == f"{version}+cpu"
+    missing = run(*fetch[:-1], "cu1", cwd=checkout, **offline, UV_FIND_LINKS=folders)
+    assert missing.returncode == 1
+    assert "UV_FIND_LINKS" in missing.stderr
 
 
 def test_the_wheel_carries_its_types(site):

@@ -36,7 +36,7 @@ _INSTALLERS |= {"dest", "python-version", "implementation", "platform"}
 _INSTALLERS |= {"python-platform", "no-header", "no-annotate"}
 _INSTALLERS |= {
     "torch-backend",
-    "clear",
+    "upgrade-package",
     "python",
     "no-config",
     "no-hashes",
