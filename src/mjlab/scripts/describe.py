@@ -16,13 +16,15 @@ from mjlab.cli.flags import (
 )
 from mjlab.deploy.terms import unmeasured_table
 from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
+from mjlab.utils.config_json import config_json, signatures_json
 from mjlab.utils.errors import BadCallError
 from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
 from mjlab.utils.tables import WIDTH, json_value, tables_text
 
 if TYPE_CHECKING:
+    from mjlab.entity import Entity
     from mjlab.own_robot.findings import Finding
 
 _MIN_WIDTH = 80
@@ -43,7 +45,7 @@ class DescribeConfig(ConfigChoice):
     """Flags of `describe`."""
 
     json: bool = field(default=False, metadata=shown("run"))
-    """Print JSON, with all columns and lists in full."""
+    """Print JSON: all columns, lists in full, and what a config is written from."""
     markdown: bool = field(default=False, metadata=shown("run"))
     """Print Markdown."""
     check: bool = field(default=False, metadata=shown("run"))
@@ -99,13 +101,13 @@ def describe(task: str, cfg: DescribeConfig | None = None) -> TaskDescription:
     cfg = cfg or DescribeConfig()
     env_cfg = copy.deepcopy(cfg.env) or load_env_cfg(task, cfg.play, cfg.profile)
     prepare_env_cfg(task, cfg, env_cfg, checkpoint=None)
-    num_envs = env_cfg.scene.num_envs
-    env_cfg.scene.num_envs = 1
+    built_cfg = copy.deepcopy(env_cfg)
+    built_cfg.scene.num_envs = 1
     # Tasks that require a GPU are described without one.
-    env_cfg.sim.engine = "auto"
-    env = ManagerBasedRlEnv(env_cfg, device="cpu")
+    built_cfg.sim.engine = "auto"
+    env = ManagerBasedRlEnv(built_cfg, device="cpu")
     try:
-        return TaskDescription(task, cfg, num_envs, env)
+        return TaskDescription(task, cfg, env_cfg, env)
     finally:
         env.close()
 
@@ -116,18 +118,23 @@ class TaskDescription:
     Args:
         task: Name of the task.
         cfg: Flags with profile and purpose.
-        num_envs: Number of environments in the config.
+        env_cfg: Config of the environment.
         env: Environment of the task with any number of environments.
     """
 
     def __init__(
-        self, task: str, cfg: DescribeConfig, num_envs: int, env: ManagerBasedRlEnv
+        self, task: str, cfg: DescribeConfig, env_cfg: ManagerBasedRlEnvCfg, env: ManagerBasedRlEnv
     ) -> None:
         self.task = task
+        self._profile = cfg.profile
+        self._env_cfg = env_cfg
+        self._parts = {name: _parts(entity) for name, entity in env.scene.entities.items()}
+        num_envs = env_cfg.scene.num_envs
         observations, *others = env.tables()
         self.tables = [observations, unmeasured_table(env), *others]
         self._facts = {
             "task": task,
+            "profiles": list_profiles(task),
             "profile": cfg.profile,
             "play": cfg.play,
             "num_envs": num_envs,
@@ -144,8 +151,20 @@ class TaskDescription:
         self._summary = f"{counted(num_envs, 'environment')} by default; {env.describe_time()}."
 
     def as_json(self) -> dict[str, Any]:
-        """Return sizes and times, and the rows of each table, as JSON values."""
-        return json_value(self._facts) | {table.name: table.records() for table in self.tables}
+        """Return all that a config is written from, as JSON values.
+
+        Sizes and times, the rows of each table, the parts of each entity by name, the configs of the
+        environment and of the learner, and the functions and classes in them.
+        """
+        rl_cfg = load_rl_cfg(self.task, profile=self._profile)
+        return {
+            **json_value(self._facts),
+            **{table.name: table.records() for table in self.tables},
+            "parts": json_value(self._parts),
+            "env_cfg": config_json(self._env_cfg),
+            "rl_cfg": config_json(rl_cfg),
+            "functions": signatures_json(self._env_cfg, rl_cfg),
+        }
 
     def text(self, width: int = WIDTH) -> str:
         """Return the tables as text of at most `width` characters per line."""
@@ -158,3 +177,20 @@ class TaskDescription:
             if table.rows:
                 parts += [f"**{table.title}**", table.markdown()]
         return "\n\n".join(parts)
+
+
+def _parts(entity: Entity) -> dict[str, Any]:
+    """Return the names of an entity's parts, and range and initial position of its joints."""
+    joints = {}
+    if entity.num_joints:
+        data = entity.data
+        limits, initial = data.joint_pos_limits[0], data.default_joint_pos[0]
+        for name, bounds, position in zip(entity.joint_names, limits, initial, strict=True):
+            joints[name] = {"range": bounds, "initial": position}
+    return {
+        "joints": joints,
+        "actuators": entity.actuator_names,
+        "bodies": entity.body_names,
+        "geoms": list(filter(None, entity.geom_names)),
+        "sites": entity.site_names,
+    }
