@@ -10,7 +10,7 @@ help:  ## Show this list.
 
 # TORCH names a build of torch that is not the default: that without CUDA on Linux.
 train:  ## Train the cartpole swing-up on this machine's CPU; on Linux without a GPU: make train TORCH=cpu.
-	$(if $(TORCH),$(UV) run -q --no-project --python '>=3.11,<3.15' tools/torch_wheel.py $(TORCH))
+	@test -z "$(TORCH)" || $(UV) run -q --no-project --python '>=3.11,<3.15' tools/torch_wheel.py $(TORCH)
 	$(UV) run mjlab train Mjlab-Cartpole-Swingup --profile cpu --device cpu --result-video True
 
 test:  ## Run the test suite.

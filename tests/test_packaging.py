@@ -248,6 +248,15 @@ constraint-dependencies = ["{pinned}"]
     assert "UV_FIND_LINKS" in missing.stderr
 
 
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+@pytest.mark.parametrize(("words", "fetches"), [(("TORCH=cpu",), True), ((), False)])
+def test_make_fetches_the_build_that_is_named(words, fetches):
+    done = run("make", "-n", "train", *words, cwd=ROOT)
+    shell = run("sh", "-n", "-c", done.stdout, cwd=ROOT)
+    assert (done.returncode, shell.returncode) == (0, 0), done.stderr + shell.stderr
+    assert ("tools/torch_wheel.py cpu" in done.stdout) == fetches
+
+
 def test_the_wheel_carries_its_types(site):
     assert (site / "mjlab" / "py.typed").is_file()
 
