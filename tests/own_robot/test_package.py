@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import re
 import runpy
+import subprocess
 import sys
 import tomllib
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 
 import mujoco
-import numpy as np
 import pytest
 import torch
 from legged import legged_spec
-from small_robots import arm_spec, write_archive, write_quadruped, write_urdf
+from packaging.requirements import Requirement
+from small_robots import arm_spec, write_archive, write_quadruped, write_still_motion, write_urdf
 from tensordict import TensorDict
 
 from mjlab.entity import EntityCfg
@@ -26,7 +29,8 @@ from mjlab.envs import ManagerBasedRlEnv
 from mjlab.own_robot.model_source import RobotModel, model_file
 from mjlab.own_robot.package import Package, questions_table, values_table
 from mjlab.own_robot.report import describe_robot
-from mjlab.own_robot.rewriting import Record, read_record, write_files
+from mjlab.own_robot.rewriting import Record, deleted_files, read_record, write_files
+from mjlab.own_robot.robot_source import by_pattern
 from mjlab.tasks.velocity.symmetry import mirror_left_right
 from mjlab.utils.errors import UserError
 
@@ -244,21 +248,7 @@ def test_reach_task_of_an_arm(tmp_path: Path, imported, registered: list[dict]) 
 
 def test_tracking_task_of_a_motion(tmp_path: Path, imported) -> None:
     package = quadruped(tmp_path / "model")
-    model = package.report.compiled
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    poses = np.repeat(data.xpos[None, 1:], 10, axis=0), np.repeat(data.xquat[None, 1:], 10, axis=0)
-    motion = tmp_path / "still.npz"
-    np.savez(
-        motion,
-        fps=[50],
-        joint_pos=np.zeros((10, 12)),
-        joint_vel=np.zeros((10, 12)),
-        body_pos_w=poses[0],
-        body_quat_w=poses[1],
-        body_lin_vel_w=np.zeros_like(poses[0]),
-        body_ang_vel_w=np.zeros_like(poses[0]),
-    )
+    motion = write_still_motion(package.report.compiled, tmp_path / "still.npz")
     folder = written(tmp_path / "package", Package("dog", "tracking", package.report, motion))
     cfg = imported(folder, "dog.task").env_cfg(play=True)
     assert cfg.commands["motion"].body_names[0] == "trunk"
@@ -274,10 +264,71 @@ def test_setting_changes_a_value_and_its_reason(tmp_path: Path) -> None:
     after = quadruped(tmp_path / "b", stiffness="33", **{"pose.FL_calf": "-1.5"})
     assert "stiffness=33.0" in after.files("", Path("dog"))[ROBOT].decode()
     assert "stiffness=33.0" not in before.files("", Path("dog"))[ROBOT].decode()
-    sources = {row[0]: row[2] for row in values_table(after.report).rows}
-    assert sources["stiffness"] == "set"
-    assert sources["pose"] == "set"
-    assert "(as set)" in after.files("", Path("dog"))[ROBOT].decode()
+    # One joint of the pose.
+    rows = {(row[0], row[2]): row[1] for row in values_table(after.report).rows}
+    assert ("stiffness", "guessed") not in rows
+    assert rows["pose", "set"] == "FL_calf -1.5"
+    assert "FR_calf" in rows["pose", "guessed"]
+
+
+def test_table_shows_all_joints(tmp_path: Path) -> None:
+    report = quadruped(tmp_path / "model").report
+    shown = " ".join(row[1] for row in values_table(report).rows if row[0] == "pose")
+    for name in by_pattern({n: q for n, q in report.joint_pos.value.items() if q}, report):
+        assert name in shown
+
+
+@pytest.mark.parametrize("legs", [2, 4])
+def test_readme_and_task_have_the_names_of_each_other(tmp_path: Path, imported, legs: int) -> None:
+    report = describe_robot(RobotModel(legged_spec(legs), "robot", "robot", None, None))
+    folder = written(tmp_path, Package(f"robot{legs}", "velocity", report))
+    readme, task = (folder / "README.md").read_text(), imported(folder, f"robot{legs}.task")
+    assert ("BIPED" in readme) == (legs == 2) == hasattr(task, "BIPED")
+    # No claim that two legs stand by themselves.
+    assert ("; stands" in readme or "| stands" in readme) == (legs == 4)
+    if legs == 2:
+        for gains in re.findall(r"gains=(mdp\.\w+)", readme):
+            assert replace(
+                task.BIPED, gains=pkgutil.resolve_name(f"mjlab.tasks.velocity.{gains}")()
+            )
+
+
+def test_two_legs_fall_late(tmp_path: Path, imported) -> None:
+    report = describe_robot(RobotModel(legged_spec(2), "robot", "robot", None, None))
+    folder = written(tmp_path, Package("stilts", "velocity", report))
+    imported(folder, "stilts.task")
+    tests = runpy.run_path(str(folder / "tests" / "test_stilts.py"))
+    assert not any("stand" in name for name in tests if name.startswith("test_"))
+    tests["test_falls_late"]()
+
+
+def test_project_requires_this_release(tmp_path: Path) -> None:
+    project = tomllib.loads(
+        quadruped(tmp_path / "m").files("", tmp_path)["pyproject.toml"].decode()
+    )
+    (requirement,) = map(Requirement, project["project"]["dependencies"])
+    assert requirement.specifier.contains(version("mjlab"), prereleases=True)
+    assert not requirement.specifier.contains("1.6.0")
+
+
+@pytest.mark.parametrize("task", ["velocity", "bare"])
+def test_ruff_accepts_files(tmp_path: Path, task: str) -> None:
+    package = replace(quadruped(tmp_path / "model"), task=task)
+    folder = written(tmp_path / "package", package)
+    words = [
+        "ruff",
+        "check",
+        "--isolated",
+        "--select",
+        "E,F,I",
+        "--line-length",
+        "100",
+        str(folder),
+    ]
+    outcome = subprocess.run(
+        [sys.executable, "-m", *words], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert outcome.returncode == 0, outcome.stdout
 
 
 # Later runs.
@@ -289,14 +340,42 @@ def test_edits_are_kept(tmp_path: Path) -> None:
     files = package.files("", folder)
     assert write_files(folder, files, read_record(folder)) == []
     (folder / ROBOT).write_text("# mine\n")
-    changed = files | {ROBOT: b"# new\n", "README.md": b"new\n"}
+    changed = files | {ROBOT: b"# new\n", "pyproject.toml": b"new\n"}
     assert write_files(folder, changed, read_record(folder)) == [ROBOT]
     assert (folder / ROBOT).read_text() == "# mine\n"
     assert (folder / f"{ROBOT}.new").read_text() == "# new\n"
-    assert (folder / "README.md").read_text() == "new\n"
+    assert (folder / "pyproject.toml").read_text() == "new\n"
     # The next run keeps the edits too.
     assert write_files(folder, files, read_record(folder)) == [ROBOT]
     assert (folder / ROBOT).read_text() == "# mine\n"
+
+
+def test_edits_of_a_new_file_are_not_lost(tmp_path: Path) -> None:
+    folder, new = tmp_path / "dog_package", tmp_path / "dog_package" / f"{ROBOT}.new"
+    files = quadruped(tmp_path / "model").files("", folder)
+    write_files(folder, files, read_record(folder))
+    (folder / ROBOT).write_text("# mine\n")
+    write_files(folder, files, read_record(folder))
+    new.write_text("# half merged\n")
+    with pytest.raises(UserError, match="robot.py.new"):
+        write_files(folder, files | {"pyproject.toml": b""}, read_record(folder))
+    assert new.read_text() == "# half merged\n"
+    assert (folder / "pyproject.toml").read_bytes() == files["pyproject.toml"]
+    new.unlink()
+    assert write_files(folder, files, read_record(folder)) == [ROBOT]
+
+
+def test_deleted_tests_do_not_come_back(tmp_path: Path) -> None:
+    folder, test = tmp_path / "dog_package", "tests/test_dog.py"
+    files = quadruped(tmp_path / "model").files("", folder)
+    write_files(folder, files, read_record(folder))
+    (folder / test).unlink()
+    (folder / ROBOT).unlink()
+    for _ in range(2):
+        write_files(folder, files, read_record(folder))
+        assert deleted_files(folder, read_record(folder)) == [test]
+        # The package does not work without it.
+        assert (folder / ROBOT).exists()
 
 
 def test_other_folders_are_rejected(tmp_path: Path) -> None:

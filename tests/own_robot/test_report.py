@@ -15,7 +15,7 @@ from mjlab.asset_zoo.robots.unitree_g1.g1_constants import G1_XML
 from mjlab.asset_zoo.robots.unitree_go1.go1_constants import GO1_XML
 from mjlab.own_robot.model_source import RobotModel
 from mjlab.own_robot.report import describe_robot
-from mjlab.own_robot.robot_source import robot_source
+from mjlab.own_robot.robot_source import imu_site, robot_source
 from mjlab.utils.errors import UnknownNameError
 
 
@@ -131,3 +131,45 @@ def test_answer_of_one_joint_is_its_own():
     source = robot_source(report, "Robot", Path("robot.xml"))
     assert source.count("stiffness=70.125,") == 1
     assert source.count(": 0.31,") == 1
+
+
+def test_each_joint_has_its_own_reason():
+    settings = {"effort.a0_3": "12", "pose.b0_2": "0.8", "armature.a0_1": "0.01"}
+    report = describe_robot(small(legged_spec(4)), settings)
+    for key, guess in (
+        ("effort", report.effort),
+        ("pose", report.joint_pos),
+        ("armature", report.armature),
+    ):
+        answered = {name for name in guess.value if f"{key}.{name}" in settings}
+        assert len(answered) == 1
+        assert {n for n, reason in guess.reasons.items() if reason.source == "set"} == answered
+
+
+@pytest.mark.parametrize(
+    ("effort", "word"),
+    [
+        (60.0, "effort limit"),
+        # What holds the weight counts if motors are weak; the time step, if they are strong.
+        (2.0, "weight"),
+        (3000.0, "time step"),
+    ],
+)
+def test_reason_of_the_stiffness_is_the_rule_that_won(effort, word):
+    spec = legged_spec(4)
+    for actuator in spec.actuators:
+        actuator.ctrlrange = (-effort, effort)
+    setting = {"effort": str(effort)}
+    reasons = describe_robot(small(spec), setting).stiffness.reasons
+    assert word in reasons["a0_3"].rule
+
+
+@pytest.mark.parametrize(("setting", "site"), [("chest", "chest"), ("trunk", None)])
+def test_answer_to_the_imu_is_used(setting, site):
+    spec = legged_spec(4)
+    spec.body("trunk").add_site(name="chest", pos=(0.1, 0, 0))
+    report = describe_robot(small(spec), {"imu_site": setting})
+    assert report.anatomy.imu_site.value == site
+    found, _ = imu_site(report)
+    assert found == (site or "imu")
+    assert "imu_site" not in {question.key for question in report.questions}

@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 # A trunk of 0.4 x 0.2 m; legs of two links of 0.15 m.
 _HIPS = {"FL": (0.2, 0.1), "FR": (0.2, -0.1), "RL": (-0.2, 0.1), "RR": (-0.2, -0.1)}
@@ -54,6 +55,17 @@ def write_quadruped(folder: Path) -> Path:
   </worldbody>
   <actuator>{motors}</actuator>
 </mujoco>""")
+    return path
+
+
+def write_still_motion(model: mujoco.MjModel, path: Path) -> Path:
+    """Write a motion file in which a robot stays at its initial pose; return its path."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    frames = {"body_pos_w": data.xpos[1:], "body_quat_w": data.xquat[1:]}
+    frames |= {name: np.zeros_like(data.xpos[1:]) for name in ("body_lin_vel_w", "body_ang_vel_w")}
+    frames |= {name: np.zeros(model.nv - 6) for name in ("joint_pos", "joint_vel")}
+    np.savez(path, fps=[50], **{name: np.repeat(x[None], 10, axis=0) for name, x in frames.items()})
     return path
 
 

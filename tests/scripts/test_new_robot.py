@@ -8,8 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import pytest
-from small_robots import write_archive, write_quadruped
+from small_robots import write_archive, write_quadruped, write_still_motion
 
 from mjlab.scripts import new_robot
 
@@ -93,10 +94,11 @@ def test_edits_survive_a_second_run(run, model: str, folder: Path) -> None:
     assert robot.read_text() == mine
     assert "stiffness=33.0" in robot.with_name("robot.py.new").read_text()
     assert "src/dog/robot.py" in outcome.out
-    # The task fits the robot that is kept.
-    task = robot.with_name("task.py").read_text()
+    # The task and the README fit the robot that is kept.
+    paths = (robot.with_name("task.py"), folder / "README.md")
+    texts = [path.read_text() for path in paths]
     outcome = run("new_robot", model, "--output", str(folder), "--set", "root_height=0.4")
-    assert robot.with_name("task.py").read_text() == task
+    assert [path.read_text() for path in paths] == texts
     assert "Not in force" in outcome.out
 
 
@@ -191,3 +193,22 @@ def test_task_is_remembered(run, model: str, tmp_path: Path, folder: Path) -> No
     assert not (folder / "src" / "dog" / "task.py").exists()
     other = str(write_quadruped(tmp_path / "other"))
     assert "--output" in run("new_robot", other, "--output", str(folder)).message
+
+
+def test_motion_is_remembered(run, model: str, tmp_path: Path, folder: Path) -> None:
+    compiled = mujoco.MjModel.from_xml_path(model)
+    motion = write_still_motion(compiled, tmp_path / "still.npz")
+    flags = ("--task", "tracking", "--motion", str(motion))
+    assert run("new_robot", model, "--output", str(folder), *flags).status == 0
+    outcome = run("new_robot", model, "--output", str(folder), "--set", "damping=2")
+    assert outcome.status == 0, outcome.err
+    assert (folder / "src" / "dog" / "motions" / motion.name).is_file()
+    assert "damping=2.0" in (folder / "src" / "dog" / "robot.py").read_text()
+
+
+def test_deleted_test_is_named(run, model: str, folder: Path) -> None:
+    run("new_robot", model, "--output", str(folder))
+    (folder / "tests" / "test_dog.py").unlink()
+    outcome = run("new_robot", model, "--output", str(folder))
+    assert "tests/test_dog.py" in outcome.out.split("Wrote")[1]
+    assert not (folder / "tests" / "test_dog.py").exists()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,6 +17,8 @@ from mjlab.utils.mirror import mirror_pairs
 Kind = Literal["legged", "arm", "other"]
 Drive = Literal["motor", "position", "other", "none"]
 
+SOLE_RULE = "geoms within 1 cm of the lowest point of a foot"
+"""Reason of the soles."""
 SOLE_DEPTH = 0.01
 """Distance above the lowest point of a foot within which a geom is part of the sole (m)."""
 FOOT_BAND = 0.05
@@ -121,7 +123,7 @@ def find_anatomy(model: mujoco.MjModel, *, kind: Kind | None = None) -> Anatomy:
     return Anatomy(
         kind=found,
         trunk=_trunk(model, free, trunk),
-        feet=Guess(feet, "end links lowest in a standing pose; soles: geoms within 1 cm of it"),
+        feet=Guess(feet, "end links lowest in a standing pose"),
         legs=Guess(legs, "joints from the trunk to a foot"),
         front=_front(model, legs, feet),
         upright=_upright(model, trunk, legs),
@@ -469,6 +471,26 @@ def actuated_joint(model: mujoco.MjModel, actuator: int) -> int | None:
     if model.actuator_trntype[actuator] not in kinds:
         return None
     return int(model.actuator_trnid[actuator, 0])
+
+
+def like_joints(
+    anatomy: Anatomy, joints: Iterable[str], answers: Mapping[str, object] | None = None
+) -> list[tuple[str, ...]]:
+    """Return groups of joints that serve alike: those in one place of like legs, and mirror images.
+
+    Joints with different answers of the user are not alike.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    legs = {
+        name: (len(leg.joints), index)
+        for leg in anatomy.legs.value
+        for index, name in enumerate(leg.joints)
+    }
+    for name in joints:
+        partner, _ = anatomy.mirror.value.get(name, (name, 1.0))
+        role = legs.get(name, tuple(sorted((name, partner))))
+        groups.setdefault((role, (answers or {}).get(name)), []).append(name)
+    return [tuple(group) for group in groups.values()]
 
 
 def _colliding(model: mujoco.MjModel) -> Guess[tuple[str, ...]]:

@@ -3,20 +3,22 @@
 A joint has the stiffness of the file's servo, unless that is far below the rule (`STAND_IN`). Rule for a
 leg joint: the effort limit per rad, or the static torque of the standing pose per `STATIC_SAG`,
 whichever is larger, and at most (`STABLE` / dt)^2 I with the inertia I at the joint, so that the
-oscillation is resolved by the time step. Joints that sag by more than `MAX_SAG` in simulation get more.
+oscillation is resolved by the time step. Joints that sag by more than `MAX_SAG` in simulation get more. Joints
+that serve alike get the largest of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from scipy.optimize import nnls
 
 from mjlab.own_robot import geometry as geo
-from mjlab.own_robot.anatomy import Anatomy, actuated_joint, drives
-from mjlab.own_robot.guess import Guess, Question
+from mjlab.own_robot.anatomy import Anatomy, actuated_joint, drives, like_joints
+from mjlab.own_robot.guess import JointGuess, Question, Reason
 from mjlab.own_robot.posture import sole_points
 
 MAX_SAG = 0.15
@@ -47,12 +49,12 @@ MAX_ROUNDS = 8
 """Rounds of raising the stiffness of joints that sag."""
 
 
-def effort_limits(
+def find_efforts(
     model: mujoco.MjModel,
     size: float,
     main_joints: tuple[str, ...] = (),
     answers: dict[str, float] | None = None,
-) -> tuple[Guess[dict[str, float]], list[Question]]:
+) -> tuple[JointGuess, list[Question]]:
     """Return the effort limit of each joint (N m, N), with questions about doubtful ones.
 
     Args:
@@ -63,41 +65,36 @@ def effort_limits(
     """
     answers = answers or {}
     weight = float(model.body_mass.sum()) * 9.81
-    limits, missing, implausible = {}, [], []
-    for joint in geo.joint_ids(model):
-        name = model.joint(joint).name
-        limit = answers.get(name, file_effort(model, joint))
-        if name not in answers and limit is not None and limit > MAX_EFFORT * weight * size:
-            implausible.append(name)
-            limit = None
-        if limit is None:
-            if name not in implausible:
-                missing.append(name)
-            continue
-        limits[name] = limit
     stand_in = 0.25 * weight * size
-    questions = []
-    doubtful = missing + implausible
+    limits, reasons = {}, {}
+    doubtful: dict[str, list[str]] = {}
+    for joint in geo.joint_ids(model):
+        name, limit = model.joint(joint).name, file_effort(model, joint)
+        if limit is not None and limit <= MAX_EFFORT * weight * size:
+            limits[name], reasons[name] = limit, _FILE_EFFORT
+            continue
+        why = "no limit in the file" if limit is None else f"above {MAX_EFFORT:g} x weight x height"
+        limits[name] = stand_in
+        reasons[name] = Reason(f"{why}: a quarter of weight x height", "asked")
+        if name not in answers:
+            doubtful.setdefault(why, []).append(name)
+    guess, questions = JointGuess(limits, reasons).answered(answers), []
     if doubtful:
-        reasons = [
-            f"{_some(names)}: {reason}"
-            for names, reason in (
-                (missing, "no limit in the file"),
-                (implausible, f"above {MAX_EFFORT:g} x weight x height"),
-            )
-            if names
-        ]
-        key = "effort" if len(doubtful) > 1 else f"effort.{doubtful[0]}"
-        text = f"effort limit of {'; '.join(reasons)}"
-        questions.append(Question(key, text, f"{stand_in:.3g} N m"))
-        limits |= dict.fromkeys(doubtful, stand_in)
-    same = _same_limits(limits, main_joints, answers)
-    if same is not None and not questions:
+        names = [name for found in doubtful.values() for name in found]
+        key = "effort" if len(names) > 1 else f"effort.{names[0]}"
+        text = "; ".join(f"{_some(found)}: {why}" for why, found in doubtful.items())
+        questions.append(Question(key, f"effort limit of {text}", f"{stand_in:.3g} N m"))
+    elif (same := _same_limits(guess.value, main_joints, answers)) is not None:
         text = f"effort limit: {same:g} N m for all of {_some(list(main_joints))}, like a stand-in"
         questions.append(Question("effort", text, f"{same:g} N m"))
-    source = "asked" if questions else "set" if answers else "file"
-    rule = "tightest of forcerange, actuatorfrcrange and a motor's ctrlrange x gear"
-    return Guess(limits, rule, source), questions
+        asked = Reason(f"{_FILE_EFFORT.rule}, the same for all", "asked")
+        guess = JointGuess(guess.value, guess.reasons | dict.fromkeys(main_joints, asked))
+    return guess, questions
+
+
+_FILE_EFFORT = Reason(
+    "tightest of forcerange, actuatorfrcrange and a motor's ctrlrange x gear", "file"
+)
 
 
 def _same_limits(
@@ -135,30 +132,32 @@ def rotor_inertias(
     effort: dict[str, float],
     is_arm: bool,
     answers: dict[str, float] | None = None,
-) -> tuple[Guess[dict[str, float]], list[Question]]:
+) -> tuple[JointGuess, list[Question]]:
     """Return the armature of each joint (kg m^2, kg), with a question where the file has 0."""
     answers = answers or {}
     # 1.1e-4 to 2.5e-4 kg m^2 per N m on Go1 and G1; 1e-3 on UR5e and Panda, with gears of 100.
     share = 1e-3 if is_arm else 2e-4
-    inertias, missing = {}, []
+    inertias, reasons = {}, {}
     for joint in geo.joint_ids(model):
         name = model.joint(joint).name
         own = float(model.dof_armature[model.jnt_dofadr[joint]])
-        if name not in answers and own == 0.0:
-            missing.append(name)
-        inertias[name] = answers.get(name, own or share * effort[name])
+        inertias[name] = own or share * effort[name]
+        reasons[name] = (
+            Reason("armature of the file", "file")
+            if own
+            else Reason(f"0 in the file: {share:g} s^2 x effort limit", "asked")
+        )
+    guess = JointGuess(inertias, reasons).answered(answers)
+    missing = [name for name, reason in guess.reasons.items() if reason.source == "asked"]
     if not missing:
-        source = "set" if answers else "file"
-        return Guess(inertias, "armature of the file", source), []
+        return guess, []
     low, high = min(inertias[n] for n in missing), max(inertias[n] for n in missing)
     question = Question(
         "armature" if len(missing) > 1 else f"armature.{missing[0]}",
         f"rotor inertia times squared gear ratio of {_some(missing)}: 0 in the file",
         f"{share:g} s^2 x effort limit: {low:.2g} to {high:.2g} kg m^2",
     )
-    return Guess(inertias, "armature of the file; where it is 0, a share of the effort", "asked"), [
-        question
-    ]
+    return guess, [question]
 
 
 def joint_inertias(
@@ -233,86 +232,135 @@ def find_gains(
     effort: dict[str, float],
     armature: dict[str, float],
     answers: dict[str, float] | None = None,
-) -> tuple[Guess[dict[str, float]], Guess[dict[str, float]], list[Question]]:
+) -> tuple[JointGuess, JointGuess, list[Question]]:
     """Return stiffness (N m/rad, N/m) and damping (N m s/rad, N s/m) of each joint, with questions."""
     answers = answers or {}
     legged = anatomy.kind.value == "legged"
-    torque = static_torques(model, anatomy, joint_pos)
     inertia = joint_inertias(model, joint_pos, armature)
-    own = servo_stiffness(model)
-    stiffness, cap, stand_ins = {}, {}, []
-    sway = _sway_stiffness(model, anatomy, height)
-    for name in joint_pos:
-        cap[name] = (STABLE / TIMESTEP) ** 2 * inertia[name]
-        error = 1.0 if legged else ARM_ERROR
-        wanted = max(effort[name] / error, abs(torque[name]) / STATIC_SAG, sway.get(name, 0.0))
-        if own.get(name, 0.0) * 0.2 > abs(torque[name]):
-            if own[name] < STAND_IN * min(wanted, cap[name]) and name not in answers:
-                stand_ins.append(name)
-            else:
-                wanted = own[name]
-        stiffness[name] = min(wanted, cap[name])
     groups = like_joints(anatomy, list(joint_pos), answers)
-    stiffness = _alike(stiffness, groups) | answers
-    rule = (
-        "servo of the file, or effort per rad and static torque per 0.14 rad, at most (0.5/dt)^2 I"
-        if legged
-        else f"servo of the file, or effort per {ARM_ERROR:g} rad, at most (0.5/dt)^2 I"
-    )
-    if sway:
-        rule += f"; hips {SWAY_MARGIN:g} m g h / legs or more"
-    if stand_ins:
-        rule += f"; servo of the file below {STAND_IN:g} of that, overridden: {_some(stand_ins)}"
+    stiffness = _file_or_rule(model, anatomy, joint_pos, height, effort, inertia, answers)
+    stiffness = stiffness.alike(groups).answered(answers)
     questions = []
     if legged:
-        railed = rail_model(spec, model, anatomy, effort, armature)
-        for _ in range(MAX_ROUNDS):
-            damping = _alike(_damping(stiffness, inertia, legged), groups)
-            sag = settle(railed, joint_pos, height, stiffness, damping)
-            low = [
-                name
-                for name in anatomy.leg_joints
-                if sag[name] > 0.5 * (STATIC_SAG + MAX_SAG) and name not in answers
-            ]
-            if not low:
-                break
-            for name in low:
-                raised = stiffness[name] * min(sag[name] / STATIC_SAG, 2.0)
-                # Up to w dt = 1 the joint is stable, though not well resolved.
-                stiffness[name] = min(raised, 4.0 * cap[name])
-            stiffness = _alike(stiffness, groups) | answers
-        rule += f"; sag in simulation at most {max(sag[n] for n in anatomy.leg_joints):.2f} rad"
+        legs = _Legs(spec, model, anatomy, joint_pos, height, effort, armature, inertia, groups)
+        stiffness = _hold_weight(legs, stiffness, answers)
         if len(anatomy.legs.value) >= 4 and set(anatomy.leg_joints) - answers.keys():
-            free = rail_model(spec, model, anatomy, effort, armature, free=True)
-            # Like joints stay alike, so the smallest bound of them counts.
-            ceiling = {n: 4.0 * min(cap[m] for m in group) for group in groups for n in group}
-            trials = (
-                stiffened(stiffness, 1.15**step, ceiling, set(anatomy.leg_joints) - answers.keys())
-                for step in range(MAX_ROUNDS)
-            )
-            found = _first_that_stands(free, anatomy, joint_pos, height, trials, inertia, groups)
-            if found is None:
-                text = "stiffness of the legs: other bodies than the feet touch the ground"
-                most = f"up to {1.15 ** (MAX_ROUNDS - 1):.2g} times as stiff, or as the time step allows"
-                questions.append(
-                    Question(
-                        "stiffness", f"{text}, {most}", "what holds the trunk on a vertical rail"
-                    )
-                )
-            elif found != stiffness:
-                factor = max(found[name] / stiffness[name] for name in anatomy.leg_joints)
-                rule += f"; up to x {factor:.2f} to keep all but the feet off the ground"
-                stiffness = found
-    damping = _alike(_damping(stiffness, inertia, legged), groups)
-    return (
-        Guess(stiffness, rule, "set" if answers else "rule"),
-        Guess(
-            damping,
-            "damping ratio 0.7 with the inertia at the joint, stiffness / 40 s to "
-            + ("/ 20 s" if legged else "/ 5 s"),
-        ),
-        questions,
-    )
+            stiffness, questions = _stand_on_feet(legs, stiffness, answers)
+    return stiffness, _damping(stiffness.value, inertia, legged).alike(groups), questions
+
+
+@dataclass(frozen=True)
+class _Legs:
+    """Legged robot that settles on the ground in simulation; see `find_gains`."""
+
+    spec: mujoco.MjSpec
+    model: mujoco.MjModel
+    anatomy: Anatomy
+    joint_pos: dict[str, float]
+    height: float
+    effort: dict[str, float]
+    armature: dict[str, float]
+    inertia: dict[str, float]
+    groups: list[tuple[str, ...]]
+
+    def simulated(self, *, free: bool) -> mujoco.MjModel:
+        """Return the model with servos, on a rail if not `free`."""
+        return rail_model(
+            self.spec, self.model, self.anatomy, self.effort, self.armature, free=free
+        )
+
+    def damping(self, stiffness: dict[str, float]) -> dict[str, float]:
+        """Return the damping with a stiffness."""
+        return _damping(stiffness, self.inertia, legged=True).alike(self.groups).value
+
+
+def _most(inertia: float) -> float:
+    """Return the stiffness whose oscillation the time step resolves."""
+    return (STABLE / TIMESTEP) ** 2 * inertia
+
+
+def _file_or_rule(
+    model: mujoco.MjModel,
+    anatomy: Anatomy,
+    joint_pos: dict[str, float],
+    height: float,
+    effort: dict[str, float],
+    inertia: dict[str, float],
+    answers: dict[str, float],
+) -> JointGuess:
+    """Return the stiffness of each joint's servo in the file, or by the rule of this module."""
+    legged = anatomy.kind.value == "legged"
+    error = 1.0 if legged else ARM_ERROR
+    torque, own = static_torques(model, anatomy, joint_pos), servo_stiffness(model)
+    sway = _sway_stiffness(model, anatomy, height)
+    stiffness, reasons = {}, {}
+    for name in joint_pos:
+        wanted, rule = max(
+            (effort[name] / error, f"effort limit per {error:g} rad"),
+            (abs(torque[name]) / STATIC_SAG, f"torque of the weight per {STATIC_SAG:g} rad"),
+            (sway.get(name, 0.0), f"{SWAY_MARGIN:g} m g h / legs, against swaying over"),
+        )
+        reason = Reason(rule)
+        if own.get(name, 0.0) * 0.2 > abs(torque[name]):
+            if own[name] < STAND_IN * min(wanted, _most(inertia[name])) and name not in answers:
+                reason = Reason(f"{rule}; the file's servo has less than {STAND_IN:g} of it")
+            else:
+                wanted, reason = own[name], Reason("servo of the file", "file")
+        if wanted > _most(inertia[name]):
+            step = f"a time step of {1e3 * TIMESTEP:g} ms"
+            reason = Reason(f"the most that {step} resolves; wanted: {reason.rule}")
+        stiffness[name], reasons[name] = min(wanted, _most(inertia[name])), reason
+    return JointGuess(stiffness, reasons)
+
+
+def _hold_weight(legs: _Legs, stiffness: JointGuess, answers: dict[str, float]) -> JointGuess:
+    """Raise the stiffness of leg joints until none sags in simulation by more than `MAX_SAG`."""
+    railed = legs.simulated(free=False)
+    for _ in range(MAX_ROUNDS):
+        values = dict(stiffness.value)
+        sag = settle(railed, legs.joint_pos, legs.height, values, legs.damping(values))
+        low = {
+            name
+            for name in legs.anatomy.leg_joints
+            if sag[name] > 0.5 * (STATIC_SAG + MAX_SAG) and name not in answers
+        }
+        if not low:
+            break
+        for name in low:
+            raised = values[name] * min(sag[name] / STATIC_SAG, 2.0)
+            # Up to w dt = 1 the joint is stable, though not well resolved.
+            values[name] = min(raised, 4.0 * _most(legs.inertia[name]))
+        rule = f"raised until the weight bends it by less than {MAX_SAG:g} rad in simulation"
+        reasons = stiffness.reasons | dict.fromkeys(low, Reason(rule))
+        stiffness = JointGuess(values, reasons).alike(legs.groups).answered(answers)
+    return stiffness
+
+
+def _stand_on_feet(
+    legs: _Legs, stiffness: JointGuess, answers: dict[str, float]
+) -> tuple[JointGuess, list[Question]]:
+    """Stiffen the legs until nothing but the feet touches the ground; ask if no trial stands."""
+    joints = set(legs.anatomy.leg_joints) - answers.keys()
+    # Like joints stay alike, so the smallest bound of them counts.
+    ceiling = {
+        name: 4.0 * min(_most(legs.inertia[other]) for other in group)
+        for group in legs.groups
+        for name in group
+    }
+    trials = (stiffened(stiffness.value, 1.15**step, ceiling, joints) for step in range(MAX_ROUNDS))
+    found = _first_that_stands(legs, trials)
+    if found is None:
+        text = "stiffness of the legs: other bodies than the feet touch the ground"
+        most = f"up to {1.15 ** (MAX_ROUNDS - 1):.2g} times as stiff, or as the time step allows"
+        used = "what holds the trunk on a vertical rail"
+        return stiffness, [Question("stiffness", f"{text}, {most}", used)]
+    factor = max(found[name] / stiffness.value[name] for name in joints)
+    raised = {
+        name: Reason(f"{reason.rule}; up to x {factor:.2f}, so that only feet touch the ground")
+        for name, reason in stiffness.reasons.items()
+        if found[name] > stiffness.value[name]
+    }
+    return JointGuess(found, stiffness.reasons | raised), []
 
 
 def stiffened(
@@ -326,24 +374,17 @@ def stiffened(
     return stiffness | raised
 
 
-def _first_that_stands(
-    model: mujoco.MjModel,
-    anatomy: Anatomy,
-    joint_pos: dict[str, float],
-    height: float,
-    trials: Iterable[dict[str, float]],
-    inertia: dict[str, float],
-    groups: list[tuple[str, ...]],
-) -> dict[str, float] | None:
+def _first_that_stands(legs: _Legs, trials: Iterable[dict[str, float]]) -> dict[str, float] | None:
     """Return the first stiffness with which the robot stands on its feet alone; None if none does.
 
     Without a rail, the trunk pitches and sways too: knees of the HyQReal2 that sag by 0.14 rad on the rail
     give way by 0.22 rad, so that its thighs touch the ground.
     """
-    fallen = {model.body(name).id for name in anatomy.fall_bodies.value}
+    model = legs.simulated(free=True)
+    fallen = {model.body(name).id for name in legs.anatomy.fall_bodies.value}
     for trial in trials:
-        set_gains(model, trial, _alike(_damping(trial, inertia, legged=True), groups))
-        if not _touches(model, fallen, joint_pos, height + DROP):
+        set_gains(model, trial, legs.damping(trial))
+        if not _touches(model, fallen, legs.joint_pos, legs.height + DROP):
             return trial
     return None
 
@@ -378,50 +419,21 @@ def _sway_stiffness(model: mujoco.MjModel, anatomy: Anatomy, height: float) -> d
     return {name: smallest for leg in legs for name in leg.joints[:2]}
 
 
-def like_joints(
-    anatomy: Anatomy, joints: list[str], answers: dict[str, float]
-) -> list[tuple[str, ...]]:
-    """Return the groups of joints with the same gains: those of like legs, and mirror images.
-
-    Joints with different answers of the user are not alike.
-    """
-    groups: dict[tuple[object, ...], list[str]] = {}
-    legs = {
-        name: (len(leg.joints), index)
-        for leg in anatomy.legs.value
-        for index, name in enumerate(leg.joints)
-    }
-    for name in joints:
-        partner, _ = anatomy.mirror.value.get(name, (name, 1.0))
-        role = legs.get(name, tuple(sorted((name, partner))))
-        groups.setdefault((role, answers.get(name)), []).append(name)
-    return [tuple(group) for group in groups.values()]
-
-
-def _alike(values: dict[str, float], groups: list[tuple[str, ...]]) -> dict[str, float]:
-    """Return the largest value of each group for all its joints, with three digits."""
-    return {
-        name: float(f"{max(values[other] for other in group):.3g}")
-        for group in groups
-        for name in group
-    }
-
-
-def _damping(
-    stiffness: dict[str, float], inertia: dict[str, float], legged: bool
-) -> dict[str, float]:
+def _damping(stiffness: dict[str, float], inertia: dict[str, float], legged: bool) -> JointGuess:
     """Return 2 z sqrt(k I) with the damping ratio z, within the published range of damping over k.
 
     Published for legs: 1/40 s of Spot and H1, 1/32 of the B2, 1/20 of the Aliengo, 1/16 of the Go1 and G1;
     for arms up to 1/5 s of the UR5e.
     """
-    longest = 1.0 / 20.0 if legged else 1.0 / 5.0
-    return {
+    longest = 20.0 if legged else 5.0
+    values = {
         name: float(
-            np.clip(2.0 * DAMPING_RATIO * np.sqrt(kp * inertia[name]), kp / 40.0, kp * longest)
+            np.clip(2.0 * DAMPING_RATIO * np.sqrt(kp * inertia[name]), kp / 40.0, kp / longest)
         )
         for name, kp in stiffness.items()
     }
+    rule = f"damping ratio {DAMPING_RATIO:g}, between 1/40 and 1/{longest:g} s of the stiffness"
+    return JointGuess.of(values, rule)
 
 
 def settle(

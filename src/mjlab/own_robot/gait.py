@@ -11,8 +11,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from mjlab.own_robot import geometry as geo
-from mjlab.own_robot.anatomy import Anatomy, Foot, Leg
-from mjlab.own_robot.guess import Guess
+from mjlab.own_robot.anatomy import Anatomy, Foot, Leg, like_joints
+from mjlab.own_robot.guess import Guess, JointGuess, Reason
 
 REFERENCE_HEIGHT = {2: 0.76, 4: 0.28}
 """Height of the trunk of the G1 and Go1, by number of feet, which are commanded 1 m/s (m)."""
@@ -46,7 +46,8 @@ def command_ranges(height: float, feet: int) -> Guess[dict[str, tuple[float, flo
         "ang_vel_z": (-turn, turn),
     }
     model = "G1" if feet == 2 else "Go1"
-    return Guess(ranges, f"Froude number of the {model}: 1 m/s x sqrt(height / {reference} m)")
+    rule = f"speed of the {model} for its size: 1 m/s x sqrt(height / {reference} m)"
+    return Guess(ranges, rule)
 
 
 def lift(height: float, feet: int) -> float:
@@ -56,9 +57,10 @@ def lift(height: float, feet: int) -> float:
 
 def pose_tolerance(
     model: mujoco.MjModel, anatomy: Anatomy, joint_pos: dict[str, float], height: float
-) -> Guess[dict[str, float]]:
+) -> JointGuess:
     """Return the tolerance of each joint around the standing pose that strides need (rad)."""
     tolerance = dict.fromkeys(joint_pos, REST_TOLERANCE)
+    reasons = dict.fromkeys(joint_pos, Reason("outside the legs"))
     feet = 2 if len(anatomy.feet.value) == 2 else 4
     stride, up = STRIDE[feet] * height, lift(height, feet)
     moves = np.array(
@@ -87,10 +89,9 @@ def pose_tolerance(
             partner, _ = mirror.get(name, (name, 1.0))
             done |= {name, partner}
             tolerance[name] = tolerance[partner] = round(float(value), 2)
-    return Guess(
-        tolerance,
-        f"0.8 of what strides of {stride:.2f} m and lifts of {up:.2f} m need; 0.15 rad elsewhere",
-    )
+    rule = f"{SPREAD:g} of what strides of {stride:.2f} m and lifts of {up:.2f} m need"
+    reasons |= dict.fromkeys(anatomy.leg_joints, Reason(rule))
+    return JointGuess(tolerance, reasons).alike(like_joints(anatomy, joint_pos))
 
 
 def step(

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import shlex
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mjlab.own_robot.anatomy import SOLE_RULE
 from mjlab.own_robot.guess import Guess
 from mjlab.own_robot.model_files import copy_model
 from mjlab.own_robot.python_text import number
 from mjlab.own_robot.report import RobotReport
 from mjlab.own_robot.rewriting import Task
-from mjlab.own_robot.robot_source import by_pattern, imu_site, robot_source, shared
+from mjlab.own_robot.robot_source import by_pattern, imu_site, robot_source
+from mjlab.own_robot.settings import PER_JOINT
 from mjlab.own_robot.task_source import reach_source, tracking_source, velocity_source
 from mjlab.own_robot.templates import template
 from mjlab.utils.tables import Table
@@ -84,34 +87,43 @@ class Package:
             found[f"{module}/motions/{self.motion.name}"] = self.motion.read_bytes()
         return found | {name: content.encode() for name, content in text.items()}
 
+    @property
+    def _has_two_legs(self) -> bool:
+        return self.task == "velocity" and len(self.report.anatomy.feet.value) == 2
+
+    @property
+    def _standing(self) -> str:
+        """Claim of the package's test."""
+        return (
+            f"falls no sooner than after {_TWO_LEGS_STAND:g} s" if self._has_two_legs else "stands"
+        )
+
     def _test(self, kind: str, names: dict[str, str]) -> str:
         if kind != "legged":
             return template(f"{kind}_test.py").substitute(names)
-        has_two = len(self.report.anatomy.feet.value) == 2
+        has_two = self._has_two_legs
         reason = "Two legs fall soon without a policy." if has_two else "Legs yield a little."
         return template("legged_test.py").substitute(
             names,
-            seconds=0.4 if has_two else 2.0,
+            seconds=_TWO_LEGS_STAND if has_two else 2.0,
             test_name="falls_late" if has_two else "stands_for_two_seconds",
-            what="falls no sooner than after 0.4 s" if has_two else "stands",
+            what=self._standing,
             seconds_reason=reason,
         )
 
     def _readme(self, command: str, folder: Path) -> str:
         module = f"src/{self.name}"
-        has_two = self.task == "velocity" and len(self.report.anatomy.feet.value) == 2
-        stands = "falls no sooner than after 0.4 s" if has_two else "stands"
         contents = {
             f"{module}/robot.py": "initial pose, motors, parts: each value with its reason",
             f"{module}/model/": "the model file and its meshes",
             f"{module}/__init__.py": "registration of the tasks",
-            f"tests/test_{self.name}.py": f"{stands}, and its tasks can be stepped (`uv run pytest`)",
+            f"tests/test_{self.name}.py": f"{self._standing}, and its tasks can be stepped (`uv run pytest`)",
         }
         if self.tasks:
             contents[f"{module}/task.py"] = "commands, rewards, terminations, profile for a CPU"
         questions = questions_table(self.report)
         asked = ["", "## Questions", "", questions.markdown()] if questions.rows else []
-        if has_two:
+        if self._has_two_legs:
             asked += ["", _TWO_LEGS]
         return template("README.md").substitute(
             title=self.title,
@@ -138,6 +150,8 @@ class Package:
         ]
 
 
+_TWO_LEGS_STAND = 0.4
+"""Time that two legs stand without a policy (s)."""
 _TWO_LEGS = """\
 ## Two legs
 
@@ -151,9 +165,12 @@ change `lead`; if they fall sideways, `step_sideways`."""
 
 
 def values_table(report: RobotReport) -> Table:
-    """Return the table of all values: found in the file, guessed and by which rule, set, or asked."""
+    """Return the table of all values: found in the file, guessed and by which rule, set, or asked.
+
+    Values of joints have one row per reason.
+    """
     anatomy = report.anatomy
-    parts: dict[str, tuple[object, Guess]] = {
+    parts: dict[str, tuple[str, Guess]] = {
         "kind": (anatomy.kind.value, anatomy.kind),
         "trunk": (anatomy.trunk.value, anatomy.trunk),
     }
@@ -161,39 +178,42 @@ def values_table(report: RobotReport) -> Table:
         imu, reason = imu_site(report)
         soles = [name for foot in anatomy.feet.value for name in foot.sole]
         parts |= {
-            "feet": ([foot.link for foot in anatomy.feet.value], anatomy.feet),
-            "soles": (soles, anatomy.feet),
+            "feet": (", ".join(foot.link for foot in anatomy.feet.value), anatomy.feet),
+            "soles": (", ".join(soles), Guess(soles, SOLE_RULE)),
             "front": ("x" if anatomy.front.value > 0 else "-x", anatomy.front),
             "kept upright": (anatomy.upright.value, anatomy.upright),
             "IMU": (imu, replace(anatomy.imu_site, rule=reason)),
         }
     if anatomy.hands.value:
-        parts["hands"] = ([hand.link for hand in anatomy.hands.value], anatomy.hands)
+        parts["hands"] = (", ".join(hand.link for hand in anatomy.hands.value), anatomy.hands)
     pairs = [name for name, (partner, _) in anatomy.mirror.value.items() if partner != name]
-    parts["mirror pairs"] = (len(pairs) // 2, anatomy.mirror)
-    parts["height"] = (float(number(report.root_height.value)), report.root_height)
-    for name, guess in (
-        ("pose", report.joint_pos),
-        ("effort", report.effort),
-        ("armature", report.armature),
-        ("stiffness", report.stiffness),
-        ("damping", report.damping),
-        ("action_scale", report.action_scale),
-    ):
-        is_shared = name not in ("pose", "armature")
-        answers = report.answers[name]
-        values = shared(guess.value, report, answers) if is_shared else guess.value
-        parts[name] = (by_pattern(values, report), guess)
-    if anatomy.kind.value == "legged":
-        tolerance = by_pattern(shared(report.pose_tolerance.value, report), report)
-        parts["pose_tolerance"] = (tolerance, report.pose_tolerance)
-        speeds = {k: float(number(high)) for k, (_, high) in report.commands.value.items()}
-        parts["commands"] = (speeds, report.commands)
-    labels = {"file": "found", "rule": "guessed", "set": "set", "asked": "asked"}
+    parts["mirror pairs"] = (str(len(pairs) // 2), anatomy.mirror)
+    parts["height"] = (number(report.root_height.value), report.root_height)
     rows = [
-        (name, value, labels[guess.source], guess.rule) for name, (value, guess) in parts.items()
+        (name, value, _FROM[guess.source], guess.rule) for name, (value, guess) in parts.items()
     ]
+    joints = {name: getattr(report, "joint_pos" if name == "pose" else name) for name in PER_JOINT}
+    if anatomy.kind.value == "legged":
+        joints["pose_tolerance"] = report.pose_tolerance
+    rows += [
+        (name, _listed(by_pattern(values, report)), _FROM[reason.source], reason.rule)
+        for name, guess in joints.items()
+        for reason, values in guess.by_reason().items()
+    ]
+    if anatomy.kind.value == "legged":
+        speeds = _listed({name: high for name, (_, high) in report.commands.value.items()})
+        rows.append(("commands", speeds, _FROM[report.commands.source], report.commands.rule))
     return Table("values", ("value", "is", "from", "reason"), rows)
+
+
+_FROM = {"file": "found", "rule": "guessed", "set": "set", "asked": "asked"}
+
+
+def _listed(values: Mapping[str, float]) -> str:
+    """Return values by name, zeros at the end as `others 0`."""
+    shown = {name: float(number(value)) for name, value in values.items()}
+    items = [f"{name} {value:g}" for name, value in shown.items() if value]
+    return ", ".join([*items, *(["others 0" if items else "0"] * (len(items) < len(shown)))])
 
 
 def questions_table(report: RobotReport) -> Table:

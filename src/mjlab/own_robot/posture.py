@@ -6,7 +6,6 @@ until the sole is level and below the center of mass at `EXTENSION` of its lengt
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import mujoco
@@ -16,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from mjlab.own_robot import geometry as geo
 from mjlab.own_robot.anatomy import Anatomy, Foot, Leg, candidate_poses, foot_links
-from mjlab.own_robot.guess import Guess, Question
+from mjlab.own_robot.guess import Guess, JointGuess, Question
 
 EXTENSION = {2: 0.92, 4: 0.75}
 """Height of the hips above the soles in a searched pose, as a share of the leg's length, by number of legs:
@@ -35,7 +34,7 @@ MARGIN = 0.05
 class Posture:
     """Standing pose."""
 
-    joint_pos: Guess[dict[str, float]]
+    joint_pos: JointGuess
     """Position of each hinge and slide (rad, m)."""
     root_height: Guess[float]
     """Height of the trunk's frame with the lowest colliding geom on the ground (m)."""
@@ -64,7 +63,7 @@ def find_posture(
         }
         faults = check_pose(model, anatomy, joint_pos, straight)
         if name != "zero pose" and not faults:
-            pose = Guess(joint_pos, f"{name}: stands, inside limits, feet mirrored", "file")
+            rule, source = f"{name}: stands, inside limits, feet mirrored", "file"
             questions: tuple[Question, ...] = ()
             break
         rejected.append((name, faults))
@@ -76,12 +75,9 @@ def find_posture(
         why = "; ".join(f"{name}: {faults[0]}" for name, faults in rejected[:-1]) or "no keyframe"
         source = "asked" if questions else "rule"
         share = EXTENSION[2 if len(anatomy.legs.value) == 2 else 4]
-        pose = Guess(
-            joint_pos, f"{why}; soles level, legs at {share} of their length, mirrored", source
-        )
-    pose = dataclasses.replace(pose, value={n: round(q, 4) + 0.0 for n, q in pose.value.items()})
-    if answers:
-        pose = dataclasses.replace(pose, value=pose.value | answers, source="set")
+        rule = f"{why}; soles level, legs at {share} of their length, mirrored"
+    rounded = {name: round(position, 4) + 0.0 for name, position in joint_pos.items()}
+    pose = JointGuess.of(rounded, rule, source).answered(answers)
     height = ground_height(model, data, anatomy, pose.value)
     return Posture(pose, Guess(height, "lowest colliding geom on the ground"), straight, questions)
 

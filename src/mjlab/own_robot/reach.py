@@ -7,7 +7,7 @@ import numpy as np
 
 from mjlab.own_robot import geometry as geo
 from mjlab.own_robot.anatomy import Anatomy, candidate_poses
-from mjlab.own_robot.guess import Guess, Question
+from mjlab.own_robot.guess import JointGuess, Question
 
 MIDDLE_SHARE = 0.8
 """Middle share of each joint's range that poses are drawn from, as the goals of pose commands are."""
@@ -25,7 +25,7 @@ def arm_home(
     model: mujoco.MjModel,
     anatomy: Anatomy,
     answers: dict[str, float] | None = None,
-) -> tuple[Guess[dict[str, float]], list[Question]]:
+) -> tuple[JointGuess, list[Question]]:
     """Return the home pose of an arm: a keyframe without contact, else a searched one."""
     answers = answers or {}
     data = mujoco.MjData(model)
@@ -40,16 +40,17 @@ def arm_home(
             for low, high in [geo.joint_range(model, j)]
         )
         if name != "zero pose" and inside and is_free(data):
-            source = "set" if answers else "file"
-            return Guess(pose | answers, f"{name}: inside limits, no contact", source), []
+            rule = f"{name}: inside limits, no contact"
+            return JointGuess.of(pose, rule, "file").answered(answers), []
     pose = _searched_home(model, anatomy, is_free, answers)
     pose = {name: round(position, 3) + 0.0 for name, position in pose.items()}
     rule = "no keyframe: close to the middle of the ranges, bent for dexterity"
+    home = JointGuess.of(pose, rule, "asked").answered(answers)
     if pose.keys() <= answers.keys():
-        return Guess(pose, "as set", "set"), []
+        return home, []
     used = ", ".join(f"{position:g}" for position in pose.values())
     text = f"home of the arm, joint by joint ({', '.join(pose)}): no keyframe"
-    return Guess(pose, rule, "asked"), [Question("pose", text, used)]
+    return home, [Question("pose", text, used)]
 
 
 def stand_height(model: mujoco.MjModel, anatomy: Anatomy) -> float:

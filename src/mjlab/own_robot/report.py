@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry as geo
-from mjlab.own_robot.anatomy import Anatomy, find_anatomy, fixed_legs
-from mjlab.own_robot.gains import effort_limits, find_gains, rotor_inertias
+from mjlab.own_robot.anatomy import Anatomy, find_anatomy, fixed_legs, like_joints
+from mjlab.own_robot.gains import find_efforts, find_gains, rotor_inertias
 from mjlab.own_robot.gait import command_ranges, pose_tolerance
-from mjlab.own_robot.guess import Guess, Question
+from mjlab.own_robot.guess import Guess, JointGuess, Question
 from mjlab.own_robot.model_source import RobotModel, load_model, name_elements
 from mjlab.own_robot.posture import Posture, find_posture
 from mjlab.own_robot.reach import arm_home, stand_height
@@ -33,21 +33,21 @@ class RobotReport:
     anatomy: Anatomy
     posture: Posture | None
     """Standing pose; None but for legged robots."""
-    joint_pos: Guess[dict[str, float]]
+    joint_pos: JointGuess
     """Initial position of each joint (rad, m)."""
     root_height: Guess[float]
     """Initial height of the trunk or base (m)."""
-    effort: Guess[dict[str, float]]
+    effort: JointGuess
     """Effort limit of each joint (N m, N)."""
-    armature: Guess[dict[str, float]]
+    armature: JointGuess
     """Rotor inertia times squared gear ratio of each joint (kg m^2, kg)."""
-    stiffness: Guess[dict[str, float]]
+    stiffness: JointGuess
     """Stiffness of each joint's position servo (N m/rad, N/m)."""
-    damping: Guess[dict[str, float]]
+    damping: JointGuess
     """Damping of each joint's position servo (N m s/rad, N s/m)."""
-    action_scale: Guess[dict[str, float]]
+    action_scale: JointGuess
     """Change of a joint's target by a unit action (rad, m)."""
-    pose_tolerance: Guess[dict[str, float]]
+    pose_tolerance: JointGuess
     """Deviation of each joint from the initial pose that walking needs (rad)."""
     commands: Guess[dict[str, tuple[float, float]]]
     """Ranges of velocity commands (`lin_vel_x`, `lin_vel_y` in m/s, `ang_vel_z` in rad/s)."""
@@ -92,7 +92,7 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         size = _reach(compiled)
     if given.root_height is not None:
         height = Guess(given.root_height, "as set", "set")
-    effort, asked = effort_limits(compiled, size, _main_joints(anatomy), answers["effort"])
+    effort, asked = find_efforts(compiled, size, _main_joints(anatomy), answers["effort"])
     questions += asked
     armature, asked = rotor_inertias(compiled, effort.value, is_arm, answers["armature"])
     questions += asked
@@ -108,7 +108,7 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         answers["stiffness"],
     )
     questions += asked
-    scale = _action_scale(compiled, is_arm, effort.value, stiffness.value)
+    scale = _action_scale(compiled, anatomy, effort.value, stiffness.value, answers)
     commands = command_ranges(height.value, len(anatomy.feet.value))
     return RobotReport(
         model=model,
@@ -121,8 +121,8 @@ def describe_robot(source: str | RobotModel, settings: dict[str, str] | None = N
         effort=effort,
         armature=armature,
         stiffness=stiffness,
-        damping=_answered(damping, answers["damping"]),
-        action_scale=_answered(scale, answers["action_scale"]),
+        damping=damping.answered(answers["damping"]),
+        action_scale=scale.answered(answers["action_scale"]),
         pose_tolerance=pose_tolerance(compiled, anatomy, pose, height.value),
         commands=commands if legged else Guess({}, "no legs"),
         answers=answers,
@@ -217,10 +217,6 @@ def _answered_imu(compiled: mujoco.MjModel, anatomy: Anatomy, site: str) -> Gues
     return Guess(None if site == "trunk" else site, "as set", "set")
 
 
-def _answered(guess: Guess[dict[str, float]], answers: dict[str, float]) -> Guess[dict[str, float]]:
-    return Guess(guess.value | answers, "as set", "set") if answers else guess
-
-
 def _main_joints(anatomy: Anatomy) -> tuple[str, ...]:
     """Return the joints of the legs, of an arm those of its first hand."""
     if anatomy.kind.value == "arm":
@@ -229,15 +225,22 @@ def _main_joints(anatomy: Anatomy) -> tuple[str, ...]:
 
 
 def _action_scale(
-    model: mujoco.MjModel, is_arm: bool, effort: dict[str, float], stiffness: dict[str, float]
-) -> Guess[dict[str, float]]:
-    if is_arm:
+    model: mujoco.MjModel,
+    anatomy: Anatomy,
+    effort: dict[str, float],
+    stiffness: dict[str, float],
+    answers: dict[str, dict[str, float]],
+) -> JointGuess:
+    if anatomy.kind.value == "arm":
         ranges = {n: geo.joint_range(model, model.joint(n).id) for n in effort}
         # As the YAM's, with which 0.25 million steps teach three times as much as with half of it.
         scale = {n: min(0.25 * (high - low), 1.5) for n, (low, high) in ranges.items()}
-        return Guess(scale, "a quarter of the range, at most 1.5 rad")
-    scale = {n: float(np.clip(0.25 * effort[n] / stiffness[n], 0.2, 0.5)) for n in effort}
-    return Guess(scale, "0.25 x effort / stiffness, between 0.2 and 0.5 rad")
+        rule = "a quarter of the range, at most 1.5 rad"
+    else:
+        scale = {n: float(np.clip(0.25 * effort[n] / stiffness[n], 0.2, 0.5)) for n in effort}
+        rule = "0.25 x effort limit / stiffness, between 0.2 and 0.5 rad"
+    of_joint = {n: (answers["effort"].get(n), answers["stiffness"].get(n)) for n in effort}
+    return JointGuess.of(scale, rule).alike(like_joints(anatomy, effort, of_joint))
 
 
 def _reach(model: mujoco.MjModel) -> float:

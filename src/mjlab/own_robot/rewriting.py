@@ -1,7 +1,8 @@
 """Files of a written package, rewritten without loss of a user's edits.
 
 The package keeps a record of the files as they were written (`new_robot.json`). A later run replaces
-the files that are still the same, and writes `<file>.new` beside those that a user has edited.
+the files that are still the same, and writes `<file>.new` beside those that a user has edited. Tests, README
+and project file that a user has deleted do not come back.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ class Record:
     """Model, as given to the command."""
     task: Task | None = None
     """Task, as given to the command."""
+    motion: str | None = None
+    """Motion file of the task `tracking`, as given to the command."""
     settings: dict[str, str] = field(default_factory=dict)
     """Answers of the user, by key."""
     files: dict[str, str] = field(default_factory=dict)
@@ -57,27 +60,45 @@ def write_files(folder: Path, files: dict[str, bytes], record: Record) -> list[s
         folder: Package.
         files: Content by path in the package.
         record: Record to write; its files are those of the last time, and are updated.
+
+    Raises:
+        UserError: a `<file>.new` of an earlier run has been edited. Nothing is written.
     """
-    kept = []
+    gone = deleted_files(folder, record)
+    files = {name: content for name, content in files.items() if name not in gone}
     edited = {name for name, content in files.items() if _is_edited(folder, name, content, record)}
     if any(name.endswith("/robot.py") for name in edited):
-        # A task of other values than those of the kept robot would not fit it.
+        # A task, or a table, of other values than those of the kept robot would not fit it.
         edited |= {
             name
             for name, content in files.items()
-            if name.endswith("/task.py") and _differs(folder / name, content)
+            if (name.endswith("/task.py") or name == "README.md")
+            and _differs(folder / name, content)
         }
-    for name, content in files.items():
-        path = folder / name
-        if name in edited:
-            kept.append(name)
-            path = path.with_name(path.name + ".new")
-        else:
-            record.files[name] = _hash(content)
-        write_atomically(path, content)
+    written = {f"{name}.new" if name in edited else name: files[name] for name in files}
+    for name, content in written.items():
+        if name not in files and _is_edited(folder, name, content, record):
+            raise UserError(
+                f"{folder / name}: edited by you, and a new one is to be written; merge it into "
+                f"{name.removesuffix('.new')} and delete it. Nothing was written."
+            )
+    for name, content in written.items():
+        record.files[name] = _hash(content)
+        write_atomically(folder / name, content)
     text = json.dumps(vars(record), indent=2, ensure_ascii=False) + "\n"
     write_atomically(folder / RECORD, text.encode())
-    return kept
+    return [name for name in files if name in edited]
+
+
+def deleted_files(folder: Path, record: Record) -> list[str]:
+    """Return the files of the record outside `src` that the user has deleted."""
+    return [
+        name
+        for name in record.files
+        if not name.startswith("src/")
+        and not name.endswith(".new")
+        and not (folder / name).exists()
+    ]
 
 
 def _is_edited(folder: Path, name: str, content: bytes, record: Record) -> bool:

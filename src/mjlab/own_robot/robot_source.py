@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from mjlab.own_robot import geometry
-from mjlab.own_robot.anatomy import Foot
+from mjlab.own_robot.anatomy import SOLE_RULE, Foot, like_joints
 from mjlab.own_robot.findings import soft_soles
-from mjlab.own_robot.guess import Guess
+from mjlab.own_robot.guess import Guess, JointGuess
 from mjlab.own_robot.model_source import name_elements
 from mjlab.own_robot.python_text import (
     comment_lines,
@@ -28,6 +28,7 @@ from mjlab.own_robot.templates import template
 SOLE_FRICTION = 0.8
 """Sliding friction of soles, in the middle of the range that velocity tasks randomize."""
 _RAY_GROUP, _VISUAL_GROUP, _COLLISION_GROUP = 0, 2, 3
+_MARKS = {"asked": " (ASKED: not in the file)"}
 
 
 def robot_source(report: RobotReport, title: str, model: Path) -> str:
@@ -39,18 +40,14 @@ def robot_source(report: RobotReport, title: str, model: Path) -> str:
         model: Model file, relative to the folder of models.
     """
     is_urdf = model.suffix.lower() == ".urdf"
-    joints = driven_joints(report)
+    joints = motor_joints(report)
     imports = []
     if _unnamed(report):
         imports.append("from mjlab.own_robot.model_source import name_elements")
     if is_urdf:
         imports.append("from mjlab.utils.urdf import read_urdf")
     motor_reasons, motors = _motors(report, joints)
-    scale = shared(
-        {name: report.action_scale.value[name] for name in joints},
-        report,
-        report.answers["action_scale"],
-    )
+    scale = {name: report.action_scale.value[name] for name in joints}
     return template("robot.py").substitute(
         title=title,
         imports="".join(f"{line}\n" for line in imports),
@@ -59,7 +56,9 @@ def robot_source(report: RobotReport, title: str, model: Path) -> str:
         pose="\n".join(_pose(report)),
         motor_reasons="\n".join(motor_reasons),
         motors="\n".join(motors),
-        scale="\n".join(reason_lines("Joint target (rad) per unit action", report.action_scale)),
+        scale="\n".join(
+            joint_reason_lines("Joint target (rad) per unit action", report.action_scale, report)
+        ),
         action_scale=dict_source(
             by_pattern(scale, report) if report.anatomy.kind.value == "legged" else scale
         ),
@@ -67,7 +66,7 @@ def robot_source(report: RobotReport, title: str, model: Path) -> str:
     )
 
 
-def driven_joints(report: RobotReport) -> tuple[str, ...]:
+def motor_joints(report: RobotReport) -> tuple[str, ...]:
     """Return the joints with motors: those with an actuator in the file; all if it has none."""
     drives = report.anatomy.drives.value
     return tuple(name for name, drive in drives.items() if drive != "none") or tuple(drives)
@@ -108,55 +107,36 @@ def foot_names(report: RobotReport) -> tuple[str, ...]:
     return tuple(names)
 
 
-def roles(report: RobotReport) -> list[tuple[str, ...]]:
-    """Return the joints in groups of the same role: the knees of all legs, both shoulders, a waist."""
-    anatomy = report.anatomy
-    legs = [leg.joints for leg in anatomy.legs.value]
-    groups = []
-    if len({len(leg) for leg in legs}) == 1:
-        groups = list(zip(*legs, strict=True))
-    grouped = {name for group in groups for name in group}
-    for name in anatomy.drives.value:
-        if name not in grouped:
-            partner, _ = anatomy.mirror.value.get(name, (name, 1.0))
-            groups.append((name,) if partner == name else (name, partner))
-            grouped |= {name, partner}
-    return groups
-
-
-def shared(
-    values: Mapping[str, float], report: RobotReport, answers: Collection[str] = ()
-) -> dict[str, float]:
-    """Return values that joints of the same role share: the largest, if it is near the smallest.
-
-    Masses and rotor inertias that were identified for each joint separately differ from leg to leg.
-    Joints of `answers` keep the value that the user gave.
-    """
-    result = dict(values)
-    for role in roles(report):
-        names = [name for name in role if name in values and name not in answers]
-        found = [values[name] for name in names]
-        if found and max(found) < 1.5 * min(found):
-            result |= dict.fromkeys(names, max(found))
-    return result
-
-
 def by_pattern(values: Mapping[str, float], report: RobotReport) -> dict[str, float]:
-    """Return values by joint name pattern; joints of the same role and value share one."""
+    """Return values by joint name pattern; joints that serve alike, with the same value, share one."""
     among, patterns = report.joint_pos.value, {}
-    for role in roles(report):
-        groups: dict[str, list[str]] = {}
-        for name in role:
-            if name in values:
-                groups.setdefault(number(values[name]), []).append(name)
-        patterns |= {pattern(names, among): float(value) for value, names in groups.items()}
+    for group in like_joints(report.anatomy, values):
+        equal: dict[str, list[str]] = {}
+        for name in group:
+            equal.setdefault(number(values[name]), []).append(name)
+        patterns |= {pattern(names, among): float(value) for value, names in equal.items()}
     return patterns
 
 
 def reason_lines(what: str, guess: Guess) -> list[str]:
     """Return a comment with the reason of a value."""
-    marks = {"asked": " (ASKED: not in the file)", "set": " (as set)"}
-    return comment_lines(f"{what}: {guess.rule}{marks.get(guess.source, '')}.")
+    return comment_lines(f"{what}: {guess.rule}{_MARKS.get(guess.source, '')}.")
+
+
+def joint_reason_lines(what: str, guess: JointGuess, report: RobotReport) -> list[str]:
+    """Return comments with the reasons of the values of joints, and the joints of each."""
+    found = guess.by_reason()
+    joints = {
+        reason: "" if len(found) == 1 else f" of {', '.join(by_pattern(values, report))}"
+        for reason, values in found.items()
+    }
+    return [
+        line
+        for reason, of_joints in joints.items()
+        for line in comment_lines(
+            f"{what}{of_joints}: {reason.rule}{_MARKS.get(reason.source, '')}."
+        )
+    ]
 
 
 def _parts(report: RobotReport) -> list[str]:
@@ -176,7 +156,7 @@ def _parts(report: RobotReport) -> list[str]:
     soles = [name for foot in feet for name in foot.sole]
     _, contacts = foot_contacts(report)
     lines += [
-        *comment_lines(f"Feet, in model order: {anatomy.feet.rule}."),
+        *comment_lines(f"Feet, in model order: {anatomy.feet.rule}; soles: {SOLE_RULE}."),
         "# Sites that `get_spec` adds: body, and middle of the sole in its frame.",
         "FOOT_SITES = {",
         *(
@@ -245,7 +225,7 @@ def _pose(report: RobotReport) -> list[str]:
     values = {name: value for name, value in pose.value.items() if number(value) != "0.0"}
     return [
         commented(f"HEIGHT = {number(height.value)}", height.rule),
-        *reason_lines("Joint positions (others: 0)", pose),
+        *joint_reason_lines("Joint positions (others: 0)", pose, report),
         f"POSE = {dict_source(by_pattern(values, report))}",
     ]
 
@@ -258,23 +238,24 @@ def _motors(report: RobotReport, joints: tuple[str, ...]) -> tuple[list[str], li
         "effort_limit": report.effort,
         "armature": report.armature,
     }
-    reasons = [line for name, guess in fields.items() for line in reason_lines(name, guess)]
-    if report.armature.source == "file" and not report.answers["armature"]:
+    reasons = [
+        line for name, guess in fields.items() for line in joint_reason_lines(name, guess, report)
+    ]
+    if report.armature.source == "file":
         # What the file has stays as it is.
         del fields["armature"]
     settings = {name: "effort" if name == "effort_limit" else name for name in fields}
     groups: dict[tuple[str, ...], list[str]] = {}
-    for role in roles(report):
-        for joint in role:
-            if joint in joints:
-                key = tuple(
-                    # Answers as they were given.
-                    repr(guess.value[joint])
-                    if joint in report.answers[settings[name]]
-                    else number(guess.value[joint], 3)
-                    for name, guess in fields.items()
-                )
-                groups.setdefault((role[0], *key), []).append(joint)
+    for group in like_joints(report.anatomy, joints):
+        for joint in group:
+            key = tuple(
+                # Answers as they were given.
+                repr(guess.value[joint])
+                if joint in report.answers[settings[name]]
+                else number(guess.value[joint], 3)
+                for name, guess in fields.items()
+            )
+            groups.setdefault((group[0], *key), []).append(joint)
     lines = []
     for (_, *values), names in groups.items():
         target = literal(pattern(names, report.joint_pos.value))
@@ -336,7 +317,7 @@ def _spec(report: RobotReport, is_urdf: bool) -> list[str]:
 
 def _removals(report: RobotReport, spec: mujoco.MjSpec) -> list[str]:
     lines = []
-    joints = set(driven_joints(report))
+    joints = set(motor_joints(report))
     replaced = [a for a in spec.actuators if a.target in joints]
     if replaced or spec.keys:
         actuators = (

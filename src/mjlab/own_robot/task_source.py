@@ -16,11 +16,11 @@ from mjlab.own_robot.python_text import comment_lines, dict_source, number, tupl
 from mjlab.own_robot.report import RobotReport
 from mjlab.own_robot.robot_source import (
     by_pattern,
-    driven_joints,
     feet_in_model_order,
     foot_contacts,
+    joint_reason_lines,
+    motor_joints,
     reason_lines,
-    shared,
 )
 from mjlab.own_robot.templates import template
 
@@ -48,7 +48,7 @@ _OTHER_PROFILE = "from mjlab.tasks.velocity.rl.ppo import cpu_without_gait, velo
 def velocity_source(report: RobotReport, package: str, title: str, task_name: str) -> str:
     """Return the source of the velocity task."""
     mode, _ = foot_contacts(report)
-    tolerance = {name: report.pose_tolerance.value[name] for name in driven_joints(report)}
+    tolerance = {name: report.pose_tolerance.value[name] for name in motor_joints(report)}
     fallen = report.anatomy.fall_bodies
     commands = report.commands.value
     num_feet = len(report.anatomy.feet.value)
@@ -72,9 +72,11 @@ def velocity_source(report: RobotReport, package: str, title: str, task_name: st
         lin_vel=_range(commands["lin_vel_x"]),
         ang_vel=_range(commands["ang_vel_z"]),
         tolerance_reason="\n".join(
-            reason_lines("Tolerance of joints around the initial pose (rad)", report.pose_tolerance)
+            joint_reason_lines(
+                "Tolerance of joints around the initial pose (rad)", report.pose_tolerance, report
+            )
         ),
-        std_walking=dict_source(by_pattern(shared(tolerance, report), report)),
+        std_walking=dict_source(by_pattern(tolerance, report)),
         friction_reason="\n".join(comment_lines(friction_reason)),
         joint_friction=friction,
         fallen_reason="\n".join(reason_lines("Bodies that touch the ground after a fall", fallen)),
@@ -133,10 +135,10 @@ def _range(bounds: tuple[float, float]) -> str:
 
 def _joint_friction(report: RobotReport) -> tuple[str, str]:
     """Return the reason and the source of the ranges of dry friction."""
-    names, model = driven_joints(report), report.compiled
+    names, model = motor_joints(report), report.compiled
     if any(model.dof_frictionloss[model.joint(name).dofadr[0]] > 0.0 for name in names):
         return "Dry friction of joints. None: 0.75 to 1.25 times that of the file.", "None"
-    limits = by_pattern(shared({name: report.effort.value[name] for name in names}, report), report)
+    limits = by_pattern({name: report.effort.value[name] for name in names}, report)
     ranges = {name: (0.0, GEAR_FRICTION * limit) for name, limit in limits.items()}
     reason = (
         f"Dry friction of joints (N m): not in the file. Up to {GEAR_FRICTION:.0%} of the effort limit, as "
@@ -215,7 +217,7 @@ def leg_limits(report: RobotReport) -> tuple[dict[str, float], dict[str, float]]
     Those of the G1: hip pitch and knee may move by 1 rad at no cost, a hip's roll and yaw by 0.6 rad, an
     ankle's pitch by 1 rad and roll by 0.8 rad, and other joints by 0.25 rad.
     """
-    joints = driven_joints(report)
+    joints = motor_joints(report)
     bounds, pose = dict.fromkeys(joints, 0.25), dict.fromkeys(joints, 50.0)
     for leg in report.anatomy.legs.value:
         pitch = pitch_joints(report.compiled, leg)

@@ -24,7 +24,7 @@ from mjlab.own_robot.guess import Question
 from mjlab.own_robot.model_source import identifier, load_model, model_file
 from mjlab.own_robot.package import Package, questions_table, values_table
 from mjlab.own_robot.report import RobotReport, describe_robot
-from mjlab.own_robot.rewriting import RECORD, Task, read_record, write_files
+from mjlab.own_robot.rewriting import RECORD, Record, Task, deleted_files, read_record, write_files
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.string import suggest
 from mjlab.utils.tables import WIDTH, tables_text
@@ -74,23 +74,23 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
         # As `python -m` does: modules in the working folder can be imported.
         sys.path.append(os.getcwd())
     path = Path(source).expanduser()
-    # An archive is unpacked once.
-    file = str(model_file(path)) if path.exists() else source
-    name = cfg.name or (identifier(path.stem) if path.suffix == ".zip" else _model_name(file))
+    try:
+        # An archive is unpacked once.
+        model = load_model(str(model_file(path)) if path.exists() else source)
+    except ModuleNotFoundError as error:
+        raise UserError(str(error)) from error
+    name = cfg.name or (identifier(path.stem) if path.suffix == ".zip" else model.name)
     folder = Path(cfg.output or name).expanduser()
     _check_name(name, folder)
     record = read_record(folder)
     _check_model(source, record.model, folder)
-    cfg = replace(cfg, task=cfg.task or record.task)
+    cfg = _with_recorded(cfg, record)
     # A later run keeps the answers of earlier ones.
     settings = record.settings | answers
-    try:
-        report = describe_robot(file, settings)
-    except ModuleNotFoundError as error:
-        raise UserError(str(error)) from error
+    report = describe_robot(model, settings)
     if report.questions and not answers and on_terminal():
         settings |= _ask(report.questions)
-        report = describe_robot(file, settings)
+        report = describe_robot(model, settings)
     package = Package(name, cfg.task or _task(report), report, cfg.motion)
     _check_task(package.task, report)
     if (package.task == "tracking") != (cfg.motion is not None):
@@ -103,21 +103,22 @@ def run_new_robot(source: str, cfg: NewRobotConfig) -> Path:
     print(tables_text([table for table in tables if table.rows], WIDTH))
     _check_bases(report)
     files = package.files(_command_line(source, cfg, settings), folder)
-    kept = write_files(
-        folder, files, replace(record, model=source, task=cfg.task, settings=settings)
-    )
+    motion = str(cfg.motion) if cfg.motion else None
+    record = replace(record, model=source, task=cfg.task, motion=motion, settings=settings)
+    kept = write_files(folder, files, record)
     print(_findings(package, folder))
-    print(_summary(package, folder, kept))
+    print(_summary(package, folder, kept, deleted_files(folder, record)))
     if cfg.install:
         _install(folder)
     return folder
 
 
-def _model_name(source: str) -> str:
-    try:
-        return load_model(source).name
-    except ModuleNotFoundError as error:
-        raise UserError(str(error)) from error
+def _with_recorded(cfg: NewRobotConfig, record: Record) -> NewRobotConfig:
+    """Return the flags with the task and the motion of an earlier run, where they are not given."""
+    task = cfg.task or record.task
+    is_tracking = task == "tracking" and record.motion is not None
+    motion = cfg.motion or (Path(record.motion) if is_tracking else None)
+    return replace(cfg, task=task, motion=motion)
 
 
 def _setting(text: str) -> tuple[str, str]:
@@ -230,12 +231,14 @@ def _findings(package: Package, folder: Path) -> str:
     return report(f"\nmjlab check {package.tasks[0] if package.tasks else package.name}", findings)
 
 
-def _summary(package: Package, folder: Path, kept: list[str]) -> str:
+def _summary(package: Package, folder: Path, kept: list[str], deleted: list[str]) -> str:
     lines = ["", f"Wrote {folder}. Read {folder}/src/{package.name}/robot.py."]
     if kept:
         lines.append(
             f"Edited by you, and kept: {', '.join(kept)}. The new ones: FILE.new beside them."
         )
+    if deleted:
+        lines.append(f"Deleted by you, and left out: {', '.join(deleted)}.")
     if any(name.endswith("/robot.py") for name in kept):
         lines.append(
             "Not in force: values above that differ from robot.py, which is yours. Merge robot.py.new."
