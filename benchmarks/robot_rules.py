@@ -183,7 +183,7 @@ def check_legs(report: RobotReport, truth: dict[str, Any], questions: set[str]) 
             yield rule, False, "no posture"
         return
     kind = "keyframe" if report.joint_pos.source == "file" else "searched"
-    yield "pose", kind == truth["pose"], f"{kind}: {report.joint_pos.rule}"
+    yield "pose", kind == truth["pose"], f"{kind}: {report.joint_pos.by_reason().keys()}"
     if "knees" in truth:
         forward = {
             knee_forward(model, anatomy, leg, report.joint_pos.value) for leg in anatomy.legs.value

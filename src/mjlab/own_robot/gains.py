@@ -296,9 +296,9 @@ def _file_or_rule(
     stiffness, reasons = {}, {}
     for name in joint_pos:
         wanted, rule = max(
-            (effort[name] / error, f"effort limit per {error:g} rad"),
+            (effort[name] / error, f"effort limit per {'' if legged else f'{ARM_ERROR:g} '}rad"),
             (abs(torque[name]) / STATIC_SAG, f"torque of the weight per {STATIC_SAG:g} rad"),
-            (sway.get(name, 0.0), f"{SWAY_MARGIN:g} m g h / legs, against swaying over"),
+            (sway.get(name, 0.0), f"{SWAY_MARGIN:g} x weight x height / legs, against swaying"),
         )
         reason = Reason(rule)
         if own.get(name, 0.0) * 0.2 > abs(torque[name]):
