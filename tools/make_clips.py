@@ -1,7 +1,7 @@
 """Record the clips of the README: `python tools/make_clips.py [NAME ...] --run lift=FOLDER`.
 
-Animated WebP of 480 x 270 pixels at 25 frames per second, below 500 KB each. Clips of policies that do
-not ship with the package need the run folder of a training, for example
+Animated WebP of 480 x 270 pixels at 25 frames per second, below 500 KB each; the first one of the README
+is larger, and its animated pictures have 1.5 MB in all. Clips of policies that do not ship with the package need the run folder of a training, for example
 
     uv run mjlab train Mjlab-Lift-Cube-Yam --profile cpu
     uv run python tools/make_clips.py lift --run lift=logs/rsl_rl/yam_lift_cube/<time>
@@ -34,10 +34,9 @@ from mjlab.viewer.native.visualizer import add_moving_geoms
 from mjlab.viewer.offscreen_renderer import open_renderer
 
 _IMAGES = Path(__file__).parents[1] / "docs" / "images"
-_WIDTH, _HEIGHT, _FPS = 480, 270, 25
+_FPS = 25
 # Frames are rendered larger and downsampled for antialiasing.
 _OVERSAMPLING = 2
-_MAX_BYTES = 500_000
 _HORIZON = (0.93, 0.94, 0.96)
 _BOX = (0.68, 0.71, 0.75, 1.0)
 
@@ -80,6 +79,10 @@ class Clip:
     """Elevation of the view (degrees)."""
     hidden_sites: bool = True
     """Hide sites."""
+    size: tuple[int, int] = (480, 270)
+    """Width and height (pixels)."""
+    max_bytes: int = 500_000
+    """Limit of the file's size."""
 
 
 CLIPS = {
@@ -104,7 +107,8 @@ CLIPS = {
     "g1": Clip(
         DEMOS["g1"].task, "cpu", DEMOS["g1"].policy, num_envs=2, spacing=1.2,
         command={"lin_vel_x": (0.8, 0.8), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
-        start=3.0, seconds=3.0, body="robot/pelvis", lookat=(0.0, 0.0, 0.6), distance=3.4, azimuth=155.0,
+        start=3.0, seconds=3.0, body="robot/pelvis", lookat=(0.0, 0.0, 0.62), distance=3.0, azimuth=150.0,
+        size=(720, 405), max_bytes=700_000,
     ),
     "lift": Clip(
         "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0, elevation=-16.0,
@@ -180,7 +184,7 @@ def main(args: Args) -> None:
             raise SystemExit(f"{runs[name]}: expected a checkpoint, found none.")
         frames = record(clip, policy, args.seed)
         path = args.folder / f"{name}.webp"
-        save(frames, path)
+        save(frames, path, clip.max_bytes)
         if args.frames is not None:
             args.frames.mkdir(parents=True, exist_ok=True)
             for index in range(0, len(frames), 15):
@@ -188,17 +192,17 @@ def main(args: Args) -> None:
         print(f"{path}: {path.stat().st_size // 1000} kB, {len(frames)} frames")
 
 
-def save(frames: list[np.ndarray], path: Path) -> None:
-    """Write an animated WebP, at the best quality below the size limit."""
+def save(frames: list[np.ndarray], path: Path, max_bytes: int) -> None:
+    """Write an animated WebP, at the best quality below the limit of its size."""
     first, *rest = [Image.fromarray(frame) for frame in frames]
     for quality in (80, 70, 60, 50, 40):
         first.save(
             path, save_all=True, append_images=rest, duration=1000 // _FPS, loop=0, quality=quality,
             method=6, minimize_size=True,
         )  # fmt: skip
-        if path.stat().st_size < _MAX_BYTES:
+        if path.stat().st_size < max_bytes:
             return
-    raise SystemExit(f"{path}: expected less than {_MAX_BYTES} bytes; use a shorter clip.")
+    raise SystemExit(f"{path}: expected less than {max_bytes} bytes; use a shorter clip.")
 
 
 def record(clip: Clip, policy: Path, seed: int) -> list[np.ndarray]:
@@ -250,10 +254,11 @@ def film(clip: Clip, env: Any, policy: Any) -> list[np.ndarray]:
     option.sitegroup[:] = not clip.hidden_sites
     camera.distance, camera.azimuth, camera.elevation = clip.distance, clip.azimuth, clip.elevation
     steps_per_frame = max(round(clip.speed / _FPS / env.unwrapped.step_dt), 1)
-    size = (_HEIGHT * _OVERSAMPLING, _WIDTH * _OVERSAMPLING)
+    width, height = (_OVERSAMPLING * length for length in clip.size)
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     frames: list[np.ndarray] = []
     target = np.zeros(3)
-    with torch.inference_mode(), open_renderer(model, *size) as renderer:
+    with torch.inference_mode(), open_renderer(model, height, width) as renderer:
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = True
         for _ in range(round(clip.start / env.unwrapped.step_dt)):
             env.step(policy(env.get_observations()))
@@ -277,7 +282,7 @@ def film(clip: Clip, env: Any, policy: Any) -> list[np.ndarray]:
                 compute_poses(model, data)
                 add_moving_geoms(renderer.scene, model, data, option)
             image = Image.fromarray(renderer.render())
-            frames.append(np.asarray(image.resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS)))
+            frames.append(np.asarray(image.resize(clip.size, Image.Resampling.LANCZOS)))
             for _ in range(steps_per_frame):
                 env.step(policy(env.get_observations()))
     return frames
@@ -323,8 +328,6 @@ def light_studio(spec: mujoco.MjSpec) -> None:
     visual.map.haze, visual.map.fogstart, visual.map.fogend = 0.5, 1.5, 9.0
     visual.quality.offsamples, visual.quality.shadowsize = 8, 4096
     visual.global_.fovy = 38.0
-    visual.global_.offwidth = _WIDTH * _OVERSAMPLING
-    visual.global_.offheight = _HEIGHT * _OVERSAMPLING
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
-"""Draw the pictures of the documentation: `python tools/make_pictures.py`.
+"""Draw the pictures of the documentation: `python tools/make_pictures.py [NAME ...]`.
 
-Renders offscreen, without a display. Run again when a terrain preset or the example of
-`variants.md` changes.
+Renders offscreen, without a display. Run again when a terrain preset, the example of `variants.md`, the
+reference runs of the Go1 or a statement of a badge changes.
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,10 +17,11 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
+from mjlab.runs.reference import DATA, Reference, reference_path
 from mjlab.scene import Scene, SceneCfg
 from mjlab.sensor import CameraSensorCfg
 from mjlab.sim import Simulation, SimulationCfg
-from mjlab.tasks.registry import load_env_cfg
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.terrains import SubTerrainCfg, TerrainEntityCfg, TerrainGenerator, TerrainGeneratorCfg
 from mjlab.terrains.config import ALL_TERRAIN_PRESETS
 from mjlab.viewer.offscreen_renderer import OffscreenRenderer, open_renderer
@@ -28,6 +31,7 @@ from mjlab.viewer.viser.camera_viewer import depth_colors, segmentation_colors
 _DOCS = Path(__file__).parents[1] / "docs"
 _IMAGES = _DOCS / "images"
 
+_WALKING = "Mjlab-Velocity-Flat-Unitree-Go1-No-State-Estimation"
 # Extent of one terrain (m), and difficulties of a strip.
 _SIZE = 8.0
 _DIFFICULTIES = (0.0, 0.5, 1.0)
@@ -36,11 +40,64 @@ _STRIPS_PER_ROW = 2
 _WIDTH, _HEIGHT, _TITLE, _OVERSAMPLING = 640, 168, 22, 2
 
 
-def main() -> None:
-    """Draw all pictures."""
-    draw_terrains(_IMAGES / "terrains.png")
-    draw_variants(_IMAGES / "variants.png")
-    draw_cameras(_IMAGES / "cameras.png")
+# Badges of the README: name and statement.
+BADGES = {
+    "tests": "make test",
+    "docs": "make docs",
+    "python": "3.11 to 3.13",
+    "license": "Apache 2.0",
+    "cite": "CITATION.cff",
+}
+_BADGE = """\
+<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="20" role="img" aria-label="{name}: {text}">
+<clipPath id="r"><rect width="{width}" height="20" rx="3"/></clipPath>
+<g clip-path="url(#r)"><rect width="{width}" height="20" fill="#3b6ea5"/>
+<rect width="{left}" height="20" fill="#4a4f57"/></g>
+<g fill="#fff" font-family="Verdana,DejaVu Sans,sans-serif" font-size="11" text-anchor="middle">
+<text x="{name_at}" y="14">{name}</text><text x="{text_at}" y="14">{text}</text></g></svg>
+"""
+# Pixels of a character and around a word.
+_CHARACTER, _AROUND = 7, 12
+
+
+def main(names: Sequence[str]) -> None:
+    """Draw the pictures with these names."""
+    for name in names:
+        PICTURES[name](_IMAGES / f"{name}.png")
+
+
+def draw_badges(path: Path) -> None:
+    """Write the badges of the README as SVG, beside `path`."""
+    for name, text in BADGES.items():
+        left, right = (_CHARACTER * len(word) + _AROUND for word in (name, text))
+        badge = _BADGE.format(
+            name=name, text=text, width=left + right, left=left, name_at=left / 2,
+            text_at=left + right / 2,
+        )  # fmt: skip
+        path.with_name(f"badge_{name}.svg").write_text(badge, encoding="utf-8")
+
+
+def draw_learning(path: Path) -> None:
+    """Draw the velocity error of the bundled reference runs over time, and the goal."""
+    reference = Reference.load(reference_path(DATA, _WALKING, "cpu"))
+    goal = load_rl_cfg(_WALKING, profile="cpu").evaluation.solved_below["lin_vel_error"]
+    figure = Figure(figsize=(9.0, 3.4), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    for record in reference.seeds:
+        minutes = np.array(record.run.seconds_at) / 60
+        axes.plot(minutes, record.run.figures["lin_vel_error"], lw=2, label=f"seed {record.seed}")
+    axes.axhline(goal, ls="--", lw=1.2, color="dimgray")
+    axes.text(0.01, goal - 0.015, f"goal: {goal:g} m/s", va="top", color="dimgray")
+    axes.set(
+        xlim=(0.0, None), ylim=(0.0, None), xlabel="Minutes of training on two CPU cores (AMD EPYC)",
+        ylabel="Error of the velocity (m/s)", title="A Go1 learns to walk: error in evaluations",
+    )  # fmt: skip
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, loc="upper right")
+    figure.savefig(path)
+    Image.open(path).convert("RGB").quantize(128).save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size // 1024} kB")
 
 
 def draw_cameras(path: Path) -> None:
@@ -222,5 +279,13 @@ def _strip_spec(sub: SubTerrainCfg) -> mujoco.MjSpec:
     return spec
 
 
+PICTURES = {
+    "badges": draw_badges,
+    "go1_learning": draw_learning,
+    "terrains": draw_terrains,
+    "variants": draw_variants,
+    "cameras": draw_cameras,
+}
+
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:] or list(PICTURES))

@@ -37,6 +37,7 @@ _INSTALLERS |= {"python-platform", "no-header", "no-annotate"}
 _INSTALLERS |= {
     "torch-backend",
     "upgrade-package",
+    "editable",
     "python",
     "no-config",
     "no-hashes",
@@ -117,6 +118,28 @@ def test_commands_to_type_are_spelled_alike() -> None:
 def test_examples_in_the_help_are_commands() -> None:
     names = {command.name for command in COMMANDS}
     assert {line.split()[0] for command in COMMANDS for line in command.examples} <= names
+
+
+def test_the_front_page_is_short_and_light() -> None:
+    page = ROOT / "README.md"
+    text = page.read_text(encoding="utf-8")
+    clips = [ROOT / name for name in re.findall(r"\(([^)]+\.webp)\)", text)]
+    assert text.count("\n") < 90
+    assert 0 < sum(clip.stat().st_size for clip in clips) < 1_500_000
+
+
+def test_badges_say_what_is_true() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    badges = dict(re.findall(r"^\[!\[(\w+): ([^]]+)\]\(docs/images/badge_", text, re.MULTILINE))
+    for name, statement in badges.items():
+        badge = ROOT / "docs" / "images" / f"badge_{name}.svg"
+        assert f"{name}: {statement}" in badge.read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert badges["license"].replace(" ", "-") == project["license"]
+    assert (ROOT / badges["cite"]).exists()
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for name in ("tests", "docs"):
+        assert f"\n{badges[name].removeprefix('make ')}:" in makefile
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_ids)
