@@ -8,9 +8,11 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
 from docutils.nodes import SkipNode
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.builders.text import TextBuilder
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
 from mjlab.scripts.describe import describe
@@ -21,6 +23,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 project = "mjlab"
 author = "the mjlab developers"
+copyright = "2026, the mjlab developers. Apache License 2.0"
 release = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]["version"]
 version = release
 
@@ -40,9 +43,16 @@ copybutton_exclude = ".linenos, .gp, .go"
 html_theme = "furo"
 html_title = f"mjlab {release}"
 html_static_path = ["_static"]
+templates_path = ["_templates"]
 html_css_files = ["mjlab.css"]
+# List of the pages in plain Markdown, which stand beside the HTML: see `_write_markdown`.
+html_extra_path = ["llms.txt"]
+html_copy_source = False
+# Lines under the headings of text, as in Markdown.
+text_sectionchars = "=-~^+`"
 
 html_theme_options = {
+    "top_of_page_buttons": [],
     "light_css_variables": {"color-brand-primary": "#2f6690", "color-brand-content": "#2f6690"},
     "dark_css_variables": {"color-brand-primary": "#8fc1e3", "color-brand-content": "#8fc1e3"},
 }
@@ -129,10 +139,38 @@ def _add_task_tables(app: Sphinx, page: str, source: list[str]) -> None:
         source[0] += "".join(f"\n{describe(name).markdown()}\n" for name in names)
 
 
+def _write_markdown(app: Sphinx, page: str, source: list[str]) -> None:
+    """Write a page as plain Markdown beside its HTML, for readers without a browser."""
+    if app.builder.format == "html" and not _is_api(page):
+        _write_beside(app, page, re.sub(r"```{toctree}\n(?s:.*?)```\n*", "", source[0]))
+
+
+def _write_api_text(app: Sphinx, doctree: nodes.document, page: str) -> None:
+    """Write a page of the API as text: its source names classes, and has no docstrings."""
+    if app.builder.format == "html" and _is_api(page):
+        builder = TextBuilder(app, app.env)
+        builder.init()
+        text: Any = builder.create_translator(doctree, builder)
+        doctree.walkabout(text)
+        _write_beside(app, page, text.body)
+
+
+def _is_api(page: str) -> bool:
+    return page.startswith("reference/api/") and page != "reference/api/index"
+
+
+def _write_beside(app: Sphinx, page: str, text: str) -> None:
+    path = Path(app.outdir) / f"{page}.md"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
 def setup(app: Sphinx) -> None:
     """Register the handlers of pages, docstrings, signatures and formulas."""
     app.add_html_math_renderer("mathml", _math("inline"), _math("block"))
     app.connect("source-read", _add_summary)
     app.connect("source-read", _add_task_tables)
+    app.connect("source-read", _write_markdown, priority=900)
+    app.connect("doctree-resolved", _write_api_text)
     app.connect("autodoc-process-signature", _readable)
     app.connect("autodoc-process-docstring", _to_rst)

@@ -180,6 +180,19 @@ def test_links_have_a_text_and_lead_to_files_and_headings(page: Path) -> None:
             assert anchor in slugs, (target, anchor)
 
 
+def test_llms_txt_lists_every_page_by_its_title() -> None:
+    text = (ROOT / "docs" / "llms.txt").read_text("utf-8")
+    listed = {target: title for title, target in re.findall(r"^- \[(.+)\]\((\S+)\): .", text, re.M)}
+    titles = {
+        page.relative_to(ROOT / "docs").as_posix(): re.findall(
+            r"^# (.*)", page.read_text("utf-8"), re.M
+        )[0]
+        for page in PAGES
+    }
+    del titles["index.md"]
+    assert listed == titles
+
+
 @cache
 def _flags_of() -> dict[str, list[object]]:
     """Each command's flags: configs, whose fields they are, and sets of names."""
