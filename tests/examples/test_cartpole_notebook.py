@@ -28,6 +28,16 @@ def code_cells() -> list[str]:
     return cells
 
 
+def test_outputs_are_stored_and_name_no_machine():
+    text = NOTEBOOK.read_text(encoding="utf-8")
+    cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+    kinds = {kind for cell in cells for output in cell["outputs"] for kind in output["data"]}
+    assert {"text/html", "image/png"} <= kinds
+    assert all(cell["execution_count"] for cell in cells)
+    assert "/home/" not in text
+    assert len(text) < 300_000
+
+
 class Output:
     """Stands in for an output of a notebook; collects its contents."""
 
