@@ -52,10 +52,27 @@ def write_demo(name: str, folder: Path, steps: int = STEPS) -> Path:
     return folder
 
 
+def relative_targets(env: Any, agent: Any) -> None:
+    """Let the arm follow targets relative to the measured positions."""
+    from mjlab.envs.mdp.actions import RelativeJointPositionActionCfg
+
+    action = env.actions["joint_pos"]
+    env.actions["joint_pos"] = RelativeJointPositionActionCfg(
+        entity_name=action.entity_name,
+        actuator_names=action.actuator_names,
+        scale=0.5,
+        clip={".*": (-0.1, 0.2)},
+        read_every_substep=False,
+    )
+
+
+_EDITS = {"Mjlab-Reach-Yam": relative_targets}
+
+
 def write_random(
     task: str,
     folder: Path,
-    edit: Callable[[Any, Any], None] = lambda env, agent: None,
+    edit: Callable[[Any, Any], None] | None = None,
     steps: int = STEPS,
 ) -> Path:
     """Write the bundle of an untrained policy of `task`; `edit` changes both configs in place."""
@@ -68,6 +85,7 @@ def write_random(
     from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
 
     evaluated, agent = load_env_cfg(task, evaluate=True), load_rl_cfg(task)
+    edit = edit or _EDITS.get(task, lambda env, agent: None)
     edit(evaluated, agent)
     cfg, lacks = nominal_cfg(evaluated, agent.clip_actions)
     cfg.seed = 1

@@ -36,6 +36,7 @@ from mjlab.envs.mdp.actions import (
     JointEffortAction,
     JointPositionAction,
     JointVelocityAction,
+    RelativeJointPositionAction,
 )
 from mjlab.rl.exporter_utils import joint_actuators, joint_gains, shortest
 from mjlab.utils.lab_api.string import resolve_matching_names_values
@@ -51,6 +52,7 @@ _ACTIONS: dict[type, str] = {
     JointPositionAction: "joint_position",
     JointVelocityAction: "joint_velocity",
     JointEffortAction: "joint_effort",
+    RelativeJointPositionAction: "relative_joint_position",
     BinaryJointPositionAction: "binary_joint_position",
 }
 # Limits that a robot's program should replace by those of its motors.
@@ -424,7 +426,8 @@ def _actions(env: ManagerBasedRlEnv) -> list[dict[str, Any]]:
     manager, start, target, entries = env.action_manager, 0, 0, []
     for name in manager.active_terms:
         term: Any = manager.get_term(name)
-        kind, factors = _ACTIONS.get(type(term), "custom"), joint_factors(env, term)
+        factors = joint_factors(env, term)
+        kind = _kind(term, factors)
         entry: dict[str, Any] = {
             "name": name,
             "kind": kind,
@@ -451,6 +454,16 @@ def _actions(env: ManagerBasedRlEnv) -> list[dict[str, Any]]:
         entries.append(entry)
         start, target = entry["stop"], entry["target_stop"]
     return entries
+
+
+def _kind(term: Any, factors: Sequence[float]) -> str:
+    """Return the kind of an action, `custom` for one that the runtime does not know."""
+    kind = _ACTIONS.get(type(term), "custom")
+    if kind != "relative_joint_position":
+        return kind
+    # No program of a robot reads positions between the steps of the policy.
+    is_known = not term.cfg.read_every_substep and set(factors) == {1.0}
+    return kind if is_known else "custom"
 
 
 def joint_factors(env: ManagerBasedRlEnv, term: Any) -> list[float]:

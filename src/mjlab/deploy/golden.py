@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from mjlab.deploy.contract import joint_factors
+from mjlab.envs.mdp.actions import RelativeJointPositionAction
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -174,6 +175,8 @@ class _Recorder:
 def _targets(env: Any, term: Any) -> torch.Tensor:
     """Return the targets of an action, at the joints, (N, T)."""
     targets: torch.Tensor = getattr(term, "_processed_actions", term.raw_action)
+    if isinstance(term, RelativeJointPositionAction):
+        targets = targets + term.measured
     factors = joint_factors(env, term)
     # An action of another package may have targets of its own.
     is_of_joints = len(factors) == targets.shape[1]

@@ -317,7 +317,7 @@ def _recomputed(
         logged = answers["action"].row(k) if "action" in answers else None
         if logged is not None:
             policy.action = logged
-        policy.targets()
+        policy.targets(measured["joint_pos"])
         add("target", policy.target.copy())
     trace = {name: np.array(values) for name, values in rows.items()}
     return {**trace, **raw, "first": first, "motion": motions, "time": table.columns["time"]}

@@ -317,7 +317,8 @@ class Policy {
     for (const Term& term : terms_) observe(term, values);
     episode_.is_first = false;
     infer();
-    return episode_.reason.empty() ? targets() : damp(values["joint_pos"]);
+    const Vector& q = values["joint_pos"];
+    return episode_.reason.empty() ? targets(q) : damp(q);
   }
 
   /// Let the network answer its inputs, and keep its memory.
@@ -385,6 +386,7 @@ class Policy {
   struct Action {
     Vector scale, offset, open, closed;  // Of a gripper open and closed, else scale and offset.
     size_t start = 0;                    // In the action vector.
+    bool is_relative = false;            // Targets are relative to the measured positions.
     Vector Targets::*field = nullptr;
     std::vector<size_t> index;  // Joints.
     std::vector<std::array<double, 2>> clip;
@@ -450,7 +452,8 @@ class Policy {
     if (kind == "custom") fail("Action '" + name + "': compute its targets here.");
     const auto get = [&entry](const char* key) { return entry.value(key, json()); };
     Action action{numbers(get("scale")), numbers(get("offset")), numbers(get("open")),
-                  numbers(get("closed")), entry["start"], &Targets::position, {}, {}};
+                  numbers(get("closed")), entry["start"], kind == "relative_joint_position",
+                  &Targets::position, {}, {}};
     if (kind == "joint_velocity") action.field = &Targets::velocity;
     if (kind == "joint_effort") action.field = &Targets::effort;
     const json clip = get("clip");
@@ -592,8 +595,8 @@ class Policy {
     }
   }
 
-  /// Return the motor commands of the last action, within the limits.
-  Targets targets() {
+  /// Return the motor commands of the last action at measured positions, within the limits.
+  Targets targets(const Vector& joint_pos) {
     target_.clear();
     for (const Action& action : actions_)
       for (size_t k = 0; k < action.index.size(); ++k) {
@@ -601,7 +604,8 @@ class Policy {
         const double raw = action_.at(action.start + (is_gripper ? 0 : k));
         const double target = is_gripper ? (raw < 0 ? action.closed : action.open).at(k)
                                          : raw * at(action.scale, k) + at(action.offset, k);
-        target_.push_back(std::clamp(target, action.clip[k][0], action.clip[k][1]));
+        target_.push_back(std::clamp(target, action.clip[k][0], action.clip[k][1]) +
+                          (action.is_relative ? joint_pos.at(action.index[k]) : 0.0));
       }
     Vector sent = target_;
     for (size_t k = 0; is_limited_ && k < sent.size(); ++k) {

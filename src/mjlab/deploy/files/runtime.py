@@ -178,9 +178,8 @@ class Policy:
                 slot.reshape(-1, history)[:] = value
             else:
                 slot[:-history], slot[-history:] = slot[history:].copy(), value
-        self._is_first = False
-        self.action = self.infer(self.inputs)
-        return self.damp(values["joint_pos"]) if self.reason else self.targets()
+        self._is_first, self.action = False, self.infer(self.inputs)
+        return (self.damp if self.reason else self.targets)(values["joint_pos"])
 
     def infer(self, inputs):
         """Return the answer of the network, within the clip of raw actions, and keep its memory."""
@@ -277,8 +276,8 @@ class Policy:
         if "time_step" in self.inputs:
             self.inputs["time_step"][:] = t
 
-    def targets(self):
-        """Return the motor commands of the last action, within the limits."""
+    def targets(self, joint_pos):
+        """Return the motor commands of the last action at measured positions, within the limits."""
         parts = []
         for action in self._actions:
             raw = self.action[action["start"] : action["stop"]]
@@ -286,13 +285,14 @@ class Policy:
                 target = np.where(raw < 0, action["closed"], action["open"])
             else:
                 target = raw * action["scale"] + action["offset"]
-            parts.append(np.fmax(np.fmin(target, action["high"]), action["low"]))
+            target = np.fmax(np.fmin(target, action["high"]), action["low"])
+            is_relative = action["kind"] == "relative_joint_position"
+            parts.append(target + is_relative * joint_pos[action["index"]])
         self.target = sent = np.concatenate(parts)
         if self._limited:
             sent = sent.clip(self.limits["target_low"], self.limits["target_high"])
             if self._sent is not None:
-                step = self.limits["target_step"]
-                sent = sent.clip(self._sent - step, self._sent + step)
+                sent = sent.clip(*(self._sent + np.outer((-1, 1), self.limits["target_step"])))
         self._sent, commands = sent, self.commanded(self.default.copy())
         for a in self._actions:
             getattr(commands, a["field"])[a["index"]] = sent[a["target_start"] : a["target_stop"]]

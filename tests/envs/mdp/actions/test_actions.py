@@ -145,6 +145,20 @@ def test_relative_positions_follow_the_joint(world: Any) -> None:
         act.RelativeJointPositionActionCfg(**JOINTS, offset=0.5)
 
 
+def test_relative_positions_of_the_start_of_a_step(world: Any) -> None:
+    cfg = act.RelativeJointPositionActionCfg(**JOINTS, scale=0.1, read_every_substep=False)
+    term = cfg.build(world)
+    assert not term.needs_substep
+    for start in (0.0, 1.0):
+        world.sim.data.qpos[:, 7:] = start
+        step(term, [1.0, -0.2, 0.0])
+        # The joint moves within the step.
+        world.sim.data.qpos[:, 7:] = start + 0.5
+        term.apply_actions()
+        target = world.robot.data.joint_pos_target[0]
+        torch.testing.assert_close(target, start + torch.tensor([0.1, -0.02, 0.0]))
+
+
 @pytest.mark.parametrize(
     ("preserve_order", "expected"),
     [(False, ["hip", "knee", "ankle"]), (True, ["ankle", "knee", "hip"])],

@@ -224,6 +224,10 @@ class JointPositionAction(BaseAction):
 class RelativeJointPositionActionCfg(BaseActionCfg):
     """Relative joint position target configuration. `offset` must be 0."""
 
+    read_every_substep: bool = True
+    """Read the current positions at every physics substep. False: once per step, as a robot's program, so that
+    policies can be deployed."""
+
     def __post_init__(self) -> None:
         self.transmission_type = TransmissionType.JOINT
         if self.offset != 0.0:
@@ -239,11 +243,35 @@ class RelativeJointPositionActionCfg(BaseActionCfg):
 class RelativeJointPositionAction(BaseAction):
     """Commands joint position increments (rad or m); `clip` bounds the increment.
 
-    The current position is read at every physics substep.
+    The current position is read at every physics substep, or once per step: `read_every_substep`.
     """
 
+    _transient = BaseAction._transient | {"_measured", "_reads_every_substep"}
+
+    def __init__(self, cfg: RelativeJointPositionActionCfg, env: ManagerBasedRlEnv) -> None:
+        super().__init__(cfg, env)
+        self._reads_every_substep = cfg.read_every_substep
+        self._measured = torch.zeros_like(self._processed_actions)
+
+    @property
+    def measured(self) -> torch.Tensor:
+        """Positions that the targets are relative to, (N, action_dim), as last read."""
+        return self._measured
+
+    @property
+    def needs_substep(self) -> bool:
+        """True if the position is read at every substep."""
+        return self._reads_every_substep
+
+    def process_actions(self, actions: torch.Tensor) -> None:
+        """Scale and clip `actions` (N, action_dim), and read the positions."""
+        super().process_actions(actions)
+        self._measured.copy_(self._entity.data.joint_pos[:, self._columns])
+
     def apply_actions(self) -> None:
-        target = self._entity.data.joint_pos[:, self._columns] + self._processed_actions
+        if self._reads_every_substep:
+            self._measured.copy_(self._entity.data.joint_pos[:, self._columns])
+        target = self._measured + self._processed_actions
         self._entity.set_joint_position_target(target, joint_ids=self._columns)
 
 
