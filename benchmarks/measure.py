@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from mjlab.utils.processes import available_cores
+from mjlab.utils.processes import available_cores, processor
 
 RESULTS = Path(__file__).parent / "results"
 Sample = Callable[[], Any]
@@ -68,16 +68,6 @@ def write(rows: list[Row]) -> None:
     (RESULTS / "table.md").write_text(f"{show(rows)}\n\nMeasured: {about}.\n", encoding="utf-8")
     content = {"machine": machine, "rows": [asdict(row) for row in rows]}
     (RESULTS / "table.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
-def processor() -> str:
-    """Return the name of the processor."""
-    for line in (
-        Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else ()
-    ):
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def alternate(

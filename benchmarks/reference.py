@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
 
 from learning import EVALUATION_SEED  # noqa: E402
-from measure import output_of, processor  # noqa: E402
+from measure import output_of  # noqa: E402
 
 from mjlab.cli.devices import resolve_device  # noqa: E402
 from mjlab.cli.resume import resume_flags  # noqa: E402
@@ -59,7 +59,7 @@ from mjlab.tasks.registry import (  # noqa: E402
     require_task,
 )
 from mjlab.utils.errors import UserError  # noqa: E402
-from mjlab.utils.processes import available_cores  # noqa: E402
+from mjlab.utils.processes import available_cores, processor  # noqa: E402
 
 PAGES = ROOT / "docs" / "reference" / "runs"
 PROFILE = "cpu"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from sphinx.application import Sphinx
 from sphinx.builders.text import TextBuilder
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
+from mjlab.scripts.demo import DEMOS
 from mjlab.scripts.describe import describe
 from mjlab.tasks.registry import list_tasks
 from mjlab.tasks.velocity import mdp as velocity_mdp
@@ -165,9 +168,20 @@ def _write_beside(app: Sphinx, page: str, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
+def _share_demos(app: Sphinx) -> None:
+    """Write the pages of the bundled policies that the gallery links, unless they are there."""
+    for name in DEMOS if app.builder.format == "html" else ():
+        page = Path(app.outdir) / "shared" / f"{name}.html"
+        if not page.exists():
+            page.parent.mkdir(exist_ok=True)
+            command = ["-m", "mjlab.cli.main", "share", name, "--output", str(page)]
+            subprocess.run([sys.executable, *command], check=True)
+
+
 def setup(app: Sphinx) -> None:
     """Register the handlers of pages, docstrings, signatures and formulas."""
     app.add_html_math_renderer("mathml", _math("inline"), _math("block"))
+    app.connect("builder-inited", _share_demos)
     app.connect("source-read", _add_summary)
     app.connect("source-read", _add_task_tables)
     app.connect("source-read", _write_markdown, priority=900)

@@ -14,6 +14,7 @@ from mjlab.cli.train_config import TrainConfig
 from mjlab.scripts.evaluate import EvaluateConfig
 from mjlab.scripts.play import PlayConfig
 from mjlab.scripts.profile_env import ProfileConfig
+from mjlab.scripts.share import ShareConfig
 from mjlab.tasks.registry import list_tasks, load_env_cfg
 
 TASK = "Mjlab-Cartpole-Swingup"
@@ -21,6 +22,7 @@ TRACKING = "Mjlab-Tracking-Flat-Unitree-G1"
 TASKS = [name for name in list_tasks() if name.startswith("Mjlab-")]
 POLICY_FLAGS = {
     "play": PlayConfig, "demo": PlayConfig, "evaluate": EvaluateConfig, "profile-env": ProfileConfig,
+    "share": ShareConfig,
 }  # fmt: skip
 
 

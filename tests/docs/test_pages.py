@@ -23,7 +23,7 @@ _COMMAND = re.compile(r"\buv run (?:--(?:extra|group) \S+ |--\S+ )*([\w-]+)")
 _FLAG = re.compile(r"(?<![\w-])--([a-z][\w.-]*[a-z])")
 _OBJECT = re.compile(r"^\.\. auto\w+:: (\S+)$", re.MULTILINE)
 _COMMAND_LINE = re.compile(
-    r"\b(train-seeds|train|demo|describe|play|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
+    r"\b(train-seeds|train|demo|describe|play|(?<=mjlab )share|evaluate|profile-env|export-scene|viz-nan|visualize_terrain"
     r"|csv_to_npz|verify|(?<=mjlab )check)"
     r"((?: [^\s`#]+)*)"
 )
@@ -206,6 +206,7 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.scripts.new_robot import NewRobotConfig
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
+    from mjlab.scripts.share import ShareConfig
     from mjlab.scripts.train import TrainConfig
     from mjlab.scripts.verify import VerifyConfig
     from mjlab.scripts.visualize_terrain import VisualizeTerrainConfig
@@ -225,6 +226,7 @@ def _flags_of() -> dict[str, list[object]]:
         "demo": [play],
         "describe": [DescribeConfig(env=train.env), MotionOptions()],
         "play": [play, MotionOptions()],
+        "share": [ShareConfig(env=train.env), MotionOptions()],
         "evaluate": [EvaluateConfig(env=train.env), MotionOptions()],
         "csv_to_npz": [CsvToNpzConfig()],
         "profile-env": [ProfileConfig(env=train.env)],

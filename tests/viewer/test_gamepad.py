@@ -2,62 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
 import time
-from contextlib import contextmanager
-from urllib.request import urlopen
 
 import pytest
+from browser import browser, evaluated, needs_chromium, wait_for
 
 from mjlab.viewer.gamepad import stick_position
 from mjlab.viewer.page_server import page_url, serve_page
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 STAND_IN = """
   window.pad = {connected: true, id: "Stand-in", axes: [0, 0, 0, 0]};
   navigator.getGamepads = () => [null, window.pad];
 """
 
 
-@contextmanager
-def browser(folder):
-    """Yield a function that sends a command to a tab of a headless Chromium."""
-    from websockets.sync.client import connect
-
-    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "about:blank"]
-    command += [f"--user-data-dir={folder}", "--remote-debugging-port=0"]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
-        try:
-            port_file = folder / "DevToolsActivePort"
-            wait_for(lambda: port_file.exists() and port_file.read_text().count("\n"))
-            port = port_file.read_text().split("\n")[0]
-            tabs = json.load(urlopen(f"http://127.0.0.1:{port}/json"))
-            tab = next(tab for tab in tabs if tab["type"] == "page")
-            with connect(tab["webSocketDebuggerUrl"], max_size=None) as connection:
-
-                def send(method, **params):
-                    connection.send(json.dumps({"id": 1, "method": method, "params": params}))
-                    while (got := json.loads(connection.recv())).get("id") != 1:
-                        pass
-                    return got["result"]
-
-                yield send
-        finally:
-            process.terminate()
-
-
-def wait_for(condition, seconds=20.0):
-    end = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    return found
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+@needs_chromium
 def test_sticks_reach_the_server(tmp_path):
     server, sticks = serve_page(port=18500), []
     server.on_gamepad = sticks.append
@@ -76,7 +36,7 @@ def test_sticks_reach_the_server(tmp_path):
             send("Page.addScriptToEvaluateOnNewDocument", source=STAND_IN)
             send("Page.navigate", url=f"{page_url(server)}/gamepad")
             named = "document.querySelector('p')?.textContent.startsWith('Stand-in')"
-            wait_for(lambda: send("Runtime.evaluate", expression=named)["result"].get("value"))
+            wait_for(lambda: evaluated(send, named))
             # Centered sticks leave the sampled commands alone.
             time.sleep(0.3)
             assert sticks == []

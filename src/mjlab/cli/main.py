@@ -184,6 +184,23 @@ interval, and the success rate if the task defines success.""",
         ),
     ),
     Command(
+        "share",
+        "watch",
+        "a page to send: episodes in 3-D, curve, evaluation",
+        argument="POLICY",
+        details="""\
+Write one HTML file that opens offline in any browser: recorded episodes to turn and scrub in 3-D,
+commands, rewards, learning curve, evaluation with its intervals, and where the policy comes from.
+
+POLICY is the folder of a run, a checkpoint (.pt), an exported policy (.onnx) of a run, or a bundled
+policy (go1, g1). Values are those of `evaluate --output`; without it, the page says how to measure.""",
+        examples=(
+            "share g1 --output g1.html",
+            "share logs/rsl_rl/go1_velocity/2026-01-02_03-04-05",
+            "share go1 --num-episodes 3 --seconds 6 --num-envs 4",
+        ),
+    ),
+    Command(
         "runs",
         "watch",
         "your runs of a task, their settings and scores",

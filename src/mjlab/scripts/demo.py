@@ -25,14 +25,22 @@ class Demo:
     """Profile that defines the observations and actions of the policy."""
     policy: Path
     """Path of the exported policy."""
+    evaluation: Path
+    """Path of its evaluation."""
 
 
 DEMOS = {
     "go1": Demo(
-        "Mjlab-Velocity-Flat-Unitree-Go1-No-State-Estimation", None, _FOLDER / "go1_velocity.onnx"
+        "Mjlab-Velocity-Flat-Unitree-Go1-No-State-Estimation",
+        None,
+        _FOLDER / "go1_velocity.onnx",
+        _FOLDER / "evaluation.json",
     ),
     "g1": Demo(
-        "Mjlab-Velocity-Flat-Unitree-G1-No-State-Estimation", "cpu", _FOLDER / "g1_velocity.onnx"
+        "Mjlab-Velocity-Flat-Unitree-G1-No-State-Estimation",
+        "cpu",
+        _FOLDER / "g1_velocity.onnx",
+        _FOLDER / "g1_evaluation.json",
     ),
 }
 

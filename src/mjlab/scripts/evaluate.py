@@ -88,7 +88,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     try:
         policy = make_policy(task, env, cfg.agent, checkpoint, device, cfg.profile)
         if checkpoint is not None:
-            _load_curricula(task, env, checkpoint)
+            load_curricula_of(task, env, checkpoint)
         with EvaluationProgress(cfg.num_episodes) as progress:
             result = evaluate_policy(
                 env,
@@ -124,7 +124,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     return metrics
 
 
-def _load_curricula(task: str, env: Any, checkpoint: Checkpoint) -> None:
+def load_curricula_of(task: str, env: Any, checkpoint: Checkpoint) -> None:
     """Restore the curricula of the policy's run; print a line if their state is unknown."""
     from mjlab.rl.evaluation import load_curricula
 

@@ -64,7 +64,7 @@ from mjlab.runs.settings import Settings, differences, is_of_the_session, typed_
 from mjlab.utils.lazy import import_to_stay
 from mjlab.utils.logging import beside_results, print_list, print_notice
 from mjlab.utils.os import to_plain
-from mjlab.utils.processes import ProcessRank, end_with_launcher, process_rank
+from mjlab.utils.processes import ProcessRank, end_with_launcher, machine, process_rank
 from mjlab.utils.ranges import check_ranges
 from mjlab.utils.signals import Interrupted
 
@@ -223,6 +223,7 @@ def _train(
                     learner=cfg.learner_name,
                     command=sys.argv,
                     started=datetime.now().isoformat(),
+                    machine=machine(device),
                     settings=settings,
                     prepared=[
                         one.path for one in differences(cfg.env, to_plain(requested.env), "env")

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import math
 import os
+import platform
 import signal
 import threading
 import time
@@ -131,6 +132,25 @@ def end_with_launcher() -> None:
 def cores_per_process() -> int:
     """Return the number of CPU cores per process of the run on this machine, at least 1."""
     return max(1, available_cores() // process_rank().local_world_size)
+
+
+def machine(device: str) -> str:
+    """Return a description of this machine: cores, processor and, for a CUDA device, GPU."""
+    found = f"{available_cores()} cores ({processor()})"
+    if device.startswith("cuda"):
+        import torch
+
+        found += f", {torch.cuda.get_device_name(device)}"
+    return found
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    file = Path("/proc/cpuinfo")
+    for line in file.read_text().splitlines() if file.exists() else ():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def available_cores() -> int:

@@ -11,7 +11,7 @@ import re
 import secrets
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from typing import Any
 from urllib.parse import parse_qs
@@ -45,12 +45,9 @@ class PageServer(viser.ViserServer):
 
     def __init__(self, host: str, port: int, names: set[str]) -> None:
         """Start serving; browsers may also use the page by these `names`, in lower case."""
-        console = rich.get_console()
-        quiet, console.quiet = console.quiet, True  # Viser would print its own address.
-        try:
+        # Viser would print its own address.
+        with _quiet_console():
             super().__init__(_random_loopback_address(), 0, verbose=False)
-        finally:
-            console.quiet = quiet
         self._viser_address = super().get_host(), super().get_port()
         self._page_address = host, port
         own = socket.gethostname().lower()
@@ -85,7 +82,8 @@ class PageServer(viser.ViserServer):
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._stopping.set)
         self._proxy.join(timeout=1.0)
-        super().stop()
+        with _quiet_console():
+            super().stop()
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Return None: viser's tunnel passes by the proxy, and does not find viser's address."""
@@ -238,6 +236,17 @@ async def _copy(source: asyncio.StreamReader, target: asyncio.StreamWriter) -> N
             target.write(data)
             await target.drain()
     target.close()
+
+
+@contextlib.contextmanager
+def _quiet_console() -> Generator[None]:
+    """Leave out what viser prints within the block."""
+    console = rich.get_console()
+    quiet, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = quiet
 
 
 def _random_loopback_address() -> str:

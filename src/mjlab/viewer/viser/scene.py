@@ -21,7 +21,12 @@ import viser.transforms as vtf
 from mjviser import ViserMujocoScene
 from mjviser.conversions import group_geoms_by_visual_compat, merge_geoms
 
-from mjlab.viewer.camera import CameraView, first_moving_body, whole_model_view
+from mjlab.viewer.camera import (
+    CameraView,
+    first_moving_body,
+    resolve_camera,
+    whole_model_view,
+)
 from mjlab.viewer.model_sync import VIEWER_MODEL_FIELDS as VIEWER_MODEL_FIELDS
 from mjlab.viewer.model_sync import copy_state, host_model, sync_model_fields, to_numpy
 from mjlab.viewer.viser.look import set_look, set_plain_look, without_metal
@@ -379,6 +384,33 @@ class MjlabViserScene(ViserMujocoScene, ViserDebugVisualizer):
         @reset.on_click
         def _(_: Any) -> None:
             self.aim()
+
+
+def scene_of(env: Any, server: viser.ViserServer) -> MjlabViserScene:
+    """Return the scene of an unwrapped environment, with the drawings of its commands.
+
+    Other drawings are switched off: too many arrows say nothing.
+    """
+    model, cfg = env.sim.mj_model, env.cfg.viewer
+    scene = MjlabViserScene(
+        server,
+        model,
+        env.num_envs,
+        env.sim.model,
+        env.sim.expanded_fields,
+        view=resolve_camera(cfg, model, env.scene.entities),
+        geom_group=cfg.geom_group,
+        site_group=cfg.site_group,
+    )
+    # Reading a field makes the engine provide it.
+    for name in ("xpos", "xmat", *(("mocap_pos", "mocap_quat") if model.nmocap > 0 else ())):
+        getattr(env.sim.data, name)
+    managers = env.manager_visualizers.items()
+    hidden = [part for manager, part in managers if manager != "command_manager"]
+    for part in (*hidden, env.sensor_visualizers):
+        for name, _ in part.get_visualizable_terms():
+            part.set_debug_vis(name, False)
+    return scene
 
 
 def geom_group_meanings(model: mujoco.MjModel) -> dict[int, str]:

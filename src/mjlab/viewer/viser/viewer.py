@@ -25,7 +25,6 @@ from mjlab.utils.os import files_in
 from mjlab.utils.string import encodable, escaped
 from mjlab.viewer import gamepad
 from mjlab.viewer.base import BaseViewer, VerbosityLevel, ViewerAction, ViewerStatus, reset_policy
-from mjlab.viewer.camera import resolve_camera
 from mjlab.viewer.native.keys import BINDINGS, KEY_HELP, STEERING_HELP, Binding
 from mjlab.viewer.page_proxy import PageServer
 from mjlab.viewer.page_server import DEFAULT_HOST as DEFAULT_HOST
@@ -39,7 +38,7 @@ from mjlab.viewer.viser.overlays import (
     ViserDebugOverlays,
     ViserTermOverlays,
 )
-from mjlab.viewer.viser.scene import MjlabViserScene
+from mjlab.viewer.viser.scene import MjlabViserScene, scene_of
 
 if TYPE_CHECKING:
     from mjlab.viewer.base import EnvProtocol, PolicyProtocol
@@ -158,16 +157,7 @@ class ViserPlayViewer(BaseViewer):
     def setup(self) -> None:
         env, cfg = self.env.unwrapped, self.cfg
         model = env.sim.mj_model
-        scene = self._scene = MjlabViserScene(
-            self._server,
-            model,
-            env.num_envs,
-            env.sim.model,
-            env.sim.expanded_fields,
-            view=resolve_camera(cfg, model, env.scene.entities),
-            geom_group=cfg.geom_group,
-            site_group=cfg.site_group,
-        )
+        scene = self._scene = scene_of(env, self._server)
         scene.set_refresh_handler(lambda: self._update_reasons.add(UpdateReason.SCENE_REQUEST))
         scene.env_idx = self._shown_env = min(max(cfg.env_idx, 0), env.num_envs - 1)
         self._term_overlays = ViserTermOverlays(
@@ -178,15 +168,6 @@ class ViserPlayViewer(BaseViewer):
         )
         self._debug_overlays = ViserDebugOverlays(env, scene)
         self._contact_overlays = ViserContactOverlays(scene)
-        # Reading a field makes the engine provide it.
-        for name in ("xpos", "xmat", *(("mocap_pos", "mocap_quat") if model.nmocap > 0 else ())):
-            getattr(env.sim.data, name)
-        # Too many arrows say nothing; the switches under Debug Viz show them.
-        managers = env.manager_visualizers.items()
-        hidden = [part for manager, part in managers if manager != "command_manager"]
-        for part in (*hidden, env.sensor_visualizers):
-            for name, _ in part.get_visualizable_terms():
-                part.set_debug_vis(name, False)
         self._create_gui()
 
     def is_running(self) -> bool:
