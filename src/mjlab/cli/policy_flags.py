@@ -229,15 +229,17 @@ def report_policy(
     run.check_terms(env, ("actor", "student"))
 
 
-def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Run | None) -> None:
+def prepare_teacher(
+    task: str, env: ManagerBasedRlEnvCfg, cfg: RslRlBaseRunnerCfg, resumed: Run | None
+) -> None:
     """Resolve checkpoint and network of the teacher in a distillation config, in place.
 
-    The network is that of the teacher's run. A `resumed` run keeps its teacher. Other configs are
-    unchanged.
+    The network is that of the teacher's run, which may be of another task with the same terms. A
+    `resumed` run keeps its teacher. Other configs are unchanged.
 
     Raises:
-        UserError: checkpoint not found, or not a PPO checkpoint of this task; or the resumed run
-            has a different teacher.
+        UserError: checkpoint not found, or not of PPO; the teacher's observation or action terms are
+            not those of `env`; or the resumed run has a different teacher.
         CheckpointError: the checkpoint is damaged.
     """
     if not isinstance(cfg, RslRlDistillationRunnerCfg):
@@ -256,11 +258,9 @@ def prepare_teacher(task: str, cfg: RslRlBaseRunnerCfg, resumed: Run | None) -> 
             raise UserError(
                 f"{flag}: expected a checkpoint of the learner 'ppo', got {checkpoint} of {learner!r}."
             )
-        run = Run(checkpoint.path.parent, task)
-        if not run.is_of(task, None):
-            raise UserError(
-                f"{flag}: expected a checkpoint of {task}, got {checkpoint} of {run.info['task']}."
-            )
+        run = Run(checkpoint.path.parent)
+        run = Run(run.folder, run.task or task)
+        run.check_teacher(env, cfg.obs_groups.get("teacher", ()))
         cfg.teacher_checkpoint = str(checkpoint)
         of_teacher: Any = run.cfg("train", learner="ppo").agent
         cfg.teacher = of_teacher.actor

@@ -403,19 +403,33 @@ class Run:
         Raises:
             UserError: names or order differ.
         """
+        groups = self.params["agent"].get("obs_groups")
+        lists = [groups.get(network) for network in networks] if isinstance(groups, dict) else ()
+        read = [group for names in lists if isinstance(names, list) for group in names]
+        self._check_terms(env, {group: group for group in read})
+
+    def check_teacher(self, env: ManagerBasedRlEnvCfg, groups: Iterable[str]) -> None:
+        """Check that the actor of the run, maybe of another task, can act on observation `groups` of `env`.
+
+        Raises:
+            UserError: names or order of observation or action terms differ.
+        """
+        read = self.recorded("agent.obs_groups.actor")
+        pairs = zip(read if isinstance(read, list) else ("actor",), groups, strict=False)
+        self._check_terms(env, dict(pairs))
+
+    def _check_terms(self, env: ManagerBasedRlEnvCfg, groups: Mapping[str, str]) -> None:
+        """Compare the action terms, and those of observation `groups`: recorded name, name in `env`."""
         from mjlab.rl.checkpoint import other_terms
 
         # Weights & Biases does not keep the order of what it stores.
         if self.folder.parent.name == WANDB_CACHE:
             return
-        groups = self.params["agent"].get("obs_groups")
-        lists = [groups.get(network) for network in networks] if isinstance(groups, dict) else ()
-        read = [group for names in lists if isinstance(names, list) for group in names]
         recorded, actions = (self.params["env"].get(name) for name in ("observations", "actions"))
         pairs = {"actions": (actions, env.actions)}
         for group, then in recorded.items() if isinstance(recorded, dict) else ():
-            now = env.observations.get(group)
-            if now is not None and isinstance(then, dict) and group in read:
+            now = env.observations.get(groups.get(group, ""))
+            if now is not None and isinstance(then, dict):
                 pairs[f"observations.{group}"] = then.get("terms"), now.terms
         known = {name: pair for name, pair in pairs.items() if isinstance(pair[0], dict)}
         trained, used = ({name: _names(pair[i]) for name, pair in known.items()} for i in (0, 1))

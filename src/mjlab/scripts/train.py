@@ -179,7 +179,7 @@ def _train(
     if rank.is_first:
         report_moved_goal(task, cfg)
     with fail_together():
-        prepare_teacher(task, cfg.agent, run)
+        prepare_teacher(task, cfg.env, cfg.agent, run)
     with _run_folder(cfg, rank, output) as folder, contextlib.ExitStack() as stack:
         with fail_together():
             fetched_from = None if checkpoint is None else cfg.wandb_run_path
