@@ -194,6 +194,7 @@ ACTING: dict[str, Settings] = {
         "algorithm.learning_rate": 1e-5,
         "algorithm.max_grad_norm": 1e-3,
         "algorithm.loss_type": "huber",
+        "algorithm.teacher_iterations": 4,
         "algorithm.optimizer": "rmsprop",
         "algorithm.use_mixed_precision": True,
     },

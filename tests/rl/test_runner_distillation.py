@@ -32,7 +32,10 @@ def teacher(tmp_path_factory) -> Path:
 
 
 def student_runner(
-    folder: Path | None = None, of_teacher: dict[str, Any] | None = None, **of_student: Any
+    folder: Path | None = None,
+    of_teacher: dict[str, Any] | None = None,
+    of_algorithm: dict[str, Any] | None = None,
+    **of_student: Any,
 ) -> MjlabOnPolicyRunner:
     student = {"hidden_dims": (16,), "distribution_cfg": gaussian_distribution(0.3), **of_student}
     cfg = RslRlDistillationRunnerCfg(
@@ -46,7 +49,9 @@ def student_runner(
             distribution_cfg=gaussian_distribution(),
             **(of_teacher or {}),
         ),
-        algorithm=RslRlDistillationAlgorithmCfg(gradient_length=3, learning_rate=1e-2),
+        algorithm=RslRlDistillationAlgorithmCfg(
+            gradient_length=3, learning_rate=1e-2, **(of_algorithm or {})
+        ),
     )
     env = RslRlVecEnvWrapper(FakeEnv(FakeEnvCfg()))
     return MjlabOnPolicyRunner(env, asdict(cfg), None if folder is None else str(folder))
@@ -71,7 +76,12 @@ def test_the_student_acts_as_the_teacher_in_the_end(teacher):
 
 
 @pytest.mark.parametrize(
-    "of_student", [{}, {"class_name": "RNNModel", "rnn_type": "lstm", "rnn_hidden_dim": 4}]
+    "of_student",
+    [
+        {},
+        {"class_name": "RNNModel", "rnn_type": "lstm", "rnn_hidden_dim": 4},
+        {"of_algorithm": {"teacher_iterations": 5}},
+    ],
 )
 def test_a_resumed_run_takes_the_same_course(teacher, tmp_path, of_student):
     torch.manual_seed(3)
@@ -90,6 +100,38 @@ def test_a_resumed_run_takes_the_same_course(teacher, tmp_path, of_student):
     second.learn(6)
     expected, found = (runner.alg.student.state_dict() for runner in (whole, second))
     assert all(torch.equal(found[name], value) for name, value in expected.items())
+
+
+def test_the_teacher_acts_in_fewer_and_fewer_environments(teacher):
+    torch.manual_seed(4)
+    runner = student_runner(
+        of_algorithm={"teacher_iterations": 4}, distribution_cfg=gaussian_distribution(1e-4)
+    )
+    runner.load_teacher(str(teacher))
+    act, driven = runner.alg.act, []
+
+    def acting(observations):
+        actions = act(observations)
+        distance = (actions - runner.alg.teacher(observations)).abs().amax(dim=1)
+        driven.append(distance < 1e-3)
+        return actions
+
+    runner.alg.act = acting
+    runner.learn(6)
+    of_iterations = torch.stack(driven).unflatten(0, (6, 6))
+    # The same environments in all steps of an iteration.
+    assert (of_iterations == of_iterations[:, :1]).all()
+    shares = of_iterations[:, 0].float().mean(dim=1)
+    assert shares[0] == 1.0
+    assert 0.0 < shares[1:4].mean() < 1.0
+    assert (shares[4:] == 0.0).all()
+
+
+def test_a_correction_has_a_value_per_action_and_a_flag():
+    with pytest.raises(ValueError, match="correction: expected an observation group of shape"):
+        student_runner(of_algorithm={"correction": "actor"})
+    with pytest.raises(ValueError, match="'unknown' of shape None. Available:"):
+        student_runner(of_algorithm={"correction": "unknown"})
 
 
 def test_a_teacher_with_memory_keeps_it_from_one_iteration_to_the_next(tmp_path):

@@ -206,12 +206,19 @@ class RslRlDistillationAlgorithmCfg:
     max_grad_norm: Limit | None = 1.0
     """Maximum gradient norm; larger gradients are rescaled. None: unlimited."""
     loss_type: Literal["mse", "huber"] = "mse"
-    """Loss between the actions of student and teacher."""
+    """Loss between the actions of student and teacher. `huber` limits the influence of large actions,
+    as a teacher's are where it has never been."""
+    teacher_iterations: CountOrZero = 0
+    """Number of iterations in which the teacher acts in some environments, a share that falls from 1 to
+    0. 0: the student acts from the start."""
+    correction: str | None = None
+    """Observation group that corrects the teacher, (N, actions + 1): where the last column is 1, the
+    student imitates the others instead. For what the teacher sees and the student does not."""
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
     """Optimizer."""
     use_mixed_precision: bool = False
     """Use mixed precision in updates (bfloat16 networks)."""
-    class_name: str = "Distillation"
+    class_name: str = "mjlab.rl.dagger:DAgger"
     """rsl_rl class name, or `module:Class`."""
 
 

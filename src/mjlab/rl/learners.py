@@ -28,7 +28,12 @@ _ADDED: dict[str, Any] = {
     "upload_git_diff": False,
     "evaluation": asdict(EvaluationCfg()),
 }
-_ADDED_TO_ALGORITHM = {"symmetry_cfg": None, "use_mixed_precision": False}
+_ADDED_TO_ALGORITHM = {
+    "symmetry_cfg": None,
+    "use_mixed_precision": False,
+    "teacher_iterations": 0,
+    "correction": None,
+}
 
 
 def learner_of(cfg: RslRlBaseRunnerCfg) -> Learner:
