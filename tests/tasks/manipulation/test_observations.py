@@ -78,6 +78,17 @@ def test_the_goal_is_seen_from_the_object_in_the_frame_of_the_root(env):
     close(mdp.object_to_goal_distance(env, "cube", "lift_height"), rows(env, row))
 
 
+def test_the_object_of_the_command_is_seen_as_any_object(env, hand):
+    assert torch.equal(
+        mdp.ee_to_target_object(env, "lift_height", hand),
+        mdp.ee_to_object_distance(env, "cube", hand),
+    )
+    assert torch.equal(
+        mdp.target_object_to_goal(env, "lift_height"),
+        mdp.object_to_goal_distance(env, "cube", "lift_height"),
+    )
+
+
 def test_the_goal_is_seen_from_the_hand_in_the_frame_of_the_hand(env, hand):
     def row(model, data, goal):
         return data.site(SITE).xmat.reshape(3, 3).T @ (goal - data.site(SITE).xpos)

@@ -30,8 +30,10 @@ __all__ = [
     "camera_segmentation",
     "camera_target_cube_mask",
     "ee_to_object_distance",
+    "ee_to_target_object",
     "ee_velocity",
     "object_to_goal_distance",
+    "target_object_to_goal",
     "target_position",
 ]
 
@@ -66,6 +68,32 @@ def object_to_goal_distance(
     goal = goal_command(env, command_name, LiftingCommand).target_pos
     offset = goal - target.data.root_link_pos_w
     return quat_apply_inverse(asset.data.root_link_quat_w, offset)
+
+
+def ee_to_target_object(
+    env: ManagerBasedRlEnv, command_name: str, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Vector from the end effector to the object of a command in the frame of the root (m), (N, 3).
+
+    Raises:
+        TypeError: the command is not a `LiftingCommand` or `MultiCubeLiftingCommand`.
+    """
+    target = goal_command(env, command_name).object_pos()
+    root = env.scene[asset_cfg.name].data.root_link_quat_w
+    return quat_apply_inverse(root, target - site_pos(env, asset_cfg))
+
+
+def target_object_to_goal(
+    env: ManagerBasedRlEnv, command_name: str, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
+) -> torch.Tensor:
+    """Vector from the object of a command to its goal in the frame of the root (m), (N, 3).
+
+    Raises:
+        TypeError: the command is not a `LiftingCommand` or `MultiCubeLiftingCommand`.
+    """
+    command = goal_command(env, command_name)
+    root = env.scene[asset_cfg.name].data.root_link_quat_w
+    return quat_apply_inverse(root, command.target_pos - command.object_pos())
 
 
 def target_position(

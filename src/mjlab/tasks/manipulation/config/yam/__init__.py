@@ -35,19 +35,22 @@ _RL_CFG = "mjlab.tasks.manipulation.config.yam.rl_cfg"
 _RUNNER = "mjlab.tasks.manipulation.rl"
 _PROFILES = "mjlab.tasks.manipulation.config.yam.rl_cfg"
 
-# Task: environment config, runner config, profile.
-for _task, (_env, _rl, _profile) in {
-    "Mjlab-Lift-Cube-Yam": ("lift_cube", "lift_cube", "cpu"),
-    "Mjlab-Lift-Cube-Yam-Rgb": ("lift_cube_rgb", "lift_cube_vision", "cpu_vision"),
-    "Mjlab-Lift-Cube-Yam-Depth": ("lift_cube_depth", "lift_cube_vision", "cpu_vision"),
-    "Mjlab-Multi-Cube-Seg-Yam": ("multi_cube_seg", "multi_cube_seg", "cpu_vision"),
+_OF_STATE = {"cpu": f"{_PROFILES}:cpu"}
+_OF_IMAGES = {"cpu": f"{_PROFILES}:cpu_vision", "student": f"{_PROFILES}:student"}
+
+# Task: environment config, runner config, profiles.
+for _task, (_env, _rl, _profiles) in {
+    "Mjlab-Lift-Cube-Yam": ("lift_cube", "lift_cube", _OF_STATE),
+    "Mjlab-Lift-Cube-Yam-Rgb": ("lift_cube_rgb", "lift_cube_vision", _OF_IMAGES),
+    "Mjlab-Lift-Cube-Yam-Depth": ("lift_cube_depth", "lift_cube_vision", _OF_IMAGES),
+    "Mjlab-Multi-Cube-Seg-Yam": ("multi_cube_seg", "multi_cube_seg", _OF_IMAGES),
 }.items():
     register_mjlab_task(
         task_id=_task,
         env_cfg=f"{_ENV_CFGS}:yam_{_env}_env_cfg",
         rl_cfg=f"{_RL_CFG}:yam_{_rl}_ppo_runner_cfg",
         runner_cls=f"{_RUNNER}:ManipulationOnPolicyRunner",
-        profiles={"cpu": f"{_PROFILES}:{_profile}"},
+        profiles=_profiles,
     )
 
 __getattr__ = lazy_names(

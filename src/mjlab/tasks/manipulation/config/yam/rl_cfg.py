@@ -15,6 +15,7 @@ torsional friction, steps are twice as fast, but the cube turns and slips out of
 
 from __future__ import annotations
 
+import copy
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -22,15 +23,31 @@ from typing import Any
 import torch
 
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.managers import RewardTermCfg
+from mjlab.managers import (
+    ObservationGroupCfg,
+    ObservationTermCfg,
+    RewardTermCfg,
+    SceneEntityCfg,
+)
 from mjlab.rl.config import (
     EvaluationCfg,
+    RslRlBaseRunnerCfg,
+    RslRlDistillationAlgorithmCfg,
+    RslRlDistillationRunnerCfg,
     RslRlModelCfg,
     RslRlOnPolicyRunnerCfg,
     gaussian_distribution,
 )
+from mjlab.rl.learners import with_learner
 from mjlab.tasks.cpu_profile import cpu_profile
 from mjlab.tasks.manipulation import mdp
+from mjlab.tasks.manipulation.config.yam.env_cfgs import (
+    CAMERA,
+    DEPTH_CUTOFF,
+    HAND,
+    yam_lift_cube_env_cfg,
+)
+from mjlab.tasks.registry import Profile
 
 _REACH, _NARROW_REACH = "lift", "lift_narrow"
 _NARROW_STD = 0.04
@@ -45,6 +62,19 @@ _COMMAND = "lift_height"
 _FINGERS = {"left_finger": (0.02, 0.03), "right_finger": (-0.02, -0.03)}
 # Times between goals in training (s), for more starts: a policy that lifts needs 2 s.
 _TRAINING_TIMES = (3.0, 5.0)
+# Of a maximum return of 3000.
+_TRIGGER = 1800.0
+_TEACHER = "teacher"
+_SEARCH = "search"
+_STUDENT_STEPS = 16
+_TEACHER_ITERATIONS = 100
+# Joint targets (rad, m) that hold the camera over all places of cubes, with open fingers.
+_LOOKING = {
+    "joint2": 1.00,
+    "joint3": 1.60,
+    "joint4": -0.73,
+    "left_finger": 0.1,
+}
 _CNN: dict[str, Any] = {
     "output_channels": [16, 32],
     "kernel_size": [5, 3],
@@ -171,7 +201,7 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None
 
 def _evaluate(
     _env_cfg: ManagerBasedRlEnvCfg,
-    rl_cfg: RslRlOnPolicyRunnerCfg,
+    rl_cfg: RslRlBaseRunnerCfg,
     trigger_return: float | None = None,
 ) -> None:
     evaluation = rl_cfg.evaluation
@@ -187,9 +217,72 @@ cpu = cpu_profile(_ease, **_SHARED)
 
 # Image encoders take most of the time, above all in the update.
 cpu_vision = cpu_profile(
-    # Of a maximum return of 3000.
-    partial(_evaluate, trigger_return=1800.0),
+    partial(_evaluate, trigger_return=_TRIGGER),
     num_envs=256,
     **_SHARED,
 )
 """Profile of the image-based tasks."""
+
+
+def _imitate_policy_of_state(
+    env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg
+) -> RslRlBaseRunnerCfg:
+    """Let the image-based policy imitate one that is trained in the state-based task under `cpu`."""
+    state_env_cfg, state_rl_cfg = yam_lift_cube_env_cfg(), yam_lift_cube_ppo_runner_cfg()
+    cpu.policy(state_env_cfg, state_rl_cfg)
+    env_cfg.observations[_SEARCH] = ObservationGroupCfg(terms={"joints": _search()})
+    env_cfg.observations[_TEACHER] = _of_target_cube(state_env_cfg.observations["critic"])
+    rl_cfg.num_steps_per_env, rl_cfg.max_iterations = _STUDENT_STEPS, 4000
+    cfg = with_learner(rl_cfg, "distillation")
+    assert isinstance(cfg, RslRlDistillationRunnerCfg)
+    cfg.teacher = state_rl_cfg.actor
+    cfg.obs_groups["teacher"] = (_TEACHER,)
+    cfg.algorithm = RslRlDistillationAlgorithmCfg(
+        num_learning_epochs=3,
+        gradient_length=1,
+        loss_type="huber",
+        teacher_iterations=_TEACHER_ITERATIONS,
+        correction=_SEARCH,
+    )
+    return cfg
+
+
+def _of_target_cube(state: ObservationGroupCfg) -> ObservationGroupCfg:
+    """Return observations of the state-based task, of the cube that the command selects."""
+    state = copy.deepcopy(state)
+    for name, func in {
+        "ee_to_cube": mdp.ee_to_target_object,
+        "cube_to_goal": mdp.target_object_to_goal,
+    }.items():
+        term = state.terms[name]
+        term.func = func
+        term.params.pop("object_name")
+        term.params["command_name"] = _COMMAND
+    return state
+
+
+def _search() -> ObservationTermCfg:
+    """Return the term of joint positions from which all cubes can be seen, for cubes out of sight."""
+    return ObservationTermCfg(
+        func=mdp.search_action,
+        params={
+            "command_name": _COMMAND,
+            "sensor_name": CAMERA,
+            "joint_pos": _LOOKING,
+            "max_depth": DEPTH_CUTOFF,
+            "near": 0.08,
+            "asset_cfg": SceneEntityCfg("robot", site_names=HAND),
+        },
+    )
+
+
+def _ease_imitation(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
+    env_cfg.scene.num_envs = 256
+    env_cfg.commands[_COMMAND].resampling_time_range = _TRAINING_TIMES
+    _evaluate(env_cfg, rl_cfg, _TRIGGER)
+    # An evaluation takes a minute and a half.
+    rl_cfg.evaluation.min_interval = 200
+
+
+student = Profile(_imitate_policy_of_state, _ease_imitation)
+"""Profile of the image-based tasks: imitation of a policy of the state-based task."""
