@@ -15,7 +15,7 @@ from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg, runner_cfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.evaluation import SolvedCheck, episodes_to_show
-from mjlab.rl.plot import read_scalars
+from mjlab.rl.plot import DEFAULT_TAG, read_all_scalars, read_scalars
 from mjlab.rl.run_logger import TrainingObserver
 
 BOUND = 0.05
@@ -98,6 +98,20 @@ def test_training_stops_where_other_episodes_confirm_and_reports_those(tmp_path:
     iterations, rates = read_scalars(tmp_path / "run", "Confirmation/failure_rate")
     assert list(iterations + 1) == [iteration for _, iteration, _, _ in confirmations]
     assert rates[-1] == pytest.approx(confirmations[-1][3])
+
+
+def test_the_first_group_of_scalars_has_what_the_task_aims_at(tmp_path: Path):
+    runner, _ = learner(SEED, tmp_path / "run")
+    runner.learn(100)
+    curves = read_all_scalars(tmp_path / "run")
+    first = {tag: curve for tag, curve in curves.items() if tag.startswith("Aim/")}
+    assert min(curves) in first
+    assert first.keys() == {"Aim/exploring_return", "Aim/mean_return", "Aim/failure_rate"}
+    for of, tag in (
+        ("Aim/failure_rate", "Evaluation/failure_rate"),
+        ("Aim/exploring_return", DEFAULT_TAG),
+    ):
+        assert first[of][1].tolist() == curves[tag][1].tolist()
 
 
 def test_no_two_samples_share_a_seed_with_each_other_or_with_training():

@@ -257,6 +257,23 @@ def test_goals_besides_the_return_have_their_own_axes(tmp_path: Path, figures):
     assert {y for _, y in points_of(failures, "goal")} == {5.0}
 
 
+def test_seeds_are_drawn_with_what_solves_the_task(tmp_path: Path, figures):
+    evaluation = EvaluationCfg(solved_below={"speed_error": 0.2}, units={"speed_error": "m/s"})
+    runs = []
+    for at in (2, 3):
+        others = {"Train/speed_error": {0: 0.5, 4: 0.2}, "Evaluation/speed_error": {at: 0.1}}
+        runs.append(write_run(tmp_path / str(at), {0: 1.0, 4: 2.0}, others=others))
+    plot_seeds(runs, tmp_path / "seeds.png", evaluation=evaluation)
+    _, errors = figures[0].axes
+    assert errors.get_title() == "Speed error (m/s)"
+    drawn = [line.get_xydata().tolist() for line in errors.lines[1:4:2]]
+    assert drawn == [[[3.0, pytest.approx(0.1)]], [[4.0, pytest.approx(0.1)]]]
+    assert {y for _, y in points_of(errors, "goal")} == {0.2}
+    # Another tag is drawn alone.
+    plot_seeds(runs, tmp_path / "seeds.png", tag=DEFAULT_TAG, evaluation=evaluation)
+    assert len(figures[1].axes) == 1
+
+
 @pytest.mark.parametrize("tag", ["Train/mean_step_reward", "Train/mean_reward"])
 def test_runs_without_a_return_have_another_unit(tmp_path: Path, figures, tag):
     run = write_run(tmp_path, {0: 1.0, 1: 2.0}, tag=tag)

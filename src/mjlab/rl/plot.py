@@ -198,7 +198,6 @@ def plot_run(
         ValueError: see `read_scalars`.
     """
     from mjlab.rl.evaluation import Bound
-    from mjlab.rl.progress import label
 
     folder, curves = _folders(run)[-1], read_all_scalars(run)
     shown = default_tag([curves]) if tag is None else tag
@@ -213,12 +212,7 @@ def plot_run(
         _draw_evaluations(top, curves, "mean_return", goals[0] if goals else None)
     for axes, bound in zip(below, others, strict=True):
         _draw_evaluations(axes, curves, bound.name, bound)
-        axes.set_xlim(top.get_xlim())
-        name, unit = label(bound.name).capitalize(), "%" if bound.is_rate else bound.unit
-        axes.set_title(f"{name} ({unit})" if unit else name, fontsize="small")
-        axes.tick_params(labelsize="small")
-        if axes.dataLim.y0 >= 0.0:
-            axes.set_ylim(bottom=0.0)
+        _finish_small(axes, bound, top)
     _add_environment_steps(top, curves)
     title = folder.resolve().name if title is None else title
     return _save(figure, folder / "learning_curve.png" if output is None else output, title)
@@ -246,6 +240,18 @@ def _draw_evaluations(
             axes.plot(curve[0] + 1, scale * curve[1], label=group.lower(), **style)
     if goal is not None:
         _draw_goal(axes, scale * goal.limit)
+
+
+def _finish_small(axes: Axes, bound: Bound, top: Axes) -> None:
+    """Name the value on small axes, which share the iterations of `top`."""
+    from mjlab.rl.progress import label
+
+    axes.set_xlim(top.get_xlim())
+    name, unit = label(bound.name).capitalize(), "%" if bound.is_rate else bound.unit
+    axes.set_title(f"{name} ({unit})" if unit else name, fontsize="small")
+    axes.tick_params(labelsize="small")
+    if axes.dataLim.y0 >= 0.0:
+        axes.set_ylim(bottom=0.0)
 
 
 def _draw_goal(axes: Axes, goal: float) -> None:
@@ -283,6 +289,7 @@ def plot_seeds(
     tag: str | None = None,
     title: str | None = None,
     goal: float | None = None,
+    evaluation: EvaluationCfg | Mapping[str, Any] | None = None,
 ) -> Path:
     """Plot the mean over runs with different seeds, with one sample standard deviation shaded.
 
@@ -295,6 +302,9 @@ def plot_seeds(
         tag: Tag to plot, as in the event files. None: the return of the exploring policy.
         title: Title of the figure; None: the number of seeds.
         goal: Value to mark by a line.
+        evaluation: `EvaluationCfg` of the runs, or its fields by name: without `tag`, what solves the
+            task besides the return is drawn on its own axes for each run: evaluations as points, values
+            while exploring as lines.
 
     Returns:
         Path of the PNG file.
@@ -305,8 +315,17 @@ def plot_seeds(
     groups = runs if isinstance(runs, Mapping) else {"": runs}
     if not groups or not all(groups.values()):
         raise ValueError(f"runs: expected at least one run folder, got {runs}.")
+    from mjlab.rl.evaluation import Bound
+
     read = {name: [(run, read_all_scalars(run)) for run in of] for name, of in groups.items()}
-    tag = tag or default_tag([curves for of in read.values() for _, curves in of])
+    bounds = Bound.all_of(EvaluationCfg.of(evaluation)) if tag is None else []
+    every = [curves for of in read.values() for _, curves in of]
+    others = [
+        bound
+        for bound in bounds
+        if bound.name != "mean_return" and any(f"Evaluation/{bound.name}" in c for c in every)
+    ]
+    tag = tag or default_tag(every)
     drawn: dict[str, list[Curve]] = {}
     for name, of in read.items():
         found = [_curve(run, curves, tag) for run, curves in of]
@@ -316,12 +335,21 @@ def plot_seeds(
         count = counted(max(map(len, drawn.values())), "seed")
         over = "seeds" if any(groups) else count
         title = f"Mean and standard deviation over {over}"
-
-    def draw(axes: Axes) -> None:
-        if goal is not None:
-            _draw_goal(axes, goal)
-
-    return plot_curves(drawn, output, title=title, ylabel=LABELS.get(tag, tag), draw=draw)
+    figure, top, below = _new_figure(len(others))
+    colors = _draw_groups(top, drawn)
+    if goal is not None:
+        _draw_goal(top, goal)
+    top.set(xlabel="Iteration", ylabel=LABELS.get(tag, tag))
+    for axes, bound in zip(below, others, strict=True):
+        scale = 100.0 if bound.is_rate else 1.0
+        for color, of in zip(colors, read.values(), strict=True):
+            for _, curves in of:
+                for group, style in (("Train", "-"), ("Evaluation", "o")):
+                    if (curve := curves.get(f"{group}/{bound.name}")) is not None:
+                        axes.plot(curve[0] + 1, scale * curve[1], style, lw=0.8, ms=4, c=color)
+        _draw_goal(axes, scale * bound.limit)
+        _finish_small(axes, bound, top)
+    return _save(figure, output, title)
 
 
 def plot_curves(
@@ -349,10 +377,21 @@ def plot_curves(
         Path of the PNG file.
     """
     figure, axes, _ = _new_figure()
+    _draw_groups(axes, groups)
+    if draw is not None:
+        draw(axes)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    return _save(figure, output, title)
+
+
+def _draw_groups(axes: Axes, groups: Mapping[str, Sequence[Curve]]) -> list[Any]:
+    """Draw mean and standard deviation of each group; return their colors."""
+    colors = []
     for name, curves in groups.items():
         x, mean, std = mean_and_std(curves)
         (line,) = axes.plot(x, mean, label=name or None)
         color = line.get_color()
+        colors.append(color)
         axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=color, lw=0)
         for one in curves:
             # Up to the first and from the last point of the mean.
@@ -366,10 +405,7 @@ def plot_curves(
                         "label": "single seeds",
                     }
                     axes.plot(one[0][part], one[1][part], **style)
-    if draw is not None:
-        draw(axes)
-    axes.set(xlabel=xlabel, ylabel=ylabel)
-    return _save(figure, output, title)
+    return colors
 
 
 def _new_figure(below: int = 0) -> tuple[Figure, Axes, list[Axes]]:

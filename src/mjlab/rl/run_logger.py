@@ -13,18 +13,17 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from rsl_rl.utils.logger import Logger
 
 from mjlab.rl.checkpoint import ensure_writable_folder
+from mjlab.rl.config import EvaluationCfg
+from mjlab.rl.evaluation import Bound, EvaluationResult
 from mjlab.utils.logging import beside_results
 from mjlab.utils.os import replacing
 from mjlab.utils.wandb import check_wandb_login
-
-if TYPE_CHECKING:
-    from mjlab.rl.evaluation import EvaluationResult
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +31,8 @@ logger = logging.getLogger(__name__)
 _LOGGER_TYPES = {"WandbLogWriter": "wandb", "NeptuneLogWriter": "neptune"}
 # Iterations after the first of a session that an estimate of the time left needs.
 _MEASURED = 2
+# TensorBoard shows groups of tags by name: the first one has what the task aims at.
+_FIRST = "Aim"
 # Folders of installed packages.
 _INSTALLED = ("site-packages", "dist-packages")
 
@@ -124,7 +125,8 @@ class RunLogger(Logger):
 
     Step data stays on the device until `finish_iteration` reads all of it at once. Tags in the
     event files are rsl_rl's, `Train/mean_step_reward`, `Train/exploring_return` and `Train/<metric>` of
-    `IterationStats.exploring`.
+    `IterationStats.exploring`. `Aim/` repeats the returns, and the metrics of evaluations that solve the
+    task, in the group that TensorBoard shows first.
 
     Runners with a custom loop, written against rsl_rl, call `log` instead.
     """
@@ -152,6 +154,8 @@ class RunLogger(Logger):
         self._reward_unit = reward_unit
         self._episode_steps = episode_steps
         self._uses_rnd = bool(self.cfg["algorithm"].get("rnd_cfg"))
+        bounds = Bound.all_of(EvaluationCfg.of(self.cfg.get("evaluation")))
+        self._goals = dict.fromkeys(["mean_return", *(bound.name for bound in bounds)])
         # rsl_rl's default is the repository around the virtual environment.
         self.git_status_repos = []
         # Iterations finished, and the time, at the end of the first iteration of this session.
@@ -355,6 +359,9 @@ class RunLogger(Logger):
             scalars["failure_rate"] = result.failure_rate
         scalars |= {name: value.mean for name, value in result.metrics.items()}
         scalars = {f"{group}/{name}": value for name, value in scalars.items()}
+        if group == "Evaluation":
+            found = {name: scalars.get(f"{group}/{name}") for name in self._goals}
+            scalars |= {f"{_FIRST}/{name}": v for name, v in found.items() if v is not None}
         scalars[f"Perf/{group.lower()}_time"] = result.duration
         self.write_scalars(scalars, iteration)
 
@@ -481,6 +488,9 @@ class RunLogger(Logger):
         }
         if stats.exploring_return is not None:
             scalars["Train/exploring_return"] = stats.exploring_return
+            scalars[f"{_FIRST}/exploring_return"] = stats.exploring_return
+        aims = {name: v for name, v in stats.exploring.items() if name in self._goals}
+        scalars |= {f"{_FIRST}/exploring_{name}": value for name, value in aims.items()}
         over_time = {}
         if stats.mean_reward is not None and stats.mean_episode_length is not None:
             scalars["Train/mean_reward"] = stats.mean_reward

@@ -84,7 +84,9 @@ def command(argv: list[str], prog: str) -> None:
         help="name and run folders of a curve; several --group: several curves",
     )  # fmt: skip
     parser.add_argument("--output", type=Path, default=Path("seeds.png"), help="output PNG")
-    parser.add_argument("--tag", help="TensorBoard tag to plot; default: the return")
+    parser.add_argument(
+        "--tag", help="TensorBoard tag to plot; default: the return, and errors that solve the task"
+    )
     parser.add_argument("--title", help="title of the plot")
     args = parser.parse_intermixed_args(argv)
     output = picture_path(args.output, "--output")
@@ -101,9 +103,10 @@ def command(argv: list[str], prog: str) -> None:
     path = plot_seeds(
         {name: [seed.parts for seed in seeds] for name, seeds in groups.items()},
         output,
-        tag=tag,
+        tag=args.tag,
         title=args.title,
         goal=common_goal(every, tag),
+        evaluation=common_evaluation(every),
     )
     print(f"{seeds_table(groups, tag).text()}\n")
     print(path)
@@ -149,6 +152,12 @@ def _differences(runs: Sequence[Run]) -> list[str]:
     paths.discard("agent.max_iterations")
     different = [p for p in sorted(paths) if len({str(run.recorded(p)) for run in runs}) > 1]
     return [*(["task"] if is_mixed else []), *different]
+
+
+def common_evaluation(seeds: Sequence[Seed]) -> EvaluationCfg | None:
+    """Return the conditions of a solved task, None if the runs have different ones."""
+    first = seeds[0].evaluation
+    return first if all(seed.evaluation == first for seed in seeds) else None
 
 
 def common_goal(seeds: Sequence[Seed], tag: str) -> float | None:
