@@ -86,9 +86,10 @@ class Clip:
 
 
 CLIPS = {
+    # The view of the model's camera `side`, as in clips of users.
     "swingup": Clip(
-        "Mjlab-Cartpole-Swingup", lookat=(0.0, 0.0, 1.1), distance=4.4, azimuth=90.0,
-        elevation=-6.0, seconds=5.0,
+        "Mjlab-Cartpole-Swingup", lookat=(0.0, 0.0, 1.0), distance=5.0, azimuth=90.0,
+        elevation=-22.0, seconds=5.0,
     ),
     "go1": Clip(
         DEMOS["go1"].task, None, DEMOS["go1"].policy, num_envs=6, spacing=0.9,
