@@ -163,10 +163,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="duration of an episode")
     parser.add_argument("--bundle", help="folder that `mjlab deploy` wrote from the policy")
     options = parser.parse_args()
-    task, path, flags = policy_of(options.policy, [])
+    task, flags = policy_of(options.policy)
     with tempfile.TemporaryDirectory() as temporary:
         bundle = Path(options.bundle or f"{temporary}/bundle")
-        flags = ["--checkpoint-file", str(path), "--output", str(bundle), "--steps", "100", *flags]
+        flags += ["--output", str(bundle), "--steps", "100"]
         cfg = parse_policy_flags(DeployConfig, flags, task, "deploy", purpose="evaluate")
         if options.bundle is None:
             run_deploy(task, cfg)

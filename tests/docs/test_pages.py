@@ -206,6 +206,7 @@ def _flags_of() -> dict[str, list[object]]:
     from mjlab.scripts.new_robot import NewRobotConfig
     from mjlab.scripts.play import PlayConfig
     from mjlab.scripts.profile_env import ProfileConfig
+    from mjlab.scripts.publish import PublishConfig
     from mjlab.scripts.share import ShareConfig
     from mjlab.scripts.train import TrainConfig
     from mjlab.scripts.verify import VerifyConfig
@@ -238,6 +239,7 @@ def _flags_of() -> dict[str, list[object]]:
         "verify": [VerifyConfig()],
         "check": [CheckConfig()],
         "check-deploy": [CheckDeployConfig()],
+        "publish": [PublishConfig()],
     }
 
 

@@ -52,7 +52,8 @@ class Command:
     summary: str
     """A few words in `mjlab --help`."""
     argument: str | None = None
-    """Required first argument: TASK (a registered task) or another placeholder. None: optional."""
+    """Required first argument: TASK (a registered task), TASK|POLICY or another placeholder. None:
+    optional."""
     details: str = ""
     """Text of `--help`. Without `details` and `argument`, the function handles `--help`."""
     examples: tuple[str, ...] = ()
@@ -74,10 +75,16 @@ class Command:
             ]
         if self.argument:
             lines.append(f"`uv run mjlab {self.name} {self.argument} --help` shows its flags.")
-        if self.argument == "TASK":
+        if self.argument in _OF_TASKS:
             lines.append("`uv run mjlab list-envs` lists the tasks.")
         return "\n".join(lines).rstrip()
 
+
+_POLICY = """\
+POLICY is the folder of a run, a checkpoint (.pt) or exported policy (.onnx) in it, a folder that
+`mjlab publish` wrote, a ZIP archive of one, or hf:NAME/REPO or hf:NAME/REPO@REVISION of the Hugging
+Face Hub."""
+_OF_TASKS = ("TASK", "TASK|POLICY")
 
 COMMANDS = (
     Command(
@@ -160,24 +167,30 @@ Play a robot that tracks velocity commands, in the browser and offline: a Unitre
         "play",
         "watch",
         "your newest policy, in the browser",
-        argument="TASK",
-        details="""\
-Show a trained policy (default: the newest) in the browser, in MuJoCo's window, or as a video.""",
+        argument="TASK|POLICY",
+        details=f"""\
+Show a trained policy (default: the newest of TASK) in the browser, in MuJoCo's window, or as a
+video.
+
+{_POLICY}""",
         examples=(
             "play Mjlab-Cartpole-Swingup",
             "play Mjlab-Cartpole-Swingup --checkpoint-file logs/rsl_rl/cartpole/model_500.pt",
             "play Mjlab-Cartpole-Swingup --agent random --viewer native",
             "play Mjlab-Cartpole-Swingup --viewer none --num-steps 200 --video True",
+            "play hf:NAME/REPO",
         ),
     ),
     Command(
         "evaluate",
         "watch",
         "return, errors and falls, with intervals",
-        argument="TASK",
-        details="""\
-Play episodes with a trained policy, one per environment, and print the mean return with a 95 %
-interval, and the success rate if the task defines success.""",
+        argument="TASK|POLICY",
+        details=f"""\
+Play episodes with a trained policy (default: the newest of TASK), one per environment, and print the
+mean return with a 95 % interval, and the success rate if the task defines success.
+
+{_POLICY}""",
         examples=(
             "evaluate Mjlab-Cartpole-Swingup",
             "evaluate Mjlab-Cartpole-Swingup --num-episodes 1024 --json True",
@@ -336,15 +349,31 @@ TARGET is the name of a task, a robot (g1, go1, yam), or module:function, a func
         "deploy",
         "a policy as a folder for a robot",
         argument="POLICY",
-        details="""\
+        details=f"""\
 Write a folder that runs a policy without this package and without torch: network (ONNX), contract
 (JSON), scene, golden trace, and programs to read.
 
-POLICY is the folder of a run, a checkpoint (.pt), an exported policy (.onnx) of a run, or a bundled
-policy (go1, g1).""",
+{_POLICY} Or a bundled policy (go1, g1).""",
         examples=(
             "deploy go1 --output go1_bundle",
             "deploy logs/rsl_rl/go1_velocity/2026-01-02_03-04-05",
+        ),
+    ),
+    Command(
+        "publish",
+        "deploy",
+        "a policy for others: folder or Hugging Face Hub",
+        argument="POLICY",
+        details=f"""\
+Write a policy as people share them: checkpoint, network (ONNX), settings, evaluation, clip, and a
+card (README.md) that states what `mjlab evaluate --output` measured. Logs, replay buffers and paths
+of this machine stay here. `play`, `evaluate` and `deploy` take the result.
+
+{_POLICY}""",
+        examples=(
+            "publish logs/rsl_rl/cartpole/2026-01-02_03-04-05 --to swingup",
+            "publish logs/rsl_rl/cartpole/2026-01-02_03-04-05 --to hf:NAME/REPO --license apache-2.0",
+            "play hf:NAME/REPO",
         ),
     ),
     Command(
@@ -452,14 +481,15 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
         return
     if argument and argv[0].startswith("-") and not argument.startswith("-"):
         raise UserError(f"Expected {argument} first, got {argv[0]!r}.\n\n{command.usage(prog)}")
-    if argument == "TASK":
+    if argument in _OF_TASKS:
         from mjlab.tasks.registry import UnknownTaskError, require_task
 
         try:
             require_task(argv[0])
         except UnknownTaskError as error:
             error.exit_status = command.unknown_task_status
-            raise
+            if argument == "TASK" or not _is_policy(argv[0]):
+                raise
     module = command.module or f"mjlab.scripts.{command.name.replace('-', '_')}"
     was_changed = end_by_interrupt(True)
     try:
@@ -468,6 +498,11 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
         if was_changed:
             end_by_interrupt(False)
     implementation.command(argv, prog)
+
+
+def _is_policy(text: str) -> bool:
+    """Return True for a path, and for a repository of the Hugging Face Hub."""
+    return text.startswith("hf:") or Path(text).exists()
 
 
 def run_alias(name: str) -> None:

@@ -18,9 +18,10 @@ from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl.config import RslRlBaseRunnerCfg, RslRlDistillationRunnerCfg
 from mjlab.rl.learners import Learner
 from mjlab.runs import Checkpoint, Run, newest_run, resolve_checkpoint, runs_in
-from mjlab.runs.run import Purpose, RunCfg, registered_env_cfg
+from mjlab.runs.run import INFO_FILE, Purpose, RunCfg, registered_env_cfg
 from mjlab.runs.settings import apply_settings, with_changes
-from mjlab.tasks.registry import load_rl_cfg
+from mjlab.runs.source import local_policy
+from mjlab.tasks.registry import list_tasks, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_list, print_notice
 from mjlab.utils.os import get_wandb_checkpoint_path
@@ -37,8 +38,8 @@ class PolicyFlags:
     )
     """Policy: `zero` actions, `random` uniform actions in [-1, 1], or a `trained` policy."""
     checkpoint_file: str | None = field(default=None, metadata=shown("policy", "FILE"))
-    """Checkpoint of the trained policy, its export (`.onnx`), or the folder of its run. None: last
-    checkpoint of the newest run of the task."""
+    """Checkpoint of the trained policy, its export (`.onnx`), the folder of its run, a ZIP archive, or
+    hf:NAME/REPO. None: last checkpoint of the newest run of the task."""
     wandb_run_path: str | None = field(default=None, metadata=shown("policy", "PATH"))
     """Weights & Biases run of the policy, as entity/project/run."""
     wandb_checkpoint_name: str | None = None
@@ -107,6 +108,47 @@ def parse_policy_flags(
 
 
 # Policy selection.
+
+
+def task_and_flags(argv: list[str]) -> tuple[str, list[str]]:
+    """Return task and flags of the arguments of a command that takes a task or a policy.
+
+    Raises:
+        UserError: see `task_and_policy`.
+    """
+    target, *flags = argv
+    if target in list_tasks():
+        return target, flags
+    task, policy = task_and_policy(target)
+    return task, ["--checkpoint-file", str(policy), *flags]
+
+
+def task_and_policy(source: str) -> tuple[str, Path]:
+    """Return the task of a policy, and its file or folder on this machine.
+
+    Args:
+        source: Folder of a run, checkpoint, export, ZIP archive or hf:NAME/REPO.
+
+    Raises:
+        UserError: the policy or its task was not found.
+    """
+    path = local_policy(source)
+    if not path.exists():
+        raise UserError(
+            f"Policy {source!r}: expected a run folder, a checkpoint (.pt), an exported policy (.onnx), a "
+            "ZIP archive or hf:NAME/REPO; not found."
+        )
+    run = Run(path if path.is_dir() else path.parent)
+    task = run.task
+    if task is None and path.suffix == ".pt":
+        task = Checkpoint(path).task
+    if task is None or task not in list_tasks():
+        package = run.info.get("package") or "the package of the task"
+        raise UserError(
+            f"Policy {source!r} task: expected a registered task in {run.folder / INFO_FILE}, got {task!r}; "
+            f"install {package}."
+        )
+    return task, path
 
 
 def find_checkpoint(task: str, flags: PolicyFlags) -> Checkpoint | None:
@@ -208,25 +250,27 @@ def report_policy(
     flags: PolicyFlags,
     env: ManagerBasedRlEnvCfg,
     purpose: Purpose,
-) -> None:
+) -> list[str]:
     """Print the selected policy, and how its environment `env` differs from the registered one.
+
+    Returns:
+        Differences, one line each.
 
     Raises:
         UserError: observations or actions of the run were in another order.
     """
     if checkpoint is None:
-        return
+        return []
     run = Run(checkpoint.path.parent, task)
     if flags.checkpoint_file is None:
         print_notice(f"Checkpoint: {checkpoint} ({run.describe()})")
     cfg = RunCfg(env=env, agent=load_rl_cfg(task), left_out={})
     if not flags.as_registered:
         cfg = replace(run.cfg(purpose), env=env)
-    print_list(
-        f"Settings of {run.folder.name} and of this command:",
-        run.notes(purpose, cfg, flags.profile),
-    )
+    notes = run.notes(purpose, cfg, flags.profile)
+    print_list(f"Settings of {run.folder.name} and of this command:", notes)
     run.check_terms(env, ("actor", "student"))
+    return notes
 
 
 def prepare_teacher(

@@ -45,36 +45,46 @@ def record_policy(
     device: str,
     video: VideoCfg | None = None,
 ) -> Path | None:
-    """Record one clip into `folder` and return its path.
+    """Record one clip into `folder`, print its path and return it.
 
     Raises:
         RenderingUnavailableError: rendering is not available; the message names packages to install.
     """
     video = video or VideoCfg()
+    name = video.agent if checkpoint is None else checkpoint.path.stem
+    path = folder / f"{task}-{name}.{video.suffix}"
+    written = write_clip(task, env_cfg, checkpoint, path, device, video)
+    print(f"Video: {written}")
+    return written
+
+
+def write_clip(
+    task: str,
+    env_cfg: ManagerBasedRlEnvCfg,
+    checkpoint: Checkpoint | None,
+    path: Path,
+    device: str,
+    video: VideoCfg,
+) -> Path | None:
+    """Record one clip to the file `path` and return it; None without frames.
+
+    Raises:
+        RenderingUnavailableError: rendering is not available; the message names packages to install.
+    """
     env_cfg = copy.deepcopy(env_cfg)
     env_cfg.viewer.height = video.height or env_cfg.viewer.height
     env_cfg.viewer.width = video.width or env_cfg.viewer.width
-    env = make_env(
-        task,
-        env_cfg,
-        device,
-        render_mode="rgb_array",
-        agent=agent_cfg_of(task, checkpoint, video.profile),
-    )
+    agent = agent_cfg_of(task, checkpoint, video.profile)
+    env = make_env(task, env_cfg, device, render_mode="rgb_array", agent=agent)
     try:
         policy = make_policy(task, env, video.agent, checkpoint, device, video.profile)
-        name = video.agent if checkpoint is None else checkpoint.path.stem
-        writer = ClipWriter(
-            folder / f"{task}-{name}.{video.suffix}", env.unwrapped.metadata["render_fps"]
-        )
+        writer = ClipWriter(path, env.unwrapped.metadata["render_fps"])
         size = f"{env_cfg.viewer.width} x {env_cfg.viewer.height} pixels"
         print(f"Recording a clip: {counted(video.length, 'frame')} of {size} ...", flush=True)
         with torch.inference_mode():
             for _ in range(video.length):
                 reset_policy(policy, done_mask(env.step(policy(env.get_observations()))))
                 writer.add(env.unwrapped.render(video.camera))
-        path = writer.close()
+        return writer.close()
     finally:
         env.close()
-    print(f"Video: {path}")
-    return path

@@ -92,7 +92,7 @@ def origin(task: str, profile: str | None, checkpoint: Path, **known: Any) -> di
     return {
         "task": task,
         "profile": profile,
-        "run": checkpoint.resolve().parent.name,
+        "run": checkpoint.parent.resolve().name,
         "checkpoint": checkpoint.name,
         **known,
         "package": f"mjlab {version('mjlab')}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from mjlab.rl.learners import acting_cfg
 from mjlab.runs.checkpoint import Checkpoint
 from mjlab.runs.run import Run
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
+from mjlab.utils.errors import UserError
 from mjlab.utils.torch import prepare_torch
 
 
@@ -103,6 +105,29 @@ def load_runner(
     network = "student" if isinstance(agent_cfg, RslRlDistillationRunnerCfg) else "actor"
     checkpoint.load_into(runner, {network: True}, device)
     return runner
+
+
+def export_policy(
+    task: str, env: Any, checkpoint: Checkpoint, path: Path, profile: str | None = None
+) -> None:
+    """Write the policy in `checkpoint` to `path` (`.onnx`), with the metadata of its environment.
+
+    Arguments are those of `load_policy`.
+
+    Raises:
+        CheckpointError: see `load_policy`.
+        UserError: the export failed.
+    """
+    if checkpoint.path.suffix == ".onnx":
+        from mjlab.rl.exporter_utils import load_onnx_policy
+
+        # Checks that it is a policy of the environment.
+        load_onnx_policy(checkpoint.path, env, "cpu", load_env_cfg(task, profile=profile))
+        shutil.copyfile(checkpoint.path, path)
+        return
+    runner = load_runner(task, env, checkpoint, "cpu", profile)
+    if runner.export_policy(str(path)) is None:
+        raise UserError(f"Policy {checkpoint}: exporting it as ONNX failed, see above.")
 
 
 def has_foreign_runner(task: str) -> bool:

@@ -27,6 +27,7 @@ from mjlab.runs.settings import (
     read_yaml,
     warn_unreadable,
 )
+from mjlab.runs.source import local_policy
 from mjlab.tasks.registry import list_profiles, load_env_cfg, load_rl_cfg
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
@@ -50,6 +51,8 @@ INFO_FILE = "run.json"
 """File of the metadata of a run."""
 RUNNING_FILE = ".running"
 """File that the training process locks while it runs."""
+POLICY_FILE = "policy.onnx"
+"""Exported policy in a folder that was published."""
 TIME_FORMAT = "%Y-%m-%d_%H-%M-%S"
 """Format of the start time in the name of a folder."""
 DONE = ("solved", "finished")
@@ -180,17 +183,23 @@ class Run:
 
         None also for several repositories: the folder does not tell whose the task is.
         """
+        found = _COMMIT.match(self._git)
+        return self._text("commit") or (found[1] if found else None)
+
+    @property
+    def has_changed_commit(self) -> bool:
+        """True if the files of the task's repository differed from `commit` at the start."""
+        changes = self._git.partition("--- git diff ---")[2]
+        return self.info.get("has_changed_commit") is True or bool(changes.strip())
+
+    @cached_property
+    def _git(self) -> str:
+        """State of the task's repository at the start, as rsl_rl writes it; empty if unknown."""
         files = list((self.folder / "git").glob("*.diff"))
-        if len(files) != 1:
-            return None
-        with (
-            contextlib.suppress(OSError),
-            files[0].open(encoding="utf-8", errors="replace") as file,
-        ):
-            # The changes that follow may be long.
-            found = _COMMIT.match(file.read(200))
-            return found[1] if found else None
-        return None
+        if len(files) == 1:
+            with contextlib.suppress(OSError):
+                return files[0].read_text(encoding="utf-8", errors="replace")
+        return ""
 
     @property
     def started(self) -> datetime | None:
@@ -520,20 +529,23 @@ def newest_run(runs: Iterable[Run]) -> Run | None:
 
 
 def resolve_checkpoint(path: Path, task: str) -> Checkpoint:
-    """Return the checkpoint at `path`, or the last one of a run folder.
+    """Return the checkpoint at `path`, or the last one of a run folder, else its exported policy.
 
-    The path may omit the run folder: `logs/rsl_rl/cartpole/model_500.pt` refers to that file of the
-    newest run of `task`, or to the last checkpoint of that run if it was solved or finished before
-    iteration 500.
+    The path may also be a ZIP archive or `hf:NAME/REPO`; see `local_policy`. It may omit the run folder:
+    `logs/rsl_rl/cartpole/model_500.pt` refers to that file of the newest run of `task`, or to the last
+    checkpoint of that run if it was solved or finished before iteration 500.
 
     Raises:
-        UserError: file not found; the message lists the available checkpoints.
+        UserError: file not found; the message lists the available checkpoints. Or see `local_policy`.
     """
+    path = local_policy(path)
     if path.is_file():
         return Checkpoint(path)
     folder, number = Run(path, task), checkpoint_number(path.name)
     if folder.newest is not None:
         return folder.newest
+    if (exported := path / POLICY_FILE).is_file():
+        return Checkpoint(exported)
     newest = newest_run(runs_in(path.parent, task)) if number is not None else None
     last = newest.newest if newest is not None else None
     if newest is not None and last is not None and number is not None:

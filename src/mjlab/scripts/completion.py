@@ -57,7 +57,7 @@ def candidates(words: list[str]) -> list[str]:
     *before, partial = words or [""]
     if not before:
         names = [command.name for command in COMMANDS]
-    elif before in ([c.name] for c in COMMANDS if c.argument in ("TASK", "TARGET")):
+    elif before in ([c.name] for c in COMMANDS if c.argument in ("TASK", "TASK|POLICY", "TARGET")):
         from mjlab.tasks.registry import list_tasks
 
         names = list_tasks()

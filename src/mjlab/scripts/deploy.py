@@ -1,4 +1,4 @@
-"""Write what a robot needs to run a policy: `uv run mjlab deploy RUN|CHECKPOINT [flags]`."""
+"""Write what a robot needs to run a policy: `uv run mjlab deploy POLICY [flags]`."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mjlab.cli.policy_flags import (
     find_checkpoint,
     parse_policy_flags,
     report_policy,
+    task_and_policy,
 )
 from mjlab.deploy.bundle import Bundle, origin, write_bundle
 from mjlab.deploy.contract import Contract
 from mjlab.deploy.nominal import nominal_cfg
 from mjlab.runs import Checkpoint, Run
-from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, load_runner, make_env
+from mjlab.runs.policy import agent_cfg_of, export_policy, has_foreign_runner, make_env
 from mjlab.scripts.demo import DEMOS
-from mjlab.tasks.registry import list_tasks
 from mjlab.utils.errors import UserError
 from mjlab.utils.ranges import Count
 from mjlab.utils.screen import shown
@@ -42,8 +42,8 @@ class DeployConfig(PolicyFlags):
 def command(argv: list[str], prog: str) -> None:
     """Run `deploy`."""
     target, *flags = argv
-    task, path, defaults = policy_of(target, flags)
-    flags = ["--checkpoint-file", str(path), *defaults, *flags]
+    task, implied = policy_of(target)
+    flags = [*implied, *flags]
     cfg = parse_policy_flags(DeployConfig, flags, task, f"{prog} {target}", purpose="evaluate")
     bundle = run_deploy(task, cfg)
     print(f"Wrote {bundle.folder}.")
@@ -51,32 +51,18 @@ def command(argv: list[str], prog: str) -> None:
         print(f"  {note}")
 
 
-def policy_of(target: str, flags: list[str]) -> tuple[str, Path, list[str]]:
-    """Return task and path of the policy that `target` names, and flags that it implies.
+def policy_of(target: str) -> tuple[str, list[str]]:
+    """Return the task of the policy that `target` names, and the flags that select the policy.
 
     Raises:
         UserError: the policy or its task was not found.
     """
-    if target in DEMOS:
-        demo = DEMOS[target]
-        profile = [] if demo.profile is None else ["--profile", demo.profile]
-        return demo.task, demo.policy, profile
-    path = Path(target)
-    if not path.exists():
-        raise UserError(
-            f"Policy {target!r}: expected a run folder, a checkpoint (.pt), an exported policy (.onnx) "
-            f"or one of {', '.join(DEMOS)}; not found."
-        )
-    folder = path if path.is_dir() else path.parent
-    task = Run(folder).task
-    if task is None and path.suffix == ".pt":
-        task = Checkpoint(path).task
-    if task not in list_tasks():
-        raise UserError(
-            f"Policy {target!r} task: expected a registered task in {folder / 'run.json'}, got {task!r}; "
-            "install the package of the task."
-        )
-    return task, path, []
+    if target not in DEMOS:
+        task, policy = task_and_policy(target)
+        return task, ["--checkpoint-file", str(policy)]
+    demo = DEMOS[target]
+    profile = [] if demo.profile is None else ["--profile", demo.profile]
+    return demo.task, ["--checkpoint-file", str(demo.policy), *profile]
 
 
 def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
@@ -107,7 +93,8 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".deploy-") as temporary:
             made = Path(temporary) / "bundle"
             made.mkdir()
-            _export(task, env, checkpoint, made, cfg.profile)
+            export_policy(task, env, checkpoint, made / "policy.onnx", cfg.profile)
+            _restore_curricula(task, env, checkpoint)
             contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
             is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
             run = Run(checkpoint.path.parent)
@@ -128,24 +115,15 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
     return Bundle(folder, bundle.contract, bundle.notes)
 
 
-def _export(task: str, env: Any, checkpoint: Checkpoint, folder: Path, profile: str | None) -> None:
-    """Write `policy.onnx`, and let the curricula of the run set the ranges of `env`."""
-    if checkpoint.path.suffix == ".onnx":
-        from mjlab.rl.exporter_utils import load_onnx_policy
-        from mjlab.tasks.registry import load_env_cfg
-
-        load_onnx_policy(checkpoint.path, env, "cpu", load_env_cfg(task, profile=profile))
-        shutil.copyfile(checkpoint.path, folder / "policy.onnx")
+def _restore_curricula(task: str, env: Any, checkpoint: Checkpoint) -> None:
+    """Let the curricula of the run set the ranges of `env`."""
+    if checkpoint.path.suffix == ".onnx" or has_foreign_runner(task):
         return
-    runner = load_runner(task, env, checkpoint, "cpu", profile)
-    if runner.export_policy(str(folder / "policy.onnx")) is None:
-        raise UserError(f"Policy {checkpoint}: exporting it as ONNX failed, see above.")
-    if not has_foreign_runner(task):
-        from mjlab.rl.checkpoint import curricula_of
-        from mjlab.rl.evaluation import load_curricula
+    from mjlab.rl.checkpoint import curricula_of
+    from mjlab.rl.evaluation import load_curricula
 
-        if (state := curricula_of(checkpoint.content)) is not None:
-            load_curricula(env, state)
+    if (state := curricula_of(checkpoint.content)) is not None:
+        load_curricula(env, state)
 
 
 def main() -> None:

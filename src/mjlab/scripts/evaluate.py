@@ -1,4 +1,4 @@
-"""Evaluate a policy: `uv run mjlab evaluate TASK [flags]`."""
+"""Evaluate a policy: `uv run mjlab evaluate TASK|POLICY [flags]`."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from mjlab.cli.policy_flags import (
     find_checkpoint,
     parse_policy_flags,
     report_policy,
+    task_and_flags,
 )
 from mjlab.rl.checkpoint import curricula_of, naming_checkpoint
 from mjlab.runs import Checkpoint
@@ -60,7 +61,7 @@ class EvaluateConfig(PolicyFlags):
 
 def command(argv: list[str], prog: str) -> None:
     """Run `evaluate`."""
-    task, *flags = argv
+    task, flags = task_and_flags(argv)
     cfg = parse_policy_flags(EvaluateConfig, flags, task, prog, purpose="evaluate")
     run_evaluate(task, cfg, keep_num_envs=is_given("--env.scene.num-envs", flags))
 
@@ -77,7 +78,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
-    report_policy(task, checkpoint, cfg, env_cfg, "evaluate")
+    settings = report_policy(task, checkpoint, cfg, env_cfg, "evaluate")
     default = load_env_cfg(task, profile=cfg.profile, evaluate=True).scene.num_envs
     if cfg.num_envs is None and not keep_num_envs and env_cfg.scene.num_envs == default:
         env_cfg.scene.num_envs = cfg.num_episodes
@@ -112,6 +113,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
         "physics": physics,
         "seed": cfg.seed,
         "num_envs": num_envs,
+        "settings": settings,
         "success_definition": success_definition(solved),
         **result.to_dict(),
         "units": dict(solved.units),

@@ -1,4 +1,4 @@
-"""Play a policy: `uv run mjlab play TASK [flags]`."""
+"""Play a policy: `uv run mjlab play TASK|POLICY [flags]`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from mjlab.cli.policy_flags import (
     find_checkpoint,
     parse_policy_flags,
     report_policy,
+    task_and_flags,
 )
 from mjlab.cli.record import VideoCfg, record_policy
 from mjlab.compat import older_names
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.policy import agent_cfg_of, load_policy, make_env, make_policy
+from mjlab.runs.source import is_fetched
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
 from mjlab.utils.ranges import Count, CountOrZero
@@ -65,7 +67,7 @@ class PlayConfig(PolicyFlags):
 
 def command(argv: list[str], prog: str) -> None:
     """Run `play`."""
-    task, *flags = argv
+    task, flags = task_and_flags(argv)
     run_play(task, parse_policy_flags(PlayConfig, flags, task, prog, purpose="play"))
 
 
@@ -96,8 +98,9 @@ def run_play(task: str, cfg: PlayConfig) -> None:
         env_cfg.terminations = {}
     if cfg.video:
         folder = Path("videos")
-        if checkpoint is not None and Run(checkpoint.path.parent, task).exists:
-            folder = checkpoint.path.parent / "videos" / "play"
+        run_dir = None if checkpoint is None else checkpoint.path.parent
+        if run_dir is not None and Run(run_dir, task).exists and not is_fetched(run_dir):
+            folder = run_dir / "videos" / "play"
         video = VideoCfg(
             length=cfg.num_steps or max(cfg.video_length, 1),
             suffix=cfg.video_format,

@@ -61,10 +61,10 @@ class ShareConfig(PolicyFlags):
 def command(argv: list[str], prog: str) -> None:
     """Run `share`."""
     target, *flags = argv
-    task, path, defaults = policy_of(target, flags)
+    task, implied = policy_of(target)
     if target in DEMOS:
-        defaults = [*defaults, "--evaluation", str(DEMOS[target].evaluation)]
-    flags = ["--checkpoint-file", str(path), *defaults, *flags]
+        implied += ["--evaluation", str(DEMOS[target].evaluation)]
+    flags = [*implied, *flags]
     cfg = parse_policy_flags(ShareConfig, flags, task, f"{prog} {target}", purpose="evaluate")
     if not is_given("--env.scene.num-envs", flags) and cfg.num_envs is None:
         cfg.num_envs = 1

@@ -24,7 +24,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -199,6 +199,15 @@ def task_source(task_name: str) -> str | None:
     return getattr(module, "__file__", None)
 
 
+def task_package(task_name: str) -> str | None:
+    """Return name and version of the package that registered a task; None for mjlab, and for scripts."""
+    module = (_find(task_name).package or "").partition(".")[0]
+    if module in ("", "mjlab"):
+        return None
+    names = packages_distributions().get(module)
+    return f"{names[0]} {version(names[0])}" if names else module
+
+
 # Profiles: alternative settings.
 
 
@@ -231,6 +240,9 @@ class TaskOptions:
 
     unrecorded: ClassVar[tuple[str, ...]] = ()
     """Fields that are not recorded, because the run folder holds the data that they select."""
+    run_files: ClassVar[tuple[str, ...]] = ()
+    """Patterns of the files in a run folder that `prepare` reads, such as "motion/*". A published policy
+    has them."""
 
     def prepare(self, env_cfg: Any, origin: PolicyOrigin) -> None:
         """Edit the environment config in place, and fetch required data.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mjlab.tasks.registry import PolicyOrigin, TaskOptions, load_env_cfg
 from mjlab.tasks.tracking.motion_file import MotionFileError
 from mjlab.tasks.tracking.motion_sources import (
+    FOLDER,
     fetch_artifact,
     fetch_motions_of_run,
     find_motions,
@@ -33,6 +34,7 @@ class MotionOptions(TaskOptions):
     """
 
     unrecorded = ("motion_file", "registry_name")
+    run_files = (f"{FOLDER}/*",)
 
     motion_file: str | None = None
     """Motions to imitate: files, folders, or names of bundled motions (e.g. squat), separated by
