@@ -44,8 +44,10 @@ _INSTALLERS |= {
     "no-emit-project",
     "no-emit-package",
 }
-# Slurm.
-_SLURM = {"open-mode", "requeue", "signal", "time"}
+# Slurm and Ray.
+_QUEUES = {"open-mode", "requeue", "signal", "time", "array", "nodes", "ntasks-per-node", "gpus"}
+_QUEUES |= {"gpus-per-node", "address", "submission-id", "no-wait", "entrypoint-num-gpus", "follow"}
+_QUEUES |= {"runtime-env-json"}
 # TensorBoard, ruff, sphinx-build, and the commands of Isaac Lab.
 _OTHERS = {
     "logdir",
@@ -284,7 +286,7 @@ def test_flags_are_fields_of_the_commands() -> None:
         | _TORCHRUN
         | _INSTALLERS
         | _OTHERS
-        | _SLURM
+        | _QUEUES
         | _OPTUNA
         | _flags_of_gpu()
         | _flags_of_sweep()

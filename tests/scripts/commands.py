@@ -91,12 +91,12 @@ def run_main(main: Callable[[], None], name: str, *argv: str) -> Outcome:
 
 
 @contextlib.contextmanager
-def stopped_after(iterations: int) -> Iterator[None]:
-    """Send SIGINT to this process when a training run in it has had so many iterations."""
+def stopped_after(iterations: int, number: int = signal.SIGINT) -> Iterator[None]:
+    """Send a signal to this process when a training run in it has had so many iterations."""
 
     def stop(observer: object, stats: IterationStats) -> None:
         if stats.iteration == iterations:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(display.RunRecorder, "on_iteration", stop)

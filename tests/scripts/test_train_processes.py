@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import SMALL, TASK, interrupt_training
+from commands import SMALL, TASK, interrupt_training, stopped_after
 from process_runs import SMALL as SMALL_PROCESS
 from process_runs import Ended, ProcessRun
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -99,6 +99,29 @@ def test_sigterm_saves_and_exports(tmp_path):
         -1
     ].name == f"model_{info['iterations'] - 1}.pt"
     assert list(run_dir.glob("*.onnx"))
+
+
+def test_a_preempted_job_gives_the_same_bits(run, tmp_path):
+    """As a queue does it: SIGTERM, time to end, and the same command again."""
+    job, straight = (
+        [TASK, *SMALL, "--log-root", str(tmp_path / name), "--agent.max-iterations", "6"]
+        + ["--agent.save-interval", "1000", "--agent.resume", "auto", "--grace", "25"]
+        for name in ("job", "straight")
+    )
+    with stopped_after(3, signal.SIGTERM):
+        assert run("train", *job).status == 143
+    for command in (job, straight):
+        outcome = run("train", *command)
+        assert outcome.status == 0, outcome.err
+    preempted, resumed = sorted((tmp_path / "job" / "cartpole").iterdir())
+    assert Run(preempted).info["iterations"] < 6
+    (uninterrupted,) = (tmp_path / "straight" / "cartpole").iterdir()
+    for model in ("actor_state_dict", "critic_state_dict"):
+        one, other = (
+            load_checkpoint(folder / "model_5.pt")[model] for folder in (resumed, uninterrupted)
+        )
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[key], other[key]) for key in one)
 
 
 @pytest.mark.slow
