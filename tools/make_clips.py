@@ -301,6 +301,11 @@ def light_studio(spec: mujoco.MjSpec) -> None:
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, dir=direction, diffuse=diffuse,
             ambient=(0.0, 0.0, 0.0), specular=(0.1, 0.1, 0.1), castshadow=casts,
         )  # fmt: skip
+    paint_studio(spec, 2.0)
+
+
+def paint_studio(spec: mujoco.MjSpec, tiles: float) -> None:
+    """Replace sky and ground: light and dull, with pairs of tiles that are `tiles` m wide."""
     for texture in list(spec.textures):
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             spec.delete(texture)
@@ -315,7 +320,11 @@ def light_studio(spec: mujoco.MjSpec) -> None:
         width=512, height=512,
     )  # fmt: skip
     ground = spec.add_material(
-        name="studio_ground", texuniform=True, texrepeat=(0.5, 0.5), reflectance=0.0, specular=0.0
+        name="studio_ground",
+        texuniform=True,
+        texrepeat=(1.0 / tiles,) * 2,
+        reflectance=0.0,
+        specular=0.0,
     )
     ground.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "studio_ground"
     for geom in spec.geoms:

@@ -14,8 +14,9 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 import torch
+from make_clips import paint_studio
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, ImageEnhance
 
 from mjlab.runs.reference import DATA, Reference, reference_path
 from mjlab.scene import Scene, SceneCfg
@@ -37,7 +38,9 @@ _SIZE = 8.0
 _DIFFICULTIES = (0.0, 0.5, 1.0)
 _STRIPS_PER_ROW = 2
 # Pixels of a strip and of its title. Strips are rendered larger and downsampled for antialiasing.
-_WIDTH, _HEIGHT, _TITLE, _OVERSAMPLING = 640, 168, 22, 2
+_WIDTH, _HEIGHT, _TITLE, _OVERSAMPLING = 640, 146, 24, 3
+# Saturation and brightness of the colors of terrains, which tell heights but are strong.
+_SATURATION, _BRIGHTNESS = 0.55, 1.25
 
 
 # Badges of the README: name and statement.
@@ -170,6 +173,7 @@ def draw_variants(path: Path) -> None:
     scene = Scene(
         SceneCfg(num_envs=12, env_spacing=0.3, terrain=plane, entities=entities), device="cpu"
     )
+    paint_studio(scene.spec, 0.3)
     sim = Simulation(
         scene.num_envs,
         SimulationCfg(engine="native"),
@@ -181,13 +185,14 @@ def draw_variants(path: Path) -> None:
     sim.data.qpos[:, :3] = scene.env_origins + torch.tensor([0.0, 0.0, 0.1])
     sim.step(500)
     cfg = ViewerConfig(
-        width=720, height=300, max_extra_envs=11, origin_type=ViewerConfig.OriginType.WORLD,
-        distance=0.95, elevation=-35.0, azimuth=90.0, lookat=(0.0, 0.0, 0.05),
+        width=1440, height=600, max_extra_envs=11, origin_type=ViewerConfig.OriginType.WORLD,
+        distance=1.25, elevation=-38.0, azimuth=90.0, lookat=(0.0, -0.03, 0.0),
     )  # fmt: skip
     renderer = OffscreenRenderer(sim.mj_model, cfg, scene)
     renderer.initialize()
     renderer.update(sim)
-    Image.fromarray(renderer.render()).save(path, optimize=True)
+    image = Image.fromarray(renderer.render()).resize((720, 300), Image.Resampling.LANCZOS)
+    image.save(path, optimize=True)
     renderer.close()
     print(f"{path}: {path.stat().st_size // 1024} kB")
 
@@ -228,13 +233,14 @@ def render_strip(sub: SubTerrainCfg) -> np.ndarray:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
-    camera.lookat = (0.0, 0.6, 0.0)
+    camera.lookat = (0.0, -0.2, 0.0)
     camera.distance, camera.azimuth, camera.elevation = 46.0, 90.0, -36.0
     with open_renderer(model, _HEIGHT * _OVERSAMPLING, _WIDTH * _OVERSAMPLING) as renderer:
         renderer.update_scene(data, camera)
         pixels = renderer.render()
     small = Image.fromarray(pixels).resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS)
-    return np.asarray(small)
+    soft = ImageEnhance.Color(small).enhance(_SATURATION)
+    return np.asarray(ImageEnhance.Brightness(soft).enhance(_BRIGHTNESS))
 
 
 def _strip_spec(sub: SubTerrainCfg) -> mujoco.MjSpec:
@@ -273,7 +279,7 @@ def _strip_spec(sub: SubTerrainCfg) -> mujoco.MjSpec:
     visual.headlight.specular = (0.0, 0.0, 0.0)
     visual.quality.shadowsize = 8192
     # A narrow field of view from afar: perspective is equal along the strip.
-    visual.global_.fovy = 9.1
+    visual.global_.fovy = 7.9
     visual.global_.offwidth = _WIDTH * _OVERSAMPLING
     visual.global_.offheight = _HEIGHT * _OVERSAMPLING
     return spec
