@@ -273,6 +273,15 @@ def alphabetical(content: dict[str, Any]) -> None:
         one["start"], place = place, one["stop"]
 
 
+def stiffer_calf(content: dict[str, Any]) -> None:
+    """Give a motor another gain, wherever the contract lists it."""
+    joint = content["joints"][2]
+    joint["kp"] *= 1.2
+    for one in content["actuators"]:
+        if one["joint"] == joint["scene_name"]:
+            one["kp"] = joint["kp"]
+
+
 def slower(content: dict[str, Any]) -> None:
     """Run at twice the control rate."""
     content["rates"]["step_dt"] /= 2
@@ -414,6 +423,7 @@ PLANTS = (
     Plant("no effort limit", "odd", joints("effort", lambda limits: [None] * len(limits)), "other effort limit"),
     Plant("no effort limit of a wrist, never reached", "g1", joints("effort", lambda limits: [*limits[:-1], None]), UNDECIDABLE),
     Plant("gains of the scene, with a gear", "geared", model("actuator_gainprm", lambda x: 0.8 * x), "other gains"),
+    Plant("gain of a motor in both lists of the contract", "go1", contract(stiffer_calf), "other gains"),
 )  # fmt: skip
 """Numbered list of mistakes of deployments, as users reported them."""
 

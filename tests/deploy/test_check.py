@@ -98,6 +98,25 @@ def test_formula_of_the_user_is_known_to_the_causes(folder):
     assert check_bundle(folder).causes == ["opposite sign"]
 
 
+@pytest.mark.parametrize("key", ["default_pos", "armature", "damping", "frictionloss"])
+def test_joints_of_the_contract_are_those_of_the_scene(folder, key):
+    edit_contract(folder, lambda content: content["joints"][2].update({key: 0.5}))
+    (finding,) = check_bundle(folder).as_dict()["findings"]
+    assert finding["stage"] == "contract"
+    assert finding["values"] == f"joints/{key}"
+    assert finding["component"] == "FR_calf_joint"
+
+
+def test_joints_are_listed_in_the_order_of_their_positions(folder):
+    """Programs fill `joint_pos` in the order of the names."""
+
+    def swap(content: dict[str, Any]) -> None:
+        content["joints"].insert(0, content["joints"].pop(3))
+
+    edit_contract(folder, swap)
+    assert "joints/order" in str(check_bundle(folder))
+
+
 def test_sensor_that_is_left_out_differs(folder):
     edit_program(
         folder / "simulate.py",

@@ -12,6 +12,7 @@ Each stage starts from the values of the trace, so that a mistake shows where it
     state          the same -> state after one control step
     next sensors   the same -> `Simulation.measure` after it
     free steps     two control steps of an episode without values of the trace
+    contract       scene -> what `contract.json` lists of the joints, and no other stage compares
 
 No code of this package runs between a state and the next: `Simulation` of the bundle calls `mj_step`.
 """
@@ -45,6 +46,7 @@ TOLERANCES = {
     "state": 1e-4,
     "next sensors": 1e-4,
     "free steps": 1e-3,
+    "contract": 1e-4,
 }
 """Largest difference by stage, in causal order, as a fraction of the range of the values; for rates, of the period."""
 _CHAINS = (
@@ -52,7 +54,9 @@ _CHAINS = (
     ("sensors",),
     ("term", "history", "vector", "action", "target"),
     ("torque", "state", "next sensors"),
+    ("contract",),
 )
+_JOINT_FIELDS = ("default_pos", "armature", "damping", "frictionloss")
 _SMALLEST_RANGE = 1e-3
 _FREE_STEPS = 2
 # The trace shows frames if it tilts and turns by this much (rad).
@@ -317,7 +321,34 @@ def replay(evidence: Evidence, programs: Programs) -> dict[tuple[str, str], np.n
     if evidence.has_physics:
         for stage, name, value in _free(evidence, policy, simulation):
             add(stage, name, value)
+    for name, values in _listed(evidence).items():
+        add("contract", name, values)
     return {key: np.array(rows) for key, rows in found.items()}
+
+
+def _listed(evidence: Evidence) -> dict[str, np.ndarray]:
+    """Return what the contract lists of the joints: their order in the scene, and numbers."""
+    joints = evidence.contract["joints"]
+    order = [evidence.model.joint(joint["scene_name"]).id for joint in joints]
+    numbers = {f"joints/{key}": np.array([j[key] for j in joints]) for key in _JOINT_FIELDS}
+    return {"joints/order": np.array(order), **numbers}
+
+
+def _in_scene(evidence: Evidence) -> dict[str, np.ndarray]:
+    """Return the values of `_listed` in the scene, in the order of `joint_pos`; NaN without a keyframe."""
+    model, measurements = evidence.model, evidence.contract["measurements"]
+    (source,) = (one["source"] for one in measurements if one["name"] == "joint_pos")
+    joints = [model.joint(name) for name in source["joints"]]
+    dofs = [int(joint.dofadr[0]) for joint in joints]
+    # The last keyframe is that of the initial state.
+    pose = model.key_qpos[-1] if model.nkey else np.full(model.nq, np.nan)
+    return {
+        "joints/order": np.array([joint.id for joint in joints]),
+        "joints/default_pos": pose[[int(joint.qposadr[0]) for joint in joints]],
+        "joints/armature": model.dof_armature[dofs],
+        "joints/damping": model.dof_damping.reshape(model.nv, -1)[dofs, 0],
+        "joints/frictionloss": model.dof_frictionloss[dofs],
+    }
 
 
 def _sensors(evidence: Evidence, simulation: Any) -> dict[str, np.ndarray]:
@@ -387,6 +418,8 @@ def _expected(evidence: Evidence, stage: str, name: str) -> np.ndarray | None:
     trace = evidence.trace
     if stage == "rates":
         return np.full((len(trace["time"]), 1), np.median(np.diff(trace["time"])))
+    if stage == "contract":
+        return _in_scene(evidence)[name][None]
     if name == "sent":
         return flat(trace["target"]).astype(float)
     if stage == "next sensors":
@@ -422,7 +455,7 @@ def _labels(evidence: Evidence, name: str, count: int) -> list[str]:
     inputs = term.get("inputs", [key])
     size = term.get("size", count)
     names: list[str] = []
-    if inputs in (["joint_pos"], ["joint_vel"]):
+    if inputs in (["joint_pos"], ["joint_vel"]) or name.startswith("joints/"):
         names = evidence.joint_names
         names = [names[k] for k in term["columns"]] if term.get("columns") else names
     elif key in ("target", "sent") or term.get("kind") == "last_action" or key == "action":
@@ -512,6 +545,8 @@ def _difference(one: Comparison) -> Difference | None:
 def _verdict(
     evidence: Evidence, one: Comparison, again: dict[tuple[str, str], np.ndarray]
 ) -> Verdict:
+    if one.stage == "contract":
+        return Verdict(None, {}, "contract.json and the scene differ")
     difference = _difference(one)
     if difference is None:
         return Verdict(None, {}, "values of another size, or not finite")

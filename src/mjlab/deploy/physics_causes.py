@@ -198,36 +198,47 @@ def _gains(contract: dict, model: mujoco.MjModel) -> np.ndarray:
     return np.array(rows).swapaxes(0, 1)
 
 
-def _correct_gains(is_order: bool) -> Callable[[dict, mujoco.MjModel], bool]:
+def _correct_gains(is_order: bool, source: str) -> Callable[[dict, mujoco.MjModel], bool]:
     def correct(contract: dict, model: mujoco.MjModel) -> bool:
         held, listed = _gains(contract, model)
         same = np.allclose(np.sort(held, axis=0), np.sort(listed, axis=0), rtol=1e-5)
         if np.allclose(held, listed, rtol=1e-5) or same != is_order:
             return False
         joints = {joint["scene_name"]: joint for joint in contract["joints"]}
-        for k, actuator in enumerate(contract["actuators"]):
-            joint = joints.get(actuator["joint"])
-            if joint is None:
+        driven = [a for a in enumerate(contract["actuators"]) if a[1]["joint"] in joints]
+        for (k, actuator), (kp, _, kd) in zip(driven, held, strict=True):
+            joint = joints[actuator["joint"]]
+            if source == "scene":
+                joint["kp"], joint["kd"] = kp, kd
                 continue
+            joint["kp"], joint["kd"] = actuator["kp"], actuator["kd"]
             if actuator["law"] == "position":
                 square = model.actuator_gear[k, 0] ** 2
-                kp, kd = actuator["kp"] / square, actuator["kd"] / square
-                model.actuator_gainprm[k, 0] = kp
-                model.actuator_biasprm[k, 1:3] = -kp, -kd
-            joint["kp"], joint["kd"] = actuator["kp"], actuator["kd"]
+                model.actuator_gainprm[k, 0] = actuator["kp"] / square
+                model.actuator_biasprm[k, 1:3] = -actuator["kp"] / square, -actuator["kd"] / square
         return True
 
     return correct
 
 
-def gains(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Correct gains other than those of the contract's actuators."""
-    return _corrected(d, evidence, "gains", _correct_gains(False))
+def _of_gains(is_order: bool) -> Callable[[Difference, Evidence], np.ndarray | None]:
+    """Return the cause of wrong gains; those of the contract's actuators, or of the scene, are right."""
+
+    def explain(d: Difference, evidence: Evidence) -> np.ndarray | None:
+        found = [
+            _corrected(d, evidence, f"gains {is_order} {source}", _correct_gains(is_order, source))
+            for source in ("actuators", "scene")
+        ]
+        known = [one for one in found if one is not None]
+        return min(known, key=lambda one: np.nanmax(np.abs(one - d.got)), default=None)
+
+    return explain
 
 
-def gains_order(d: Difference, evidence: Evidence) -> np.ndarray | None:
-    """Correct gains in another order."""
-    return _corrected(d, evidence, "gains_order", _correct_gains(True))
+gains = _of_gains(False)
+"""Correct gains that are others."""
+gains_order = _of_gains(True)
+"""Correct gains in another order."""
 
 
 def effort_limit(d: Difference, evidence: Evidence) -> np.ndarray | None:
