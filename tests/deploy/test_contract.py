@@ -14,6 +14,7 @@ from mjlab.actuator import DcMotorActuatorCfg
 from mjlab.deploy.check import undecided
 from mjlab.deploy.evidence import Evidence
 from mjlab.entity import EntityArticulationInfoCfg
+from mjlab.scripts.demo import DEMOS
 
 
 def test_speeds_and_delays_of_motors(tmp_path):
@@ -46,6 +47,13 @@ def test_speeds_and_delays_of_motors(tmp_path):
     assert delays == [[1, 3]] * 4
     (text,) = [one for one in undecided(Evidence(folder)) if one.startswith("delays of")]
     assert text.startswith("delays of 4 of 12 actuators, 1 to 3 physics steps")
+
+
+def test_training_of_a_bundled_policy(bundle):
+    source = json.loads((bundle("go1") / "contract.json").read_text())["source"]
+    readme = (DEMOS["go1"].policy.parent / "README.md").read_text()
+    assert f"in {source['iteration']} iterations" in readme
+    assert f"--agent.seed {source['seed']}\n" in readme
 
 
 def test_terms_of_two_groups_with_one_name(tmp_path):

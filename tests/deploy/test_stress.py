@@ -94,6 +94,7 @@ def test_passport_has_checks_and_curves(evidence, tmp_path):
     report = check_bundle(evidence.folder)
     curves = stress(evidence, episodes=1, seconds=0.1, levels={"mass": (1.0, 1.2)})
     write_passport(tmp_path / "p.html", evidence.contract, report, curves, {"seconds": 0.1})
+    assert "<th>commit</th><td>not recorded</td>" in (tmp_path / "p.html").read_text()
     content = json.loads((tmp_path / "p.json").read_text())
     assert content["source"]["task"] == evidence.contract["source"]["task"]
     assert content["check"]["passed"]

@@ -59,12 +59,13 @@ def write_passport(
     """Write the page `path`, and JSON beside it."""
     content = as_dict(contract, report, curves, settings)
     path.with_suffix(".json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    origin = {**contract["source"], **settings}
     compared = [one for one in report.comparisons if one.num_rows]
     equal = sum(one.is_equal for one in compared)
     result = "passed" if report.is_passed else "FAILED"
     parts = [
         f"<h1>{escaped(str(contract['source']['task']))}</h1>",
-        facts({**contract["source"], **settings}),
+        facts({key: _shown(key, value) for key, value in origin.items()}),
         f"<h2>Check: {result}</h2><p>{equal} of {len(compared)} values are those of training.</p>",
         listed([str(finding) for finding in report.findings]),
         "<h2>For a robot</h2>",
@@ -79,6 +80,13 @@ def write_passport(
     head = "<!doctype html><meta charset=utf-8><meta name=viewport content=width=device-width>"
     page = f"{head}<title>Passport</title><style>{_STYLE}</style>"
     path.write_text(page + "\n".join(parts) + "\n", encoding="utf-8")
+
+
+def _shown(key: str, value: Any) -> Any:
+    """Return a fact; the profile may be none, other facts without a value were not recorded."""
+    if value is not None:
+        return value
+    return "none" if key == "profile" else "not recorded"
 
 
 def _curve(name: str, points: list[Point]) -> str:

@@ -27,6 +27,14 @@ class Demo:
     """Path of the exported policy."""
     evaluation: Path
     """Path of its evaluation."""
+    run: str
+    """Name of the run."""
+    iteration: int
+    """Iterations of the training."""
+    seed: int
+    """Seed of the training."""
+    commit: str | None
+    """Commit of the code that trained the policy; None: not recorded."""
 
 
 DEMOS = {
@@ -35,12 +43,20 @@ DEMOS = {
         None,
         _FOLDER / "go1_velocity.onnx",
         _FOLDER / "evaluation.json",
+        run="2026-11-26_09-41-23",
+        iteration=718,
+        seed=1,
+        commit=None,
     ),
     "g1": Demo(
         "Mjlab-Velocity-Flat-Unitree-G1-No-State-Estimation",
         "cpu",
         _FOLDER / "g1_velocity.onnx",
         _FOLDER / "g1_evaluation.json",
+        run="2026-11-26_21-18-47",
+        iteration=110,
+        seed=1,
+        commit="602bee2519714029bce19f214cad88be1edca66b",
     ),
 }
 

@@ -96,16 +96,7 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
             export_policy(task, env, checkpoint, made / "policy.onnx", cfg.profile)
             _restore_curricula(task, env, checkpoint)
             contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
-            is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
-            run = Run(checkpoint.path.parent)
-            source = origin(
-                task,
-                cfg.profile,
-                checkpoint.path,
-                iteration=checkpoint.iteration if is_ours else None,
-                seed=run.seed,
-                commit=run.commit,
-            )
+            source = origin(task, cfg.profile, checkpoint.path, **_recorded(task, checkpoint))
             bundle = write_bundle(contract, made, source, cfg.steps)
             if folder.exists():
                 shutil.rmtree(folder)
@@ -113,6 +104,17 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
     finally:
         env.close()
     return Bundle(folder, bundle.contract, bundle.notes)
+
+
+def _recorded(task: str, checkpoint: Checkpoint) -> dict[str, Any]:
+    """Return what is recorded of the training: by the run, or of a bundled policy by its entry."""
+    for demo in DEMOS.values():
+        if checkpoint.path == demo.policy:
+            return {key: getattr(demo, key) for key in ("run", "iteration", "seed", "commit")}
+    run = Run(checkpoint.path.parent)
+    is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
+    iteration = checkpoint.iteration if is_ours else None
+    return {"iteration": iteration, "seed": run.seed, "commit": run.commit}
 
 
 def _restore_curricula(task: str, env: Any, checkpoint: Checkpoint) -> None:
