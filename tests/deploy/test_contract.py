@@ -56,6 +56,15 @@ def test_training_of_a_bundled_policy(bundle):
     assert f"--agent.seed {source['seed']}\n" in readme
 
 
+def test_joints_that_no_fault_damps_are_named(bundle):
+    """A motor driven by effort has no kd."""
+    assert (
+        "without torque, not damped: slider ("
+        in (bundle("Mjlab-Cartpole-Swingup") / "README.md").read_text()
+    )
+    assert "not damped" not in (bundle("go1") / "README.md").read_text()
+
+
 def test_terms_of_two_groups_with_one_name(tmp_path):
     def edit(env: Any, agent: Any) -> None:
         env.observations["extra"] = copy.deepcopy(env.observations["actor"])

@@ -231,6 +231,15 @@ def test_gait_phase_is_two_steps_ahead_of_the_clock(bundle, tmp_path):
     assert phase_note(edited(bundle("go1"), lambda content: None)) is None
 
 
+def test_reason_for_the_g1_with_23_joints():
+    motors = MOTORS["G1 (29 joints)"]
+    without = ("waist_roll", "waist_pitch", "wrist_pitch", "wrist_yaw")
+    names = [f"{one}_joint" for one in motors if not one.endswith(without)]
+    assert len(names) == 23
+    with pytest.raises(UnknownToUnitreeError, match="sources disagree"):
+        motor_map(names)
+
+
 @pytest.mark.parametrize(
     ("name", "why"),
     [

@@ -88,7 +88,7 @@ def write_bundle(contract: Contract, folder: Path, source: Mapping[str, Any], st
 
 
 def origin(task: str, profile: str | None, checkpoint: Path, **known: Any) -> dict[str, Any]:
-    """Return the origin of a policy for the contract; `known` is what its run records."""
+    """Return the origin of a policy for the contract; `known` is what its run, or its README, records."""
     return {
         "task": task,
         "profile": profile,
@@ -194,6 +194,12 @@ def _notes(content: Mapping[str, Any]) -> list[str]:
         for term in observation["terms"]
         if term["kind"] == "custom"
     ]
+    free = [one["name"] for one in content["joints"] if one["is_actuated"] and not one["kd"]]
+    if free:
+        notes.append(
+            f"Faults leave joints without torque, not damped: {', '.join(free)} (kd 0, as motors driven by "
+            "effort have); brake them in your program while `targets.is_damping`."
+        )
     notes += [
         f"The runtime does not know the action {action['name']} ({action['class']})."
         for action in content["actions"]

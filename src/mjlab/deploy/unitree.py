@@ -105,7 +105,8 @@ def motor_map(names: Sequence[str]) -> list[int]:
         if sorted(short) == sorted(motors):
             return [motors.index(name) for name in short]
     raise UnknownToUnitreeError(
-        f"the motors of these joints are not known; known: {', '.join(MOTORS)}."
+        f"the motors of these joints are not known; known: {', '.join(MOTORS)}. Public sources disagree on "
+        "those of the G1 with 23 joints and of the H1-2."
     )
 
 
