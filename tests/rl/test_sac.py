@@ -288,10 +288,11 @@ def test_a_policy_learns_what_its_teacher_shows():
 class Shown(FakeEnv):
     """Environment with an additional observation, `shown`, equal in all environments."""
 
-    value = 2.0
+    value: float | torch.Tensor = 2.0
 
     def get_observations(self) -> dict[str, torch.Tensor]:
-        return super().get_observations() | {"shown": torch.full((self.num_envs, 2), self.value)}
+        shown = torch.as_tensor(self.value).expand(max(2, torch.as_tensor(self.value).numel()))
+        return super().get_observations() | {"shown": shown.repeat(self.num_envs, 1)}
 
 
 @pytest.mark.parametrize(
@@ -314,6 +315,19 @@ def test_without_an_action_or_a_weight_a_teacher_changes_no_bit(monkeypatch, val
         runner.learn(5)
         results.append(runner.alg.save()["actor_state_dict"])
     assert_same_bits(*results)
+
+
+def test_effects_of_actions_count_as_actions_do(monkeypatch):
+    monkeypatch.setitem(globals(), "FakeEnv", Shown)
+    found = {}
+    for factor in (0.0, 2.0):
+        # Two actions, and a matrix of two rows.
+        monkeypatch.setattr(Shown, "value", torch.tensor([0.5, -0.3, factor, 0.0, 0.0, factor]))
+        torch.manual_seed(3)
+        runner = make_runner(teacher="shown", imitation=((0, 1.0),), actor_learning_rate=1e-9)
+        runner.learn(1)
+        found[factor] = runner.alg.update()["imitation"]
+    assert found[2.0] == pytest.approx(5.0 * found[0.0], rel=1e-3)
 
 
 def test_a_teacher_that_weighs_nothing_is_not_compared_with():
@@ -371,8 +385,10 @@ def test_the_teacher_acts_at_first_with_exploration():
     assert min(near[:3]) > 0.0
 
 
-def test_a_teacher_that_shows_something_else_than_actions_is_refused():
-    for group, facts in (("critic", ("(2,)", "'critic'", "(4,)")), ("none", ("'none'",))):
+def test_a_teacher_that_shows_something_else_than_actions_is_refused(monkeypatch):
+    monkeypatch.setitem(globals(), "FakeEnv", Shown)
+    monkeypatch.setattr(Shown, "value", torch.zeros(3))
+    for group, facts in (("shown", ("2 actions", "'shown'", "(3,)")), ("none", ("'none'",))):
         with pytest.raises(ValueError, match="SAC teacher") as caught:
             make_runner(teacher=group)
         assert all(fact in str(caught.value) for fact in facts)

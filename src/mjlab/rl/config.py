@@ -167,7 +167,8 @@ class RslRlSacAlgorithmCfg:
     little effect from drifting to their bounds."""
     teacher: str | None = None
     """Observation group with the actions of a controller for the policy to imitate, (N, actions), e.g.
-    those of `stepping_action`. Values outside (-1, 1) leave an action free."""
+    those of `stepping_action`. Values outside (-1, 1) leave an action free. Further values are rows of a
+    matrix, (N, rows x actions): its product with the distance of the actions counts as that does."""
     teacher_steps: CountOrZero = 0
     """Number of initial environment steps controlled by the teacher, with the policy's exploration."""
     imitation: Annotated[tuple[tuple[int, float], ...], Range(0.0, ends="[)")] = ((0, 0.0),)

@@ -147,11 +147,11 @@ class SAC:
             )
         groups = list(dict.fromkeys([*actor.obs_groups, *critic.obs_groups]))
         if (teacher := alg_cfg.teacher) is not None:
-            shape = tuple(obs[teacher].shape[1:]) if teacher in obs else None
-            if shape != (env.num_actions,):
+            shape = tuple(obs[teacher].shape[1:]) if teacher in obs else ()
+            if len(shape) != 1 or shape[0] % env.num_actions or not shape[0]:
                 raise ValueError(
-                    f"SAC teacher: expected an observation group of shape ({env.num_actions},), one "
-                    f"value per action, got {teacher!r} of shape {shape}. Available: "
+                    f"SAC teacher: expected an observation group with {env.num_actions} actions, and "
+                    f"rows of as many values, got {teacher!r} of shape {shape or None}. Available: "
                     f"{sorted(obs.keys())}."
                 )
             groups.append(teacher)
@@ -574,7 +574,8 @@ class _Schedule:
 class _Teacher:
     """Controller that acts at first, and is imitated by the policy.
 
-    The observation group `group` holds its actions. Values outside (-1, 1) leave the policy free.
+    The observation group `group` holds its actions a*, and may hold a matrix W, row by row: effects of actions,
+    such as the motion of a hand. Values of a* outside (-1, 1) leave the policy free.
     """
 
     def __init__(self, cfg: RslRlSacAlgorithmCfg) -> None:
@@ -589,7 +590,7 @@ class _Teacher:
 
     def act(self, obs: TensorDict, noise: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Return the controller's actions with `noise` before tanh, `actions` for free ones."""
-        shown: Any = obs[self.group]
+        shown: Any = obs[self.group][:, : actions.shape[1]]
         near = torch.tanh(torch.atanh(shown) + noise)
         return torch.where(shown.abs() < 1.0, near, actions)
 
@@ -598,6 +599,10 @@ class _Teacher:
         return self._weight.at(num_steps)
 
     def distance(self, shown: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-        """Return the mean squared distance of `mean` (B, A) from the controller's `shown` (B, A)."""
-        difference = torch.where(shown.abs() < 1.0, mean - shown, 0.0)
-        return difference.square().sum(dim=-1).mean()
+        """Return the mean of |d|^2 + |W d|^2, d = a - a*, of `mean` a (B, A) from the group's `shown` (B, .)."""
+        size = mean.shape[1]
+        action = shown[:, :size]
+        difference = torch.where(action.abs() < 1.0, mean - action, 0.0)
+        matrix = shown[:, size:].unflatten(1, (shown.shape[1] // size - 1, size))  # (B, m, A)
+        effects = matrix @ difference.unsqueeze(2)
+        return torch.cat((difference, effects.squeeze(2)), dim=1).square().sum(dim=-1).mean()

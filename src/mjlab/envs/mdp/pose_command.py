@@ -123,6 +123,8 @@ class UniformPoseCommand(CommandTerm):
         goal_joint_pos: (N, joints) joint positions at the goal (rad or m), zeros with `ranges`. The same pose
             may be reached at others.
         goals_torque, goal_torque: Torques that hold the joints there against gravity (N m or N).
+        goals_jacobian, goal_jacobian: Motion of the frame per motion of each joint there, in the root frame,
+            (., 6, joints): translation, rotation.
         goal_age: (N,) time since the goal was sampled (s).
         num_ended: (N,) number of goals of the episode that ended, without the current one.
     """
@@ -140,6 +142,7 @@ class UniformPoseCommand(CommandTerm):
         self._reference_quat = torch.tensor([1.0, 0.0, 0.0, 0.0], device=self.device)
         self.goals: torch.Tensor | None = None
         self.goals_joint_pos = self.goals_torque = torch.empty(0, 0, device=self.device)
+        self.goals_jacobian = torch.empty(0, 6, 0, device=self.device)
         if cfg.ranges is None:
             check_in_range(
                 "UniformPoseCommandCfg.joint_range_fraction", cfg.joint_range_fraction, 0, 1
@@ -149,7 +152,7 @@ class UniformPoseCommand(CommandTerm):
                 env, self._entity, self.frame, cfg.num_goals, cfg.joint_range_fraction
             )
             self.goals, self.goals_joint_pos, self.joint_ids = found[:3]
-            self.goals_torque, self._reference_quat = found[3:]
+            self.goals_torque, self.goals_jacobian, self._reference_quat = found[3:]
 
         def zeros(*shape: int) -> torch.Tensor:
             return torch.zeros(*shape, self.num_envs, dtype=torch.float32, device=self.device)
@@ -158,6 +161,7 @@ class UniformPoseCommand(CommandTerm):
         self.pose_command_b[:, 3] = 1.0
         self.goal_joint_pos = zeros(self.goals_joint_pos.shape[1]).T.contiguous()
         self.goal_torque = torch.zeros_like(self.goal_joint_pos)
+        self.goal_jacobian = zeros(6, self.goals_joint_pos.shape[1]).movedim(2, 0).contiguous()
         self.goal_age, self.num_ended = zeros(), zeros()
         self._end_sums = zeros(3)
         self.metrics = {
@@ -242,6 +246,7 @@ class UniformPoseCommand(CommandTerm):
             self.pose_command_b[env_ids] = self.goals[picks]
             self.goal_joint_pos[env_ids] = self.goals_joint_pos[picks]
             self.goal_torque[env_ids] = self.goals_torque[picks]
+            self.goal_jacobian[env_ids] = self.goals_jacobian[picks]
 
     def _follow(self, panel: PosePanel) -> None:
         """Move a goal that the user holds to the panel's handle, else the handle to the goal."""

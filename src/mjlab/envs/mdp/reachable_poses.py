@@ -60,6 +60,9 @@ class ReachablePoses(NamedTuple):
     """Columns of these joints in the entity's joint data, (joints,)."""
     torque: torch.Tensor
     """Torques that hold the joints at `joint_pos` against gravity, (count, joints) (N m or N)."""
+    jacobian: torch.Tensor
+    """Motion of the frame per motion of each joint at `joint_pos`, in the root frame, (count, 6, joints):
+    translation, rotation."""
     home_quat: torch.Tensor
     """Orientation of the frame in the default pose, (4,)."""
 
@@ -122,6 +125,7 @@ def draw_reachable_poses(
         torch.as_tensor(positions, dtype=torch.float32, device=env.device),
         torch.as_tensor(columns, device=env.device),
         torch.as_tensor(torques, dtype=torch.float32, device=env.device),
+        chain.forward(torch.as_tensor(positions))[2].to(env.device, torch.float32),
         chain.home_quat.to(env.device, torch.float32),
     )
 
