@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+import torch
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def load(example: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(example, EXAMPLES / f"{example}.py")
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    assert spec.loader is not None
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.mark.slow
@@ -17,9 +28,24 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 )
 def test_the_swing_up_is_solved(library, example):
     pytest.importorskip(library)
-    spec = importlib.util.spec_from_file_location(example, EXAMPLES / f"{example}.py")
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    assert spec.loader is not None
-    spec.loader.exec_module(module)
-    assert module.train(seed=1)[0] >= 900.0
+    assert load(example).train(seed=1)[0] >= 900.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("library", "example"),
+    [
+        ("gymnasium", "gymnasium_cartpole"),
+        ("stable_baselines3", "sb3_cartpole"),
+        ("skrl", "skrl_cartpole"),
+        ("torchrl", "torchrl_cartpole"),
+    ],
+)
+def test_short_examples_run(library, example, monkeypatch, tmp_path):
+    pytest.importorskip(library)
+    # Some write their logs here.
+    monkeypatch.chdir(tmp_path)
+    threads = torch.get_num_threads()
+    load(example).train(num_envs=4, iterations=1)
+    torch.set_num_threads(threads)
+    assert len((EXAMPLES / f"{example}.py").read_text(encoding="utf-8").splitlines()) < 40

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from mjlab.managers import (  # noqa: E402
     ObservationTermCfg,
 )
 from mjlab.rl import check_vector_env, gymnasium_env  # noqa: E402
+from mjlab.rl.gymnasium_vector import step_env  # noqa: E402
 from mjlab.tasks.registry import list_tasks, load_env_cfg  # noqa: E402
 
 NUM_ENVS = 3
@@ -265,3 +267,18 @@ def test_a_task_that_is_registered_later_can_be_registered_too(monkeypatch):
     assert "mjlab/A-Task" in gymnasium.registry
     assert "mjlab/Not a name" not in gymnasium.registry
     del gymnasium.registry["mjlab/A-Task"]
+
+
+def test_adapters_step_with_the_threads_of_the_runner(monkeypatch):
+    monkeypatch.delenv("MJLAB_TORCH_THREADS", raising=False)
+    used = []
+
+    def step(actions: torch.Tensor) -> tuple[Any, ...]:
+        used.append(torch.get_num_threads())
+        return {}, actions, actions > 0.0, actions > 0.0, {}
+
+    core = SimpleNamespace(num_envs=2, cfg=SimpleNamespace(is_finite_horizon=False))
+    env = SimpleNamespace(step=step, unwrapped=core)
+    torch.set_num_threads(2)
+    step_env(env, torch.zeros(2), None)
+    assert (used, torch.get_num_threads()) == ([1], 2)
