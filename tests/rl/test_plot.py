@@ -245,6 +245,7 @@ def test_a_goal_that_nothing_reaches_does_not_flatten_the_curve(tmp_path: Path, 
 def test_goals_besides_the_return_have_their_own_axes(tmp_path: Path, figures):
     others = {
         "Evaluation/mean_return": {1: 3000.0},
+        "Train/speed_error": {0: 0.75, 1: 0.5},
         "Evaluation/speed_error": {1: 0.3},
         "Evaluation/failure_rate": {1: 0.1},
     }
@@ -252,6 +253,7 @@ def test_goals_besides_the_return_have_their_own_axes(tmp_path: Path, figures):
     _, error, failures = figures[0].axes
     assert error.get_title() == "Speed error (m/s)"
     assert points_of(error, "evaluation") == [(2, pytest.approx(0.3))]
+    assert points_of(error, "exploring policy") == [(1, 0.75), (2, 0.5)]
     assert failures.get_title() == "Failure rate (%)"
     assert points_of(failures, "evaluation") == [(2, pytest.approx(10.0))]
     assert {y for _, y in points_of(failures, "goal")} == {5.0}

@@ -211,6 +211,8 @@ def plot_run(
         goals = [bound for bound in bounds if bound.name == "mean_return"]
         _draw_evaluations(top, curves, "mean_return", goals[0] if goals else None)
     for axes, bound in zip(below, others, strict=True):
+        if (curve := curves.get(f"Train/{bound.name}")) is not None:
+            axes.plot(curve[0] + 1, curve[1], color="tab:blue", lw=1, label="exploring policy")
         _draw_evaluations(axes, curves, bound.name, bound)
         _finish_small(axes, bound, top)
     _add_environment_steps(top, curves)
