@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 import yaml
 from bundles import load_program
 
+from mjlab.deploy.check import check_bundle
 from mjlab.deploy.unitree import (
     MOTORS,
     UnknownToUnitreeError,
@@ -229,6 +231,43 @@ def test_gait_phase_is_two_steps_ahead_of_the_clock(bundle, tmp_path):
     np.testing.assert_allclose(got[:-2], expected[2:], atol=1e-5)
     assert "two control steps" in str(phase_note(contract))
     assert phase_note(edited(bundle("go1"), lambda content: None)) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        (lambda cfg: cfg["stiffness"].reverse(), "deploy.yaml/stiffness"),
+        (lambda cfg: cfg["observations"]["joint_pos_rel"].update(clip=[-1.0, 1.0]), "clip"),
+        (
+            lambda cfg: cfg["observations"].update(base=cfg["observations"].pop("last_action")),
+            "base",
+        ),
+        (lambda cfg: cfg.pop("commands"), "deploy.yaml/commands"),
+        (lambda cfg: cfg.clear(), "is of this contract"),
+    ],
+)
+def test_edited_file_is_found(bundle, tmp_path, change, where):
+    """A file of another task is reported to have destroyed a robot."""
+    folder = Path(shutil.copytree(bundle("go1"), tmp_path / "bundle"))
+    path = folder / "params" / "deploy.yaml"
+    settings = yaml.safe_load(path.read_text())
+    change(settings)
+    path.write_text(yaml.safe_dump(settings, sort_keys=False))
+    report = check_bundle(folder)
+    assert not report.is_passed
+    assert where in " ".join(str(one) for one in report.findings)
+
+
+def test_file_and_network_of_another_task_are_found(bundle, tmp_path):
+    folder = Path(shutil.copytree(bundle("go1"), tmp_path / "bundle"))
+    for name in ("params/deploy.yaml", "exported/policy.onnx"):
+        shutil.copyfile(bundle("g1") / name, folder / name)
+    wrong = {one.comparison.name for one in check_bundle(folder).findings}
+    assert wrong >= {"deploy.yaml/joint_ids_map", "exported/policy.onnx"}
+    other = Path(shutil.copytree(bundle("Mjlab-Cartpole-Swingup"), tmp_path / "other"))
+    (other / "params").mkdir()
+    shutil.copyfile(folder / "params" / "deploy.yaml", other / "params" / "deploy.yaml")
+    assert [one.comparison.name for one in check_bundle(other).findings] == ["deploy.yaml"]
 
 
 def test_reason_for_the_g1_with_23_joints():

@@ -12,7 +12,8 @@ Each stage starts from the values of the trace, so that a mistake shows where it
     state          the same -> state after one control step
     next sensors   the same -> `Simulation.measure` after it
     free steps     two control steps of an episode without values of the trace
-    contract       scene -> what `contract.json` lists of the joints, and no other stage compares
+    contract       scene -> what `contract.json` lists of the joints, and no other stage compares;
+                   contract -> `params/deploy.yaml` and the network beside it
 
 No code of this package runs between a state and the next: `Simulation` of the bundle calls `mj_step`.
 """
@@ -31,6 +32,7 @@ import numpy as np
 from mjlab.deploy.causes import Verdict, likely_cause
 from mjlab.deploy.evidence import Difference, Evidence, Programs, flat, one_step
 from mjlab.deploy.fitness import fitness_warnings
+from mjlab.deploy.unitree import file_numbers
 from mjlab.utils.errors import UserError
 from mjlab.utils.tables import Table
 
@@ -58,6 +60,8 @@ _CHAINS = (
 )
 _JOINT_FIELDS = ("default_pos", "armature", "damping", "frictionloss")
 _SMALLEST_RANGE = 1e-3
+# Difference of a number in `deploy.yaml` that is none, and the value of a key that is not there.
+_ROUNDED, _ABSENT = 1e-6, -1e12
 _FREE_STEPS = 2
 # The trace shows frames if it tilts and turns by this much (rad).
 _TILT, _TURN = 0.2, math.pi / 2
@@ -259,7 +263,7 @@ def check_bundle(folder: Path) -> Report:
     with _named_failures(folder):
         programs = Programs.load(folder)
         values = replay(evidence, programs)
-    comparisons = compare(evidence, values)
+    comparisons = compare(evidence, values) + _unitree_files(evidence)
     report = Report(comparisons, undecided=undecided(evidence), warnings=fitness_warnings(evidence))
     if not report.is_passed:
         report.findings = find_causes(evidence, comparisons, replay(evidence, programs))
@@ -413,6 +417,17 @@ def compare(evidence: Evidence, values: dict[tuple[str, str], np.ndarray]) -> li
     return comparisons
 
 
+def _unitree_files(evidence: Evidence) -> list[Comparison]:
+    """Return the comparisons of the files for Unitree's programs with the contract."""
+    comparisons = []
+    for name, parts in file_numbers(evidence.contract, evidence.folder).items():
+        keys = list({**parts[0], **parts[1]})
+        expected, got = (np.array([[part.get(key, _ABSENT) for key in keys]]) for part in parts)
+        if keys:
+            comparisons.append(Comparison("contract", name, expected, got, keys, _ROUNDED))
+    return comparisons
+
+
 def _expected(evidence: Evidence, stage: str, name: str) -> np.ndarray | None:
     """Return the values of the trace, (K, n); None if it has none."""
     trace = evidence.trace
@@ -546,7 +561,7 @@ def _verdict(
     evidence: Evidence, one: Comparison, again: dict[tuple[str, str], np.ndarray]
 ) -> Verdict:
     if one.stage == "contract":
-        return Verdict(None, {}, "contract.json and the scene differ")
+        return Verdict(None, {}, "contract.json and another file of the bundle differ")
     difference = _difference(one)
     if difference is None:
         return Verdict(None, {}, "values of another size, or not finite")

@@ -59,6 +59,41 @@ def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
     return None
 
 
+def file_numbers(
+    contract: Mapping[str, Any], folder: Path
+) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
+    """Return the numbers of `deploy.yaml` by part and key, as the contract gives them and as in `folder`.
+
+    Empty without the file. One that `contract` cannot have, or that is no such file, is not of this contract.
+    """
+    path, policy = folder / "params" / "deploy.yaml", folder / contract["policy"]["file"]
+    if not path.exists():
+        return {}
+    try:
+        written, found = deploy_settings(contract), yaml.safe_load(path.read_text(encoding="utf-8"))
+        for settings in (written, found):
+            names = settings["observations"]
+            settings["order of terms"] = {name: place for place, name in enumerate(names)}
+        parts = {
+            key: (_flat(written.get(key)), _flat(found.get(key))) for key in {**written, **found}
+        }
+    except (ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
+        return {"deploy.yaml": ({"is of this contract": 1.0}, {"is of this contract": 0.0})}
+    copy = folder / "exported" / "policy.onnx"
+    is_same = copy.exists() and copy.read_bytes() == policy.read_bytes()
+    parts["exported/policy.onnx"] = {"is policy.onnx": 1.0}, {"is policy.onnx": float(is_same)}
+    return {name if "/" in name else f"deploy.yaml/{name}": part for name, part in parts.items()}
+
+
+def _flat(value: Any, key: str = "") -> dict[str, float]:
+    """Return the numbers within mappings and lists, by dotted key; 0 for null."""
+    if not isinstance(value, Mapping | list):
+        return {key: float(value or 0.0)}
+    parts = value.items() if isinstance(value, Mapping) else enumerate(value)
+    flat = [_flat(part, f"{key}.{name}".lstrip(".")) for name, part in parts]
+    return {name: number for one in flat for name, number in one.items()}
+
+
 def phase_note(contract: Mapping[str, Any]) -> str | None:
     """Return a sentence on the gait phase of Unitree's programs; None for a policy without a clock."""
     clocks = [one for one in contract["commands"] if one["kind"] == "gait_clock"]
