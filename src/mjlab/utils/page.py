@@ -195,5 +195,5 @@ CHART_STYLE = """figure{margin:0 0 1em}figcaption{font-weight:600}
 svg{width:100%;height:auto;display:block}svg text{font-size:10px;fill:currentColor}
 svg path{fill:none}.grid{stroke:#8884;stroke-width:1}.rule{stroke:#888a;stroke-dasharray:2 3}
 .cursor{stroke:#e03131;stroke-width:1.5;transform:translateX(calc(var(--share,0)*var(--width)))}
-.spark{width:120px;height:22px}"""
+.spark{width:96px;height:18px}"""
 """Style sheet of charts."""
