@@ -127,13 +127,6 @@ def test_the_teacher_acts_in_fewer_and_fewer_environments(teacher):
     assert (shares[4:] == 0.0).all()
 
 
-def test_a_correction_has_a_value_per_action_and_a_flag():
-    with pytest.raises(ValueError, match="correction: expected an observation group of shape"):
-        student_runner(of_algorithm={"correction": "actor"})
-    with pytest.raises(ValueError, match="'unknown' of shape None. Available:"):
-        student_runner(of_algorithm={"correction": "unknown"})
-
-
 def test_a_teacher_with_memory_keeps_it_from_one_iteration_to_the_next(tmp_path):
     memory = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 4}
     networks = {name: {**runner_cfg()[name], **memory} for name in ("actor", "critic")}

@@ -212,9 +212,6 @@ class RslRlDistillationAlgorithmCfg:
     teacher_iterations: CountOrZero = 0
     """Number of iterations in which the teacher acts in some environments, a share that falls from 1 to
     0. 0: the student acts from the start."""
-    correction: str | None = None
-    """Observation group that corrects the teacher, (N, actions + 1): where the last column is 1, the
-    student imitates the others instead. For what the teacher sees and the student does not."""
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
     """Optimizer."""
     use_mixed_precision: bool = False

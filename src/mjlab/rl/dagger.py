@@ -23,44 +23,19 @@ class DAgger(Distillation):
     and the teacher shows how to go on from there.
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        teacher_iterations: int = 0,
-        correction: str | None = None,
-        **kwargs: Any,
-    ) -> None:
-        """Build with the settings of `RslRlDistillationAlgorithmCfg`.
-
-        Raises:
-            ValueError: `correction` is not an observation group of a value per action and a flag.
-        """
+    def __init__(self, *args: Any, teacher_iterations: int = 0, **kwargs: Any) -> None:
+        """Build; the share falls linearly over `teacher_iterations`. 0: the student always acts."""
         super().__init__(*args, **kwargs)
-        if correction is not None:
-            groups: Any = self.storage.observations
-            shape = tuple(groups[correction].shape[2:]) if correction in groups else None
-            expected = (self.storage.actions.shape[-1] + 1,)
-            if shape != expected:
-                raise ValueError(
-                    f"Distillation correction: expected an observation group of shape {expected}, one "
-                    f"value per action and a flag, got {correction!r} of shape {shape}. Available: "
-                    f"{sorted(groups.keys())}."
-                )
         self._teacher_iterations = teacher_iterations
-        self._correction = correction
 
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Return the student's sampled actions, or the teacher's with the student's noise."""
         actions = super().act(obs)
-        shown: Any = self.transition.privileged_actions
-        if self._correction is not None:
-            correction: Any = obs[self._correction]
-            shown = torch.where(correction[:, -1:] > 0.5, correction[:, :-1], shown)
-            self.transition.privileged_actions = shown
         if self.teacher_share > 0.0:
             if self.storage.step == 0:
                 draws = torch.rand(len(actions), 1, device=actions.device)
                 self._is_driven = draws < self.teacher_share
+            shown: Any = self.transition.privileged_actions
             actions += self._is_driven * (shown - self._raw_student.output_mean)
         return actions
 

@@ -32,7 +32,6 @@ _ADDED_TO_ALGORITHM = {
     "symmetry_cfg": None,
     "use_mixed_precision": False,
     "teacher_iterations": 0,
-    "correction": None,
 }
 
 

@@ -5,19 +5,11 @@ from mjlab.envs.mdp import *  # noqa: F403
 from mjlab.envs.mdp import __all__ as _library
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from mjlab.sensor import CameraSensor, ContactSensor
-from mjlab.tasks.manipulation.mdp import (
-    commands,
-    grasp_starts,
-    observations,
-    rewards,
-    search,
-    terminations,
-)
+from mjlab.tasks.manipulation.mdp import commands, grasp_starts, observations, rewards, terminations
 from mjlab.tasks.manipulation.mdp.commands import *  # noqa: F403
 from mjlab.tasks.manipulation.mdp.grasp_starts import *  # noqa: F403
 from mjlab.tasks.manipulation.mdp.observations import *  # noqa: F403
 from mjlab.tasks.manipulation.mdp.rewards import *  # noqa: F403
-from mjlab.tasks.manipulation.mdp.search import *  # noqa: F403
 from mjlab.tasks.manipulation.mdp.terminations import *  # noqa: F403
 
 __all__ = [
@@ -29,7 +21,6 @@ __all__ = [
     *grasp_starts.__all__,
     *observations.__all__,
     *rewards.__all__,
-    *search.__all__,
     *terminations.__all__,
     *_library,
 ]

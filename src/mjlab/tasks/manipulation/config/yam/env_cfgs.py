@@ -24,15 +24,14 @@ from mjlab.tasks.manipulation import mdp
 from mjlab.tasks.manipulation.lift_cube_env_cfg import make_lift_cube_env_cfg
 from mjlab.utils.errors import check_count, check_one_of
 
-HAND = ("grasp_site",)
+_HAND = ("grasp_site",)
 _FINGERTIPS = "[lr]f_down(6|7|8|9|10|11)_collision"
-CAMERA = "camera_d405"
-DEPTH_CUTOFF = 0.5
+_CAMERA = "camera_d405"
 _IMAGE_SIZE = 32
 # Geom groups in camera images: ground and cubes (0), collision geoms of the arm (3).
 _SEEN_GROUPS = (0, 3)
 _DEPTH_IMAGE = ObservationTermCfg(
-    func=mdp.camera_depth, params={"sensor_name": CAMERA, "cutoff_distance": DEPTH_CUTOFF}
+    func=mdp.camera_depth, params={"sensor_name": _CAMERA, "cutoff_distance": 0.5}
 )
 _PLAY_GOAL_TIME = 4.0
 # Warp contacts to reserve per cube: cubes can touch the whole gripper and the other cubes.
@@ -83,7 +82,7 @@ def yam_lift_cube_env_cfg(play: bool = False) -> ManagerBasedRlEnvCfg:
     action.scale = dict(YAM_ACTION_SCALE)
     actor, critic = cfg.observations["actor"], cfg.observations["critic"]
     for term in (actor.terms["ee_to_cube"], critic.terms["ee_to_cube"], cfg.rewards["lift"]):
-        term.params["asset_cfg"].site_names = HAND
+        term.params["asset_cfg"].site_names = _HAND
     for name in ("slide", "spin", "roll"):
         cfg.events[f"fingertip_friction_{name}"].params["asset_cfg"].geom_names = _FINGERTIPS
     (hand_on_the_ground,) = cfg.scene.sensors
@@ -112,7 +111,7 @@ def yam_lift_cube_vision_env_cfg(
     cfg = yam_lift_cube_env_cfg(play=play)
     cfg.scene.sensors += (_camera((cam_type,)),)
     if cam_type == "rgb":
-        image = ObservationTermCfg(func=mdp.camera_rgb, params={"sensor_name": CAMERA})
+        image = ObservationTermCfg(func=mdp.camera_rgb, params={"sensor_name": _CAMERA})
         cfg.events["cube_color"] = EventTermCfg(
             func=mdp.dr.geom_rgba,
             mode="reset",
@@ -127,7 +126,7 @@ def yam_lift_cube_vision_env_cfg(
     else:
         image = copy.deepcopy(_DEPTH_IMAGE)
     cfg.observations["camera"] = ObservationGroupCfg(
-        terms={f"{CAMERA}_{cam_type}": image}, enable_corruption=False
+        terms={f"{_CAMERA}_{cam_type}": image}, enable_corruption=False
     )
     _replace_cube_by_goal(cfg, "actor")
     return cfg
@@ -174,7 +173,7 @@ def yam_multi_cube_seg_env_cfg(num_cubes: int = 3, play: bool = False) -> Manage
     cfg.scene.sensors += (_camera(("depth", "segmentation")),)
     mask = ObservationTermCfg(
         func=mdp.camera_target_cube_mask,
-        params={"sensor_name": CAMERA, "command_name": "lift_height"},
+        params={"sensor_name": _CAMERA, "command_name": "lift_height"},
     )
     cfg.observations["camera"] = ObservationGroupCfg(
         terms={"depth": copy.deepcopy(_DEPTH_IMAGE), "target_mask": mask},
@@ -195,15 +194,15 @@ def _replace_cube_by_goal(cfg: ManagerBasedRlEnvCfg, group: str) -> None:
         func=mdp.target_position,
         params={
             "command_name": "lift_height",
-            "asset_cfg": SceneEntityCfg("robot", site_names=HAND),
+            "asset_cfg": SceneEntityCfg("robot", site_names=_HAND),
         },
     )
 
 
 def _camera(data_types: tuple[Literal["rgb", "depth", "segmentation"], ...]) -> CameraSensorCfg:
     return CameraSensorCfg(
-        name=CAMERA,
-        camera_name=f"robot/{CAMERA}",
+        name=_CAMERA,
+        camera_name=f"robot/{_CAMERA}",
         width=_IMAGE_SIZE,
         height=_IMAGE_SIZE,
         data_types=data_types,
