@@ -10,6 +10,7 @@ import time
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import pytest
 from bundles import load_program
 
 from mjlab.deploy.readme import readme
@@ -141,6 +142,13 @@ def test_loops_have_the_measurements_of_the_contract(bundle):
     assert "np.full(3, np.nan)" in python
     assert len(cpp.splitlines()) <= 40
     assert all(part in python for part in ("unitree_hg", "mode_pr", "MOTORS = range"))
+
+
+@pytest.mark.parametrize("name", ["go1", "Mjlab-Reach-Yam", "Mjlab-Tracking-Flat-Unitree-G1"])
+def test_missing_measurements_are_asked_for_where_they_are(bundle, name):
+    python, cpp = (bundle(name) / "README.md").read_text().split("## In C++")
+    assert ("Replace each NaN" in python) == ("np.nan" in python)
+    assert ("Replace each NaN" in cpp) == ("NAN)" in cpp)
 
 
 def test_gyroscope_of_another_link_is_missing(bundle):

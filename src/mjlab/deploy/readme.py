@@ -92,7 +92,7 @@ _NAN_NOTE = " Replace each NaN by the measurement of the line: until then, the r
 
 def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
     """Return the parts of the loops that depend on measurements and commands."""
-    python, cpp, computes, is_missing = "", "", False, False
+    python, cpp, computes = "", "", False
     for one in contract["measurements"]:
         name, size, origin = one["name"], one["size"], _origin(contract, one)
         if origin == "kinematics":
@@ -104,7 +104,6 @@ def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
             value = _CPP.get(origin, f"mjlab::Vector({size}, NAN)")
             note = "  // As Simulation.compute in simulate.py." if origin == "kinematics" else ""
             cpp += f'  measured["{name}"] = {value};{note}\n'
-        is_missing = is_missing or origin in ("", "kinematics")
     given = [one for one in contract["commands"] if one["kind"] == "given"]
     zeros = ", ".join(f'"{one["name"]}": np.zeros({one["size"]})' for one in given)
     sizes = [one["size"] for one in given]
@@ -115,7 +114,8 @@ def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
         "return_py": "measured | robot.compute(measured)" if computes else "measured",
         "import_py": "\nimport mujoco\nfrom simulate import Simulation" if computes else "",
         "robot_py": _ROBOT if computes else "",
-        "nan_note": _NAN_NOTE if is_missing else "",
+        "nan_note_py": _NAN_NOTE if "np.nan" in python else "",
+        "nan_note_cpp": _NAN_NOTE if "NAN" in cpp else "",
         "command_py": f"np.zeros({sizes[0]})" if len(sizes) == 1 else f"{{{zeros}}}",
         "command_cpp": "{twist.linear.x, twist.linear.y, twist.angular.z}"
         if is_twist
