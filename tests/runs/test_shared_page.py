@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
 from mjlab.rl.config import EvaluationCfg
@@ -106,6 +108,18 @@ def test_runs_have_their_learning_curve(trained):
     (chart,) = learning_curves(Run(trained), goal)
     assert "exploring policy" in chart
     assert "goal" in chart
+
+
+def test_goals_span_the_training(trained, monkeypatch):
+    """Also beside a single evaluation."""
+    training = (np.arange(100.0), np.linspace(0.0, 1.0, 100))
+    last = (np.array([99.0]), np.array([0.2]))
+    curves = {"Train/exploring_return": training, "Evaluation/error": last}
+    monkeypatch.setattr("mjlab.rl.plot.read_all_scalars", lambda run: curves)
+    _, error = learning_curves(Run(trained), EvaluationCfg(solved_below={"error": 0.3}))
+    dashed = re.search(r'd="M([\d.]+) [\d.]+L([\d.]+) [\d.]+" [^>]*stroke-dasharray', error)
+    assert dashed is not None
+    assert float(dashed[2]) - float(dashed[1]) > 300.0
 
 
 def test_policies_without_training_have_no_curve(tmp_path):

@@ -177,12 +177,13 @@ def learning_curves(run: Run, evaluation: EvaluationCfg) -> list[str]:
     if tag == DEFAULT_TAG:
         lines += _evaluated(curves, "mean_return")
         goal = bounds.pop("mean_return", None)
-    charts = [_with_goal(LABELS.get(tag, tag), lines, goal)]
+    span = (lines[0].x[0], lines[0].x[-1])
+    charts = [_with_goal(LABELS.get(tag, tag), lines, goal, span)]
     for name, bound in bounds.items():
         if drawn := _evaluated(curves, name, 100.0 if bound.is_rate else 1.0):
             unit = "%" if bound.is_rate else bound.unit
             title = f"{label(name).capitalize()} ({unit})" if unit else label(name).capitalize()
-            charts.append(_with_goal(title, drawn, bound))
+            charts.append(_with_goal(title, drawn, bound, span))
     return charts
 
 
@@ -195,12 +196,11 @@ def _line(name: str, curve: Curve, scale: float = 1.0, *, has_marks: bool = Fals
     return Line(name, list(curve[0] + 1), list(scale * curve[1]), has_marks=has_marks)
 
 
-def _with_goal(title: str, lines: list[Line], goal: Any) -> str:
-    """Return the chart of lines over iterations, with the bound that solves the task."""
+def _with_goal(title: str, lines: list[Line], goal: Any, span: tuple[float, float]) -> str:
+    """Return the chart of lines over the iterations in `span`, with the bound that solves the task."""
     if goal is not None:
-        first, last = min(line.x[0] for line in lines), max(line.x[-1] for line in lines)
         limit = (100.0 if goal.is_rate else 1.0) * goal.limit
-        lines = [*lines, Line("goal", [first, last], [limit, limit], is_dashed=True)]
+        lines = [*lines, Line("goal", span, [limit, limit], is_dashed=True)]
     return chart(title, lines, x_label="iteration")
 
 
