@@ -101,13 +101,8 @@ def scores(run, *policy: str) -> dict:
 def test_nothing_of_the_machine_is_published(evaluated, published):
     files = files_in(published)
     assert set(files) == FILES
-    private = [
-        str(evaluated.parent),
-        str(Path.home()),
-        "jane",
-        "dance.npz"[:0] + "replay",
-        "resumed",
-    ]
+    folders = [str(folder.parent) for folder in (evaluated, published)]
+    private = [*folders, str(Path.home()), "jane", "resumed"]
     for name, content in files.items():
         assert not [text for text in private if text.encode() in content], name
 
@@ -184,6 +179,15 @@ def test_the_card_states_what_was_measured(evaluated, published):
     # 4 episodes of 6 steps.
     assert all(note in text for note in measured["notes"])
     assert "0123abcd`, with uncommitted changes" in text
+
+
+def test_the_card_is_a_model_card(evaluated, published):
+    from huggingface_hub import ModelCard
+
+    measured = json.loads((evaluated / "evaluation.json").read_text())
+    results = ModelCard.load(published / "README.md").data.eval_results
+    assert results[0].metric_value == measured["mean_return"]
+    assert {result.dataset_name for result in results} == {TASK}
 
 
 @pytest.mark.parametrize("change", ["none", "checkpoint", "task"])
@@ -278,7 +282,7 @@ def test_publishing_needs_a_login_first(run, evaluated, hub, monkeypatch):
 @pytest.mark.parametrize(
     ("policy", "named"),
     [("hf:me/missing", "hf:me/missing"), ("hf:me/swingup@missing", "hf:me/swingup@missing"),
-     ("hf:me/swingup", "my_robots 1.2"), ("missing.zip", "missing.zip")],
+     ("hf:me/swingup", "my_robots 1.2"), ("missing.zip", "ZIP archive"), ("runs/missing", "a run folder")],
 )  # fmt: skip
 def test_policies_that_cannot_be_played(run, hub, policy, named):
     info = {"task": "My-Task", "package": "my_robots 1.2"}

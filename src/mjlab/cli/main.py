@@ -501,8 +501,9 @@ def run_subcommand(command: Command, argv: list[str], prog: str) -> None:
 
 
 def _is_policy(text: str) -> bool:
-    """Return True for a path, and for a repository of the Hugging Face Hub."""
-    return text.startswith("hf:") or Path(text).exists()
+    """Return True for a path, also of a file that is missing, and for a repository of the Hub."""
+    is_file = "/" in text or Path(text).suffix in (".zip", ".pt", ".onnx")
+    return is_file or text.startswith("hf:") or Path(text).exists()
 
 
 def run_alias(name: str) -> None:

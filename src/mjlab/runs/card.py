@@ -25,7 +25,7 @@ def write_card(folder: Path, name: str, origin: Mapping[str, Any], license: str 
 
     Args:
         folder: Folder of the policy, complete but for its card and manifest.
-        name: Name of the policy, as `play` takes it.
+        name: Name of the folder or repository, as readers pass it to `play`.
         origin: Origin of the policy; see `mjlab.deploy.bundle.origin`.
         license: License that the user states. None: none.
     """

@@ -16,7 +16,9 @@ class Destination(Protocol):
     """Place of a published policy."""
 
     name: str
-    """Name, as `play` takes it."""
+    """Name, as `play` takes it on this machine."""
+    public_name: str
+    """Name on the card: of folders, the last part."""
     parent: Path
     """Folder for the files while they are written."""
 
@@ -48,6 +50,7 @@ class FolderDestination:
         if folder.exists() and not folder.is_dir():
             raise UserError(f"--to: expected a folder or hf:NAME/REPO, got the file {folder}.")
         self.name = str(folder)
+        self.public_name = folder.resolve().name
         self.parent = folder.resolve().parent
         self._folder = folder
 
@@ -70,7 +73,7 @@ class HubDestination:
     """Repository of the Hugging Face Hub; created if it does not exist."""
 
     def __init__(self, text: str, private: bool) -> None:
-        self.name = text
+        self.name = self.public_name = text
         self.parent = Path(tempfile.gettempdir())
         self._repository, self._branch = hub.repository(text)
         self._private = private

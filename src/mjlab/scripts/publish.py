@@ -74,7 +74,7 @@ def run_publish(task: str, checkpoint: Checkpoint, cfg: PublishConfig) -> None:
     with tempfile.TemporaryDirectory(dir=place.parent, prefix=".publish-") as temporary:
         folder = Path(temporary) / checkpoint.path.parent.resolve().name
         folder.mkdir()
-        _write(task, checkpoint, folder, place.name, cfg)
+        _write(task, checkpoint, folder, place.public_name, cfg)
         names = names_in(folder)
         size = sum((folder / name).stat().st_size for name in names)
         place.write(folder, earlier - names)
