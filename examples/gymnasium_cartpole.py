@@ -1,37 +1,43 @@
-"""Cross-entropy search on the swing-up by Gymnasium's interface, one policy per environment.
-
-uv run --extra gymnasium python examples/gymnasium_cartpole.py
-"""
+"""PPO by hand on the swing-up: `uv run --extra gymnasium python examples/gymnasium_cartpole.py`."""
 
 import gymnasium
 import torch
 
-HIDDEN, ELITES = 16, 32
+NAME, GAMMA, LAMBDA = "mjlab.gymnasium:mjlab/Mjlab-Cartpole-Swingup", 0.98, 0.95
 
 
-def train(num_envs: int = 512, iterations: int = 40) -> None:
-    # The adapter steps with one thread of torch; this is for the policies.
+def train(num_envs: int = 512, iterations: int = 100) -> None:
     torch.set_num_threads(1)
-    name = "mjlab.gymnasium:mjlab/Mjlab-Cartpole-Swingup"
-    options = {"group": "actor", "clip_actions": 1.0, "tensors": True, "device": "cpu"}
-    envs = gymnasium.make_vec(name, num_envs=num_envs, **options)
+    envs = gymnasium.make_vec(NAME, num_envs, group="actor", clip_actions=1.0, tensors=True)
     inputs = envs.single_observation_space.shape[0]
-    mean, std = torch.zeros(HIDDEN * (inputs + 1)), torch.ones(HIDDEN * (inputs + 1))
+    # Mean of the action, and value.
+    net = torch.nn.Sequential(torch.nn.Linear(inputs, 128), torch.nn.ELU(), torch.nn.Linear(128, 2))
+    optimizer = torch.optim.Adam(net.parameters(), lr=2e-3)
+    seen, _ = envs.reset(seed=1)
     for _ in range(iterations):
-        weights = mean + std * torch.randn(num_envs, len(mean))
-        first, second = weights.split([HIDDEN * inputs, HIDDEN], dim=1)
-        returns, ended = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.bool)
-        observations, _ = envs.reset()
-        while not ended.all():
-            hidden = torch.tanh(first.view(num_envs, HIDDEN, inputs) @ observations[..., None])
-            actions = torch.tanh(second[:, None] @ hidden).squeeze(-1)
-            observations, rewards, terminated, truncated, _ = envs.step(actions)
-            returns += rewards * ~ended
-            ended |= terminated | truncated
-        elites = weights[returns.topk(min(ELITES, num_envs)).indices]
-        mean, std = elites.mean(0), elites.std(0) + 0.05
-        print(f"mean return {returns.mean():.0f}, best {returns.max():.0f}", flush=True)
-    envs.close()
+        steps = []
+        for _ in range(32):
+            actions = torch.normal(net(seen)[:, :1].detach(), 0.5)
+            after, reward, terminated, truncated, infos = envs.step(actions)
+            last, ended = after.clone(), terminated | truncated
+            for row in ended.nonzero().flatten().tolist():
+                last[row] = infos["final_obs"][row]
+            steps.append((seen, actions, reward, last, ~terminated, ~ended))
+            seen = after
+        batch, actions, rewards, last, lives, goes_on = map(torch.stack, zip(*steps, strict=True))
+        mean, value = net(batch).detach().unbind(-1)
+        gain = rewards + GAMMA * lives * net(last)[..., 1].detach() - value
+        for step in reversed(range(31)):
+            gain[step] += GAMMA * LAMBDA * goes_on[step] * gain[step + 1]
+        target, gain = value + gain, (gain - gain.mean()) / gain.std()
+        for _ in range(20):
+            new, value = net(batch).unbind(-1)
+            ratio = (2.0 * ((actions[..., 0] - mean) ** 2 - (actions[..., 0] - new) ** 2)).exp()
+            surrogate = torch.minimum(ratio * gain, ratio.clamp(0.8, 1.2) * gain)
+            optimizer.zero_grad()
+            ((value - target).square().mean() - surrogate.mean()).backward()
+            optimizer.step()
+        print(f"mean reward {rewards.mean():.3f}", flush=True)
 
 
 if __name__ == "__main__":

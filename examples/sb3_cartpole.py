@@ -8,7 +8,7 @@ from mjlab.rl.sb3 import Sb3VecEnv
 from mjlab.tasks.registry import load_env_cfg
 
 
-def train(num_envs: int = 512, iterations: int = 40) -> None:
+def train(num_envs: int = 512, iterations: int = 100) -> None:
     torch.set_num_threads(1)
     cfg = load_env_cfg("Mjlab-Cartpole-Swingup")
     cfg.scene.num_envs, cfg.seed = num_envs, 1

@@ -9,7 +9,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 
-def train(num_envs: int = 512, iterations: int = 40) -> None:
+def train(num_envs: int = 512, iterations: int = 100) -> None:
     torch.set_num_threads(1)
     env, size = MJLabEnv("Mjlab-Cartpole-Swingup", num_envs=num_envs, device="cpu"), 32 * num_envs
     net = torch.nn.Sequential(MLP(out_features=2, num_cells=[64, 64]), NormalParamExtractor())

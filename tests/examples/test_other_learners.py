@@ -48,4 +48,5 @@ def test_short_examples_run(library, example, monkeypatch, tmp_path):
     threads = torch.get_num_threads()
     load(example).train(num_envs=4, iterations=1)
     torch.set_num_threads(threads)
-    assert len((EXAMPLES / f"{example}.py").read_text(encoding="utf-8").splitlines()) < 40
+    lines = (EXAMPLES / f"{example}.py").read_text(encoding="utf-8").splitlines()
+    assert sum(map(bool, lines)) < 40
