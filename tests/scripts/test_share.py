@@ -55,13 +55,15 @@ def test_evaluations_of_other_checkpoints_are_not_shown(run, shared):
 
 
 @pytest.mark.parametrize("name", DEMOS)
-def test_demos_are_shared_with_their_evaluation(name, run, tmp_path):
+def test_demos_are_shared_with_their_evaluation_and_training(name, run, tmp_path):
     page = tmp_path / "demo.html"
     outcome = run("share", name, "--output", str(page), "--num-episodes", "1", *SHORT)
     assert outcome.status == 0, outcome.err
     text = page.read_text()
     assert "400 episodes, seed 1000" in text
     assert "lin_vel_x (m/s)" in text
+    for fact, value in (("iterations", DEMOS[name].iteration), ("seed of training", 1)):
+        assert f"<tr><th>{fact}</th><td>{value}</td></tr>" in text
 
 
 def test_pages_need_a_policy(run, tmp_path):

@@ -61,6 +61,11 @@ DEMOS = {
 }
 
 
+def demo_of(policy: Path) -> Demo | None:
+    """Return the bundled policy in a file; None: it is none of them."""
+    return next((demo for demo in DEMOS.values() if demo.policy == policy), None)
+
+
 def demo_cfg(demo: Demo) -> PlayConfig:
     """Return the default flags of `demo`: one robot, on the CPU, in the browser."""
     from mjlab.scripts.play import PlayConfig

@@ -21,7 +21,7 @@ from mjlab.deploy.contract import Contract
 from mjlab.deploy.nominal import nominal_cfg
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.policy import agent_cfg_of, export_policy, has_foreign_runner, make_env
-from mjlab.scripts.demo import DEMOS
+from mjlab.scripts.demo import DEMOS, demo_of
 from mjlab.utils.errors import UserError
 from mjlab.utils.ranges import Count
 from mjlab.utils.screen import shown
@@ -108,9 +108,8 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
 
 def _recorded(task: str, checkpoint: Checkpoint) -> dict[str, Any]:
     """Return what is recorded of the training: by the run, or of a bundled policy by its entry."""
-    for demo in DEMOS.values():
-        if checkpoint.path == demo.policy:
-            return {key: getattr(demo, key) for key in ("run", "iteration", "seed", "commit")}
+    if (demo := demo_of(checkpoint.path)) is not None:
+        return {key: getattr(demo, key) for key in ("run", "iteration", "seed", "commit")}
     run = Run(checkpoint.path.parent)
     is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
     iteration = checkpoint.iteration if is_ours else None

@@ -23,7 +23,7 @@ from mjlab.runs import Checkpoint, Run
 from mjlab.runs.evaluation import EVALUATION_FILE, evaluation_command, read_evaluation
 from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_policy
 from mjlab.runs.shared_page import SharedPage, learning_curves
-from mjlab.scripts.demo import DEMOS
+from mjlab.scripts.demo import DEMOS, demo_of
 from mjlab.scripts.deploy import policy_of
 from mjlab.scripts.evaluate import load_curricula_of
 from mjlab.utils.errors import UserError
@@ -135,13 +135,16 @@ def _origin(task: str, run: Run, checkpoint: Checkpoint, profile: str | None) ->
     """Return what is recorded of a policy's training; None where it is not."""
     is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
     started = run.started
+    iterations = checkpoint.iteration if is_ours else run.info.get("iterations")
+    # Run of a bundled policy.
+    demo = demo_of(checkpoint.path)
     return {
         "profile": profile or "none",
         "learner": checkpoint.learner if is_ours else run.learner,
         "policy": checkpoint.path.name,
-        "iterations": checkpoint.iteration if is_ours else run.info.get("iterations"),
-        "seed of training": run.seed,
-        "commit": run.commit,
+        "iterations": iterations if demo is None else demo.iteration,
+        "seed of training": run.seed if demo is None else demo.seed,
+        "commit": run.commit if demo is None else demo.commit,
         "trained on": run.info.get("machine"),
         "trained at": None if started is None else f"{started:%Y-%m-%d %H:%M}",
     }
