@@ -22,6 +22,7 @@ from mjlab.rl.evaluation import reward_unit
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.evaluation import EVALUATION_FILE, evaluation_command, read_evaluation
 from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_policy
+from mjlab.runs.publication import without_paths
 from mjlab.runs.shared_page import SharedPage, learning_curves
 from mjlab.scripts.demo import DEMOS, demo_of
 from mjlab.scripts.deploy import policy_of
@@ -119,7 +120,7 @@ def run_share(task: str, cfg: ShareConfig) -> Path:
         evaluation_command=evaluation_command(
             task, Path(run.folder.name) / checkpoint.path.name, profile
         ),
-        settings=run.settings if run.exists else {},
+        settings=without_paths(run.settings) if run.exists else {},
     ).html()
     if (size := len(page.encode())) > MAX_BYTES:
         print_notice(
