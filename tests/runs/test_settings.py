@@ -143,7 +143,7 @@ def test_odd_parameters_do_not_stop_a_command(tmp_path):
         run = Run(tmp_path, CARTPOLE)
         run.check_terms(cfg, ("actor", "critic"))
         json.dumps(run.settings)
-    for text in ("obs_groups: {actor: 5}",):
+    for text in ("obs_groups: {actor: 5}", "obs_groups: {actor: [[1]]}"):
         (tmp_path / "params" / "agent.yaml").write_text(text)
         Run(tmp_path, CARTPOLE).check_terms(cfg, ("actor", "critic"))
 
