@@ -415,7 +415,8 @@ class Run:
         groups = self.params["agent"].get("obs_groups")
         lists = [groups.get(network) for network in networks] if isinstance(groups, dict) else ()
         read = [group for names in lists if isinstance(names, list) for group in names]
-        self._check_terms(env, {group: group for group in read})
+        # Files edited by hand may hold anything.
+        self._check_terms(env, {group: group for group in read if isinstance(group, str)})
 
     def check_teacher(self, env: ManagerBasedRlEnvCfg, groups: Iterable[str]) -> None:
         """Check that the actor of the run, maybe of another task, can act on observation `groups` of `env`.
@@ -425,7 +426,7 @@ class Run:
         """
         read = self.recorded("agent.obs_groups.actor")
         pairs = zip(read if isinstance(read, list) else ("actor",), groups, strict=False)
-        self._check_terms(env, dict(pairs))
+        self._check_terms(env, {group: own for group, own in pairs if isinstance(group, str)})
 
     def _check_terms(self, env: ManagerBasedRlEnvCfg, groups: Mapping[str, str]) -> None:
         """Compare the action terms, and those of observation `groups`: recorded name, name in `env`."""
