@@ -356,7 +356,7 @@ def _find(task_name: str) -> _Task:
     _discover()
     if task_name not in _tasks:
         raise UnknownTaskError(
-            f"Unknown task {task_name!r}; {suggest(task_name, _tasks)} `uv run mjlab list-envs` lists all "
+            f"Unknown task {task_name!r}; {suggest(task_name, sorted(_tasks))} `uv run mjlab list-envs` lists all "
             f"{len(_tasks)} tasks."
         )
     return _tasks[task_name]
