@@ -415,8 +415,7 @@ class Run:
         groups = self.params["agent"].get("obs_groups")
         lists = [groups.get(network) for network in networks] if isinstance(groups, dict) else ()
         read = [group for names in lists if isinstance(names, list) for group in names]
-        # Files edited by hand may hold anything.
-        self._check_terms(env, {group: group for group in read if isinstance(group, str)})
+        self._check_terms(env, zip(read, read, strict=True))
 
     def check_teacher(self, env: ManagerBasedRlEnvCfg, groups: Iterable[str]) -> None:
         """Check that the actor of the run, maybe of another task, can act on observation `groups` of `env`.
@@ -425,20 +424,22 @@ class Run:
             UserError: names or order of observation or action terms differ.
         """
         read = self.recorded("agent.obs_groups.actor")
-        pairs = zip(read if isinstance(read, list) else ("actor",), groups, strict=False)
-        self._check_terms(env, {group: own for group, own in pairs if isinstance(group, str)})
+        recorded = read if isinstance(read, list) else ("actor",)
+        self._check_terms(env, zip(recorded, groups, strict=False))
 
-    def _check_terms(self, env: ManagerBasedRlEnvCfg, groups: Mapping[str, str]) -> None:
+    def _check_terms(self, env: ManagerBasedRlEnvCfg, groups: Iterable[tuple[Any, Any]]) -> None:
         """Compare the action terms, and those of observation `groups`: recorded name, name in `env`."""
         from mjlab.rl.checkpoint import other_terms
 
+        # Files edited by hand may hold anything.
+        names = {then: now for then, now in groups if isinstance(then, str)}
         # Weights & Biases does not keep the order of what it stores.
         if self.folder.parent.name == WANDB_CACHE:
             return
         recorded, actions = (self.params["env"].get(name) for name in ("observations", "actions"))
         pairs = {"actions": (actions, env.actions)}
         for group, then in recorded.items() if isinstance(recorded, dict) else ():
-            now = env.observations.get(groups.get(group, ""))
+            now = env.observations.get(names.get(group, ""))
             if now is not None and isinstance(then, dict):
                 pairs[f"observations.{group}"] = then.get("terms"), now.terms
         known = {name: pair for name, pair in pairs.items() if isinstance(pair[0], dict)}
