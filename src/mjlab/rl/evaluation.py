@@ -332,6 +332,11 @@ class Bound:
         """True for a fraction of the episodes, shown in percent."""
         return self.name in ("failure_rate", "success_rate")
 
+    @property
+    def scale(self) -> float:
+        """Factor from a value to what charts show: percent for rates."""
+        return 100.0 if self.is_rate else 1.0
+
     def is_met(self, result: EvaluationResult) -> bool:
         """Return True if `result` meets the bound. NaN does not."""
         value = result.judged(self.name)

@@ -224,7 +224,7 @@ def _draw_evaluations(
     axes: Axes, curves: Mapping[str, Curve], name: str, goal: Bound | None
 ) -> None:
     """Draw a value of evaluations and confirmations, and its goal."""
-    scale = 100.0 if goal is not None and goal.is_rate else 1.0
+    scale = 1.0 if goal is None else goal.scale
     marks: dict[str, dict[str, Any]] = {
         "Evaluation": {"ls": ":", "lw": 1, "marker": "o", "ms": 4, "color": "tab:orange"},
         # Around the evaluation that it confirms.
@@ -246,11 +246,10 @@ def _draw_evaluations(
 
 def _finish_small(axes: Axes, bound: Bound, top: Axes) -> None:
     """Name the value on small axes, which share the iterations of `top`."""
-    from mjlab.rl.progress import label
+    from mjlab.rl.progress import title
 
     axes.set_xlim(top.get_xlim())
-    name, unit = label(bound.name).capitalize(), "%" if bound.is_rate else bound.unit
-    axes.set_title(f"{name} ({unit})" if unit else name, fontsize="small")
+    axes.set_title(title(bound), fontsize="small")
     axes.tick_params(labelsize="small")
     if axes.dataLim.y0 >= 0.0:
         axes.set_ylim(bottom=0.0)
@@ -343,13 +342,13 @@ def plot_seeds(
         _draw_goal(top, goal)
     top.set(xlabel="Iteration", ylabel=LABELS.get(tag, tag))
     for axes, bound in zip(below, others, strict=True):
-        scale = 100.0 if bound.is_rate else 1.0
         for color, of in zip(colors, read.values(), strict=True):
             for _, curves in of:
                 for group, style in (("Train", "-"), ("Evaluation", "o")):
                     if (curve := curves.get(f"{group}/{bound.name}")) is not None:
-                        axes.plot(curve[0] + 1, scale * curve[1], style, lw=0.8, ms=4, c=color)
-        _draw_goal(axes, scale * bound.limit)
+                        shown = bound.scale * curve[1]
+                        axes.plot(curve[0] + 1, shown, style, lw=0.8, ms=4, c=color)
+        _draw_goal(axes, bound.scale * bound.limit)
         _finish_small(axes, bound, top)
     return _save(figure, output, title)
 

@@ -425,6 +425,12 @@ def label(name: str) -> str:
     return "return" if name == "mean_return" else name.replace("_", " ")
 
 
+def title(bound: Bound) -> str:
+    """Return the name of the value of `bound` with its unit, as charts show it."""
+    name, unit = label(bound.name).capitalize(), "%" if bound.is_rate else bound.unit
+    return f"{name} ({unit})" if unit else name
+
+
 def formatted(bound: Bound, value: float) -> str:
     """Format a value of evaluations with the unit of `bound`; rates in percent."""
     if bound.is_rate:

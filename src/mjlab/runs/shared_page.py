@@ -162,7 +162,7 @@ def learning_curves(run: Run, evaluation: EvaluationCfg) -> list[str]:
     """Return charts of the return and of other values that solve the task, over iterations."""
     from mjlab.rl.evaluation import Bound
     from mjlab.rl.plot import DEFAULT_TAG, LABELS, default_tag, read_all_scalars
-    from mjlab.rl.progress import label
+    from mjlab.rl.progress import title
     from mjlab.runs.reference import parts_of
 
     try:
@@ -180,10 +180,8 @@ def learning_curves(run: Run, evaluation: EvaluationCfg) -> list[str]:
     span = (lines[0].x[0], lines[0].x[-1])
     charts = [_with_goal(LABELS.get(tag, tag), lines, goal, span)]
     for name, bound in bounds.items():
-        if drawn := _evaluated(curves, name, 100.0 if bound.is_rate else 1.0):
-            unit = "%" if bound.is_rate else bound.unit
-            title = f"{label(name).capitalize()} ({unit})" if unit else label(name).capitalize()
-            charts.append(_with_goal(title, drawn, bound, span))
+        if drawn := _evaluated(curves, name, bound.scale):
+            charts.append(_with_goal(title(bound), drawn, bound, span))
     return charts
 
 
@@ -199,7 +197,7 @@ def _line(name: str, curve: Curve, scale: float = 1.0, *, has_marks: bool = Fals
 def _with_goal(title: str, lines: list[Line], goal: Any, span: tuple[float, float]) -> str:
     """Return the chart of lines over the iterations in `span`, with the bound that solves the task."""
     if goal is not None:
-        limit = (100.0 if goal.is_rate else 1.0) * goal.limit
+        limit = goal.scale * goal.limit
         lines = [*lines, Line("goal", span, [limit, limit], is_dashed=True)]
     return chart(title, lines, x_label="iteration")
 
