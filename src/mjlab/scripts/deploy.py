@@ -96,7 +96,7 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
             export_policy(task, env, checkpoint, made / "policy.onnx", cfg.profile)
             _restore_curricula(task, env, checkpoint)
             contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
-            source = origin(task, cfg.profile, checkpoint.path, **_recorded(task, checkpoint))
+            source = origin(task, cfg.profile, checkpoint.path, **recorded(task, checkpoint))
             bundle = write_bundle(contract, made, source, cfg.steps)
             if folder.exists():
                 shutil.rmtree(folder)
@@ -106,7 +106,7 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
     return Bundle(folder, bundle.contract, bundle.notes)
 
 
-def _recorded(task: str, checkpoint: Checkpoint) -> dict[str, Any]:
+def recorded(task: str, checkpoint: Checkpoint) -> dict[str, Any]:
     """Return what is recorded of the training: by the run, or of a bundled policy by its entry."""
     if (demo := demo_of(checkpoint.path)) is not None:
         return {key: getattr(demo, key) for key in ("run", "iteration", "seed", "commit")}

@@ -24,8 +24,8 @@ from mjlab.runs.evaluation import EVALUATION_FILE, evaluation_command, read_eval
 from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_policy
 from mjlab.runs.publication import without_paths
 from mjlab.runs.shared_page import SharedPage, learning_curves
-from mjlab.scripts.demo import DEMOS, demo_of
-from mjlab.scripts.deploy import policy_of
+from mjlab.scripts.demo import DEMOS
+from mjlab.scripts.deploy import policy_of, recorded
 from mjlab.scripts.evaluate import load_curricula_of
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
@@ -136,16 +136,15 @@ def _origin(task: str, run: Run, checkpoint: Checkpoint, profile: str | None) ->
     """Return what is recorded of a policy's training; None where it is not."""
     is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
     started = run.started
-    iterations = checkpoint.iteration if is_ours else run.info.get("iterations")
-    # Run of a bundled policy.
-    demo = demo_of(checkpoint.path)
+    training = recorded(task, checkpoint)
+    iteration = training["iteration"]
     return {
         "profile": profile or "none",
         "learner": checkpoint.learner if is_ours else run.learner,
         "policy": checkpoint.path.name,
-        "iterations": iterations if demo is None else demo.iteration,
-        "seed of training": run.seed if demo is None else demo.seed,
-        "commit": run.commit if demo is None else demo.commit,
+        "iterations": run.info.get("iterations") if iteration is None else iteration,
+        "seed of training": training["seed"],
+        "commit": training["commit"],
         "trained on": run.info.get("machine"),
         "trained at": None if started is None else f"{started:%Y-%m-%d %H:%M}",
     }
