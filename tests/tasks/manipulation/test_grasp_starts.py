@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import replace
 
 import pytest
 import torch
 
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.manipulation import mdp
 from mjlab.tasks.registry import load_env_cfg
-
-FINGERS = {"left_finger": (0.02, 0.03), "right_finger": (-0.02, -0.03)}
 
 
 def lift(**settings) -> ManagerBasedRlEnv:
-    cfg = load_env_cfg("Mjlab-Lift-Cube-Yam")
+    """Return the task under its `cpu` profile, with other settings of the command."""
+    cfg = load_env_cfg("Mjlab-Lift-Cube-Yam", profile="cpu")
     cfg.scene.num_envs, cfg.seed = 64, 1
     goal = cfg.commands["lift_height"]
-    cfg.commands["lift_height"] = mdp.GraspStartsLiftingCommandCfg(
-        **{field.name: getattr(goal, field.name) for field in fields(goal)},
-        robot_name="robot",
-        site_name="grasp_site",
-        fingers=FINGERS,
-        num_postures=100,
-        **settings,
-    )
+    cfg.commands["lift_height"] = replace(goal, num_postures=100, **settings)
     return ManagerBasedRlEnv(cfg, device="cpu")
 
 

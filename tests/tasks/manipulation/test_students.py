@@ -1,4 +1,4 @@
-"""What a student of images and its teacher observe."""
+"""Observations of an image-based student and of its state-based teacher."""
 
 from __future__ import annotations
 

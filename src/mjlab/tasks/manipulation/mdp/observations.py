@@ -46,10 +46,9 @@ def ee_to_object_distance(
     env: ManagerBasedRlEnv, object_name: str, asset_cfg: SceneEntityCfg = DEFAULT_ASSET_CFG
 ) -> torch.Tensor:
     """Vector from the end effector to the object in the frame of the root (m), (N, 3)."""
-    asset: Entity = env.scene[asset_cfg.name]
     target: Entity = env.scene[object_name]
     offset = target.data.root_link_pos_w - site_pos(env, asset_cfg)
-    return quat_apply_inverse(asset.data.root_link_quat_w, offset)
+    return _in_root_frame(env, asset_cfg, offset)
 
 
 def object_to_goal_distance(
@@ -63,11 +62,9 @@ def object_to_goal_distance(
     Raises:
         TypeError: the command is not a `LiftingCommand`.
     """
-    asset: Entity = env.scene[asset_cfg.name]
     target: Entity = env.scene[object_name]
     goal = goal_command(env, command_name, LiftingCommand).target_pos
-    offset = goal - target.data.root_link_pos_w
-    return quat_apply_inverse(asset.data.root_link_quat_w, offset)
+    return _in_root_frame(env, asset_cfg, goal - target.data.root_link_pos_w)
 
 
 def ee_to_target_object(
@@ -79,8 +76,7 @@ def ee_to_target_object(
         TypeError: the command is not a `LiftingCommand` or `MultiCubeLiftingCommand`.
     """
     target = goal_command(env, command_name).object_pos()
-    root = env.scene[asset_cfg.name].data.root_link_quat_w
-    return quat_apply_inverse(root, target - site_pos(env, asset_cfg))
+    return _in_root_frame(env, asset_cfg, target - site_pos(env, asset_cfg))
 
 
 def target_object_to_goal(
@@ -92,8 +88,7 @@ def target_object_to_goal(
         TypeError: the command is not a `LiftingCommand` or `MultiCubeLiftingCommand`.
     """
     command = goal_command(env, command_name)
-    root = env.scene[asset_cfg.name].data.root_link_quat_w
-    return quat_apply_inverse(root, command.target_pos - command.object_pos())
+    return _in_root_frame(env, asset_cfg, command.target_pos - command.object_pos())
 
 
 def target_position(
@@ -114,6 +109,14 @@ def ee_velocity(
     """Linear velocity of the end effector in the end-effector frame (m/s), (N, 3)."""
     velocity = _at_site(env, asset_cfg, env.scene[asset_cfg.name].data.site_lin_vel_w)
     return quat_apply_inverse(site_quat(env, asset_cfg), velocity)
+
+
+def _in_root_frame(
+    env: ManagerBasedRlEnv, asset_cfg: SceneEntityCfg, vector: torch.Tensor
+) -> torch.Tensor:
+    """Return a world-frame `vector` (N, 3) in the frame of the root of an entity."""
+    asset: Entity = env.scene[asset_cfg.name]
+    return quat_apply_inverse(asset.data.root_link_quat_w, vector)
 
 
 # Images.

@@ -25,10 +25,7 @@ from typing import Any
 import torch
 
 from mjlab.envs import ManagerBasedRlEnvCfg
-from mjlab.managers import (
-    ObservationGroupCfg,
-    RewardTermCfg,
-)
+from mjlab.managers import ObservationGroupCfg, RewardTermCfg
 from mjlab.rl.config import (
     EvaluationCfg,
     RslRlBaseRunnerCfg,
@@ -172,13 +169,13 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None
     )
     goal = env_cfg.commands[_COMMAND]
     assert isinstance(goal, mdp.LiftingCommandCfg)
+    goal.resampling_time_range = _TRAINING_TIMES
     env_cfg.commands[_COMMAND] = mdp.GraspStartsLiftingCommandCfg(
         **{field.name: getattr(goal, field.name) for field in fields(goal)},
         robot_name="robot",
         site_name="grasp_site",
         fingers=_FINGERS,
     )
-    env_cfg.commands[_COMMAND].resampling_time_range = _TRAINING_TIMES
     _evaluate(env_cfg, rl_cfg)
     # After 150 iterations, 12 % are lifted.
     rl_cfg.evaluation.first_iteration = 250
