@@ -2,23 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-from types import ModuleType
-
 import pytest
 import torch
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-def load(example: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(example, EXAMPLES / f"{example}.py")
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    assert spec.loader is not None
-    spec.loader.exec_module(module)
-    return module
+from example_files import EXAMPLES, load_example
 
 
 @pytest.mark.slow
@@ -28,7 +14,7 @@ def load(example: str) -> ModuleType:
 )
 def test_the_swing_up_is_solved(library, example):
     pytest.importorskip(library)
-    assert load(example).train(seed=1)[0] >= 900.0
+    assert load_example(example).train(seed=1)[0] >= 900.0
 
 
 @pytest.mark.slow
@@ -46,7 +32,7 @@ def test_short_examples_run(library, example, monkeypatch, tmp_path):
     # Some write their logs here.
     monkeypatch.chdir(tmp_path)
     threads = torch.get_num_threads()
-    load(example).train(num_envs=4, iterations=1)
+    load_example(example).train(num_envs=4, iterations=1)
     torch.set_num_threads(threads)
     lines = (EXAMPLES / f"{example}.py").read_text(encoding="utf-8").splitlines()
     assert sum(map(bool, lines)) < 40

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-EXAMPLE = Path(__file__).parents[2] / "examples" / "tune_stepping.py"
+from example_files import load_example
 
 
 @pytest.fixture(scope="module")
 def example():
     pytest.importorskip("cma")
-    spec = importlib.util.spec_from_file_location("tune_stepping", EXAMPLE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_example("tune_stepping")
 
 
 def test_good_gains_score_more_than_weak_ones(example):

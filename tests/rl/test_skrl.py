@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +10,7 @@ import torch
 
 pytest.importorskip("skrl")
 
+from example_files import load_example
 from rl_ending_env import ending_env
 from skrl.agents.torch import Agent
 
@@ -88,18 +87,6 @@ def test_without_auto_reset_there_is_no_such_environment():
     with pytest.raises(ValueError, match="auto_reset: expected True, got False"):
         SkrlEnv(env)
     env.close()
-
-
-EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-def load_example(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    assert spec.loader is not None
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_its_learner_takes_it(tmp_path):
