@@ -201,12 +201,13 @@ mean return with a 95 % interval, and the success rate if the task defines succe
         "watch",
         "a page to send: episodes in 3-D, curve, evaluation",
         argument="POLICY",
-        details="""\
+        details=f"""\
 Write one HTML file that opens offline in any browser: recorded episodes to turn and scrub in 3-D,
 commands, rewards, learning curve, evaluation with its intervals, and where the policy comes from.
 
-POLICY is the folder of a run, a checkpoint (.pt), an exported policy (.onnx) of a run, or a bundled
-policy (go1, g1). Values are those of `evaluate --output`; without it, the page says how to measure.""",
+{_POLICY} Or a bundled policy (go1, g1).
+
+Values are those of `evaluate --output`; without it, the page says how to measure.""",
         examples=(
             "share g1 --output g1.html",
             "share logs/rsl_rl/go1_velocity/2026-01-02_03-04-05",
@@ -338,7 +339,8 @@ rate.""",
         details="""\
 Write scene.xml and its assets, for MuJoCo's viewer and other programs.
 
-TARGET is the name of a task, a robot (g1, go1, yam), or module:function, a function without arguments that returns an EntityCfg.""",
+TARGET is the name of a task, a robot (g1, go1, yam), or module:function, a function without arguments
+that returns an EntityCfg.""",
         examples=(
             "export-scene Mjlab-Velocity-Flat-Unitree-Go1 --output-dir go1_flat",
             "export-scene g1 --zip",
