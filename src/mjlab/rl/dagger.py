@@ -19,7 +19,7 @@ _STATE = "dagger_state_dict"
 class DAgger(Distillation):
     """Distillation in which the teacher acts in a share of the environments, falling from 1 to 0.
 
-    Each iteration draws these environments anew, so that the student errs for some steps at a time,
+    Each iteration samples these environments, so that the student errs for some steps at a time,
     and the teacher shows how to go on from there.
     """
 
