@@ -147,7 +147,7 @@ def machine(device: str) -> str:
 def processor() -> str:
     """Return the name of the processor."""
     file = Path("/proc/cpuinfo")
-    for line in file.read_text().splitlines() if file.exists() else ():
+    for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else ():
         if line.startswith("model name"):
             return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
