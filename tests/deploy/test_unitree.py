@@ -143,6 +143,19 @@ def test_breadth_first_joints_of_the_g1():
     assert motor_map([f"{motors[k]}_joint" for k in order]) == order
 
 
+def test_joints_of_the_h1_2_are_in_the_order_of_its_motors():
+    # Of its MJCF in unitree_ros, h1_2_description.
+    leg = ("hip_yaw", "hip_pitch", "hip_roll", "knee", "ankle_pitch", "ankle_roll")
+    arm = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")
+    arm += ("wrist_roll", "wrist_pitch", "wrist_yaw")
+    parts = [("left", leg), ("right", leg), (None, ("torso",)), ("left", arm), ("right", arm)]
+    names = [
+        f"{side}_{one}_joint" if side else f"{one}_joint" for side, part in parts for one in part
+    ]
+    assert motor_map(names) == list(range(27))
+    assert motor_map(names[::-1]) == list(range(27))[::-1]
+
+
 def with_term(contract: dict, **changes: Any) -> dict:
     changed = copy.deepcopy(contract)
     changed["observations"][0]["terms"][0].update(changes)

@@ -22,6 +22,7 @@ from mjlab.deploy.usual_terms import is_velocity, usual_term
 _LEGS = ("FR", "FL", "RR", "RL")
 _SIDES = ("left", "right")
 _LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+_LEG_OF_H1_2 = ("hip_yaw", "hip_pitch", "hip_roll", "knee", "ankle_pitch", "ankle_roll")
 _ARM = (
     *("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow"),
     *("wrist_roll", "wrist_pitch", "wrist_yaw"),
@@ -31,6 +32,12 @@ MOTORS: dict[str, tuple[str, ...]] = {
     "G1 (29 joints)": (
         *(f"{side}_{joint}" for side in _SIDES for joint in _LEG),
         *("waist_yaw", "waist_roll", "waist_pitch"),
+        *(f"{side}_{joint}" for side in _SIDES for joint in _ARM),
+    ),
+    # `H1_2_JointIndex` of unitree_sdk2_python's h1_2_low_level_example.py: hips yaw first.
+    "H1-2": (
+        *(f"{side}_{joint}" for side in _SIDES for joint in _LEG_OF_H1_2),
+        "torso",
         *(f"{side}_{joint}" for side in _SIDES for joint in _ARM),
     ),
 }
@@ -141,7 +148,7 @@ def motor_map(names: Sequence[str]) -> list[int]:
             return [motors.index(name) for name in short]
     raise UnknownToUnitreeError(
         f"the motors of these joints are not known; known: {', '.join(MOTORS)}. Public sources disagree on "
-        "those of the G1 with 23 joints and of the H1-2."
+        "those of the G1 with 23 joints."
     )
 
 
