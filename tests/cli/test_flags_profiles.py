@@ -188,7 +188,7 @@ def test_a_profile_that_the_task_no_longer_has_is_told(run, profiled):
 
 def test_on_a_cpu_the_profile_is_suggested_in_one_line(run, tmp_path):
     short = ("--agent.max-iterations", "1", "--agent.num-steps-per-env", "2", "--num-envs", "2")
-    suggested = f"`train {PROFILED} --profile cpu`"
+    suggested = f"`uv run mjlab train {PROFILED} --profile cpu`"
     outcome = train(run, tmp_path, *short)
     assert [suggested in line for line in outcome.err.splitlines()].count(True) == 1
     resumed = train(run, tmp_path, *short, "--agent.resume", "True", "--agent.max-iterations", "2")

@@ -176,7 +176,9 @@ def test_combinations_and_seeds_run_side_by_side_once_and_are_compared(sweep, ma
     assert float(other["mean_return"]) == pytest.approx(1.0)
     assert "| 1e-3 " in (folder / "table.md").read_text(encoding="utf-8")
     assert (folder / "curves.png").read_bytes().startswith(b"\x89PNG")
-    assert f"--{RATE}=1e-3" in outcome.out.partition("Next")[2]
+    commands = [line for line in outcome.out.splitlines() if line.startswith("    uv run ")]
+    assert [line.split()[2:4] for line in commands] == [["mjlab", "train"], ["mjlab", "play"]]
+    assert f"--{RATE}=1e-3" in commands[0]
     # Again: finished runs are kept, and more seeds are added to them.
     assert sweep(*argv, "--seeds", "2").status == 0
     assert len(machine.commands) == 4

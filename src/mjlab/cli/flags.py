@@ -197,7 +197,7 @@ def profile_to_suggest(task: str, profile: str | None, device: str) -> str | Non
 def suggest_profile(task: str, profile: str | None, device: str) -> None:
     """Print a hint to the profile for this machine when training without a profile."""
     if (name := profile_to_suggest(task, profile, device)) is not None:
-        print_notice(f"`train {task} --profile {name}` has settings for a few cores.")
+        print_notice(f"`uv run mjlab train {task} --profile {name}` has settings for a few cores.")
 
 
 def report_untuned_learner(task: str, profile: str | None, learner: str) -> None:

@@ -166,8 +166,8 @@ def find_checkpoint(task: str, flags: PolicyFlags) -> Checkpoint | None:
         if flags.learner is not None:
             by, choice = f" by the learner {flags.learner!r}", f" --learner {flags.learner}"
         raise UserError(
-            f"No checkpoint of {task}{by} found in {experiment}; run `train {task}{choice}` first, or use "
-            "--checkpoint-file or --wandb-run-path."
+            f"No checkpoint of {task}{by} found in {experiment}; run `uv run mjlab train {task}{choice}` "
+            "first, or use --checkpoint-file or --wandb-run-path."
         )
     if checkpoint is None or flags.learner is None or checkpoint.path.suffix == ".onnx":
         return checkpoint

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import shlex
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +17,7 @@ from mjlab.sim.divergence import mujoco_warnings
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.logging import beside_results
 from mjlab.utils.os import files_in
-from mjlab.utils.string import counted
+from mjlab.utils.string import command_line, counted
 from mjlab.viewer.viewer_config import ViewerConfig
 
 if TYPE_CHECKING:
@@ -166,8 +163,7 @@ def _line(command: list[str]) -> str:
     script = Path(sys.argv[0])
     is_own = script.suffix == ".py" and Path(mjlab.__file__).parent not in script.resolve().parents
     program = ["python", sys.argv[0]] if is_own else ["mjlab"]
-    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
-    return join(["uv", "run", *program, *command])
+    return command_line(["uv", "run", *program, *command])
 
 
 def _short(path: Path) -> Path:

@@ -120,7 +120,8 @@ def ensure_default_checkpoint() -> str:
     """Raise `FileNotFoundError`: the package has no bundled tracking policy."""
     raise FileNotFoundError(
         "mjlab has no bundled motion tracking checkpoint; train one with "
-        "`train Mjlab-Tracking-Flat-Unitree-G1`, or run `demo` for a bundled Go1 policy."
+        "`uv run mjlab train Mjlab-Tracking-Flat-Unitree-G1`, or run `uv run mjlab demo` for a bundled Go1 "
+        "policy."
     )
 
 

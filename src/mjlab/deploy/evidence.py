@@ -100,7 +100,9 @@ class Evidence:
         """
         self.folder = folder
         if not (folder / "contract.json").exists():
-            raise UserError(f"{folder}: expected a bundle with contract.json; use `mjlab deploy`.")
+            raise UserError(
+                f"{folder}: expected a bundle with contract.json; use `uv run mjlab deploy`."
+            )
         self.contract = json.loads((folder / "contract.json").read_text(encoding="utf-8"))
         golden = folder / self.contract["golden"]["file"]
         self.trace = dict(np.load(golden) if trace is None else trace)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,7 @@ def _use(run: Run, name: str, origin: Mapping[str, Any]) -> str:
     package = run.info.get("package")
     needs = origin["package"] if package is None else f"{origin['package']} and {package}"
     needs += ", and the extra `mjlab[hub]`" if name.startswith(hub.PREFIX) else ""
+    name = shlex.quote(name)
     return (
         f"## Use\n\nWith {needs}:\n\n```bash\nuv run mjlab play {name}\nuv run mjlab evaluate {name}\n"
         f"uv run mjlab deploy {name} --output bundle   # runs without mjlab and torch\n```\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 from mjlab.runs.settings import warn_unreadable
 from mjlab.utils.logging import print_notice
 from mjlab.utils.os import regular_file
+from mjlab.utils.string import command_line
 
 EVALUATION_FILE = "evaluation.json"
 """File of the evaluation, in the folder of a policy."""
@@ -44,7 +44,7 @@ def evaluation_command(task: str, policy: Path, profile: str | None = None) -> s
     words = ["evaluate", task, "--checkpoint-file", str(policy)]
     words += [] if profile is None else ["--profile", profile]
     words += ["--output", str(policy.parent / EVALUATION_FILE)]
-    return f"uv run mjlab {shlex.join(words)}"
+    return command_line(["uv", "run", "mjlab", *words])
 
 
 def evaluation_rows(evaluation: Mapping[str, Any]) -> list[tuple[str, str, str]]:

@@ -560,5 +560,9 @@ def resolve_checkpoint(path: Path, task: str) -> Checkpoint:
             return last
     runs = [Run(path.parent), *runs_in(path.parent)[:1]]
     available = [str(checkpoint) for run in runs for checkpoint in run.checkpoints[-3:]]
-    hint = f"Available: {', '.join(available)}." if available else f"Use `train {task}` first."
+    hint = (
+        f"Available: {', '.join(available)}."
+        if available
+        else f"Use `uv run mjlab train {task}` first."
+    )
     raise UserError(f"Checkpoint {path} not found. {hint}")

@@ -26,7 +26,7 @@ from mjlab.own_robot.package import Package, questions_table, values_table
 from mjlab.own_robot.report import RobotReport, describe_robot
 from mjlab.own_robot.rewriting import RECORD, Record, Task, deleted_files, read_record, write_files
 from mjlab.utils.errors import BadCallError, UserError
-from mjlab.utils.string import suggest
+from mjlab.utils.string import command_line, suggest
 from mjlab.utils.tables import WIDTH, tables_text
 
 
@@ -203,7 +203,7 @@ def _command_line(source: str, cfg: NewRobotConfig, settings: dict[str, str]) ->
             words += [f"--{flag}", str(value)]
     for key, value in settings.items():
         words += ["--set", f"{key}={value}"]
-    return shlex.join(words)
+    return command_line(words)
 
 
 def _findings(package: Package, folder: Path) -> str:

@@ -41,7 +41,8 @@ def command(argv: list[str], prog: str) -> None:
     runs = [run for run in runs_in(experiment, task) if run.exists]
     if not runs:
         raise UserError(
-            f"No run of {task} found in {experiment.resolve()}; run `train {task}` first."
+            f"No run of {task} found in {experiment.resolve()}; run `uv run mjlab train {task}` "
+            "first."
         )
     rows = [row_of(run) for run in runs]
     if cfg.json:

@@ -15,10 +15,7 @@ The same command continues a sweep: finished runs are kept, others resume from t
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
-import shlex
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -46,7 +43,7 @@ from mjlab.sweep.settings import (
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.ranges import Range
 from mjlab.utils.signals import Interrupted
-from mjlab.utils.string import counted
+from mjlab.utils.string import command_line, counted
 
 ROOT = Path("logs/sweeps")
 """Folder of all sweeps."""
@@ -115,8 +112,7 @@ def command(argv: list[str], prog: str) -> None:
         runs = Runs(sweep, study)
         runs.train()
         Comparison(sweep, study).report()
-    words = ["uv", "run", *prog.split(), *argv]
-    line = subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
+    line = command_line(["uv", "run", *prog.split(), *argv])
     if runs.stopped_by is not None:
         print(f"Interrupted; {runs.what_is_left()}. To continue:\n    {line}")
         raise Interrupted(runs.stopped_by)

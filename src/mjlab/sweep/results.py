@@ -5,10 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
-import shlex
 import statistics
-import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +20,7 @@ from mjlab.sweep.settings import train_config
 from mjlab.sweep.study import Study, TrainedRun, setting_of, trained_run
 from mjlab.utils.logging import beside_results
 from mjlab.utils.os import write_atomically
-from mjlab.utils.string import counted
+from mjlab.utils.string import command_line, counted
 from mjlab.utils.tables import Table
 
 if TYPE_CHECKING:
@@ -218,9 +215,8 @@ class Comparison:
             run = min(first.runs, key=lambda run: sign * run.value)
             checkpoint = str(run.run.newest)
             commands.append(["play", sweep.task, "--checkpoint-file", checkpoint])
-        join = subprocess.list2cmdline if os.name == "nt" else shlex.join
         for words in commands:
-            print(f"    {join(['uv', 'run', *words])}")
+            print(f"    {command_line(['uv', 'run', 'mjlab', *words])}")
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -9,7 +9,10 @@ from __future__ import annotations
 import difflib
 import html
 import logging
+import os
 import re
+import shlex
+import subprocess
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -121,6 +124,12 @@ def encodable(text: str) -> str:
     Not `?`, so that names that differ in such bytes still differ.
     """
     return text.encode(errors="backslashreplace").decode()
+
+
+def command_line(words: Iterable[str]) -> str:
+    """Return a command line for the shell of this machine."""
+    join = subprocess.list2cmdline if os.name == "nt" else shlex.join
+    return join(list(words))
 
 
 def is_number(text: str) -> bool:

@@ -96,8 +96,8 @@ def read_motion(path: str | Path) -> Motion:
     missing = [key for key in _ARRAYS if key not in content]
     if missing:
         raise MotionFileError(
-            f"Motion {path}: missing {missing}, got {sorted(content)}; use `mjlab csv-to-npz` to "
-            "make a motion from joint angles."
+            f"Motion {path}: missing {missing}, got {sorted(content)}; use `uv run mjlab csv-to-npz` "
+            "to make a motion from joint angles."
         )
     arrays = {key: content[key] for key in _ARRAYS}
     odd = _cut(arrays)
@@ -133,7 +133,7 @@ def check_rate(path: str | Path, motion: Motion, step_dt: float) -> None:
     if motion.fps is not None and abs(motion.fps * step_dt - 1.0) > _RATE_TOLERANCE:
         warnings.warn(
             f"Motion {path} fps: expected {1.0 / step_dt:g}, the control rate (timestep {step_dt:g} "
-            f"s), got {motion.fps:g}; one frame is played per step. Resample it with `mjlab "
+            f"s), got {motion.fps:g}; one frame is played per step. Resample it with `uv run mjlab "
             f"csv-to-npz --input-file {path} --output-fps {1.0 / step_dt:g} --output-file ...`.",
             UserWarning,
             stacklevel=2,
@@ -205,7 +205,7 @@ def _load(path: Path) -> dict[str, np.ndarray]:
         # Damaged or hostile files make zipfile and NumPy raise many types of errors.
         raise MotionFileError(
             f"{path} cannot be read as a motion (.npz): {first_line(error)}; copy it from its source, or make it again by "
-            "`mjlab csv-to-npz`."
+            "`uv run mjlab csv-to-npz`."
         ) from error
 
 

@@ -186,8 +186,8 @@ def arranged(
     quats = ", and quaternions (x, y, z, w)" if order.w_last else ""
     _warn(
         f"Motion {path}: expected the order of the robot, got {got}{quats}, by forward kinematics; the "
-        "order of the poses is applied. Use `mjlab csv-to-npz` to write the motion with names and in "
-        "order."
+        "order of the poses is applied. Use `uv run mjlab csv-to-npz` to write the motion with names "
+        "and in order."
     )
     return _reordered(motion, order)
 

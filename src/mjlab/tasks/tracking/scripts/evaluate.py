@@ -54,7 +54,8 @@ def run_evaluate_tracking(task: str, cfg: EvaluateTrackingConfig) -> dict[str, f
     """
     if "Tracking" not in task:
         raise ValueError(
-            f"TASK: expected a motion tracking task, got {task!r}; use `evaluate {task}`."
+            f"TASK: expected a motion tracking task, got {task!r}; use `uv run mjlab evaluate "
+            f"{task}`."
         )
     cfg = copy.copy(cfg)
     if cfg.num_envs is not None and cfg.num_episodes == EvaluateConfig.num_episodes:
