@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from mjlab.scripts import deploy
 
 QUICK = ("--steps", "4")
 
@@ -58,6 +61,16 @@ def test_settings_of_the_run_are_in_the_contract(run, train, tmp_path):
     contract = contract_of(tmp_path / "bundle")
     assert contract["rates"]["decimation"] == 4
     assert contract["policy"]["clip"] == 2.5
+
+
+def test_a_signal_leaves_nothing(run, trained, tmp_path, monkeypatch):
+    def stop(*_) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(deploy, "export_policy", stop)
+    outcome = run("deploy", str(trained), "--output", str(tmp_path / "out" / "bundle"))
+    assert outcome.status == 128 + signal.SIGTERM
+    assert not list((tmp_path / "out").iterdir())
 
 
 @pytest.mark.parametrize("flags", [(), ("--overwrite",)])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -112,6 +114,31 @@ def test_the_manifest_lists_all_files(published):
     assert manifest["files"].keys() == FILES - {"manifest.json"}
     assert (manifest["task"], manifest["seed"], manifest["commit"]) == (TASK, 7, "0123abcd")
     assert manifest["iteration"] == 2
+
+
+def test_the_iteration_of_an_exported_policy_is_unknown(run, evaluated, published, tmp_path):
+    source = shutil.copytree(published, tmp_path / "source")
+    (source / "model_1.pt").unlink()
+    assert publish(run, source, tmp_path / "policy").status == 0
+    manifest = json.loads((tmp_path / "policy" / "manifest.json").read_text())
+    assert manifest["iteration"] is None
+    assert "iterations" not in card_of(tmp_path / "policy")[1]
+
+
+def test_a_signal_leaves_nothing(run, evaluated, tmp_path, monkeypatch):
+    def stop(*_) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(publish_script, "write_manifest", stop)
+    assert publish(run, evaluated, tmp_path / "out" / "policy").status == 128 + signal.SIGTERM
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_commands_quote_names_with_spaces(run, published, tmp_path):
+    outcome = publish(run, published, tmp_path / "my policy")
+    line = outcome.out.splitlines()[-1]
+    assert shlex.split(line) == ["uv", "run", "mjlab", "play", str(tmp_path / "my policy")]
+    assert "uv run mjlab play 'my policy'\n" in card_of(tmp_path / "my policy")[1]
 
 
 def test_checkpoints_are_published_without_episodes(evaluated, published):

@@ -25,6 +25,7 @@ from mjlab.scripts.demo import DEMOS, demo_of
 from mjlab.utils.errors import UserError
 from mjlab.utils.ranges import Count
 from mjlab.utils.screen import shown
+from mjlab.utils.signals import raising_interrupted
 
 
 @dataclass
@@ -90,7 +91,10 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
     env = make_env(task, nominal, "cpu", agent=agent)
     try:
         # Written beside the target and renamed, so that a folder never holds half a bundle.
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".deploy-") as temporary:
+        with (
+            raising_interrupted(),
+            tempfile.TemporaryDirectory(dir=folder.parent, prefix=".deploy-") as temporary,
+        ):
             made = Path(temporary) / "bundle"
             made.mkdir()
             export_policy(task, env, checkpoint, made / "policy.onnx", cfg.profile)

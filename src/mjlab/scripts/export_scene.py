@@ -9,13 +9,13 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, SimpleNamespace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from mjlab.cli.flags import parse_flags
 from mjlab.cli.main import run_alias
 from mjlab.utils.errors import UserError
-from mjlab.utils.signals import FORWARDED, Interrupted, handled_signals
+from mjlab.utils.signals import raising_interrupted
 from mjlab.utils.string import suggest
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def run_export_scene(target: str, cfg: ExportSceneConfig) -> Path:
     scene.report_overruled_options(options)
     options.apply(target_options)
     # Signals must leave no temporary files.
-    with handled_signals(_interrupt, FORWARDED):
+    with raising_interrupted():
         if cfg.zip:
             scene.write(folder, zip=True)
         else:
@@ -152,10 +152,6 @@ def _destination(cfg: ExportSceneConfig) -> tuple[Path, Path]:
             "export."
         )
     return folder, result
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise Interrupted(number)
 
 
 def _write_folder(scene: Scene, folder: Path) -> None:

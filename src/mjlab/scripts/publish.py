@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from mjlab.cli.devices import resolve_device
 from mjlab.cli.flags import parse_flags
@@ -16,7 +15,7 @@ from mjlab.runs import Checkpoint, Run, resolve_checkpoint
 from mjlab.runs.card import write_card
 from mjlab.runs.destination import Destination, destination, names_in
 from mjlab.runs.evaluation import EVALUATION_FILE, evaluation_command
-from mjlab.runs.policy import agent_cfg_of, export_policy, has_foreign_runner, make_env
+from mjlab.runs.policy import agent_cfg_of, export_policy, make_env
 from mjlab.runs.publication import (
     CLIP_FILE,
     MANIFEST_FILE,
@@ -26,8 +25,11 @@ from mjlab.runs.publication import (
     write_records,
 )
 from mjlab.runs.run import POLICY_FILE
+from mjlab.scripts.deploy import recorded
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import beside_results, print_list, print_notice
+from mjlab.utils.signals import raising_interrupted
+from mjlab.utils.string import command_line
 
 _CLIP = VideoCfg(width=640, height=360)
 
@@ -71,7 +73,10 @@ def run_publish(task: str, checkpoint: Checkpoint, cfg: PublishConfig) -> None:
     place = destination(cfg.to, cfg.private)
     earlier = _earlier_files(place, cfg)
     place.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=place.parent, prefix=".publish-") as temporary:
+    with (
+        raising_interrupted(),
+        tempfile.TemporaryDirectory(dir=place.parent, prefix=".publish-") as temporary,
+    ):
         folder = Path(temporary) / checkpoint.path.parent.resolve().name
         folder.mkdir()
         _write(task, checkpoint, folder, place.public_name, cfg)
@@ -79,7 +84,7 @@ def run_publish(task: str, checkpoint: Checkpoint, cfg: PublishConfig) -> None:
         size = sum((folder / name).stat().st_size for name in names)
         place.write(folder, earlier - names)
     print(f"Published {place.name} ({size / 1e6:.1f} MB): {', '.join(sorted(names))}")
-    print(f"Next:\n    uv run mjlab play {place.name}")
+    print(f"Next:\n    {command_line(['uv', 'run', 'mjlab', 'play', place.name])}")
 
 
 def _earlier_files(place: Destination, cfg: PublishConfig) -> set[str]:
@@ -119,10 +124,7 @@ def _write(task: str, checkpoint: Checkpoint, folder: Path, name: str, cfg: Publ
             env_cfg = env_cfg_of(task, flags, checkpoint, purpose="play")
             video = replace(_CLIP, profile=flags.profile)
             write_clip(task, env_cfg, checkpoint, folder / CLIP_FILE, device, video)
-    known: dict[str, Any] = {"seed": run.seed, "commit": run.commit}
-    if checkpoint.path.suffix == ".pt" and not has_foreign_runner(task):
-        known["iteration"] = checkpoint.iteration
-    source_of = origin(task, flags.profile, checkpoint.path, **known)
+    source_of = origin(task, flags.profile, checkpoint.path, **recorded(task, checkpoint))
     write_card(folder, name, source_of, cfg.license)
     write_manifest(folder, source_of)
 

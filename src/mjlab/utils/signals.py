@@ -126,6 +126,17 @@ def not_ignored(numbers: Iterable[int]) -> list[int]:
     return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
 
 
+@contextlib.contextmanager
+def raising_interrupted() -> Generator[None]:
+    """Let stop signals raise `Interrupted` within the block, so that its temporary files are removed."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise Interrupted(number)
+
+    with handled_signals(interrupt, FORWARDED):
+        yield
+
+
 class StopRequest:
     """Context manager: stop signals are requests, in two stages, instead of ending the process.
 
