@@ -119,6 +119,16 @@ def test_joints_are_listed_in_the_order_of_their_positions(folder):
     assert "joints/order" in str(check_bundle(folder))
 
 
+def test_difference_of_the_state_is_of_a_joint(folder):
+    edit_program(
+        folder / "simulate.py",
+        "before the last physics step.\n",
+        "before the last physics step.\n        self.data.joint('robot/RR_calf_joint').qpos[0] += 1.0\n",
+    )
+    (finding,) = {one["component"] for one in check_bundle(folder).as_dict()["findings"]} - {None}
+    assert finding == "robot/RR_calf_joint"
+
+
 def test_sensor_that_is_left_out_differs(folder):
     edit_program(
         folder / "simulate.py",

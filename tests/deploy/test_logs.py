@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from bundles import write_random
 
 from mjlab.deploy.check import Report
 from mjlab.deploy.logs import check_answers, check_log
+from mjlab.managers import ObservationTermCfg
 from mjlab.utils.errors import UserError
 
 Columns = dict[str, np.ndarray]
@@ -96,9 +100,32 @@ def test_gyroscope_of_a_log_is_that_of_the_root(bundle, tmp_path):
     assert not any("imu_ang_vel" in note for note in check_log(folder, log).undecided)
     contract = json.loads((folder / "contract.json").read_text())
     (gyro,) = [one for one in contract["measurements"] if one["name"] == "imu_ang_vel"]
-    gyro["source"]["body"] = "robot/FR_hip"
-    (folder / "contract.json").write_text(json.dumps(contract))
-    assert any("imu_ang_vel" in note for note in check_log(folder, log).undecided)
+    sensor = gyro["source"]
+    for body, is_read in (("robot/trunk", True), ("robot/FR_hip", False)):
+        for source in (sensor, {"kind": "body_ang_vel_b"}):
+            gyro["source"] = {**source, "body": body}
+            (folder / "contract.json").write_text(json.dumps(contract))
+            missing = [note for note in check_log(folder, log).undecided if "imu_ang_vel" in note]
+            assert (not missing) == is_read
+
+
+def speeds(env: Any) -> Any:
+    """Observation term that the runtime does not know."""
+    return env.scene["cartpole"].data.joint_vel.abs()
+
+
+def test_golden_table_has_the_values_of_custom_terms(tmp_path):
+    def edit(env: Any, agent: Any) -> None:
+        env.observations["actor"].terms["speeds"] = ObservationTermCfg(func=speeds)
+
+    folder = write_random("Mjlab-Cartpole-Swingup", tmp_path / "bundle", edit, steps=8)
+    # The line that the notes name.
+    (line,) = re.findall(r"`(TERMS\[.*)`", (folder / "README.md").read_text())
+    with (folder / "runtime.py").open("a") as program:
+        program.write(f"\n{line}\n")
+    report = check_log(folder, folder / "golden.csv")
+    assert report.is_passed, str(report)
+    assert [one.num_rows for one in report.comparisons if one.name == "term/obs/speeds"] == [8]
 
 
 def test_wrong_observation_in_a_log_is_named(log_of):

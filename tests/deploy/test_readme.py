@@ -140,7 +140,8 @@ def test_loops_have_the_measurements_of_the_contract(bundle):
             assert f'measured["{one["name"]}"] = ' in cpp
         assert (f'"{one["name"]}": ' in python) == (one["availability"] != "computed")
     assert "np.full(3, np.nan)" in python
-    assert len(cpp.splitlines()) <= 40
+    loop = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[1]
+    assert max(len(cpp.splitlines()), len(loop.splitlines())) <= 40
     assert all(part in python for part in ("unitree_hg", "mode_pr", "MOTORS = range"))
 
 
@@ -157,6 +158,17 @@ def test_gyroscope_of_another_link_is_missing(bundle):
     (gyro,) = [one for one in contract["measurements"] if one["name"] == "imu_ang_vel"]
     gyro["source"]["body"] = "robot/FR_hip"
     assert '"imu_ang_vel": np.full(3, np.nan)' in readme(contract, [])
+
+
+def test_orientation_of_an_askew_sensor_is_missing(bundle):
+    """The robot reports that of its root."""
+    contract = json.loads((bundle("go1") / "contract.json").read_text())
+    (quat,) = [one for one in contract["measurements"] if one["name"] == "root_quat"]
+    quat["source"] = {"kind": "sensor", "type": "framequat", "body": "robot/trunk"}
+    quat["source"]["site_quat"] = [1.0, 0.0, 0.0, 0.0]
+    assert '"root_quat": imu.quaternion' in readme(contract, [])
+    quat["source"]["site_quat"] = [0.8, 0.6, 0.0, 0.0]
+    assert '"root_quat": np.full(4, np.nan)' in readme(contract, [])
 
 
 def test_motors_of_an_unknown_robot_are_asked_for(bundle):

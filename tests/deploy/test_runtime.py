@@ -236,6 +236,14 @@ def test_command_that_is_not_finite_damps(robot):
     assert policy.step(measured, [np.nan, 0.0, 0.0]).is_damping
 
 
+def test_answer_that_is_not_finite_damps(robot):
+    policy, measured, command = robot
+    policy.network = lambda outputs, inputs: [np.full((1, 12), np.nan, np.float32)]
+    damped = policy.step(measured, command)
+    assert damped.is_damping
+    assert np.isfinite(damped.position).all()
+
+
 # Hand-over.
 
 

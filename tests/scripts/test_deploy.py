@@ -83,6 +83,13 @@ def test_a_folder_of_others_is_not_replaced(run, trained, tmp_path, flags):
     assert (tmp_path / "bundle" / "mine.txt").exists()
 
 
+def test_unknown_state_of_curricula_is_printed(run, tmp_path):
+    """The ranges of commands in the contract are those of the curricula."""
+    outcome = run("deploy", "go1", "--output", str(tmp_path / "bundle"), *QUICK)
+    assert outcome.status == 0, outcome.err
+    assert "does not hold the state of the task's curricula" in outcome.err
+
+
 def test_a_bundle_is_replaced_on_request(run, trained, tmp_path):
     flags = ("--output", str(tmp_path / "bundle"), *QUICK)
     (tmp_path / "bundle").mkdir()

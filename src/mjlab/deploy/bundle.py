@@ -188,8 +188,9 @@ def _notes(content: Mapping[str, Any]) -> list[str]:
         for one in content["unmeasured"]
     ]
     notes += [
-        f"The runtime does not know {term['function']} of the term {term['name']}: add its formula to "
-        "TERMS in runtime.py."
+        f"The runtime does not know {term['function']} of the term {term['name']}: add to runtime.py, with "
+        f"its formula or the value as the measurement {term['inputs'][0]}: "
+        f"`TERMS[{term['function']!r}] = lambda inputs, term: inputs[0]`."
         for observation in content["observations"]
         for term in observation["terms"]
         if term["kind"] == "custom"

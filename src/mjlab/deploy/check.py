@@ -27,6 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from mjlab.deploy.causes import Verdict, likely_cause
@@ -466,6 +467,10 @@ def _labels(evidence: Evidence, name: str, count: int) -> list[str]:
     """Return a name for each component."""
     key = name.rsplit("/", 1)[-1]
     contract = evidence.contract
+    if name == "time":
+        return ["period"]
+    if key in ("qpos", "qvel"):
+        return _joints_of(evidence.model, key)
     term = evidence.terms.get(tuple(name.split("/", 2)[1:]), {})
     inputs = term.get("inputs", [key])
     size = term.get("size", count)
@@ -493,6 +498,17 @@ def _labels(evidence: Evidence, name: str, count: int) -> list[str]:
         return [f"component {label}" if label.isdigit() else label for label in names]
     length = count // size
     return [f"{label}, {length - 1 - age} steps ago" for age in range(length) for label in names]
+
+
+def _joints_of(model: mujoco.MjModel, field: str) -> list[str]:
+    """Return the joint of each element of `qpos` or `qvel`, with a number within free and ball joints."""
+    starts, end = (model.jnt_qposadr, model.nq) if field == "qpos" else (model.jnt_dofadr, model.nv)
+    sizes = np.diff(np.append(starts, end))
+    return [
+        name if size == 1 else f"{name}[{k}]"
+        for name, size in zip((model.joint(j).name for j in range(model.njnt)), sizes, strict=True)
+        for k in range(size)
+    ]
 
 
 def _places(evidence: Evidence, place: str, count: int) -> list[str]:

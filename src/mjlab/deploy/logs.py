@@ -25,6 +25,7 @@ import numpy as np
 
 from mjlab.deploy.check import TOLERANCES, Comparison, Report, compare, find_causes
 from mjlab.deploy.evidence import Evidence
+from mjlab.deploy.usual_terms import imu_field
 from mjlab.utils.csv_table import CsvTable
 from mjlab.utils.errors import UserError
 
@@ -185,14 +186,14 @@ def check_log(folder: Path, path: Path, tolerance: float = TOLERANCE) -> Report:
 
 def _raw(evidence: Evidence, table: CsvTable) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return measurements and commands of a log by name in the trace, and the missing ones."""
-    found, missing, root = {}, [], evidence.contract["robot"]["root_body"]
+    found, missing = {}, []
     for entry in evidence.contract["measurements"]:
-        name, source = entry["name"], entry["source"]
+        name = entry["name"]
         joints = evidence.joint_names if name in ("joint_pos", "joint_vel") else None
         labels = joints or [str(k) for k in range(entry["size"])]
-        values = table.group(f"measurement.{name.replace('/', '.')}", labels)
+        values = table.group(f"measurement.{name}", labels)
         if values is None:
-            values = table.group(*_plain_name(name, source, labels, root))
+            values = table.group(*_plain_name(evidence.contract, entry, labels))
         if values is None:
             missing.append(f"measurement {name}")
             values = np.full((len(table.columns["time"]), entry["size"]), np.nan)
@@ -209,13 +210,13 @@ def _raw(evidence: Evidence, table: CsvTable) -> tuple[dict[str, np.ndarray], li
 
 
 def _plain_name(
-    name: str, source: Mapping[str, Any], labels: list[str], root: str
+    contract: Mapping[str, Any], entry: Mapping[str, Any], labels: list[str]
 ) -> tuple[str, list[str]]:
     """Return the shorter name of a measurement, and the labels of its columns."""
-    if source.get("type") == "gyro" and source["body"] == root:
-        return "gyroscope", list("xyz")
-    if name == "root_quat":
-        return "quaternion", list("wxyz")
+    field = imu_field(contract, entry)
+    if field is not None:
+        return field, list("xyz" if field == "gyroscope" else "wxyz")
+    name = entry["name"]
     return {"joint_pos": "position", "joint_vel": "velocity"}.get(name, name), labels
 
 

@@ -8,6 +8,7 @@ from string import Template
 from typing import Any
 
 from mjlab.deploy.unitree import UnknownToUnitreeError, motor_map
+from mjlab.deploy.usual_terms import imu_field
 
 _TEMPLATE = Path(__file__).parent / "files" / "README.md.txt"
 
@@ -60,19 +61,10 @@ def readme(contract: Mapping[str, Any], notes: Sequence[str]) -> str:
 
 def _origin(contract: Mapping[str, Any], one: Mapping[str, Any]) -> str:
     """Return the origin of a measurement in the loops: a field of the robot's state, "kinematics" or ""."""
-    source, root = one["source"], contract["robot"]["root_body"]
-    kind = source.get("type") if source["kind"] == "sensor" else source["kind"]
     if one["name"] in ("joint_pos", "joint_vel"):
         return one["name"]
-    if source.get("body") == root:
-        fields = {
-            "body_quat": "quaternion",
-            "framequat": "quaternion",
-            "body_ang_vel_b": "gyroscope",
-            "gyro": "gyroscope",
-        }
-        if kind in fields:
-            return fields[kind]
+    if (field := imu_field(contract, one)) is not None:
+        return field
     return "kinematics" if one["availability"] == "computed" else ""
 
 

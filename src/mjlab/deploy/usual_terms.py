@@ -1,9 +1,23 @@
-"""Observation terms that programs of others know, found by what a term computes."""
+"""Observation terms and measurements that programs of others know, found by what they are."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+_NO_TURN = [1.0, 0.0, 0.0, 0.0]
+
+
+def imu_field(contract: Mapping[str, Any], measurement: Mapping[str, Any]) -> str | None:
+    """Return the field of the root's IMU that a measurement is, `quaternion` or `gyroscope`; else None."""
+    source = measurement["source"]
+    kind = source.get("type") if source["kind"] == "sensor" else source["kind"]
+    if source.get("body") != contract["robot"]["root_body"]:
+        return None
+    if kind in ("body_ang_vel_b", "gyro"):
+        return "gyroscope"
+    is_of_root = measurement["frame"] == "world" and source.get("site_quat", _NO_TURN) == _NO_TURN
+    return "quaternion" if kind in ("body_quat", "framequat") and is_of_root else None
 
 
 def usual_term(contract: Mapping[str, Any], term: Mapping[str, Any]) -> str | None:
@@ -46,5 +60,5 @@ def _is_gyro_of_root(contract: Mapping[str, Any], source: Mapping[str, Any]) -> 
     root = contract["robot"]["root_body"]
     if source["kind"] == "body_ang_vel_b":
         return source["body"] == root
-    has_axes_of_root = source.get("body") == root and source["site_quat"] == [1.0, 0.0, 0.0, 0.0]
+    has_axes_of_root = source.get("body") == root and source["site_quat"] == _NO_TURN
     return source.get("type") == "gyro" and has_axes_of_root

@@ -22,6 +22,7 @@ from mjlab.deploy.nominal import nominal_cfg
 from mjlab.runs import Checkpoint, Run
 from mjlab.runs.policy import agent_cfg_of, export_policy, has_foreign_runner, make_env
 from mjlab.scripts.demo import DEMOS, demo_of
+from mjlab.scripts.evaluate import load_curricula_of
 from mjlab.utils.errors import UserError
 from mjlab.utils.ranges import Count
 from mjlab.utils.screen import shown
@@ -98,7 +99,7 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
             made = Path(temporary) / "bundle"
             made.mkdir()
             export_policy(task, env, checkpoint, made / "policy.onnx", cfg.profile)
-            _restore_curricula(task, env, checkpoint)
+            load_curricula_of(task, env, checkpoint)
             contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
             source = origin(task, cfg.profile, checkpoint.path, **recorded(task, checkpoint))
             bundle = write_bundle(contract, made, source, cfg.steps)
@@ -118,17 +119,6 @@ def recorded(task: str, checkpoint: Checkpoint) -> dict[str, Any]:
     is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
     iteration = checkpoint.iteration if is_ours else None
     return {"iteration": iteration, "seed": run.seed, "commit": run.commit}
-
-
-def _restore_curricula(task: str, env: Any, checkpoint: Checkpoint) -> None:
-    """Let the curricula of the run set the ranges of `env`."""
-    if checkpoint.path.suffix == ".onnx" or has_foreign_runner(task):
-        return
-    from mjlab.rl.checkpoint import curricula_of
-    from mjlab.rl.evaluation import load_curricula
-
-    if (state := curricula_of(checkpoint.content)) is not None:
-        load_curricula(env, state)
 
 
 def main() -> None:
