@@ -116,8 +116,8 @@ CLIPS = {
         seconds=3.0,
     ),
     "g1_tracking": Clip(
-        "Mjlab-Tracking-Flat-Unitree-G1", motion="squat", seconds=4.0, body="robot/pelvis",
-        lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
+        DEMOS["g1-tracking"].task, None, DEMOS["g1-tracking"].policy, motion="squat", seconds=4.0,
+        body="robot/pelvis", lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
     ),
 }  # fmt: skip
 # Packages that `mjlab new-robot` writes, installed: trunk and standing height (m), of four and two legs.

@@ -1,4 +1,4 @@
-"""Play a bundled policy: `uv run mjlab demo`, `uv run mjlab demo g1`."""
+"""Play a bundled policy: `uv run mjlab demo`, `uv run mjlab demo g1`, `uv run mjlab demo g1-tracking`."""
 
 from __future__ import annotations
 
@@ -58,6 +58,16 @@ DEMOS = {
         seed=1,
         commit="602bee2519714029bce19f214cad88be1edca66b",
     ),
+    "g1-tracking": Demo(
+        "Mjlab-Tracking-Flat-Unitree-G1",
+        None,
+        _FOLDER / "g1_tracking.onnx",
+        _FOLDER / "g1_tracking_evaluation.json",
+        run="2026-11-27_07-11-50",
+        iteration=600,
+        seed=1,
+        commit="b74655ede50446a251965eb8620c00c587ceae3e",
+    ),
 }
 
 
@@ -77,8 +87,9 @@ def demo_cfg(demo: Demo) -> PlayConfig:
         # Rays would distract from the robot.
         if isinstance(sensor, RayCastSensorCfg):
             sensor.debug_vis = False
-    # The policies were trained at the task's first command ranges; `play` has those of its last stage.
-    env.commands["twist"] = load_env_cfg(demo.task, profile=demo.profile).commands["twist"]
+    # Walking was trained at the task's first command ranges; `play` has those of its last stage.
+    if "twist" in env.commands:
+        env.commands["twist"] = load_env_cfg(demo.task, profile=demo.profile).commands["twist"]
     return PlayConfig(
         env=env,
         profile=demo.profile,
