@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
-from bundles import load_program
+from bundles import load_program, write_random
 
 from mjlab.deploy.check import check_bundle
 from mjlab.deploy.unitree import (
@@ -88,6 +88,12 @@ class Reader:
         bounds = [ranges[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_z")]
         return np.clip(stick, *np.array(bounds).T)
 
+    def motion_command(self, state, stick):
+        return state["motion"]
+
+    def motion_anchor_ori_b(self, state, stick):
+        return state["anchor"]
+
     def gait_phase(self, state, stick, period):
         self.phase = (self.phase + self.cfg["step_dt"] / period) % 1.0
         angle = 2 * np.pi * self.phase
@@ -121,6 +127,36 @@ def test_the_programs_act_as_in_training(bundle, name):
         np.testing.assert_allclose(observation, trace["input/obs"][k], atol=2e-5)
         targets = reader.act(observation)
         np.testing.assert_allclose(targets[motors], trace["target"][k], atol=2e-5)
+
+
+def test_the_programs_act_as_in_training_of_motions(tmp_path):
+    task = "Mjlab-Tracking-Flat-Unitree-G1-No-State-Estimation"
+    folder = write_random(task, tmp_path / "bundle", steps=8)
+    # They raise for an input that is no observation, such as a frame.
+    reader, trace = Reader(folder), dict(np.load(folder / "golden.npz"))
+    assert reader.input.name == "obs"
+    assert reader.motors.tolist() == list(range(29))
+    for k in range(len(trace["time"])):
+        if trace["first"][k]:
+            reader.action[:] = 0.0
+        state = {
+            "q": trace["measurement/joint_pos"][k],
+            "dq": trace["measurement/joint_vel"][k],
+            "gyroscope": trace["measurement/imu_ang_vel"][k],
+            "motion": trace["command/motion"][k],
+            "anchor": trace["raw/obs/motion_anchor_ori_b"][k],
+        }
+        observation = reader.observe(state, np.zeros(3))
+        np.testing.assert_allclose(observation, trace["input/obs"][k], atol=2e-5)
+        np.testing.assert_allclose(reader.act(observation), trace["target"][k], atol=2e-5)
+    assert check_bundle(folder).is_passed
+
+
+def test_memory_is_refused(bundle):
+    entry = {"name": "h_in", "shape": [1, 1, 8], "kind": "memory", "output": "h_out"}
+    contract = edited(bundle("go1"), lambda c: c["policy"]["inputs"].append(entry))
+    with pytest.raises(UnknownToUnitreeError, match="no input 'h_in'"):
+        deploy_settings(contract)
 
 
 def test_gains_are_in_the_order_of_the_motors(bundle):

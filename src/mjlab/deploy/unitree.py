@@ -9,7 +9,6 @@ control steps ahead of training's. They read its period and nothing else, so the
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -62,8 +61,35 @@ def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
     head = f"# {contract['source'].get('task')}, written by training; do not edit.\n"
     (folder / "params" / "deploy.yaml").write_text(head + text, encoding="utf-8")
-    shutil.copyfile(folder / contract["policy"]["file"], folder / "exported" / "policy.onnx")
+    (folder / "exported" / "policy.onnx").write_bytes(_network(contract, folder))
     return None
+
+
+def _network(contract: Mapping[str, Any], folder: Path) -> bytes:
+    """Return the network as the programs read it: they raise for an input that is no observation.
+
+    Of a motion's policy, the frame and what depends on nothing else are left out; the actions do not need it.
+    """
+    policy = contract["policy"]
+    path = folder / policy["file"]
+    observed = {one["name"] for one in policy["inputs"] if one["kind"] == "observation"}
+    if len(observed) == len(policy["inputs"]):
+        return path.read_bytes()
+    import onnx
+
+    model = onnx.load(str(path))
+    graph, needed = model.graph, {policy["output"]}
+    for k in reversed(range(len(graph.node))):
+        if needed.isdisjoint(graph.node[k].output):
+            del graph.node[k]
+        else:
+            needed.update(graph.node[k].input)
+    for values in (graph.input, graph.output, graph.initializer):
+        for k in reversed(range(len(values))):
+            if values[k].name not in needed:
+                del values[k]
+    del graph.value_info[:]
+    return model.SerializeToString(deterministic=True)
 
 
 def file_numbers(
@@ -73,7 +99,7 @@ def file_numbers(
 
     Empty without the file. One that `contract` cannot have, or that is no such file, is not of this contract.
     """
-    path, policy = folder / "params" / "deploy.yaml", folder / contract["policy"]["file"]
+    path = folder / "params" / "deploy.yaml"
     if not path.exists():
         return {}
     try:
@@ -87,7 +113,7 @@ def file_numbers(
     except (ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
         return {"deploy.yaml": ({"is of this contract": 1.0}, {"is of this contract": 0.0})}
     copy = folder / "exported" / "policy.onnx"
-    is_same = copy.exists() and copy.read_bytes() == policy.read_bytes()
+    is_same = copy.exists() and copy.read_bytes() == _network(contract, folder)
     parts["exported/policy.onnx"] = {"is policy.onnx": 1.0}, {"is policy.onnx": float(is_same)}
     return {name if "/" in name else f"deploy.yaml/{name}": part for name, part in parts.items()}
 
@@ -122,8 +148,10 @@ def deploy_settings(contract: Mapping[str, Any]) -> dict[str, Any]:
     motors = motor_map([joint["name"] for joint in joints])
     by_motor = sorted(range(len(joints)), key=lambda k: motors[k])
     (observation, *others) = contract["observations"]
-    if others:
-        raise UnknownToUnitreeError(f"they have no input {others[0]['input']!r}.")
+    unknown = [one["input"] for one in others]
+    unknown += [one["name"] for one in contract["policy"]["inputs"] if one["kind"] == "memory"]
+    if unknown:
+        raise UnknownToUnitreeError(f"they have no input {unknown[0]!r}.")
     return {
         "joint_ids_map": motors,
         "step_dt": contract["rates"]["step_dt"],
