@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -24,14 +25,19 @@ Row = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory) -> Path:
-    """Compile the driver; skip where this machine has no compiler or library, but in CI."""
-    program = tmp_path_factory.mktemp("replay") / "replay"
+def compiler() -> list[str]:
+    """Return the command to compile; skip where this machine has no compiler or library, but in CI."""
     library = Path("/usr/include/nlohmann/json.hpp")
     if not os.environ.get("CI") and not (shutil.which("g++") and library.exists()):
         pytest.skip("needs g++ and nlohmann-json3-dev")
-    command = ["g++", "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{FILES}"]
-    subprocess.run([*command, str(DRIVER), "-o", str(program)], check=True)
+    return ["g++", "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{FILES}"]
+
+
+@pytest.fixture(scope="module")
+def program(compiler, tmp_path_factory) -> Path:
+    """Compile the driver."""
+    program = tmp_path_factory.mktemp("replay") / "replay"
+    subprocess.run([*compiler, str(DRIVER), "-o", str(program)], check=True)
     return program
 
 
@@ -364,3 +370,29 @@ def test_measurements_of_wrong_size_are_named(robot):
     name = robot.contract["measurements"][0]["name"]
     with pytest.raises(RuntimeError, match=f"'{name}': expected 17"):
         robot.run([{}])
+
+
+# README.
+
+CONTROLLER = """
+struct Controller : controller_interface::ControllerInterface {{
+  {update}
+  std::unique_ptr<mjlab::Policy> policy_;
+  std::unique_ptr<Imu> imu_;
+  TwistBuffer twist_;
+  mjlab::Values last_;
+  mjlab::Vector command_;
+  double due_, stamp_;
+  bool has_begun_;
+}};
+"""
+
+
+@pytest.mark.parametrize("name", ["go1", "Mjlab-Tracking-Flat-Unitree-G1", "Mjlab-Reach-Yam"])
+def test_readme_compiles(bundle, compiler, tmp_path, name):
+    text = (bundle(name) / "README.md").read_text()
+    adapter, update = re.findall(r"```cpp\n(.*?)```", text, re.DOTALL)
+    shutil.copyfile(DRIVER.with_name("stand_ins.hpp"), tmp_path / "onnxruntime_cxx_api.h")
+    (tmp_path / "readme.cpp").write_text(adapter + CONTROLLER.format(update=update))
+    flags = ["-fsyntax-only", f"-I{tmp_path}"]
+    subprocess.run([*compiler, *flags, str(tmp_path / "readme.cpp")], check=True)

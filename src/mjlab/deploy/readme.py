@@ -78,6 +78,13 @@ _CPP = {
     "quaternion": "{turn[3], turn[0], turn[1], turn[2]}",
     "gyroscope": "{rate[0], rate[1], rate[2]}",
 }
+_IMU_CPP = {
+    "turn[": "  const auto turn = imu_->get_orientation();  // x, y, z, w\n",
+    "rate[": "  const auto rate = imu_->get_angular_velocity();\n",
+}
+_TWIST_CPP = (
+    "  const auto twist = *twist_.readFromRT();  // geometry_msgs/Twist of a subscription\n"
+)
 _GO2_MOTORS = 12
 _NAN_NOTE = " Replace each NaN by the measurement of the line: until then, the robot is damped."
 
@@ -96,6 +103,7 @@ def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
             value = _CPP.get(origin, f"mjlab::Vector({size}, NAN)")
             note = "  // As Simulation.compute in simulate.py." if origin == "kinematics" else ""
             cpp += f'  measured["{name}"] = {value};{note}\n'
+    cpp = "".join(line for name, line in _IMU_CPP.items() if name in cpp) + cpp
     given = [one for one in contract["commands"] if one["kind"] == "given"]
     zeros = ", ".join(f'"{one["name"]}": np.zeros({one["size"]})' for one in given)
     sizes = [one["size"] for one in given]
@@ -112,6 +120,7 @@ def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
         "command_cpp": "{twist.linear.x, twist.linear.y, twist.angular.z}"
         if is_twist
         else "command_",
+        "twist_cpp": _TWIST_CPP if is_twist else "",
     }
 
 
