@@ -156,7 +156,7 @@ def test_what_cannot_be_played_is_refused(run, flags, named):
 def test_without_any_checkpoint_the_message_says_what_to_do(run, script, tmp_path):
     outcome = run(script, TASK, "--log-root", str(tmp_path), "--device", "cpu")
     assert outcome.status == 1
-    for part in (str(tmp_path / "cartpole"), f"`train {TASK}`", "--checkpoint-file"):
+    for part in (str(tmp_path / "cartpole"), f"`uv run mjlab train {TASK}`", "--checkpoint-file"):
         assert part in outcome.message
 
 
@@ -186,7 +186,7 @@ def test_evaluation_prints_figures_for_machines_and_nothing_else(run, trained):
 
 
 def test_evaluation_is_written_for_pages(run, trained, tmp_path):
-    path = tmp_path / "evaluation.json"
+    path = tmp_path / "new" / "evaluation.json"
     flags = ("--json", "--log-root", str(trained.parents[1]), "--output", str(path))
     outcome = run("evaluate", TASK, *SHORT, *flags)
     assert outcome.status == 0, outcome.err

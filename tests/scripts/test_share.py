@@ -73,6 +73,25 @@ def test_pages_need_a_policy(run, tmp_path):
     assert not (tmp_path / "p.html").exists()
 
 
+@pytest.mark.parametrize("flag", ["--output", "--evaluation"])
+def test_wrong_files_are_named_before_the_recording(run, tmp_path, flag):
+    flags = ("--output", str(tmp_path / "p.html"), flag, str(tmp_path))
+    outcome = run("share", "go1", *flags)
+    assert outcome.status == 1
+    assert outcome.message.startswith(f"error: {flag}: ")
+    assert "Recording" not in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_facts_of_another_checkpoint_are_not_claimed(run, shared, tmp_path):
+    source = shutil.copytree(shared.parent, tmp_path / "run")
+    (exported,) = source.glob("*.onnx")
+    page = tmp_path / "new" / "page.html"
+    outcome = run("share", str(exported), "--output", str(page), "--num-episodes", "1", *SHORT)
+    assert outcome.status == 0, outcome.err
+    assert "<th>iterations</th>" not in page.read_text()
+
+
 def pixel(send, x: float, y: float) -> tuple[int, ...]:
     """Return the color of the tab at a share of its width and height."""
     shot = base64.b64decode(send("Page.captureScreenshot", format="png")["data"])

@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -28,7 +27,7 @@ from mjlab.runs import Checkpoint
 from mjlab.runs.policy import agent_cfg_of, has_foreign_runner, make_env, make_policy
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import replacing
+from mjlab.utils.os import file_to_write, replacing
 from mjlab.utils.ranges import Count, Seed, check_ranges
 from mjlab.utils.screen import shown
 from mjlab.utils.string import counted
@@ -75,6 +74,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     """
     from mjlab.rl.evaluation import evaluate_policy, success_definition
 
+    output = None if cfg.output is None else file_to_write(cfg.output)
     device = resolve_device(cfg.device)
     checkpoint = find_checkpoint(task, cfg)
     env_cfg = env_cfg_of(task, cfg, checkpoint, purpose="evaluate")
@@ -120,8 +120,8 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     }
     text = json.dumps(metrics, indent=2)
     print(text if cfg.json else _table(metrics, failures))
-    if cfg.output is not None:
-        with replacing(Path(cfg.output)) as file:
+    if output is not None:
+        with replacing(output) as file:
             file.write(f"{text}\n".encode())
     return metrics
 

@@ -1,4 +1,4 @@
-"""Write a page of a policy to share: `mjlab share RUN [flags]`."""
+"""Write a page of a policy to share: `uv run mjlab share POLICY [flags]`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mjlab.scripts.deploy import policy_of, recorded
 from mjlab.scripts.evaluate import load_curricula_of
 from mjlab.utils.errors import UserError
 from mjlab.utils.logging import print_notice
-from mjlab.utils.os import replacing
+from mjlab.utils.os import file_to_write, replacing
 from mjlab.utils.processes import machine
 from mjlab.utils.ranges import Count, Positive, Seed
 from mjlab.utils.screen import shown
@@ -79,6 +79,11 @@ def run_share(task: str, cfg: ShareConfig) -> Path:
     Raises:
         UserError, ValueError, OSError, CheckpointError: the request cannot be fulfilled.
     """
+    output = file_to_write(cfg.output)
+    if cfg.evaluation is not None and not Path(cfg.evaluation).is_file():
+        raise UserError(
+            f"--evaluation: expected a file of `evaluate --output`, got {cfg.evaluation}; not found."
+        )
     checkpoint = find_checkpoint(task, cfg)
     if checkpoint is None:
         raise UserError(f"--agent: expected 'trained', got {cfg.agent!r}; a page needs a policy.")
@@ -127,9 +132,9 @@ def run_share(task: str, cfg: ShareConfig) -> Path:
             f"The page has {size / 1e6:.1f} MB, more than {MAX_BYTES / 1e6:g}; lower --num-episodes, "
             "--seconds or --fps, or the terrain's size."
         )
-    with replacing(Path(cfg.output)) as file:
+    with replacing(output) as file:
         file.write(page.encode())
-    return Path(cfg.output)
+    return output
 
 
 def _origin(task: str, run: Run, checkpoint: Checkpoint, profile: str | None) -> dict[str, Any]:
@@ -137,12 +142,11 @@ def _origin(task: str, run: Run, checkpoint: Checkpoint, profile: str | None) ->
     is_ours = checkpoint.path.suffix == ".pt" and not has_foreign_runner(task)
     started = run.started
     training = recorded(task, checkpoint)
-    iteration = training["iteration"]
     return {
         "profile": profile or "none",
         "learner": checkpoint.learner if is_ours else run.learner,
         "policy": checkpoint.path.name,
-        "iterations": run.info.get("iterations") if iteration is None else iteration,
+        "iterations": training["iteration"],
         "seed of training": training["seed"],
         "commit": training["commit"],
         "trained on": run.info.get("machine"),

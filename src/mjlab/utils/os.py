@@ -300,6 +300,18 @@ def naming(path: Path) -> Generator[None]:
         raise
 
 
+def file_to_write(path: str) -> Path:
+    """Return the path of a file that a command writes at its end; its folder is created.
+
+    Raises:
+        UserError: a folder of this name exists.
+    """
+    if (file := Path(path)).is_dir():
+        raise UserError(f"--output: expected a file, got the folder {path}; use a path in it.")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return file
+
+
 @contextlib.contextmanager
 def replacing(path: Path, *, flush: bool = False) -> Generator[IO[bytes]]:
     """Yield a binary file that replaces `path` atomically if the block succeeds.
