@@ -843,15 +843,16 @@ def test_a_killed_worker_of_a_journal_file_continues(tmp_path):
     first, second = (
         subprocess.Popen([*command, str(folder)], stdout=subprocess.PIPE) for folder in folders
     )
-    end = time.monotonic() + 120.0
-    while not list(killed.glob("runs/*/*/model_0.pt")) and time.monotonic() < end:
+    # An evaluation follows, so the run does not end before it is killed.
+    while not list(killed.glob("runs/*/*/model_0.pt")):
+        assert first.poll() is None
         time.sleep(0.01)
     first.kill()
     first.communicate()
-    second.communicate(timeout=300.0)
+    second.communicate()
     assert second.returncode == 0
     # As a machine that is started again.
-    assert subprocess.run([*command, str(killed)], timeout=300.0).returncode == 0
+    assert subprocess.run([*command, str(killed)]).returncode == 0
     states = {row["learning-rate"]: row["state"] for row in rows_of(killed)}
     assert sorted(states.values()) == ["elsewhere", "elsewhere", "finished"]
     (setting,) = (name for name, state in states.items() if state == "finished")
@@ -868,15 +869,15 @@ def test_a_sweep_that_trains_is_interrupted_and_continued(tmp_path):
     command += ["--agent.num-steps-per-env", "8", "--agent.save-interval", "1"]
     command += ["--agent.max-iterations", "2", "--agent.evaluation.num-episodes", "4"]
     process = subprocess.Popen(command, process_group=0, stdout=subprocess.PIPE, text=True)
-    end = time.monotonic() + 120.0
-    while not list(folder.glob("runs/*/*/model_0.pt")) and time.monotonic() < end:
+    while not list(folder.glob("runs/*/*/model_0.pt")):
+        assert process.poll() is None, process.communicate()[0]
         time.sleep(0.01)
     # As a terminal does it: to the whole process group.
     os.killpg(process.pid, signal.SIGINT)
-    out = process.communicate(timeout=120.0)[0]
+    out = process.communicate()[0]
     assert process.returncode == 130, out
     assert "To continue:" in out
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300.0)
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
     for setting in ("1e-4", "1e-3"):
