@@ -155,7 +155,8 @@ line.""",
         "drive a robot that can walk, now",
         details="""\
 Play a robot that tracks velocity commands, in the browser and offline: a Unitree Go1
-(quadruped, `go1`, the default) or G1 (humanoid, `g1`). Flags are those of `play`.""",
+(quadruped, `go1`, the default) or G1 (humanoid, `g1`); or a G1 that squats and waves
+(`g1-tracking`). Flags are those of `play`.""",
         examples=(
             "demo",
             "demo g1",
@@ -205,7 +206,7 @@ mean return with a 95 % interval, and the success rate if the task defines succe
 Write one HTML file that opens offline in any browser: recorded episodes to turn and scrub in 3-D,
 commands, rewards, learning curve, evaluation with its intervals, and where the policy comes from.
 
-{_POLICY} Or a bundled policy (go1, g1).
+{_POLICY} Or a bundled policy (go1, g1, g1-tracking).
 
 Values are those of `evaluate --output`; without it, the page says how to measure.""",
         examples=(
@@ -355,7 +356,7 @@ that returns an EntityCfg.""",
 Write a folder that runs a policy without this package and without torch: network (ONNX), contract
 (JSON), scene, golden trace, and programs to read.
 
-{_POLICY} Or a bundled policy (go1, g1).""",
+{_POLICY} Or a bundled policy (go1, g1, g1-tracking).""",
         examples=(
             "deploy go1 --output go1_bundle",
             "deploy logs/rsl_rl/go1_velocity/2026-01-02_03-04-05",

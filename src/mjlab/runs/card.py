@@ -106,7 +106,9 @@ def _skill(evaluation: Mapping[str, Any] | None) -> str:
 
 def _use(run: Run, name: str, origin: Mapping[str, Any]) -> str:
     package = run.info.get("package")
-    needs = origin["package"] if package is None else f"{origin['package']} and {package}"
+    # The package index has another package of this name.
+    needs = f"{origin['package']} (from a clone, not from the package index)"
+    needs += "" if package is None else f", {package}"
     needs += ", and the extra `mjlab[hub]`" if name.startswith(hub.PREFIX) else ""
     name = shlex.quote(name)
     return (
