@@ -62,7 +62,7 @@ _OTHERS = {
     "aside",
 }
 # `simulate.py` of a bundle, and programs that read one.
-_OTHERS |= {"command", "manifest", "onnx", "yaml"}
+_OTHERS |= {"command", "config", "manifest", "onnx", "yaml"}
 _OPTUNA = {"state", "study-name", "trial-number"}
 _TORCHRUN = {"nnodes", "node-rank", "nproc-per-node", "rdzv-backend", "rdzv-endpoint", "rdzv-id"}
 
