@@ -16,7 +16,7 @@ import torch
 from rl_fake_env import FakeEnv
 
 from mjlab.rl.checkpoint import CheckpointError, RunFolderError, load_checkpoint
-from mjlab.rl.config import EvaluationCfg
+from mjlab.rl.config import EvaluationCfg, RslRlPpoAlgorithmCfg
 from mjlab.rl.rollout_watch import DivergedError
 from mjlab.rl.run_logger import IterationStats, TrainingObserver
 from mjlab.utils.random import preserved_rng
@@ -427,6 +427,24 @@ def test_a_run_whose_folder_is_gone_is_saved_beside_it(
     resumed.load(str(rescued))
     resumed.learn(4)
     assert_same_bits(everything(resumed), expected)
+
+
+def test_updates_and_exploration_fade_with_the_iterations(make_runner, tmp_path: Path):
+    algorithm = RslRlPpoAlgorithmCfg(
+        num_learning_epochs=1, desired_kl=0.02, entropy_coef=0.01, annealing=((1, 1.0), (3, 0.5))
+    )
+    runner = make_runner(tmp_path / "run", algorithm=asdict(algorithm))
+    divergences, bonuses = [], []
+    for iterations in range(1, 6):
+        runner.learn(iterations)
+        divergences.append(runner.alg.desired_kl)
+        bonuses.append(runner.alg.entropy_coef)
+    assert divergences == pytest.approx([0.02, 0.02, 0.015, 0.01, 0.01])
+    assert bonuses == pytest.approx([0.01, 0.01, 0.0075, 0.005, 0.005])
+    resumed = make_runner(algorithm=asdict(algorithm))
+    resumed.load(str(tmp_path / "run" / "model_4.pt"))
+    resumed.learn(6)
+    assert resumed.alg.desired_kl == pytest.approx(0.01)
 
 
 def solved_at(value: float, **changes) -> dict:

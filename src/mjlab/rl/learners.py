@@ -32,6 +32,7 @@ _ADDED_TO_ALGORITHM = {
     "symmetry_cfg": None,
     "use_mixed_precision": False,
     "teacher_iterations": 0,
+    "annealing": ((0, 1.0),),
 }
 
 

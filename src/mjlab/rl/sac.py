@@ -17,7 +17,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import fields
 from typing import Any
 
-import numpy as np
 import torch
 from rsl_rl.env import VecEnv
 from rsl_rl.utils import (
@@ -32,6 +31,7 @@ from torch import nn
 from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
+from mjlab.rl.schedule import Schedule
 from mjlab.utils.errors import check_field
 from mjlab.utils.memory import check_memory
 
@@ -87,7 +87,9 @@ class SAC:
             weight_decay=cfg.weight_decay,
             fused=True,
         )
-        self._rate_factor = _Schedule(cfg, "learning_rate_factor")
+        self._rate_factor = Schedule(
+            "RslRlSacAlgorithmCfg.learning_rate_factor", cfg.learning_rate_factor
+        )
         self._teacher = _Teacher(cfg)
         symmetry, self._env = cfg.symmetry_cfg, env
         self._mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
@@ -556,21 +558,6 @@ class _ReturnScale:
                 setattr(self, name, value.to(own.device).clone())
 
 
-class _Schedule:
-    """Setting given by points (environment step, value), interpolated linearly."""
-
-    def __init__(self, cfg: RslRlSacAlgorithmCfg, name: str) -> None:
-        points = getattr(cfg, name)
-        steps = [step for step, _ in points]
-        increases = len(steps) > 0 and steps == sorted(set(steps))
-        check_field(cfg, name, increases, "points with increasing steps")
-        self._steps, self._values = zip(*points, strict=True)
-
-    def at(self, num_steps: int) -> float:
-        """Return the value after `num_steps` environment steps."""
-        return float(np.interp(num_steps, self._steps, self._values))
-
-
 class _Teacher:
     """Controller that acts at first, and is imitated by the policy.
 
@@ -579,7 +566,7 @@ class _Teacher:
     """
 
     def __init__(self, cfg: RslRlSacAlgorithmCfg) -> None:
-        self._weight = _Schedule(cfg, "imitation")
+        self._weight = Schedule("RslRlSacAlgorithmCfg.imitation", cfg.imitation)
         has_weight = any(weight for _, weight in cfg.imitation)
         if cfg.teacher is None and (cfg.teacher_steps > 0 or has_weight):
             raise ValueError(
