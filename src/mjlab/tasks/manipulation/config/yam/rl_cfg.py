@@ -180,7 +180,8 @@ def _ease(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None
     # it keeps the hand from finding the cube: 1 % after 250 iterations with smaller updates from the start.
     rl_cfg.algorithm.annealing = ((280, 1.0), (300, 0.25))
     _evaluate(env_cfg, rl_cfg)
-    rl_cfg.evaluation.first_iteration, rl_cfg.evaluation.min_interval = 320, 25
+    # 90 % of the 200 episodes after 325 iterations were 87 % of 400 others; after 360, 95 %.
+    rl_cfg.evaluation.first_iteration, rl_cfg.evaluation.min_interval = 350, 25
 
 
 def _evaluate(
