@@ -152,12 +152,14 @@ def test_missing_measurements_are_asked_for_where_they_are(bundle, name):
     assert ("Replace each NaN" in cpp) == ("NAN)" in cpp)
 
 
-def test_gyroscope_of_another_link_is_missing(bundle):
+def test_gyroscope_of_another_link_or_askew_is_missing(bundle):
     contract = json.loads((bundle("go1") / "contract.json").read_text())
     assert '"imu_ang_vel": imu.gyroscope' in readme(contract, [])
     (gyro,) = [one for one in contract["measurements"] if one["name"] == "imu_ang_vel"]
-    gyro["source"]["body"] = "robot/FR_hip"
-    assert '"imu_ang_vel": np.full(3, np.nan)' in readme(contract, [])
+    source = dict(gyro["source"])
+    for change in ({"body": "robot/FR_hip"}, {"site_quat": [0.8, 0.6, 0.0, 0.0]}):
+        gyro["source"] = source | change
+        assert '"imu_ang_vel": np.full(3, np.nan)' in readme(contract, [])
 
 
 def test_orientation_of_an_askew_sensor_is_missing(bundle):

@@ -18,10 +18,12 @@ from mjlab.deploy.check import check_bundle
 from mjlab.deploy.unitree import (
     MOTORS,
     UnknownToUnitreeError,
+    _network,
     deploy_settings,
     motor_map,
     phase_note,
 )
+from mjlab.scripts.demo import DEMOS
 
 
 class Reader:
@@ -152,7 +154,23 @@ def test_the_programs_act_as_in_training_of_motions(tmp_path):
     assert check_bundle(folder).is_passed
 
 
-def test_memory_is_refused(bundle):
+def test_the_network_for_the_programs_needs_no_frame(bundle, tmp_path):
+    bundled = DEMOS["g1-tracking"].policy
+    folder = Path(shutil.copytree(bundle("Mjlab-Tracking-Flat-Unitree-G1"), tmp_path / "bundle"))
+    shutil.copyfile(bundled, folder / "policy.onnx")
+    contract = json.loads((folder / "contract.json").read_text())
+    network = _network(contract, folder)
+    assert [one.name for one in network.graph.input] == ["obs"]
+    observations = np.random.default_rng(0).normal(size=(1, 160)).astype(np.float32)
+    frame = {"time_step": np.zeros((1, 1), np.float32)}
+    programs = [
+        onnxruntime.InferenceSession(p) for p in (str(bundled), network.SerializeToString())
+    ]
+    wanted = programs[0].run(["actions"], {"obs": observations, **frame})[0]
+    np.testing.assert_array_equal(programs[1].run(None, {"obs": observations})[0], wanted)
+
+
+def test_recurrent_policy_is_rejected(bundle):
     entry = {"name": "h_in", "shape": [1, 1, 8], "kind": "memory", "output": "h_out"}
     contract = edited(bundle("go1"), lambda c: c["policy"]["inputs"].append(entry))
     with pytest.raises(UnknownToUnitreeError, match="no input 'h_in'"):
@@ -180,13 +198,35 @@ def test_breadth_first_joints_of_the_g1():
 
 
 def test_joints_of_the_h1_2_are_in_the_order_of_its_motors():
-    # Of its MJCF in unitree_ros, h1_2_description.
-    leg = ("hip_yaw", "hip_pitch", "hip_roll", "knee", "ankle_pitch", "ankle_roll")
-    arm = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")
-    arm += ("wrist_roll", "wrist_pitch", "wrist_yaw")
-    parts = [("left", leg), ("right", leg), (None, ("torso",)), ("left", arm), ("right", arm)]
+    # Of its MJCF in unitree_ros, h1_2_description, and in this order.
     names = [
-        f"{side}_{one}_joint" if side else f"{one}_joint" for side, part in parts for one in part
+        "left_hip_yaw_joint",
+        "left_hip_pitch_joint",
+        "left_hip_roll_joint",
+        "left_knee_joint",
+        "left_ankle_pitch_joint",
+        "left_ankle_roll_joint",
+        "right_hip_yaw_joint",
+        "right_hip_pitch_joint",
+        "right_hip_roll_joint",
+        "right_knee_joint",
+        "right_ankle_pitch_joint",
+        "right_ankle_roll_joint",
+        "torso_joint",
+        "left_shoulder_pitch_joint",
+        "left_shoulder_roll_joint",
+        "left_shoulder_yaw_joint",
+        "left_elbow_joint",
+        "left_wrist_roll_joint",
+        "left_wrist_pitch_joint",
+        "left_wrist_yaw_joint",
+        "right_shoulder_pitch_joint",
+        "right_shoulder_roll_joint",
+        "right_shoulder_yaw_joint",
+        "right_elbow_joint",
+        "right_wrist_roll_joint",
+        "right_wrist_pitch_joint",
+        "right_wrist_yaw_joint",
     ]
     assert motor_map(names) == list(range(27))
     assert motor_map(names[::-1]) == list(range(27))[::-1]

@@ -84,8 +84,10 @@ def test_to_act_takes_the_least_replay():
 
 def test_additions_are_passed_if_changed():
     cfg = RslRlOnPolicyRunnerCfg()
-    added = {"torch_compile_mode", "save_git_diff", "upload_git_diff", "evaluation"}
+    added = {"torch_compile_mode", "save_git_diff", "upload_git_diff", "evaluation", "annealing"}
     assert set(asdict(cfg)) - set(train_dict(cfg)) == added
+    of_algorithm = set(asdict(cfg)["algorithm"]) - set(train_dict(cfg)["algorithm"])
+    assert of_algorithm == {"symmetry_cfg", "use_mixed_precision"}
     cfg.evaluation.solved_return, cfg.algorithm.use_mixed_precision = 900.0, True
     made = train_dict(cfg)
     assert made["evaluation"]["solved_return"] == 900.0

@@ -153,7 +153,7 @@ ACTING: dict[str, Settings] = {
             "use_data_augmentation": True,
         },
         "algorithm.use_mixed_precision": True,
-        "algorithm.annealing": ((0, 0.1),),
+        "annealing": ((0, 0.1),),
     },
     "sac": {
         "seed": 5,

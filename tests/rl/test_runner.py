@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 import signal
 import sys
@@ -430,10 +431,9 @@ def test_a_run_whose_folder_is_gone_is_saved_beside_it(
 
 
 def test_updates_and_exploration_fade_with_the_iterations(make_runner, tmp_path: Path):
-    algorithm = RslRlPpoAlgorithmCfg(
-        num_learning_epochs=1, desired_kl=0.02, entropy_coef=0.01, annealing=((1, 1.0), (3, 0.5))
-    )
-    runner = make_runner(tmp_path / "run", algorithm=asdict(algorithm))
+    algorithm = RslRlPpoAlgorithmCfg(num_learning_epochs=1, desired_kl=0.02, entropy_coef=0.01)
+    changes = {"algorithm": asdict(algorithm), "annealing": ((1, 1.0), (3, 0.5))}
+    runner = make_runner(tmp_path / "run", **copy.deepcopy(changes))
     divergences, bonuses = [], []
     for iterations in range(1, 6):
         runner.learn(iterations)
@@ -441,7 +441,7 @@ def test_updates_and_exploration_fade_with_the_iterations(make_runner, tmp_path:
         bonuses.append(runner.alg.entropy_coef)
     assert divergences == pytest.approx([0.02, 0.02, 0.015, 0.01, 0.01])
     assert bonuses == pytest.approx([0.01, 0.01, 0.0075, 0.005, 0.005])
-    resumed = make_runner(algorithm=asdict(algorithm))
+    resumed = make_runner(**changes)
     resumed.load(str(tmp_path / "run" / "model_4.pt"))
     resumed.learn(6)
     assert resumed.alg.desired_kl == pytest.approx(0.01)

@@ -831,6 +831,10 @@ def test_runs_resume_with_iterations_left(monkeypatch, tmp_path):
     assert sweep.last_checkpoint({"x": "2"}, 1) is None
 
 
+# Time (s) after which a process hangs, also on a crowded machine.
+_PATIENCE = 900.0
+
+
 @pytest.mark.slow
 def test_a_killed_worker_of_a_journal_file_continues(tmp_path):
     command = [sys.executable, "-m", "mjlab.cli.main", "sweep", TASK, "--device", "cpu"]
@@ -848,11 +852,11 @@ def test_a_killed_worker_of_a_journal_file_continues(tmp_path):
         assert first.poll() is None
         time.sleep(0.01)
     first.kill()
-    first.communicate()
-    second.communicate()
+    first.communicate(timeout=_PATIENCE)
+    second.communicate(timeout=_PATIENCE)
     assert second.returncode == 0
     # As a machine that is started again.
-    assert subprocess.run([*command, str(killed)]).returncode == 0
+    assert subprocess.run([*command, str(killed)], timeout=_PATIENCE).returncode == 0
     states = {row["learning-rate"]: row["state"] for row in rows_of(killed)}
     assert sorted(states.values()) == ["elsewhere", "elsewhere", "finished"]
     (setting,) = (name for name, state in states.items() if state == "finished")
@@ -874,10 +878,10 @@ def test_a_sweep_that_trains_is_interrupted_and_continued(tmp_path):
         time.sleep(0.01)
     # As a terminal does it: to the whole process group.
     os.killpg(process.pid, signal.SIGINT)
-    out = process.communicate()[0]
+    out = process.communicate(timeout=_PATIENCE)[0]
     assert process.returncode == 130, out
     assert "To continue:" in out
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE)
     assert done.returncode == 0, done.stdout + done.stderr
     assert [row["seeds"] for row in rows_of(folder)] == ["2", "2"]
     for setting in ("1e-4", "1e-3"):

@@ -106,7 +106,8 @@ def run_sim(
         record_motion(motion, robot, path.with_suffix(".mp4"))
 
 
-_DEMO_MOTION = "slow_walk"
+# Of the bundled policy.
+_DEMO_MOTION = "squat"
 
 
 def ensure_default_motion() -> str:
@@ -117,16 +118,14 @@ def ensure_default_motion() -> str:
 
 
 def ensure_default_checkpoint() -> str:
-    """Raise `FileNotFoundError`: the package has no bundled tracking policy."""
-    raise FileNotFoundError(
-        "mjlab has no bundled motion tracking checkpoint; train one with "
-        "`uv run mjlab train Mjlab-Tracking-Flat-Unitree-G1`, or run `uv run mjlab demo` for a bundled Go1 "
-        "policy."
-    )
+    """Return the path of the bundled tracking policy, in ONNX, of squats and waves."""
+    from mjlab.scripts.demo import DEMOS
+
+    return str(DEMOS["g1-tracking"].policy)
 
 
 def ensure_asset_downloaded(asset_name: str, force_download: bool = False) -> Path:
-    """Return the path of `demo_motion.npz`; `demo_ckpt.pt` is not available."""
+    """Return the path of the bundled file that stands for `demo_motion.npz` or `demo_ckpt.pt`."""
     assets = {"demo_motion.npz": ensure_default_motion, "demo_ckpt.pt": ensure_default_checkpoint}
     if asset_name not in assets:
         raise ValueError(f"asset_name: expected one of {sorted(assets)}, got {asset_name!r}.")

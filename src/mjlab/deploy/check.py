@@ -469,7 +469,7 @@ def _labels(evidence: Evidence, name: str, count: int) -> list[str]:
     contract = evidence.contract
     if name == "time":
         return ["period"]
-    if key in ("qpos", "qvel"):
+    if name in ("after/qpos", "after/qvel"):
         return _joints_of(evidence.model, key)
     term = evidence.terms.get(tuple(name.split("/", 2)[1:]), {})
     inputs = term.get("inputs", [key])

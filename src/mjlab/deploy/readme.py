@@ -8,7 +8,7 @@ from string import Template
 from typing import Any
 
 from mjlab.deploy.unitree import UnknownToUnitreeError, motor_map
-from mjlab.deploy.usual_terms import imu_field
+from mjlab.deploy.usual_terms import imu_field, is_velocity
 
 _TEMPLATE = Path(__file__).parent / "files" / "README.md.txt"
 
@@ -107,7 +107,7 @@ def _loops(contract: Mapping[str, Any]) -> dict[str, str]:
     given = [one for one in contract["commands"] if one["kind"] == "given"]
     zeros = ", ".join(f'"{one["name"]}": np.zeros({one["size"]})' for one in given)
     sizes = [one["size"] for one in given]
-    is_twist = sizes == [3]
+    is_twist = len(given) == 1 and is_velocity(given[0])
     return {
         "measured_py": python,
         "measured_cpp": cpp,

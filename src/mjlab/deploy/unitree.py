@@ -11,12 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
 from mjlab.deploy.usual_terms import is_velocity, usual_term
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
 
 _LEGS = ("FR", "FL", "RR", "RL")
 _SIDES = ("left", "right")
@@ -33,7 +36,8 @@ MOTORS: dict[str, tuple[str, ...]] = {
         *("waist_yaw", "waist_roll", "waist_pitch"),
         *(f"{side}_{joint}" for side in _SIDES for joint in _ARM),
     ),
-    # `H1_2_JointIndex` of unitree_sdk2_python's h1_2_low_level_example.py: hips yaw first.
+    # `H1_2_JointIndex` of unitree_sdk2_python's h1_2_low_level_example.py, as the MJCF of unitree_ros. Lists of
+    # others have hip roll before hip pitch.
     "H1-2": (
         *(f"{side}_{joint}" for side in _SIDES for joint in _LEG_OF_H1_2),
         "torso",
@@ -53,7 +57,7 @@ class UnknownToUnitreeError(ValueError):
 def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
     """Write `params/deploy.yaml` and `exported/policy.onnx`; return the reason if they are not."""
     try:
-        content = deploy_settings(contract)
+        content, network = deploy_settings(contract), _network(contract, folder)
     except UnknownToUnitreeError as error:
         return f"No params/deploy.yaml for Unitree's programs: {error}"
     for name in ("params", "exported"):
@@ -61,35 +65,44 @@ def write_unitree(contract: Mapping[str, Any], folder: Path) -> str | None:
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
     head = f"# {contract['source'].get('task')}, written by training; do not edit.\n"
     (folder / "params" / "deploy.yaml").write_text(head + text, encoding="utf-8")
-    (folder / "exported" / "policy.onnx").write_bytes(_network(contract, folder))
+    (folder / "exported" / "policy.onnx").write_bytes(network.SerializeToString())
     return None
 
 
-def _network(contract: Mapping[str, Any], folder: Path) -> bytes:
+def _network(contract: Mapping[str, Any], folder: Path) -> ModelProto:
     """Return the network as the programs read it: they raise for an input that is no observation.
 
-    Of a motion's policy, the frame and what depends on nothing else are left out; the actions do not need it.
+    Of a motion's policy, the frame and what depends on nothing else are left out.
+
+    Raises:
+        UnknownToUnitreeError: the actions depend on another input.
     """
-    policy = contract["policy"]
-    path = folder / policy["file"]
-    observed = {one["name"] for one in policy["inputs"] if one["kind"] == "observation"}
-    if len(observed) == len(policy["inputs"]):
-        return path.read_bytes()
     import onnx
 
-    model = onnx.load(str(path))
+    policy = contract["policy"]
+    model = onnx.load(str(folder / policy["file"]))
+    others = {one["name"] for one in policy["inputs"] if one["kind"] != "observation"}
+    if not others:
+        return model
     graph, needed = model.graph, {policy["output"]}
+    if any(attribute.HasField("g") for node in graph.node for attribute in node.attribute):
+        raise UnknownToUnitreeError(
+            f"they have no input {min(others)!r}, and the network branches."
+        )
     for k in reversed(range(len(graph.node))):
         if needed.isdisjoint(graph.node[k].output):
             del graph.node[k]
         else:
-            needed.update(graph.node[k].input)
+            # An optional input that is left out has no name.
+            needed.update(filter(None, graph.node[k].input))
+    if used := others & needed:
+        raise UnknownToUnitreeError(f"they have no input {min(used)!r}.")
     for values in (graph.input, graph.output, graph.initializer):
         for k in reversed(range(len(values))):
             if values[k].name not in needed:
                 del values[k]
     del graph.value_info[:]
-    return model.SerializeToString(deterministic=True)
+    return model
 
 
 def file_numbers(
@@ -112,8 +125,10 @@ def file_numbers(
         }
     except (ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
         return {"deploy.yaml": ({"is of this contract": 1.0}, {"is of this contract": 0.0})}
+    import onnx
+
     copy = folder / "exported" / "policy.onnx"
-    is_same = copy.exists() and copy.read_bytes() == _network(contract, folder)
+    is_same = copy.exists() and onnx.load(str(copy)) == _network(contract, folder)
     parts["exported/policy.onnx"] = {"is policy.onnx": 1.0}, {"is policy.onnx": float(is_same)}
     return {name if "/" in name else f"deploy.yaml/{name}": part for name, part in parts.items()}
 

@@ -11,13 +11,14 @@ _NO_TURN = [1.0, 0.0, 0.0, 0.0]
 def imu_field(contract: Mapping[str, Any], measurement: Mapping[str, Any]) -> str | None:
     """Return the field of the root's IMU that a measurement is, `quaternion` or `gyroscope`; else None."""
     source = measurement["source"]
-    kind = source.get("type") if source["kind"] == "sensor" else source["kind"]
-    if source.get("body") != contract["robot"]["root_body"]:
-        return None
-    if kind in ("body_ang_vel_b", "gyro"):
+    if _is_gyro_of_root(contract, source):
         return "gyroscope"
-    is_of_root = measurement["frame"] == "world" and source.get("site_quat", _NO_TURN) == _NO_TURN
-    return "quaternion" if kind in ("body_quat", "framequat") and is_of_root else None
+    is_of_root = source.get("body") == contract["robot"]["root_body"]
+    # Other objects of a sensor are turned against the body: inertial axes, geoms, cameras.
+    has_its_axes = source["kind"] == "body_quat" or source.get("site_quat") == _NO_TURN
+    is_orientation = source["kind"] == "body_quat" or source.get("type") == "framequat"
+    in_world = measurement["frame"] == "world"
+    return "quaternion" if is_of_root and has_its_axes and is_orientation and in_world else None
 
 
 def usual_term(contract: Mapping[str, Any], term: Mapping[str, Any]) -> str | None:
@@ -60,5 +61,5 @@ def _is_gyro_of_root(contract: Mapping[str, Any], source: Mapping[str, Any]) -> 
     root = contract["robot"]["root_body"]
     if source["kind"] == "body_ang_vel_b":
         return source["body"] == root
-    has_axes_of_root = source.get("body") == root and source["site_quat"] == _NO_TURN
+    has_axes_of_root = source.get("body") == root and source.get("site_quat") == _NO_TURN
     return source.get("type") == "gyro" and has_axes_of_root

@@ -109,12 +109,6 @@ class RslRlPpoAlgorithmCfg:
     None: no augmentation."""
     use_mixed_precision: bool = field(default=False, kw_only=True)
     """Use mixed precision in updates (bfloat16 networks)."""
-    annealing: Annotated[tuple[tuple[int, float], ...], Range(0.0, ends="[)")] = field(
-        default=((0, 1.0),), kw_only=True
-    )
-    """Factor of `desired_kl` and `entropy_coef`: points (iteration, factor), interpolated linearly. Below
-    1, updates get smaller and exploration fades: a policy that solves most of its task stops changing
-    between the ways to do it."""
     class_name: str = "PPO"
     """rsl_rl class name, or `module:Class`."""
 
@@ -411,6 +405,12 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     """Learning algorithm."""
     torch_compile_mode: TorchCompileMode | None = field(default=None, kw_only=True)
     """Mode of `torch.compile` for the networks; compilation delays the start. None: no compilation."""
+    annealing: Annotated[tuple[tuple[int, float], ...], Range(0.0, ends="[)")] = field(
+        default=((0, 1.0),), kw_only=True
+    )
+    """Factor of the algorithm's `desired_kl` and `entropy_coef`: points (iteration, factor), interpolated
+    linearly. Below 1, exploration fades and, with the adaptive schedule, updates get smaller: the success
+    of a nearly solved task stops swinging between evaluations."""
 
 
 @dataclass

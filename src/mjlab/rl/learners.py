@@ -27,12 +27,12 @@ _ADDED: dict[str, Any] = {
     "save_git_diff": True,
     "upload_git_diff": False,
     "evaluation": asdict(EvaluationCfg()),
+    "annealing": ((0, 1.0),),
 }
 _ADDED_TO_ALGORITHM = {
     "symmetry_cfg": None,
     "use_mixed_precision": False,
     "teacher_iterations": 0,
-    "annealing": ((0, 1.0),),
 }
 
 

@@ -77,7 +77,6 @@ if TYPE_CHECKING:
     from mjlab.envs import ManagerBasedRlEnvCfg
 
 logger = logging.getLogger(__name__)
-_ANNEALED = ("desired_kl", "entropy_coef")
 
 
 class MjlabOnPolicyRunner(OnPolicyRunner):
@@ -131,8 +130,6 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             "agent num_steps_per_env", train_cfg["num_steps_per_env"], env.get_observations().bytes(),
             device, "fewer steps or environments",
         )  # fmt: skip
-        # Of this runner, not of rsl_rl's PPO.
-        annealing = train_cfg["algorithm"].pop("annealing", None)
         # rsl_rl prints networks and observation sets.
         with contextlib.redirect_stdout(io.StringIO()) as printed, warnings.catch_warnings():
             # Of shared encoders.
@@ -140,8 +137,11 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             super().__init__(env, train_cfg, log_dir, device)
         logger.debug("%s", printed.getvalue().rstrip())
         deduplicate_parameters(self.alg.optimizer)
-        self._annealing = annealing and Schedule("RslRlPpoAlgorithmCfg.annealing", annealing)
-        self._annealed = {name: getattr(self.alg, name, None) for name in _ANNEALED}
+        annealing = self.cfg.get("annealing", ((0, 1.0),))
+        self._annealing = Schedule("RslRlOnPolicyRunnerCfg.annealing", annealing)
+        # rsl_rl's PPO may have no desired divergence, its distillation has neither.
+        values = {name: getattr(self.alg, name, None) for name in ("desired_kl", "entropy_coef")}
+        self._annealed = {name: value for name, value in values.items() if value is not None}
         self.logger: RunLogger = RunLogger(
             log_dir=log_dir,
             cfg=self.cfg,
@@ -423,10 +423,9 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         with torch.inference_mode():
             self.alg.compute_returns(observations)
         algorithm: Any = self.alg
-        if self._annealing is not None:
-            factor = self._annealing.at(self.current_learning_iteration)
-            for name, value in self._annealed.items():
-                setattr(algorithm, name, factor * value)
+        factor = self._annealing.at(self.current_learning_iteration)
+        for name, value in self._annealed.items():
+            setattr(algorithm, name, factor * value)
         teacher = getattr(algorithm, "teacher", None)
         if teacher is None or not teacher.is_recurrent:
             return algorithm.update()

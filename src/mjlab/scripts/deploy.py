@@ -92,17 +92,15 @@ def run_deploy(task: str, cfg: DeployConfig) -> Bundle:
     env = make_env(task, nominal, "cpu", agent=agent)
     try:
         # Written beside the target and renamed, so that a folder never holds half a bundle.
-        with (
-            raising_interrupted(),
-            tempfile.TemporaryDirectory(dir=folder.parent, prefix=".deploy-") as temporary,
-        ):
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".deploy-") as temporary:
             made = Path(temporary) / "bundle"
             made.mkdir()
-            export_policy(task, env, checkpoint, made / "policy.onnx", cfg.profile)
-            load_curricula_of(task, env, checkpoint)
-            contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
-            source = origin(task, cfg.profile, checkpoint.path, **recorded(task, checkpoint))
-            bundle = write_bundle(contract, made, source, cfg.steps)
+            with raising_interrupted():
+                export_policy(task, env, checkpoint, made / "policy.onnx", cfg.profile)
+                load_curricula_of(task, env, checkpoint)
+                contract = Contract(env.unwrapped, made / "policy.onnx", lacks)
+                source = origin(task, cfg.profile, checkpoint.path, **recorded(task, checkpoint))
+                bundle = write_bundle(contract, made, source, cfg.steps)
             if folder.exists():
                 shutil.rmtree(folder)
             made.replace(folder)

@@ -121,6 +121,7 @@ def run_evaluate(task: str, cfg: EvaluateConfig, *, keep_num_envs: bool = False)
     text = json.dumps(metrics, indent=2)
     print(text if cfg.json else _table(metrics, failures))
     if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
         with replacing(output) as file:
             file.write(f"{text}\n".encode())
     return metrics

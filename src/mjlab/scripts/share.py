@@ -132,6 +132,7 @@ def run_share(task: str, cfg: ShareConfig) -> Path:
             f"The page has {size / 1e6:.1f} MB, more than {MAX_BYTES / 1e6:g}; lower --num-episodes, "
             "--seconds or --fps, or the terrain's size."
         )
+    output.parent.mkdir(parents=True, exist_ok=True)
     with replacing(output) as file:
         file.write(page.encode())
     return output

@@ -301,14 +301,13 @@ def naming(path: Path) -> Generator[None]:
 
 
 def file_to_write(path: str) -> Path:
-    """Return the path of a file that a command writes at its end; its folder is created.
+    """Return the path of a file that a command writes at its end (`--output`).
 
     Raises:
         UserError: a folder of this name exists.
     """
     if (file := Path(path)).is_dir():
         raise UserError(f"--output: expected a file, got the folder {path}; use a path in it.")
-    file.parent.mkdir(parents=True, exist_ok=True)
     return file
 
 
