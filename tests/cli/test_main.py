@@ -272,9 +272,11 @@ def test_a_thread_without_memory_ends_the_command():
     assert done.stderr.startswith("error: Out of memory: a thread did not start.")
 
 
-def test_a_reader_that_has_seen_enough_causes_no_message():
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_has_seen_enough_causes_no_message(unbuffered):
     command = f"{sys.executable} -m mjlab.scripts.train --help | true"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=environment)
     assert done.stderr == ""
 
 

@@ -44,6 +44,7 @@ def test_added_fields_do_not_shift_positional_arguments():
         "save_git_diff",
         "upload_git_diff",
         "torch_compile_mode",
+        "annealing",
     }
 
 

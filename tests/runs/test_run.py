@@ -262,5 +262,5 @@ def test_an_interrupted_run_does_not_stand_in(tmp_path):
 
 
 def test_without_checkpoints_the_message_names_the_command(tmp_path):
-    with pytest.raises(UserError, match=f"`train {TASK}` first"):
+    with pytest.raises(UserError, match=f"`uv run mjlab train {TASK}` first"):
         resolve_checkpoint(tmp_path / "model_0.pt", TASK)

@@ -576,15 +576,17 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         if isinstance(error, SystemExit) and (error.code or not lines):
             # Of the parser of flags, of a signal, or with a status that a user chose.
             raise
-        if isinstance(error, BrokenPipeError) and not lines:
-            # The reader (`| head`) closed the pipe. Python would report unwritten buffered output at
-            # exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        else:
+        # Else the reader (`| head`) closed the pipe.
+        if lines or not isinstance(error, BrokenPipeError):
             _report(error, lines)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     finally:
         sys.unraisablehook = previous
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # Python would report the unwritten output at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         # Before the callbacks that modules registered in the meantime.
         atexit.register(end_by_interrupt, True)
         # Python would search all objects for garbage as it ends, which took 0.8 s.
