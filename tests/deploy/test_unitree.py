@@ -359,6 +359,14 @@ def test_file_and_network_of_another_task_are_found(bundle, tmp_path):
     assert [one.comparison.name for one in check_bundle(other).findings] == ["deploy.yaml"]
 
 
+def test_damaged_copy_of_the_network_is_found(bundle, tmp_path):
+    folder = Path(shutil.copytree(bundle("go1"), tmp_path / "bundle"))
+    (folder / "exported" / "policy.onnx").write_bytes(b"no network")
+    assert [one.comparison.name for one in check_bundle(folder).findings] == [
+        "exported/policy.onnx"
+    ]
+
+
 def test_reason_for_the_g1_with_23_joints():
     motors = MOTORS["G1 (29 joints)"]
     without = ("waist_roll", "waist_pitch", "wrist_pitch", "wrist_yaw")

@@ -447,6 +447,13 @@ def test_updates_and_exploration_fade_with_the_iterations(make_runner, tmp_path:
     assert resumed.alg.desired_kl == pytest.approx(0.01)
 
 
+def test_without_annealing_settings_that_others_change_stay(make_runner):
+    runner = make_runner()
+    runner.alg.entropy_coef, runner.alg.desired_kl = 0.3, 0.4
+    runner.learn(2)
+    assert (runner.alg.entropy_coef, runner.alg.desired_kl) == (0.3, 0.4)
+
+
 def solved_at(value: float, **changes) -> dict:
     return asdict(EvaluationCfg(solved_return=value, num_episodes=4, min_interval=1, **changes))
 

@@ -576,17 +576,20 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         if isinstance(error, SystemExit) and (error.code or not lines):
             # Of the parser of flags, of a signal, or with a status that a user chose.
             raise
-        # Else the reader (`| head`) closed the pipe.
+        # Without such lines, the reader (`| head`) closed the pipe.
         if lines or not isinstance(error, BrokenPipeError):
             _report(error, lines)
         sys.exit(error.exit_status if isinstance(error, MjlabError) else 1)
     finally:
         sys.unraisablehook = previous
         try:
-            sys.stdout.flush()
+            print(end="", flush=True)
         except BrokenPipeError:
             # Python would report the unwritten output at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except OSError:
+            # Python reports it at exit, such as a full disk.
+            pass
         # Before the callbacks that modules registered in the meantime.
         atexit.register(end_by_interrupt, True)
         # Python would search all objects for garbage as it ends, which took 0.8 s.

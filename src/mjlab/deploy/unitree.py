@@ -117,6 +117,7 @@ def file_numbers(
         return {}
     try:
         written, found = deploy_settings(contract), yaml.safe_load(path.read_text(encoding="utf-8"))
+        network = _network(contract, folder)
         for settings in (written, found):
             names = settings["observations"]
             settings["order of terms"] = {name: place for place, name in enumerate(names)}
@@ -125,12 +126,20 @@ def file_numbers(
         }
     except (ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
         return {"deploy.yaml": ({"is of this contract": 1.0}, {"is of this contract": 0.0})}
-    import onnx
-
-    copy = folder / "exported" / "policy.onnx"
-    is_same = copy.exists() and onnx.load(str(copy)) == _network(contract, folder)
+    is_same = _holds(folder / "exported" / "policy.onnx", network)
     parts["exported/policy.onnx"] = {"is policy.onnx": 1.0}, {"is policy.onnx": float(is_same)}
     return {name if "/" in name else f"deploy.yaml/{name}": part for name, part in parts.items()}
+
+
+def _holds(path: Path, network: ModelProto) -> bool:
+    """Return True if the file is there, can be read, and is `network`."""
+    import onnx
+    from google.protobuf.message import DecodeError
+
+    try:
+        return onnx.load(str(path)) == network
+    except (OSError, DecodeError):
+        return False
 
 
 def _flat(value: Any, key: str = "") -> dict[str, float]:

@@ -137,8 +137,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
             super().__init__(env, train_cfg, log_dir, device)
         logger.debug("%s", printed.getvalue().rstrip())
         deduplicate_parameters(self.alg.optimizer)
-        annealing = self.cfg.get("annealing", ((0, 1.0),))
-        self._annealing = Schedule("RslRlOnPolicyRunnerCfg.annealing", annealing)
+        # Without it, the settings are left alone: runners and terms of packages may change them.
+        points = self.cfg.get("annealing")
+        name = "RslRlOnPolicyRunnerCfg.annealing"
+        self._annealing = None if points is None else Schedule(name, points)
         # rsl_rl's PPO may have no desired divergence, its distillation has neither.
         values = {name: getattr(self.alg, name, None) for name in ("desired_kl", "entropy_coef")}
         self._annealed = {name: value for name, value in values.items() if value is not None}
@@ -423,9 +425,10 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
         with torch.inference_mode():
             self.alg.compute_returns(observations)
         algorithm: Any = self.alg
-        factor = self._annealing.at(self.current_learning_iteration)
-        for name, value in self._annealed.items():
-            setattr(algorithm, name, factor * value)
+        if self._annealing is not None:
+            factor = self._annealing.at(self.current_learning_iteration)
+            for name, value in self._annealed.items():
+                setattr(algorithm, name, factor * value)
         teacher = getattr(algorithm, "teacher", None)
         if teacher is None or not teacher.is_recurrent:
             return algorithm.update()
