@@ -197,7 +197,7 @@ def _evaluate(
     evaluation.trigger_return = trigger_return
 
 
-cpu = cpu_profile(_ease, **_SHARED)
+cpu = cpu_profile(_ease, mirror="mjlab.tasks.manipulation.symmetry:mirror_left_right", **_SHARED)
 """Profile of the state-based task."""
 
 

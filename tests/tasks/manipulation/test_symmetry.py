@@ -1,0 +1,147 @@
+"""Mirror images of an arm that lifts, against simulated mirrored arms."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import mujoco
+import pytest
+import torch
+from lifting_tasks import lifting, task_cfg
+from tensordict import TensorDict
+
+from mjlab.envs import ManagerBasedRlEnv
+from mjlab.managers import ObservationTermCfg
+from mjlab.tasks.manipulation.symmetry import mirror_left_right
+from mjlab.tasks.symmetry import Mirror, mirror_of_joints
+from mjlab.tasks.symmetry import mirror_left_right as mirror_with_terms
+from mjlab.utils.mirror import DIRECTION
+
+
+def make_env(edit=None):
+    """Two arms without randomization."""
+    cfg = task_cfg(num_envs=2)
+    cfg.events = {name: term for name, term in cfg.events.items() if "friction" not in name}
+    cfg.observations["actor"].enable_corruption = False
+    if edit is not None:
+        edit(cfg)
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    env.reset()
+    return env
+
+
+def put_before_mirror(env):
+    """Put cube and goal of environment 1 to the right where those of environment 0 are to the left."""
+    left, right = env.scene.env_origins.clone()
+    cube, side = torch.tensor([0.3, 0.08, 0.02]), torch.tensor(DIRECTION)
+    pose = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]] * 2)
+    pose[:, :3] = torch.stack([left + cube, right + side * cube])
+    env.scene["cube"].write_root_link_pose_to_sim(pose)
+    goal = torch.tensor([0.3, 0.1, 0.3])
+    lifting(env).target_pos[:] = torch.stack([left + goal, right + side * goal])
+
+
+def columns_of_terms(env, group):
+    sizes = [size for (size,) in env.observation_manager.group_obs_term_dim[group]]
+    ends = torch.tensor(sizes).cumsum(0).tolist()
+    names = env.observation_manager.active_terms[group]
+    return [(n, slice(end - k, end)) for n, end, k in zip(names, ends, sizes, strict=True)]
+
+
+def test_the_mirror_image_is_what_a_mirrored_arm_senses():
+    env = make_env()
+    put_before_mirror(env)
+    torch.manual_seed(0)
+    for _ in range(40):
+        seen = env.step(mirror_left_right(env, actions=0.5 * torch.randn(1, 7))[1])[0]
+        both, _ = mirror_left_right(env, TensorDict(seen, batch_size=[2]))
+        for group, values in seen.items():
+            torch.testing.assert_close(both[group][:2], values)
+            for name, columns in columns_of_terms(env, group):
+                # Masses of the two sides differ by some grams.
+                gap = (both[group][2, columns] - values[1, columns]).abs().max()
+                turn = (values[0, columns] - values[1, columns]).abs().max()
+                assert gap < max(0.01, 0.2 * turn), (group, name, gap, turn)
+                # Without the mirror, every term differs: the base turns to the other side.
+                assert turn > 0.02 or name == "joint_pos"
+    env.close()
+
+
+def test_the_image_of_an_image_is_the_original():
+    env = make_env()
+    obs = TensorDict({"actor": torch.randn(3, 29), "critic": torch.randn(3, 29)}, batch_size=[3])
+    actions = torch.randn(3, 7)
+    once = mirror_left_right(env, obs, actions)
+    twice = mirror_left_right(env, once[0][3:], once[1][3:])
+    for group in ("actor", "critic"):
+        torch.testing.assert_close(twice[0][group][3:], obs[group])
+    torch.testing.assert_close(twice[1][3:], actions)
+    env.close()
+
+
+def test_a_hand_beside_the_mirror_plane_is_refused():
+    def move_the_hand(cfg):
+        spec_fn = cfg.scene.entities["robot"].spec_fn
+
+        def spec_with_moved_hand():
+            spec = spec_fn()
+            spec.site("grasp_site").pos = spec.site("grasp_site").pos + 0.02
+            return spec
+
+        cfg.scene.entities["robot"].spec_fn = spec_with_moved_hand
+
+    env = make_env(move_the_hand)
+    with pytest.raises(ValueError, match="'grasp_site'.*on the mirror plane"):
+        mirror_left_right(env, actions=torch.zeros(2, 7))
+    env.close()
+
+
+def test_terms_of_a_package_are_mirrored_as_it_says():
+    def place(env):
+        return env.scene["cube"].data.root_link_pos_w - env.scene.env_origins
+
+    def observe_the_place(cfg):
+        for group in cfg.observations.values():
+            group.terms = {"place": ObservationTermCfg(func=place)}
+
+    env = make_env(observe_the_place)
+    values = torch.tensor([[1.0, 2.0, 3.0]])
+    obs = TensorDict({"actor": values, "critic": values}, batch_size=[1])
+    with pytest.raises(ValueError, match="actor/place.*`terms`"):
+        mirror_left_right(env, obs)
+    terms = {place: lambda *_: Mirror(range(3), DIRECTION)}
+    image, _ = mirror_with_terms(env, obs, terms=terms)
+    assert image["actor"].tolist() == [[1.0, 2.0, 3.0], [1.0, -2.0, 3.0]]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("constraint", "sign"),
+    [
+        ('joint1="left" joint2="right" polycoef="0 -1 0 0 0"', 1.0),
+        ('joint1="right" joint2="left" polycoef="0 1 0 0 0"', -1.0),
+        ('joint1="right" joint2="left" polycoef="0 -0.5 0 0 0"', None),
+        ('joint1="right" joint2="left" polycoef="0 -1 0 0 0" active="false"', None),
+    ],
+)
+def test_a_finger_stands_for_the_one_that_follows_it(constraint, sign):
+    fingers = "".join(
+        f'<body pos="0 {y} 0"><joint name="{name}" type="slide" axis="0 1 0"/><geom size=".1"/></body>'
+        for name, y in (("left", 0.1), ("right", -0.1))
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="hand"><geom size=".1"/>{fingers}</body></worldbody>'
+        f"<equality><joint {constraint}/></equality></mujoco>"
+    )
+    hand = SimpleNamespace(
+        joint_names=["left", "right"],
+        data=SimpleNamespace(default_joint_pos=torch.zeros(1, 2)),
+        indexing=SimpleNamespace(root_body_id=1, joint_ids=torch.tensor([0, 1])),
+    )
+    if sign is None:
+        with pytest.raises(ValueError, match="both sides"):
+            mirror_of_joints(model, hand, names=["left"])
+    else:
+        assert mirror_of_joints(model, hand, names=["left"]).signs.tolist() == [sign]
+    # Both fingers are each other's images, coupled or not.
+    assert mirror_of_joints(model, hand).sources.tolist() == [1, 0]
