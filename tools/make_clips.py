@@ -115,6 +115,10 @@ CLIPS = {
         "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0, elevation=-16.0,
         seconds=3.0,
     ),
+    "multi_cube": Clip(
+        "Mjlab-Multi-Cube-Seg-Yam", "student", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0,
+        elevation=-16.0, seconds=6.0, speed=2.0,
+    ),
     "g1_tracking": Clip(
         DEMOS["g1-tracking"].task, None, DEMOS["g1-tracking"].policy, motion="squat", seconds=4.0,
         body="robot/pelvis", lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
