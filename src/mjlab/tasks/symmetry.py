@@ -1,10 +1,10 @@
 """Left-right symmetry augmentation of observations and actions.
 
 For a robot that is symmetric, the mirror image of each sample is a further sample without simulation cost
-(Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024). Name a
-function with the arguments of `mirror_left_right` in `symmetry_cfg` of `RslRlPpoAlgorithmCfg`: that of
-`mjlab.tasks.velocity.symmetry` or `mjlab.tasks.manipulation.symmetry`, which know the terms of their tasks,
-or a function of the task's own:
+(Mittal et al., "Symmetry Considerations for Learning Task Symmetric Robot Policies", ICRA 2024). Name
+`mirror_left_right` of `mjlab.tasks.velocity.symmetry` or `mjlab.tasks.manipulation.symmetry` in
+`symmetry_cfg` of `RslRlPpoAlgorithmCfg`. They know the terms of their tasks; others are mirrored by a
+function of the task's own:
 
     def mirror_of_door(robot, params):
         return Mirror(range(3), DIRECTION)
@@ -76,7 +76,8 @@ def mirror_left_right(
         actions: Actions (N, A), or None.
         pairs: Names of joints and feet (geoms, bodies, sites) and of their partners on the other side, in
             either direction. Others are found by geometry; None: all are.
-        terms: Mirrors of observation functions that are not in `TERMS`.
+        terms: Mirrors of observation functions that are not in `TERMS`, by functions defined once: others
+            are built anew in each call.
 
     Returns:
         Observations and actions with 2 N rows, the originals first.
@@ -87,7 +88,7 @@ def mirror_left_right(
     env = env.unwrapped
     kinds = {**TERMS, **(terms or {})}
     mirrors = _cache.get(env)
-    if mirrors is None or (mirrors.robot.pairs, mirrors.kinds) != (pairs or {}, kinds):
+    if mirrors is None or (mirrors.pairs, mirrors.kinds) != (pairs or {}, kinds):
         mirrors = _cache[env] = _Mirrors(env, pairs or {}, kinds)
     if obs is not None:
         image = obs.clone()
@@ -105,8 +106,9 @@ class _Mirrors:
     def __init__(
         self, env: ManagerBasedRlEnv, pairs: Mapping[str, str], kinds: Mapping[Any, MirrorOfTerm]
     ) -> None:
-        self.robot = robot = SymmetricRobot(env, dict(pairs))
-        self.kinds = kinds
+        # Without the robot, which refers to the environment: that would never be freed.
+        self.pairs, self.kinds = dict(pairs), kinds
+        robot = SymmetricRobot(env, self.pairs)
         manager = env.observation_manager
         self.groups: dict[str, Mirror] = {}
         for group, names in manager.active_terms.items():
@@ -185,7 +187,7 @@ def _mirror_of_term(
     if kind is None:
         raise ValueError(
             f"{owner}: mirror_left_right does not support this term. Supported: "
-            f"{', '.join(sorted(func.__name__ for func in kinds))}. Name its mirror in `terms`, "
+            f"{', '.join(sorted(getattr(func, '__name__', str(func)) for func in kinds))}. Name its mirror in `terms`, "
             f"in a function of your own. {HINT}"
         )
     clip = cfg.clip
@@ -330,6 +332,7 @@ def _of_joints(robot: SymmetricRobot, params: dict[str, Any]) -> Mirror:
 
 
 def of_actions(robot: SymmetricRobot, params: dict[str, Any] | None = None) -> Mirror:
+    """Return the mirror of the actions of one `JointPositionAction`."""
     manager = robot.env.action_manager
     terms = {name: manager.get_term(name) for name in manager.active_terms}
     (term, *others) = terms.values()
@@ -490,7 +493,7 @@ def _coupling_factor(model: mujoco.MjModel, follower: int, joint: int) -> float 
     """Return +-1 if an equality constraint makes joint `follower` that multiple of `joint`, else None."""
     is_coupling = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0
     for index in np.flatnonzero(is_coupling):
-        factor = float(model.eq_data[index, 1])
         if {model.eq_obj1id[index], model.eq_obj2id[index]} == {follower, joint}:
-            return factor if abs(factor) == 1.0 else None
+            offset, factor, *curvature = model.eq_data[index, :5].tolist()
+            return factor if abs(factor) == 1.0 and not any((offset, *curvature)) else None
     return None

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import mujoco
 import pytest
 import torch
-from lifting_tasks import lifting, task_cfg
+from lifting_tasks import LIFT, lifting, task_cfg
 from tensordict import TensorDict
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg
+from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.tasks.manipulation.symmetry import mirror_left_right
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.tasks.symmetry import Mirror, mirror_of_joints
-from mjlab.tasks.symmetry import mirror_left_right as mirror_with_terms
 from mjlab.utils.mirror import DIRECTION
 
 
@@ -62,8 +66,10 @@ def test_the_mirror_image_is_what_a_mirrored_arm_senses():
                 gap = (both[group][2, columns] - values[1, columns]).abs().max()
                 turn = (values[0, columns] - values[1, columns]).abs().max()
                 assert gap < max(0.01, 0.2 * turn), (group, name, gap, turn)
-                # Without the mirror, every term differs: the base turns to the other side.
-                assert turn > 0.02 or name == "joint_pos"
+    # The two sides agree only after mirroring.
+    for group, values in seen.items():
+        for name, columns in columns_of_terms(env, group):
+            assert (values[0, columns] - values[1, columns]).abs().max() > 0.02, (group, name)
     env.close()
 
 
@@ -74,6 +80,7 @@ def test_the_image_of_an_image_is_the_original():
     once = mirror_left_right(env, obs, actions)
     twice = mirror_left_right(env, once[0][3:], once[1][3:])
     for group in ("actor", "critic"):
+        assert not torch.allclose(once[0][group][3:], obs[group])
         torch.testing.assert_close(twice[0][group][3:], obs[group])
     torch.testing.assert_close(twice[1][3:], actions)
     env.close()
@@ -96,22 +103,50 @@ def test_a_hand_beside_the_mirror_plane_is_refused():
     env.close()
 
 
-def test_terms_of_a_package_are_mirrored_as_it_says():
-    def place(env):
-        return env.scene["cube"].data.root_link_pos_w - env.scene.env_origins
+def place(env):
+    return env.scene["cube"].data.root_link_pos_w - env.scene.env_origins
 
+
+def mirror_of_place(robot, params):
+    return Mirror(range(3), DIRECTION)
+
+
+def test_a_package_mirrors_its_own_term_beside_those_of_the_task():
     def observe_the_place(cfg):
-        for group in cfg.observations.values():
-            group.terms = {"place": ObservationTermCfg(func=place)}
+        cfg.observations["actor"].terms["place"] = ObservationTermCfg(func=place)
 
     env = make_env(observe_the_place)
-    values = torch.tensor([[1.0, 2.0, 3.0]])
-    obs = TensorDict({"actor": values, "critic": values}, batch_size=[1])
+    obs = TensorDict({"actor": torch.ones(1, 32), "critic": torch.ones(1, 29)}, batch_size=[1])
     with pytest.raises(ValueError, match="actor/place.*`terms`"):
         mirror_left_right(env, obs)
-    terms = {place: lambda *_: Mirror(range(3), DIRECTION)}
-    image, _ = mirror_with_terms(env, obs, terms=terms)
-    assert image["actor"].tolist() == [[1.0, 2.0, 3.0], [1.0, -2.0, 3.0]]
+    image, _ = mirror_left_right(env, obs, terms={place: mirror_of_place})
+    assert image["actor"][1, 29:].tolist() == [1.0, -1.0, 1.0]
+    env.close()
+
+
+def test_mirrors_do_not_keep_an_environment():
+    env = make_env()
+    mirror_left_right(env, actions=torch.zeros(1, 7))
+    kept = weakref.ref(env)
+    env.close()
+    del env
+    gc.collect()
+    assert kept() is None
+
+
+def test_the_cpu_profile_learns_from_mirror_images():
+    cfg, rl_cfg = load_env_cfg(LIFT, profile="cpu"), load_rl_cfg(LIFT, profile="cpu")
+    cfg.scene.num_envs, rl_cfg.num_steps_per_env = 8, 4
+    cfg.commands["lift_height"].num_postures = 10
+    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
+    runner = MjlabOnPolicyRunner(env, asdict(rl_cfg), None, "cpu")
+    sizes = []
+    runner.alg.actor.register_forward_pre_hook(
+        lambda module, args: sizes.append(args[0].batch_size[0])
+    )
+    runner.learn(1)
+    # A mini-batch is a quarter of 8 environments times 4 steps, and its mirror image.
+    assert max(sizes) == 2 * 8 * 4 // 4
     env.close()
 
 
@@ -121,6 +156,7 @@ def test_terms_of_a_package_are_mirrored_as_it_says():
         ('joint1="left" joint2="right" polycoef="0 -1 0 0 0"', 1.0),
         ('joint1="right" joint2="left" polycoef="0 1 0 0 0"', -1.0),
         ('joint1="right" joint2="left" polycoef="0 -0.5 0 0 0"', None),
+        ('joint1="right" joint2="left" polycoef="0.01 -1 0 0 0"', None),
         ('joint1="right" joint2="left" polycoef="0 -1 0 0 0" active="false"', None),
     ],
 )

@@ -6,6 +6,7 @@ Name `mirror_left_right` in `symmetry_cfg` of `RslRlPpoAlgorithmCfg`. How images
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -17,7 +18,11 @@ from mjlab.utils.mirror import DIRECTION
 
 
 def mirror_left_right(
-    env: Any, obs: Any = None, actions: torch.Tensor | None = None
+    env: Any,
+    obs: Any = None,
+    actions: torch.Tensor | None = None,
+    pairs: Mapping[str, str] | None = None,
+    terms: Mapping[Any, MirrorOfTerm] | None = None,
 ) -> tuple[Any, torch.Tensor | None]:
     """Append mirror images to observations and actions.
 
@@ -25,6 +30,8 @@ def mirror_left_right(
         env: Environment, wrapped or not.
         obs: TensorDict of observation groups, each (N, D), or None.
         actions: Actions (N, A), or None.
+        pairs: Names of joints and of their partners; others are found by geometry.
+        terms: Mirrors of further observation functions, see `mjlab.tasks.symmetry`.
 
     Returns:
         Observations and actions with 2 N rows, the originals first.
@@ -32,7 +39,7 @@ def mirror_left_right(
     Raises:
         ValueError: the arm is not symmetric, or a term has no known mirror image.
     """
-    return symmetry.mirror_left_right(env, obs, actions, terms=_TERMS)
+    return symmetry.mirror_left_right(env, obs, actions, pairs, {**TERMS, **(terms or {})})
 
 
 def _of_hand(robot: SymmetricRobot, params: dict[str, Any]) -> Mirror:
@@ -47,7 +54,8 @@ def _of_hand(robot: SymmetricRobot, params: dict[str, Any]) -> Mirror:
     return Mirror(range(3), DIRECTION)
 
 
-_TERMS: dict[Any, MirrorOfTerm] = {
+TERMS: dict[Any, MirrorOfTerm] = {
     mdp.ee_to_object_distance: _of_hand,
     mdp.object_to_goal_distance: lambda *_: Mirror(range(3), DIRECTION),
 }
+"""Mirrors of the observation functions of these tasks."""

@@ -20,7 +20,9 @@ import torch
 from mjlab.envs import mdp as envs_mdp
 from mjlab.sensor import ContactSensor
 from mjlab.tasks import symmetry
-from mjlab.tasks.symmetry import HINT, Mirror, MirrorOfTerm, SymmetricRobot
+from mjlab.tasks.symmetry import HINT, MirrorOfTerm, SymmetricRobot
+from mjlab.tasks.symmetry import Coupling as Coupling
+from mjlab.tasks.symmetry import Mirror as Mirror
 from mjlab.tasks.symmetry import mirror_of_joints as mirror_of_joints
 from mjlab.tasks.velocity import mdp
 from mjlab.utils.mirror import DIRECTION
@@ -35,6 +37,7 @@ def mirror_left_right(
     obs: Any = None,
     actions: torch.Tensor | None = None,
     pairs: Mapping[str, str] | None = None,
+    terms: Mapping[Any, MirrorOfTerm] | None = None,
 ) -> tuple[Any, torch.Tensor | None]:
     """Append mirror images to observations and actions.
 
@@ -44,6 +47,7 @@ def mirror_left_right(
         actions: Actions (N, A), or None.
         pairs: Names of joints and feet (geoms, bodies, sites) and of their partners on the other side, in
             either direction. Others are found by geometry; None: all are.
+        terms: Mirrors of further observation functions, see `mjlab.tasks.symmetry`.
 
     Returns:
         Observations and actions with 2 N rows, the originals first.
@@ -51,7 +55,7 @@ def mirror_left_right(
     Raises:
         ValueError: the robot is not symmetric, or a term has no known mirror image.
     """
-    return symmetry.mirror_left_right(env, obs, actions, pairs, _TERMS)
+    return symmetry.mirror_left_right(env, obs, actions, pairs, {**TERMS, **(terms or {})})
 
 
 def _of_command(robot: SymmetricRobot, params: dict[str, Any]) -> Mirror:
@@ -82,7 +86,7 @@ def _of_feet(
     return Mirror([size * foot + i for foot in feet for i in range(size)], signs * len(feet))
 
 
-_TERMS: dict[Any, MirrorOfTerm] = {
+TERMS: dict[Any, MirrorOfTerm] = {
     envs_mdp.generated_commands: _of_command,
     mdp.stepping_action: symmetry.of_actions,
     mdp.foot_height: _of_feet,
@@ -90,3 +94,4 @@ _TERMS: dict[Any, MirrorOfTerm] = {
     mdp.foot_contact: _of_feet,
     mdp.foot_contact_forces: partial(_of_feet, signs=DIRECTION),
 }
+"""Mirrors of the observation functions of these tasks."""
