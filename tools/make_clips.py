@@ -137,6 +137,7 @@ _BIPEDS = {
     "T1": ("Trunk", 0.665),
     "H1": ("pelvis", 0.99),
     "Berkeley-Humanoid": ("torso", 0.518),
+    "Apptronik-Apollo": ("torso_link", 1.022),  # docs/images/own_apollo.webp
 }
 
 
