@@ -10,10 +10,12 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from mjlab.asset_zoo.robots import get_go1_robot_cfg
 from mjlab.envs import ManagerBasedRlEnv
-from mjlab.tasks.registry import load_rl_cfg
+from mjlab.managers import ObservationTermCfg
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "guides" / "velocity.md"
 
@@ -26,7 +28,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     robots.get_my_robot_cfg = get_go1_robot_cfg
     monkeypatch.setitem(sys.modules, "my_robots", robots)
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     namespace: dict[str, Any] = {}
     for block in blocks:
         exec(block, namespace)
@@ -51,6 +53,17 @@ def test_the_example_builds_and_steps(example, name, play):
 def test_the_snippet_about_mirror_images_is_that_of_the_profile(example):
     profile = load_rl_cfg("Mjlab-Velocity-Flat-Unitree-Go1", profile="cpu")
     assert example["rl_cfg"].algorithm.symmetry_cfg == profile.algorithm.symmetry_cfg
+
+
+def test_the_snippet_mirrors_an_observation_of_its_own(example):
+    cfg = load_env_cfg("Mjlab-Lift-Cube-Yam")
+    velocity = ObservationTermCfg(func=example["cube_velocity"])
+    cfg.observations["actor"].terms["velocity"] = velocity
+    env = ManagerBasedRlEnv(cfg, device="cpu")
+    obs = TensorDict({"actor": torch.ones(1, 32), "critic": torch.ones(1, 29)}, batch_size=[1])
+    image, _ = example["mirror_with_velocity"](env, obs)
+    assert image["actor"][1, 29:].tolist() == [1.0, -1.0, 1.0]
+    env.close()
 
 
 def test_the_snippet_about_the_elapsed_time_sets_a_parameter_that_exists(example, make_env):
