@@ -12,13 +12,14 @@ import pytest
 import torch
 from lifting_tasks import LIFT, lifting, task_cfg
 from tensordict import TensorDict
+from term_columns import term_columns
 
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.managers import ObservationTermCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.tasks.manipulation.symmetry import mirror_left_right
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
-from mjlab.tasks.symmetry import Mirror, mirror_of_joints
+from mjlab.tasks.symmetry import mirror_of_joints, of_direction
 from mjlab.utils.mirror import DIRECTION
 
 
@@ -45,13 +46,6 @@ def put_before_mirror(env):
     lifting(env).target_pos[:] = torch.stack([left + goal, right + side * goal])
 
 
-def columns_of_terms(env, group):
-    sizes = [size for (size,) in env.observation_manager.group_obs_term_dim[group]]
-    ends = torch.tensor(sizes).cumsum(0).tolist()
-    names = env.observation_manager.active_terms[group]
-    return [(n, slice(end - k, end)) for n, end, k in zip(names, ends, sizes, strict=True)]
-
-
 def test_the_mirror_image_is_what_a_mirrored_arm_senses():
     env = make_env()
     put_before_mirror(env)
@@ -61,14 +55,14 @@ def test_the_mirror_image_is_what_a_mirrored_arm_senses():
         both, _ = mirror_left_right(env, TensorDict(seen, batch_size=[2]))
         for group, values in seen.items():
             torch.testing.assert_close(both[group][:2], values)
-            for name, columns in columns_of_terms(env, group):
+            for name, columns in term_columns(env, group):
                 # Masses of the two sides differ by some grams.
                 gap = (both[group][2, columns] - values[1, columns]).abs().max()
                 turn = (values[0, columns] - values[1, columns]).abs().max()
                 assert gap < max(0.01, 0.2 * turn), (group, name, gap, turn)
     # The two sides agree only after mirroring.
     for group, values in seen.items():
-        for name, columns in columns_of_terms(env, group):
+        for name, columns in term_columns(env, group):
             assert (values[0, columns] - values[1, columns]).abs().max() > 0.02, (group, name)
     env.close()
 
@@ -107,10 +101,6 @@ def place(env):
     return env.scene["cube"].data.root_link_pos_w - env.scene.env_origins
 
 
-def mirror_of_place(robot, params):
-    return Mirror(range(3), DIRECTION)
-
-
 def test_a_package_mirrors_its_own_term_beside_those_of_the_task():
     def observe_the_place(cfg):
         cfg.observations["actor"].terms["place"] = ObservationTermCfg(func=place)
@@ -119,7 +109,7 @@ def test_a_package_mirrors_its_own_term_beside_those_of_the_task():
     obs = TensorDict({"actor": torch.ones(1, 32), "critic": torch.ones(1, 29)}, batch_size=[1])
     with pytest.raises(ValueError, match="actor/place.*`terms`"):
         mirror_left_right(env, obs)
-    image, _ = mirror_left_right(env, obs, terms={place: mirror_of_place})
+    image, _ = mirror_left_right(env, obs, terms={place: of_direction})
     assert image["actor"][1, 29:].tolist() == [1.0, -1.0, 1.0]
     env.close()
 

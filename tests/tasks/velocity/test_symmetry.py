@@ -9,6 +9,7 @@ import mujoco
 import pytest
 import torch
 from tensordict import TensorDict
+from term_columns import term_columns
 
 from mjlab.cli.train_config import parse_train_flags
 from mjlab.envs import ManagerBasedRlEnv
@@ -78,17 +79,6 @@ def put_before_mirror(env, height, turning=0.1, left=0.0):
     env.scene.write_data_to_sim()
     env.sim.forward()
     env.sim.sense()
-
-
-def term_columns(env, group):
-    """Yield the name of each term of a group, and its columns."""
-    start = 0
-    manager = env.observation_manager
-    for name, (size,) in zip(
-        manager.active_terms[group], manager.group_obs_term_dim[group], strict=True
-    ):
-        yield name, slice(start, start + size)
-        start += size
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -13,8 +13,7 @@ import torch
 
 from mjlab.tasks import symmetry
 from mjlab.tasks.manipulation import mdp
-from mjlab.tasks.symmetry import HINT, Mirror, MirrorOfTerm, SymmetricRobot
-from mjlab.utils.mirror import DIRECTION
+from mjlab.tasks.symmetry import HINT, Mirror, MirrorOfTerm, SymmetricRobot, of_direction
 
 
 def mirror_left_right(
@@ -51,11 +50,11 @@ def _of_hand(robot: SymmetricRobot, params: dict[str, Any]) -> Mirror:
         raise ValueError(
             f"Site {name!r}: mirror_left_right expected a hand on the mirror plane of the robot. {HINT}"
         )
-    return Mirror(range(3), DIRECTION)
+    return of_direction(robot, params)
 
 
 TERMS: dict[Any, MirrorOfTerm] = {
     mdp.ee_to_object_distance: _of_hand,
-    mdp.object_to_goal_distance: lambda *_: Mirror(range(3), DIRECTION),
+    mdp.object_to_goal_distance: of_direction,
 }
 """Mirrors of the observation functions of these tasks."""
