@@ -111,6 +111,15 @@ CLIPS = {
         start=3.0, seconds=3.0, body="robot/pelvis", lookat=(0.0, 0.0, 0.62), distance=3.0, azimuth=150.0,
         size=(720, 405), max_bytes=700_000,
     ),
+    "g1_rough": Clip(
+        "Mjlab-Velocity-Rough-Unitree-G1",
+        command={"lin_vel_x": (0.8, 0.8), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
+        terrain=BoxInvertedPyramidStairsTerrainCfg(
+            size=(8.0, 8.0), step_height_range=(0.06, 0.06), step_width=0.3, platform_width=2.0
+        ),
+        start=1.0, seconds=4.0, speed=2.0, body="robot/pelvis", lookat=(0.0, 0.0, 0.5), distance=3.4,
+        azimuth=110.0,
+    ),
     "lift": Clip(
         "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0, elevation=-16.0,
         seconds=3.0,
