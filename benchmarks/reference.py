@@ -28,6 +28,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
 
@@ -37,7 +39,7 @@ from measure import output_of  # noqa: E402
 from mjlab.cli.devices import resolve_device  # noqa: E402
 from mjlab.cli.resume import resume_flags  # noqa: E402
 from mjlab.cli.train_process import run_forwarding_signals, train_command  # noqa: E402
-from mjlab.rl.plot import LABELS, plot_curves  # noqa: E402
+from mjlab.rl.plot import LABELS, Curve, plot_curves  # noqa: E402
 from mjlab.runs import Run  # noqa: E402
 from mjlab.runs.reference import (  # noqa: E402
     DATA,
@@ -60,6 +62,7 @@ from mjlab.tasks.registry import (  # noqa: E402
 )
 from mjlab.utils.errors import UserError  # noqa: E402
 from mjlab.utils.processes import available_cores, processor  # noqa: E402
+from mjlab.utils.string import counted  # noqa: E402
 
 PAGES = ROOT / "docs" / "reference" / "runs"
 PROFILE = "cpu"
@@ -398,8 +401,8 @@ def _words(name: str) -> str:
 
 def _draw(references: list[Reference], pages: Path) -> None:
     groups = {
-        f"{reference.kind.upper()}, {len(reference.seeds)} seeds": [
-            seed.run.curve_in_millions() for seed in reference.seeds
+        f"{reference.kind.upper()}, {counted(len(reference.seeds), 'seed')}": [
+            _curve(seed) for seed in reference.seeds
         ]
         for reference in references
         if reference.seeds
@@ -411,6 +414,17 @@ def _draw(references: list[Reference], pages: Path) -> None:
         title=task,
         xlabel="Samples (millions)",
         ylabel=LABELS["Evaluation/mean_return"],
+    )
+
+
+def _curve(seed: SeedRecord) -> Curve:
+    """Return millions of samples and mean returns of the evaluations, (n,) each, the last at the time limit."""
+    samples, returns = seed.run.curve_in_millions()
+    if seed.run.ended != "minutes":
+        return samples, returns
+    return (
+        np.append(samples, seed.run.samples / 1e6),
+        np.append(returns, seed.evaluation["mean_return"]),
     )
 
 

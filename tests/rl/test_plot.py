@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from mjlab.rl.config import EvaluationCfg
 from mjlab.rl.plot import (
@@ -96,6 +97,17 @@ def test_single_runs_are_drawn_beyond_the_mean(tmp_path: Path):
     spans = [(line.get_xdata()[0], line.get_xdata()[-1]) for line in axes.lines]
     assert spans == [(0, 3), (3, 7)]
     assert axes.lines[0].get_linewidth() > axes.lines[1].get_linewidth()
+
+
+def test_a_single_evaluation_is_seen(tmp_path: Path):
+    pixels = []
+    for y in (1.0, np.nan):
+        path = plot_curves(
+            {"a": [(np.array([3]), np.array([y]))]}, tmp_path / "x.png", title="", ylabel="",
+            draw=lambda axes: axes.set(xlim=(0, 6), ylim=(0, 2)),
+        )  # fmt: skip
+        pixels.append(np.asarray(Image.open(path)))
+    assert (pixels[0] != pixels[1]).any()
 
 
 def test_one_run_and_several_seeds_become_pngs(tmp_path: Path):

@@ -390,7 +390,8 @@ def _draw_groups(axes: Axes, groups: Mapping[str, Sequence[Curve]]) -> list[Any]
     colors = []
     for name, curves in groups.items():
         x, mean, std = mean_and_std(curves)
-        (line,) = axes.plot(x, mean, label=name or None)
+        # A line through one point is invisible.
+        (line,) = axes.plot(x, mean, marker="o" if len(x) == 1 else None, label=name or None)
         color = line.get_color()
         colors.append(color)
         axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=color, lw=0)
