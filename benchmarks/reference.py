@@ -18,6 +18,7 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
+import math
 import os
 import shlex
 import shutil
@@ -70,6 +71,12 @@ KINDS: tuple[Kind, ...] = ("cpu", "gpu")
 MINUTES = 60.0
 SEEDS = {"Mjlab-Cartpole-Swingup": 5}
 """Seeds of tasks that are trained in seconds; others have three."""
+FLAGS: dict[str, tuple[str, ...]] = {
+    "Mjlab-Lift-Cube-Yam-Depth": ("--agent.evaluation.min-interval", "100"),
+    "Mjlab-Reach-Yam": ("--agent.evaluation.first-iteration", "40"),
+    "Mjlab-Velocity-Rough-Unitree-G1": ("--agent.evaluation.min-interval", "60"),
+}
+"""Flags of tasks whose evaluations would otherwise take as long as their training."""
 # For a task without the profile: tasks have one environment, and an evaluation of the cartpole takes the
 # time of ten iterations.
 _FLAGS = ["--num-envs", "512", "--agent.evaluation.min-interval", "6"]
@@ -145,7 +152,13 @@ def _reference(task: str, options: Options) -> Reference:
     profile = PROFILE if PROFILE in list_profiles(task) else None
     bounds = load_rl_cfg(task, profile=profile).evaluation.trigger_below
     unbounded = [f for name in bounds for f in (f"--agent.evaluation.trigger-below.{name}", "inf")]
-    flags = [*([] if profile else _FLAGS), *_EVALUATIONS, *unbounded, *options.flags]
+    flags = [
+        *([] if profile else _FLAGS),
+        *_EVALUATIONS,
+        *unbounded,
+        *FLAGS.get(task, ()),
+        *options.flags,
+    ]
     new = Reference(task=task, kind=options.kind, profile=profile, flags=flags)
     path = reference_path(options.data, task, options.kind)
     if not path.is_file():
@@ -273,7 +286,8 @@ seed until its evaluations solve the task, or until its time limit. `make refere
 - **Final**: result of `evaluate` for the last policies, on seeds not used in training: the mean over seeds and, in
   brackets, the lowest and the highest end of their 95 % intervals. The table shows the metrics that solve the task;
   the sections show all.
-- Curves: mean evaluation returns over seeds, with one sample standard deviation shaded.
+- Curves: mean evaluation returns over seeds, with one sample standard deviation shaded. The last point of a run that
+  ended between two evaluations is its final result.
 """
 
 
@@ -346,7 +360,7 @@ def _section(task: str, references: list[Reference]) -> str:
         newest = reference.seeds[-1]
         names = _all_metrics(newest.evaluation)
         libraries = ", ".join(f"{name} {value}" for name, value in newest.versions.items())
-        cores = f"{newest.machine['cores']} cores ({newest.machine['processor']})"
+        cores = f"{counted(newest.machine['cores'], 'core')} ({newest.machine['processor']})"
         where = ", ".join(filter(None, (newest.machine["gpu"], cores)))
         lines += [
             f"`uv run mjlab train {shlex.join([task, *reference.train_flags])}`, on {where}, {libraries}:",
@@ -391,7 +405,9 @@ def _final(name: str, evaluations: list[dict[str, Any]]) -> str:
 
 
 def _spread(values: list[float]) -> str:
-    """Return median and range."""
+    """Return median and range, or the only value."""
+    if len(values) == 1:
+        return f"{values[0]:.3g}"
     return f"{median(values):.3g} ({min(values):.3g} to {max(values):.3g})"
 
 
@@ -418,14 +434,15 @@ def _draw(references: list[Reference], pages: Path) -> None:
 
 
 def _curve(seed: SeedRecord) -> Curve:
-    """Return millions of samples and mean returns of the evaluations, (n,) each, the last at the time limit."""
+    """Return millions of samples and mean returns of the evaluations, (n,) each.
+
+    The final result comes last if the run ended between two evaluations.
+    """
     samples, returns = seed.run.curve_in_millions()
-    if seed.run.ended != "minutes":
+    end = seed.run.samples / 1e6
+    if len(samples) and math.isclose(samples[-1], end, rel_tol=1e-3):
         return samples, returns
-    return (
-        np.append(samples, seed.run.samples / 1e6),
-        np.append(returns, seed.evaluation["mean_return"]),
-    )
+    return np.append(samples, end), np.append(returns, seed.evaluation[METRIC])
 
 
 def main() -> int:

@@ -132,7 +132,6 @@ CLIPS = {
         DEMOS["g1-tracking"].task, None, DEMOS["g1-tracking"].policy, motion="squat", seconds=4.0,
         body="robot/pelvis", lookat=(0.0, 0.0, 0.7), distance=2.9, azimuth=150.0,
     ),
-    # One policy, five motions.
     "five_motions": Clip(
         "Mjlab-Tracking-Flat-Unitree-G1", num_envs=5, spacing=1.4,
         motion="squat,wave,side_step,slow_walk,turn_in_place", seconds=4.4,

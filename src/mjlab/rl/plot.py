@@ -396,14 +396,15 @@ def _draw_groups(axes: Axes, groups: Mapping[str, Sequence[Curve]]) -> list[Any]
         colors.append(color)
         axes.fill_between(x, mean - std, mean + std, alpha=0.25, color=color, lw=0)
         for one in curves:
-            # Up to the first and from the last point of the mean.
-            begin, end = (x[0], x[-1]) if len(x) else (np.inf, np.inf)
+            # Up to the first and from the last point of the mean, which it may only touch.
+            begin, end, touching = (x[0], x[-1], 1) if len(x) else (np.inf, np.inf, 0)
             for part in (one[0] <= begin, one[0] >= end):
-                if part.sum() > 1:
+                if part.sum() > touching:
                     style: dict[str, Any] = {
                         "lw": 0.8,
                         "alpha": 0.6,
                         "color": color,
+                        "marker": "o" if part.sum() == 1 else None,
                         "label": "single seeds",
                     }
                     axes.plot(one[0][part], one[1][part], **style)

@@ -31,6 +31,7 @@ from mjlab.runs.run import DONE
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.ranges import Seed
 from mjlab.utils.signals import Interrupted
+from mjlab.utils.string import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -146,7 +147,7 @@ def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
         for texts in (
             (", ".join(f"{n} {v}" for n, v in seed.versions.items()) for seed in reference.seeds),
             (
-                one.get("gpu") or f"{one.get('cores')} cores ({one.get('processor')})"
+                one.get("gpu") or f"{counted(one['cores'], 'core')} ({one.get('processor')})"
                 for one in (seed.machine for seed in reference.seeds)
             ),
             (seed.commit for seed in reference.seeds),
