@@ -74,6 +74,11 @@ SEEDS = {"Mjlab-Cartpole-Swingup": 5}
 FLAGS: dict[str, tuple[str, ...]] = {
     "Mjlab-Lift-Cube-Yam-Depth": ("--agent.evaluation.min-interval", "100"),
     "Mjlab-Reach-Yam": ("--agent.evaluation.first-iteration", "40"),
+    "Mjlab-Velocity-Flat-Unitree-G1": ("--agent.evaluation.first-iteration", "100"),
+    "Mjlab-Velocity-Flat-Unitree-G1-No-State-Estimation": (
+        "--agent.evaluation.first-iteration",
+        "100",
+    ),
     "Mjlab-Velocity-Rough-Unitree-G1": ("--agent.evaluation.min-interval", "60"),
 }
 """Flags of tasks whose evaluations would otherwise take as long as their training."""

@@ -300,6 +300,10 @@ def test_a_record_says_how_it_was_made(made):
     assert str(made) not in json.dumps(first.evaluation)
 
 
+def test_settings_of_references_are_of_stock_tasks(module):
+    assert {*module.SEEDS, *module.FLAGS} <= set(module.stock_tasks())
+
+
 def test_the_page_shows_what_was_run(made, module):
     text = (made / "pages" / "index.md").read_text()
     rows = {row[0]: row for line in text.splitlines() if (row := _cells(line))}
