@@ -18,7 +18,6 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import math
 import os
 import shlex
 import shutil
@@ -71,7 +70,7 @@ KINDS: tuple[Kind, ...] = ("cpu", "gpu")
 MINUTES = 60.0
 SEEDS = {"Mjlab-Cartpole-Swingup": 5}
 """Seeds of tasks that are trained in seconds; others have three."""
-FLAGS: dict[str, tuple[str, ...]] = {
+EVALUATION_FLAGS: dict[str, tuple[str, ...]] = {
     "Mjlab-Lift-Cube-Yam-Depth": ("--agent.evaluation.min-interval", "100"),
     "Mjlab-Reach-Yam": ("--agent.evaluation.first-iteration", "40"),
     "Mjlab-Velocity-Flat-Unitree-G1": ("--agent.evaluation.first-iteration", "100"),
@@ -161,7 +160,7 @@ def _reference(task: str, options: Options) -> Reference:
         *([] if profile else _FLAGS),
         *_EVALUATIONS,
         *unbounded,
-        *FLAGS.get(task, ()),
+        *EVALUATION_FLAGS.get(task, ()),
         *options.flags,
     ]
     new = Reference(task=task, kind=options.kind, profile=profile, flags=flags)
@@ -445,7 +444,7 @@ def _curve(seed: SeedRecord) -> Curve:
     """
     samples, returns = seed.run.curve_in_millions()
     end = seed.run.samples / 1e6
-    if len(samples) and math.isclose(samples[-1], end, rel_tol=1e-3):
+    if len(samples) and samples[-1] == end:
         return samples, returns
     return np.append(samples, end), np.append(returns, seed.evaluation[METRIC])
 
