@@ -31,6 +31,8 @@ Kind = Literal["cpu", "gpu"]
 
 DATA = Path(__file__).parents[1] / "reference"
 """Folder of the bundled references."""
+STUDENT = "student"
+"""Profile of tasks that are learned from a teacher."""
 METRIC = "mean_return"
 """Evaluation metric to compare. Every task has it, and learning increases it."""
 FALSE_ALARMS = 0.05
@@ -309,26 +311,32 @@ def band(
 
     with probability 1 - a, if seeds are normally distributed. Student's t accounts for the uncertainty
     of s: for n = 3 and a = 1/60, t = 7.6 instead of 2.4 for the normal distribution. Seeds may agree
-    by chance, so s is at least `standard_error`, that of one evaluation. s is undefined for n < 2.
+    by chance, so s is at least `standard_error`, that of one evaluation. For n = 1, the half width is
+    infinite.
     """
     import numpy as np
 
     values = np.stack([np.interp(at, *curve) for curve in curves])
+    mean = values.mean(axis=0)
+    if len(curves) == 1:
+        return mean, np.full_like(mean, np.inf)
     deviation = np.maximum(values.std(axis=0, ddof=1), standard_error)
-    return values.mean(axis=0), _width(len(curves), 1.0 - _TAIL / 2) * deviation
+    return mean, _width(len(curves), 1.0 - _TAIL / 2) * deviation
 
 
 def samples_limit(runs: Sequence[RunRecord]) -> float | None:
     """Return the upper bound on the samples until a new seed is solved; None unless all `runs` were.
 
     The bound is the upper end of a one-sided prediction interval, as in `band`, for the logarithm of
-    the samples, and at most four times the samples of the slowest seed. The deviation is at least the
-    distance between two evaluations.
+    the samples, and at most four times the samples of the slowest seed, which is the bound of a single
+    seed. The deviation is at least the distance between two evaluations.
     """
     import numpy as np
 
     if any(run.ended != "solved" for run in runs):
         return None
+    if len(runs) == 1:
+        return _MAX_SLOWDOWN * runs[0].samples
     logarithms = np.log([run.samples for run in runs])
     steps = [1.0 - (run.samples_at[-2:-1] or [0])[0] / run.samples_at[-1] for run in runs]
     deviation = max(logarithms.std(ddof=1), float(np.mean(steps)))

@@ -16,6 +16,7 @@ from mjlab.cli.resume import resume_flags
 from mjlab.runs import Run, runs_in
 from mjlab.runs.reference import (
     DATA,
+    STUDENT,
     Comparison,
     Kind,
     NotEvaluatedError,
@@ -53,6 +54,8 @@ class VerifyConfig:
     """Torch device: cpu, cuda:0, ... None: a GPU if available."""
     reference: str | None = None
     """Reference, a JSON file written by `make reference`. None: bundled reference of the task."""
+    teacher_checkpoint: str | None = None
+    """Teacher of a task that is learned from one, such as those of images: a run or checkpoint."""
     resume: bool = False
     """Resume the newest interrupted `verify` run of this task and seed."""
     log_root: str = "logs/rsl_rl"
@@ -94,10 +97,15 @@ def _prepare(
     cfg = parse_flags(VerifyConfig, VerifyConfig(), flags, f"{prog} {task}")
     reference = load_reference(task, cfg)
     resolve_device(cfg.device)
-    if len(reference.seeds) < 2:
+    if len(reference.seeds) < 2 and reference.usual_minutes is None:
         raise UserError(
-            f"The reference of {task}: expected at least 2 seeds, got {len(reference.seeds)}; use "
-            f"`make reference TASKS={task}` for more."
+            f"The reference of {task}: expected a solved seed or at least 2 seeds, got "
+            f"{len(reference.seeds)}; use `make reference TASKS={task}` for more."
+        )
+    if reference.profile == STUDENT and cfg.teacher_checkpoint is None and not cfg.resume:
+        raise UserError(
+            f"verify {task}: expected a teacher, got none; use --teacher-checkpoint. `docs/reference/runs` "
+            "has the command that trains one."
         )
     if cfg.seed in (seed.seed for seed in reference.seeds):
         # Allowed: the curve differs on other machines or with other library versions.
@@ -108,6 +116,8 @@ def _prepare(
     train_flags += ["--agent.run-name", f"verify_seed_{cfg.seed}", "--log-root", cfg.log_root]
     train_flags += ["--agent.max-iterations", str(_iterations(reference))]
     train_flags += ["--device", cfg.device] if cfg.device is not None else []
+    if cfg.teacher_checkpoint is not None:
+        train_flags += ["--agent.teacher-checkpoint", cfg.teacher_checkpoint]
     done = None
     if cfg.resume:
         run_dir = _newest_run(task, cfg)
@@ -155,7 +165,7 @@ def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
     )
     speeds = [seed.run.steps_per_second for seed in reference.seeds]
     lines = [
-        f"Reference  {len(reference.seeds)} seeds on {machines}, commit {commits}, {versions}",
+        f"Reference  {counted(len(reference.seeds), 'seed')} on {machines}, commit {commits}, {versions}",
         f"Speed      {run.steps_per_second:,.0f} steps/s (collecting and learning); reference "
         f"{min(speeds):,.0f} to {max(speeds):,.0f}",
         "",
@@ -231,6 +241,8 @@ def command(argv: list[str], prog: str) -> None:
     print(f"\n{report(reference, run, comparison)}")
     print(f"Picture    {_draw(reference, run, comparison, run_dir / 'verify.png')}")
     part = f"{comparison.within.mean():.0%} of the way within the band"
+    if len(runs) == 1:
+        part = "no band, with one seed"
     if run.ended not in DONE:
         print(
             f"So far     {part}. Training was {run.ended}: the same command with --resume goes on."

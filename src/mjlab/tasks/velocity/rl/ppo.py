@@ -233,6 +233,9 @@ def cpu_with_gait(
             if solved_below is None:
                 evaluation.solved_below["failure_rate"] *= 2.0
             keep_levels(env_cfg, _UNCHANGED_LEVELS_SAMPLES)
+            if isinstance(rl_cfg, RslRlOnPolicyRunnerCfg):
+                # The Go1 falls in 22 to 30 % of its episodes before, and in 20 to 22 % after.
+                rl_cfg.annealing = ((735, 1.0), (785, 0.25))
 
     return cpu_profile(
         ease,
