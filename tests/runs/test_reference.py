@@ -204,8 +204,18 @@ def test_where_all_were_solved_a_run_is_to_be_solved_in_time():
     assert samples_limit([*solved, HEALTHY[0]]) is None
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_where_there_is_one_seed_a_run_is_to_be_solved_in_four_times_its_samples(late):
+    solved = run_record(RISING[:10], np.arange(10) + 1.0)
+    run = dataclasses.replace(
+        run_record(np.array(RISING[:10]) - 900.0, np.arange(10) + 1.0),
+        samples=4 * solved.samples + late,
+    )
+    assert compare([solved], run, 0.1).is_within == (not late)
+
+
 @settings(max_examples=60)
-@given(st.lists(st.integers(1, 10**6), min_size=2, max_size=5), st.integers(1, 1000))
+@given(st.lists(st.integers(1, 10**6), min_size=1, max_size=5), st.integers(1, 1000))
 def test_the_time_for_being_solved_is_more_than_any_took_and_scales(ends, scale):
     runs = [run_record([0.0, 1.0], [end, 2 * end], ended="solved") for end in ends]
     limit = samples_limit(runs)

@@ -175,6 +175,18 @@ def test_where_all_seeds_were_solved_one_that_is_not_in_time_is_outside(verify, 
 
 
 @pytest.mark.slow
+def test_with_one_solved_seed_only_being_solved_counts(verify):
+    def solve(reference: dict) -> None:
+        raise_returns(reference)
+        one_seed(reference)
+        reference["seeds"][0]["run"]["ended"] = "solved"
+
+    outcome = verify(edit=solve)
+    assert outcome.status == 1
+    assert "no band, with one seed, the samples until it is solved outside" in outcome.out
+
+
+@pytest.mark.slow
 def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):
     with stopped_after(2):
         outcome = verify("--seed", "5")
@@ -220,7 +232,7 @@ def test_a_run_interrupted_in_its_last_iteration_has_finished(verify):
     assert "Verdict" in outcome.out
 
 
-def no_seeds(reference: dict) -> None:
+def one_seed(reference: dict) -> None:
     del reference["seeds"][1:]
 
 
@@ -229,7 +241,8 @@ def no_seeds(reference: dict) -> None:
     [
         (("--resume",), None, "expected a run of `verify"),
         (("--device", "gpu"), None, "got 'gpu'"),
-        ((), no_seeds, "expected at least 2 seeds, got 1"),
+        ((), one_seed, "expected a solved seed or at least 2 seeds, got 1"),
+        ((), lambda reference: reference.update(profile="student"), "use --teacher-checkpoint"),
         ((), lambda reference: reference.update(task=OTHER), f"got {OTHER}"),
         ((), lambda reference: reference.update(profile="none-such"), "profile 'none-such'"),
         ((), lambda reference: reference.pop("flags"), "expected a reference"),
@@ -340,6 +353,24 @@ def test_only_what_is_asked_for_is_replaced(maker):
     maker.trained.clear()
     assert maker.make(seeds=1, again=True)
     assert not maker.trained
+
+
+@pytest.mark.slow
+def test_students_have_one_teacher_which_is_trained_first(empty, monkeypatch):
+    student, count = "Mjlab-Lift-Cube-Yam-Depth", 2
+    monkeypatch.setattr(empty.module, "TEACHER_FLAGS", ["--profile", "cpu", *TINY])
+    flags = [*TINY, "--agent.evaluation.first-iteration", "0"]
+    assert empty.make(student, seeds=count, flags=flags)
+    (teacher, *students) = empty.trained
+    assert teacher[0] == empty.module.TEACHER_TASK
+    assert [command[0] for command in students] == [student] * count
+    (teacher_run,) = (empty.folder / "logs" / "cpu" / "teacher").glob("*/*/")
+    assert all(f"{Run(teacher_run).newest}" in command for command in students)
+    reference = Reference.load(reference_path(empty.folder / "data", student, "cpu"))
+    assert str(empty.folder) not in " ".join(reference.flags)
+    page = (empty.folder / "pages" / "index.md").read_text()
+    assert f"{student} --profile student" in page
+    assert "--agent.teacher-checkpoint RUN" in page
 
 
 @pytest.mark.slow
