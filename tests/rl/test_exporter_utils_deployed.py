@@ -59,6 +59,9 @@ def network(kind: type, *groups: str, **settings: Any) -> Any:
     return model
 
 
+BOUNDS = [0.5 + i for i in range(ACTIONS)]
+
+
 def with_reference(model: Any) -> Any:
     """Return the export of a motion tracking policy: the reference of 4 frames and 2 bodies."""
     sizes = {"joint_pos": (6,), "joint_vel": (6,), "body_quat_w": (2, 4)}
@@ -78,6 +81,9 @@ MODELS = {
     "images_only": lambda: network(SpatialSoftmaxCNNModel, "camera", "depth", cnn_cfg=CNN_CFG),
     "spatial_softmax": lambda: network(SpatialSoftmaxCNNModel, "state", "camera", cnn_cfg=CNN_CFG),
     "sac": lambda: network(SacActorModel, "state", distribution_cfg=squashed_gaussian()),
+    "sac_with_bounds": lambda: network(
+        SacActorModel, "state", distribution_cfg=squashed_gaussian() | {"bounds": BOUNDS}
+    ),
     "tracking": lambda: network(MLPModel, "state"),
 }
 

@@ -13,6 +13,7 @@ from mjlab.rl.config import (
     RslRlModelCfg,
     RslRlOffPolicyRunnerCfg,
     RslRlOnPolicyRunnerCfg,
+    RslRlSacAlgorithmCfg,
 )
 from mjlab.rl.learners import acting_cfg, learner_of, train_dict, with_learner
 
@@ -41,7 +42,7 @@ def test_the_fields_of_the_run_survive_both_ways():
     assert isinstance(sac, RslRlOffPolicyRunnerCfg)
     assert (learner_of(cfg), learner_of(sac)) == ("ppo", "sac")
     assert base_of(sac) == base_of(cfg) == base_of(with_learner(sac, "ppo"))
-    assert sac.algorithm == RslRlOffPolicyRunnerCfg().algorithm
+    assert sac.algorithm == RslRlSacAlgorithmCfg(action_bounds="joint_ranges")
     sac.evaluation.num_episodes = 8
     assert cfg.evaluation.num_episodes == 7
 

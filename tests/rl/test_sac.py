@@ -18,9 +18,12 @@ import torch
 from rl_fake_env import FakeEnv, FakeEnvCfg, FakeSceneCfg
 from tensordict import TensorDict
 
+from mjlab.envs import ManagerBasedRlEnv
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper
 from mjlab.rl.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg, RslRlSacAlgorithmCfg
+from mjlab.rl.sac import joint_range_bounds
+from mjlab.tasks.registry import load_env_cfg
 
 
 def mirror(env: Any, obs: Any = None, actions: Any = None) -> tuple[Any, Any]:
@@ -328,6 +331,65 @@ def test_effects_of_actions_count_as_actions_do(monkeypatch):
         runner.learn(1)
         found[factor] = runner.alg.update()["imitation"]
     assert found[2.0] == pytest.approx(5.0 * found[0.0], rel=1e-3)
+
+
+class Strong(Shown):
+    """Environment whose actions have twice the effect, and whose teacher shows half."""
+
+    factor = 2.0
+
+    def step(self, action: torch.Tensor):
+        return super().step(self.factor * action)
+
+    def get_observations(self) -> dict[str, torch.Tensor]:
+        shown = super().get_observations()
+        return shown | {"shown": shown["actor"] / self.factor}
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [
+        {"noise_hold": 4, "symmetry_cfg": MIRROR},
+        {"teacher": "shown", "teacher_steps": 12, "imitation": ((5, 1.0), (25, 0.0))},
+    ],
+)
+def test_half_the_bounds_with_twice_the_effect_change_no_bit(monkeypatch, variant):
+    monkeypatch.setitem(globals(), "FakeEnv", Strong)
+    results = []
+    for factor in (1.0, 2.0):
+        monkeypatch.setattr(Strong, "factor", factor)
+        monkeypatch.setattr("mjlab.rl.sac.joint_range_bounds", lambda _, b=1.0 / factor: [b, b])
+        torch.manual_seed(3)
+        runner = make_runner(action_bounds="joint_ranges", **variant)
+        runner.learn(6)
+        results.append(everything(runner))
+        policy = runner.get_inference_policy()
+        results[-1]["actions"] = factor * policy(runner.env.get_observations()).detach()
+    names = [name for name in results[0] if not name.endswith(("bounds", "shown"))]
+    assert_same_bits(*({name: result[name] for name in names} for result in results))
+
+
+@pytest.mark.parametrize(
+    "task", ["Mjlab-Lift-Cube-Yam", "Mjlab-Velocity-Flat-Unitree-Go1", "Mjlab-Cartpole-Swingup"]
+)
+def test_bounds_reach_the_ends_of_joint_ranges(task):
+    cfg = load_env_cfg(task)
+    cfg.scene.num_envs = 2
+    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
+    bounds = torch.tensor(joint_range_bounds(env))
+    (term,) = (
+        env.unwrapped.action_manager.get_term(n) for n in env.unwrapped.action_manager.active_terms
+    )
+    if task == "Mjlab-Cartpole-Swingup":
+        assert bounds.tolist() == [1.0]
+        return
+    data = env.unwrapped.scene["robot"].data
+    low, high = data.default_joint_pos_limits[0, term.target_ids].T
+    targets = [(term.offset + sign * bounds * term.scale)[0] for sign in (-1.0, 1.0)]
+    assert ((targets[0] <= low + 1e-5) & (targets[1] >= high - 1e-5)).all()
+    # No farther than to the end of the range.
+    assert torch.minimum((targets[0] - low).abs(), (targets[1] - high).abs()).max() < 1e-5
+    env.close()
 
 
 def test_a_teacher_that_weighs_nothing_is_not_compared_with():

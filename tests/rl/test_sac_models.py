@@ -19,7 +19,7 @@ def test_squashed_log_probabilities_are_those_of_a_transformed_normal():
     ours = SquashedGaussian(3, init_std=0.5)
     ours.update(torch.randn(10, 6))
     noise = torch.randn(10, 3)
-    actions, log_prob = ours.action_and_log_prob(noise)
+    actions, log_prob = ours.share_and_log_prob(noise)
     u = Normal(ours.params[0], ours.params[1])
     theirs = TransformedDistribution(u, [TanhTransform(cache_size=1)])
     torch.testing.assert_close(log_prob, theirs.log_prob(actions).sum(-1), atol=1e-3, rtol=1e-4)

@@ -13,7 +13,7 @@ import mjlab.tasks
 from mjlab.cli.main import run_command
 from mjlab.envs import ManagerBasedRlEnvCfg
 from mjlab.rl import MjlabOnPolicyRunner, RslRlOnPolicyRunnerCfg
-from mjlab.rl.config import RslRlOffPolicyRunnerCfg
+from mjlab.rl.config import RslRlOffPolicyRunnerCfg, RslRlSacAlgorithmCfg
 from mjlab.rl.learners import with_learner
 from mjlab.scene import SceneCfg
 from mjlab.tasks import registry
@@ -209,7 +209,10 @@ def test_what_a_profile_returns_is_copied():
 def test_a_learner_is_chosen_by_name():
     register_mjlab_task("Test", env_cfg(), rl_cfg=RslRlOnPolicyRunnerCfg())
     assert load_rl_cfg("Test", learner="ppo") == load_rl_cfg("Test")
-    assert load_rl_cfg("Test", learner="sac") == RslRlOffPolicyRunnerCfg()
+    sac = load_rl_cfg("Test", learner="sac")
+    assert sac == RslRlOffPolicyRunnerCfg(
+        algorithm=RslRlSacAlgorithmCfg(action_bounds="joint_ranges")
+    )
     unknown: Any = "td3"
     with pytest.raises(ValueError, match="'td3'.*'ppo', 'sac', 'distillation'"):
         load_rl_cfg("Test", learner=unknown)

@@ -120,6 +120,10 @@ class RslRlSacAlgorithmCfg:
     The defaults are FastSAC's (Seo et al., arXiv 2512.01996), reduced for a few CPU cores.
     """
 
+    action_bounds: Literal["scale", "joint_ranges"] = "scale"
+    """Bounds of the actions. `scale`: -1 and 1, one action scale from the default joint position.
+    `joint_ranges`: joint position targets reach both ends of each joint's range; other actions as
+    `scale`."""
     batch_size: Count = field(default=2048, metadata=shown("learning", "N"))
     """Number of transitions per update, mirrored ones included."""
     num_updates: Count = field(default=4, metadata=shown("learning", "N"))
@@ -415,7 +419,7 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
 
 @dataclass
 class RslRlOffPolicyRunnerCfg(RslRlBaseRunnerCfg):
-    """Training run with an off-policy algorithm. Actions are in (-1, 1)."""
+    """Training run with an off-policy algorithm. Actions are bounded: `algorithm.action_bounds`."""
 
     actor: RslRlModelCfg = field(
         default_factory=lambda: RslRlModelCfg(

@@ -47,8 +47,9 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
     """Return `cfg` if its learner is `learner`, else a config of `learner` for the same run.
 
     The fields of `RslRlBaseRunnerCfg` and the symmetry function are copied. Networks and algorithm
-    have the learner's defaults, except for distillation: the teacher is the actor of `cfg`, and the
-    student has the same network and observations.
+    have the learner's defaults, except for SAC's `action_bounds`, `joint_ranges`, and for
+    distillation: the teacher is the actor of `cfg`, and the student has the same network and
+    observations.
 
     Raises:
         ValueError: the learner is unknown; or is SAC, and a network of `cfg` is recurrent or has an
@@ -88,6 +89,8 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
                         f"got {kind} ({field}); use --learner ppo."
                     )
         off_policy = RslRlOffPolicyRunnerCfg(**base)
+        # Unbounded actions reach several scales.
+        off_policy.algorithm.action_bounds = "joint_ranges"
         if symmetry:
             off_policy.algorithm.symmetry_cfg = {_MIRROR_FUNCTION: symmetry[_MIRROR_FUNCTION]}
         return off_policy

@@ -15,7 +15,7 @@ import copy
 import math
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from rsl_rl.env import VecEnv
@@ -28,12 +28,16 @@ from rsl_rl.utils import (
 from tensordict import TensorDict
 from torch import nn
 
+from mjlab.envs.mdp.actions import JointPositionAction
 from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.rl.schedule import Schedule
 from mjlab.utils.errors import check_field
 from mjlab.utils.memory import check_memory
+
+if TYPE_CHECKING:
+    from mjlab.rl.vecenv_wrapper import RslRlVecEnvWrapper
 
 # Range of scaled returns if `value_range` is None.
 _SCALED_RANGE = (-5.0, 5.0)
@@ -90,7 +94,9 @@ class SAC:
         self._rate_factor = Schedule(
             "RslRlSacAlgorithmCfg.learning_rate_factor", cfg.learning_rate_factor
         )
-        self._teacher = _Teacher(cfg)
+        # Replay buffer, critics and teacher have shares of the bounds, in (-1, 1).
+        self._bounds = actor.distribution.bounds
+        self._teacher = _Teacher(cfg, self._bounds)
         symmetry, self._env = cfg.symmetry_cfg, env
         self._mirror = resolve_callable(symmetry["data_augmentation_func"]) if symmetry else None
         transition = storage.num_bytes // ((cfg.replay_steps + 1) * env.num_envs)
@@ -133,6 +139,12 @@ class SAC:
         actor_class, actor_cfg = resolve_class(cfg["actor"])
         critic_class, critic_cfg = resolve_class(cfg["critic"])
         cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
+        if alg_cfg.action_bounds == "joint_ranges":
+            bounds = {"bounds": joint_range_bounds(cast("RslRlVecEnvWrapper", env))}
+            actor_cfg = {
+                **actor_cfg,
+                "distribution_cfg": {**actor_cfg["distribution_cfg"], **bounds},
+            }
         actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg)
         critic = critic_class(
             obs,
@@ -177,11 +189,11 @@ class SAC:
         distribution = self._policy.distribution
         distribution.update(self._policy.mlp(self._policy.get_latent(obs)))
         noise = self._noise.draw()
-        self._actions = distribution.action_of(noise)
+        self._actions = distribution.share_of(noise)
         if self._num_steps < self.cfg.teacher_steps:
             noise = distribution.std * noise
             self._actions = self._teacher.act(obs, noise, self._actions)
-        return self._actions
+        return self._bounds * self._actions
 
     def process_env_step(
         self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, Any]
@@ -251,7 +263,9 @@ class SAC:
         if self._reward_scale is not None:
             returns = returns * self._reward_scale.factor
         if self._mirror is not None:
+            actions = self._bounds * actions
             before, actions = self._mirror(env=self._env, obs=before, actions=actions)
+            actions = actions / self._bounds
             after, _ = self._mirror(env=self._env, obs=after, actions=None)
             returns, discounts, weights = (
                 value.repeat(2) for value in (returns, discounts, weights)
@@ -343,7 +357,8 @@ class SAC:
         metrics = {}
         if "teacher" in inputs:
             # On states that the policy visits (DAgger; Ross et al., arXiv 1011.0686).
-            distance = self._teacher.distance(inputs["teacher"], distribution.mean)
+            mean = torch.tanh(distribution.params[0])
+            distance = self._teacher.distance(inputs["teacher"], mean)
             loss = loss + self._teacher.weight(self._num_steps) * distance
             metrics["imitation"] = distance.detach()
         entropy = distribution.entropy.detach().mean()
@@ -366,7 +381,7 @@ class SAC:
         noise = torch.randn(
             (len(latent), distribution.output_dim), generator=self._generator, device=self.device
         )
-        return distribution.action_and_log_prob(noise)
+        return distribution.share_and_log_prob(noise)
 
     def _autocast(self) -> torch.autocast:
         kind = torch.device(self.device).type
@@ -486,6 +501,25 @@ class SAC:
                 torch.distributed.broadcast(tensor, src=0)
 
 
+def joint_range_bounds(env: RslRlVecEnvWrapper) -> list[float]:
+    """Return the actions that reach the ends of the joint ranges, (A,).
+
+    For joint position actions, max |q_end - q_default| / scale over both ends of the range, as FastSAC
+    (Seo et al., arXiv 2512.01996). 1 for other actions, and for joints without a range.
+    """
+    bounds = []
+    manager = env.unwrapped.action_manager
+    for term in (manager.get_term(name) for name in manager.active_terms):
+        own = torch.ones(term.action_dim)
+        if isinstance(term, JointPositionAction):
+            limits = env.unwrapped.scene[term.cfg.entity_name].data.default_joint_pos_limits
+            low, high = limits[:, term.target_ids].unbind(dim=2)
+            reach = torch.maximum(high - term.offset, term.offset - low) / abs(term.scale)
+            own = torch.where(reach.isfinite(), reach, 1.0).amax(dim=0)
+        bounds += own.tolist()
+    return bounds
+
+
 class _HeldNoise:
     """Standard normal noise (N, A), held for k steps per environment.
 
@@ -562,10 +596,10 @@ class _Teacher:
     """Controller that acts at first, and is imitated by the policy.
 
     The observation group `group` holds its actions a*, and may hold a matrix W, row by row: effects of actions,
-    such as the motion of a hand. Values of a* outside (-1, 1) leave the policy free.
+    such as the motion of a hand. Values of a* outside the bounds leave the policy free.
     """
 
-    def __init__(self, cfg: RslRlSacAlgorithmCfg) -> None:
+    def __init__(self, cfg: RslRlSacAlgorithmCfg, bounds: torch.Tensor | float) -> None:
         self._weight = Schedule("RslRlSacAlgorithmCfg.imitation", cfg.imitation)
         has_weight = any(weight for _, weight in cfg.imitation)
         if cfg.teacher is None and (cfg.teacher_steps > 0 or has_weight):
@@ -573,11 +607,14 @@ class _Teacher:
                 f"SAC teacher_steps, imitation: expected 0 without a teacher, got {cfg.teacher_steps} "
                 f"and {cfg.imitation}; set teacher to the observation group with its actions."
             )
-        self.group = cfg.teacher
+        self.group, self._bounds = cfg.teacher, bounds
 
     def act(self, obs: TensorDict, noise: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Return the controller's actions with `noise` before tanh, `actions` for free ones."""
-        shown: Any = obs[self.group][:, : actions.shape[1]]
+        """Return the controller's actions with `noise` before tanh, `actions` for free ones.
+
+        Actions are shares of the bounds.
+        """
+        shown: Any = obs[self.group][:, : actions.shape[1]] / self._bounds
         near = torch.tanh(torch.atanh(shown) + noise)
         return torch.where(shown.abs() < 1.0, near, actions)
 
@@ -586,10 +623,13 @@ class _Teacher:
         return self._weight.at(num_steps)
 
     def distance(self, shown: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-        """Return the mean of |d|^2 + |W d|^2, d = a - a*, of `mean` a (B, A) from the group's `shown` (B, .)."""
+        """Return the mean of |d|^2 + |W b d|^2, d = a - a* / b, of `mean` a (B, A) from the group's `shown` (B, .).
+
+        a are shares of the bounds b.
+        """
         size = mean.shape[1]
-        action = shown[:, :size]
+        action = shown[:, :size] / self._bounds
         difference = torch.where(action.abs() < 1.0, mean - action, 0.0)
         matrix = shown[:, size:].unflatten(1, (shown.shape[1] // size - 1, size))  # (B, m, A)
-        effects = matrix @ difference.unsqueeze(2)
+        effects = matrix @ (self._bounds * difference).unsqueeze(2)
         return torch.cat((difference, effects.squeeze(2)), dim=1).square().sum(dim=-1).mean()

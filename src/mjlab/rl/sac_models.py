@@ -23,18 +23,21 @@ _LOG_2PI = math.log(2.0 * math.pi)
 
 
 class SquashedGaussian(Distribution):
-    """Distribution of actions in (-1, 1): the tanh of a Gaussian variable u.
+    """Distribution of bounded actions b tanh(u), of a Gaussian variable u and bounds b.
 
-    The network outputs mean and standard deviation of u; the action is a = tanh(u). With the change of
-    variables, log p(a) = log N(u; mean, std) - sum_i log(1 - tanh(u_i)^2) (Haarnoja et al., arXiv
-    1801.01290, appendix C). `std` and `entropy` are those of u.
+    The network outputs mean and standard deviation of u. With the change of variables, the share
+    a = tanh(u) of the bounds has log p(a) = log N(u; mean, std) - sum_i log(1 - tanh(u_i)^2) (Haarnoja
+    et al., arXiv 1801.01290, appendix C). `std` and `entropy` are those of u.
     """
+
+    bounds: torch.Tensor | float
 
     def __init__(
         self,
         output_dim: int,
         init_std: float = 0.15,
         log_std_range: Sequence[float] = (-5.0, 0.0),
+        bounds: Sequence[float] | None = None,
     ) -> None:
         """Set up the distribution.
 
@@ -42,6 +45,7 @@ class SquashedGaussian(Distribution):
             output_dim: Number of actions.
             init_std: Initial standard deviation of u.
             log_std_range: Range (low, high) of the logarithm of the standard deviation.
+            bounds: Bounds b of the actions, (A,). None: 1.
 
         Raises:
             ValueError: `init_std` is not within the range.
@@ -55,6 +59,10 @@ class SquashedGaussian(Distribution):
             )
         self._init_std = init_std
         self._mean = self._log_std = torch.zeros(0)
+        if bounds is None:
+            self.bounds = 1.0
+        else:
+            self.register_buffer("bounds", torch.tensor(bounds))
 
     @property
     def input_dim(self) -> int:
@@ -76,14 +84,14 @@ class SquashedGaussian(Distribution):
         self._log_std = self._low + (self._high - self._low) * share
 
     def sample(self) -> torch.Tensor:
-        return self.action_of(torch.randn_like(self._mean))
+        return self.bounds * self.share_of(torch.randn_like(self._mean))
 
-    def action_of(self, noise: torch.Tensor) -> torch.Tensor:
-        """Return the action (N, A) for standard normal `noise` (N, A)."""
+    def share_of(self, noise: torch.Tensor) -> torch.Tensor:
+        """Return the share of the bounds (N, A) for standard normal `noise` (N, A)."""
         return torch.tanh(self._mean + self._log_std.exp() * noise)
 
-    def action_and_log_prob(self, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the action (N, A) for `noise` (N, A) and its log-probability (N,)."""
+    def share_and_log_prob(self, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the share of the bounds (N, A) for `noise` (N, A) and its log-probability (N,)."""
         u = self._mean + self._log_std.exp() * noise
         normal = -0.5 * (noise.square() + _LOG_2PI) - self._log_std
         # log(1 - tanh(u)^2), in a form that does not underflow.
@@ -91,14 +99,14 @@ class SquashedGaussian(Distribution):
         return torch.tanh(u), (normal - jacobian).sum(dim=-1)
 
     def deterministic_output(self, mlp_output: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(mlp_output[..., : self.output_dim])
+        return self.bounds * torch.tanh(mlp_output[..., : self.output_dim])
 
     def as_deterministic_output_module(self) -> nn.Module:
-        return _TanhOfMean(self.output_dim)
+        return _BoundedMean(self.output_dim, self.bounds)
 
     @property
     def mean(self) -> torch.Tensor:
-        return torch.tanh(self._mean)
+        return self.bounds * torch.tanh(self._mean)
 
     @property
     def std(self) -> torch.Tensor:
@@ -113,13 +121,16 @@ class SquashedGaussian(Distribution):
         return (self._mean, self.std)
 
 
-class _TanhOfMean(nn.Module):
-    def __init__(self, num_actions: int) -> None:
+class _BoundedMean(nn.Module):
+    _bounds: torch.Tensor
+
+    def __init__(self, num_actions: int, bounds: torch.Tensor | float) -> None:
         super().__init__()
         self._num_actions = num_actions
+        self.register_buffer("_bounds", torch.as_tensor(bounds))
 
     def forward(self, mlp_output: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(mlp_output[..., : self._num_actions])
+        return self._bounds * torch.tanh(mlp_output[..., : self._num_actions])
 
 
 def normalized_mlp(
