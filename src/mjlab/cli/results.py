@@ -37,32 +37,6 @@ def print_heading(task: str, cfg: TrainConfig, env: Any, rank: ProcessRank) -> N
     each = "" if rank.is_alone else f" in each of {rank.world_size} processes"
     print(f"Task:    {task}, {counted(env.num_envs, 'environment')}{each}{under}")
     print(f"Physics: {env.unwrapped.sim.capabilities.description}", flush=True)
-    if cfg.learner == "sac":
-        for line in _reach(env.unwrapped):
-            print(line, flush=True)
-
-
-def _reach(env: ManagerBasedRlEnv) -> list[str]:
-    """Return how far SAC can move joint targets. Its actions are bounded, PPO's are not.
-
-    A task's scale may count on that: the YAM's PPO reaches six scales, without which the cube is out
-    of reach.
-    """
-    import torch
-
-    from mjlab.envs.mdp import JointPositionAction
-
-    lines = []
-    for name in env.action_manager.active_terms:
-        term = env.action_manager.get_term(name)
-        if isinstance(term, JointPositionAction):
-            scale = torch.as_tensor(term.scale).expand(env.num_envs, term.action_dim)[0].abs()
-            ends = (int(scale.argmin()), int(scale.argmax()))
-            within = " to ".join(f"{float(scale[i]):.2g} ({term.target_names[i]})" for i in ends)
-            lines.append(
-                f"Reach:   {name} moves targets by at most one scale, {within}; SAC's actions are bounded"
-            )
-    return lines
 
 
 def report_divergence(env: ManagerBasedRlEnv) -> None:
