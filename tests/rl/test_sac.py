@@ -358,7 +358,8 @@ def test_half_the_bounds_with_twice_the_effect_change_no_bit(monkeypatch, varian
     results = []
     for factor in (1.0, 2.0):
         monkeypatch.setattr(Strong, "factor", factor)
-        monkeypatch.setattr("mjlab.rl.sac.joint_range_bounds", lambda _, b=1.0 / factor: [b, b])
+        bounds = [1.0 / factor, 2.0 / factor]
+        monkeypatch.setattr("mjlab.rl.sac.joint_range_bounds", lambda _, b=bounds: b)
         torch.manual_seed(3)
         runner = make_runner(action_bounds="joint_ranges", **variant)
         runner.learn(6)
@@ -369,27 +370,56 @@ def test_half_the_bounds_with_twice_the_effect_change_no_bit(monkeypatch, varian
     assert_same_bits(*({name: result[name] for name in names} for result in results))
 
 
+@pytest.fixture
+def reach():
+    """Return a function that builds an environment, and returns its arm, action and bounds."""
+    opened = []
+
+    def reach(clip: float | None = None, **changes: Any) -> tuple[Any, Any, torch.Tensor]:
+        cfg = load_env_cfg("Mjlab-Lift-Cube-Yam")
+        cfg.scene.num_envs = 2
+        cfg.actions["joint_pos"] = dataclasses.replace(cfg.actions["joint_pos"], **changes)
+        opened.append(RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"), clip_actions=clip))
+        env = opened[-1].unwrapped
+        bounds = torch.tensor(joint_range_bounds(opened[-1]))
+        return env.scene["robot"].data, env.action_manager.get_term("joint_pos"), bounds
+
+    yield reach
+    for env in opened:
+        env.close()
+
+
 @pytest.mark.parametrize(
-    "task", ["Mjlab-Lift-Cube-Yam", "Mjlab-Velocity-Flat-Unitree-Go1", "Mjlab-Cartpole-Swingup"]
+    "changes", [{}, {"scale": -0.1}, {"use_default_offset": False, "offset": 0.2, "scale": 0.05}]
 )
-def test_bounds_reach_the_ends_of_joint_ranges(task):
-    cfg = load_env_cfg(task)
-    cfg.scene.num_envs = 2
-    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, device="cpu"))
-    bounds = torch.tensor(joint_range_bounds(env))
-    (term,) = (
-        env.unwrapped.action_manager.get_term(n) for n in env.unwrapped.action_manager.active_terms
-    )
-    if task == "Mjlab-Cartpole-Swingup":
-        assert bounds.tolist() == [1.0]
-        return
-    data = env.unwrapped.scene["robot"].data
-    low, high = data.default_joint_pos_limits[0, term.target_ids].T
-    targets = [(term.offset + sign * bounds * term.scale)[0] for sign in (-1.0, 1.0)]
-    assert ((targets[0] <= low + 1e-5) & (targets[1] >= high - 1e-5)).all()
-    # No farther than to the end of the range.
-    assert torch.minimum((targets[0] - low).abs(), (targets[1] - high).abs()).max() < 1e-5
-    env.close()
+def test_bounds_reach_the_ends_of_joint_ranges_or_one_scale(reach, changes):
+    data, term, bounds = reach(**changes)
+    ends = data.default_joint_pos_limits[0, term.target_ids]
+    targets = [term.offset + sign * bounds * term.scale for sign in (-1.0, 1.0)]
+    targets = torch.stack([target.expand(2, -1)[0] for target in targets], dim=1).sort(dim=1).values
+    assert (targets[:, 0] <= ends[:, 0] + 1e-5).all()
+    assert (targets[:, 1] >= ends[:, 1] - 1e-5).all()
+    # No farther than the farther end.
+    beyond = (targets - ends).abs().amin(dim=1)
+    assert beyond[bounds > 1.0].max() < 1e-5
+    assert bounds.min() >= 1.0
+
+
+def test_bounds_are_at_most_the_clip_of_actions(reach):
+    assert reach(clip=3.0)[2].max() == 3.0
+
+
+def test_bounds_of_joints_without_a_range_are_one_scale(reach, monkeypatch):
+    original = joint_range_bounds
+
+    def unlimited(env: Any) -> list[float]:
+        env.unwrapped.scene["robot"].data.default_joint_pos_limits[:] = torch.tensor(
+            [-torch.inf, torch.inf]
+        )
+        return original(env)
+
+    monkeypatch.setitem(globals(), "joint_range_bounds", unlimited)
+    assert (reach()[2] == 1.0).all()
 
 
 def test_a_teacher_that_weighs_nothing_is_not_compared_with():

@@ -26,6 +26,12 @@ def test_squashed_log_probabilities_are_those_of_a_transformed_normal():
     torch.testing.assert_close(ours.entropy, u.entropy().sum(-1))
 
 
+@pytest.mark.parametrize("bounds", [[1.0], [1.0, 0.0], [1.0, -2.0], [1.0, float("inf")]])
+def test_bounds_are_one_positive_number_per_action(bounds):
+    with pytest.raises(ValueError, match="expected 2 positive numbers"):
+        SquashedGaussian(2, bounds=bounds)
+
+
 def test_a_deviation_out_of_range_is_refused():
     with pytest.raises(ValueError, match="init_std"):
         SquashedGaussian(2, init_std=2.0)

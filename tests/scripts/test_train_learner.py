@@ -18,6 +18,7 @@ from process_runs import ProcessRun
 from mjlab.cli import training as environments
 from mjlab.cli.policy_flags import env_cfg_of
 from mjlab.cli.train_config import parse_train_flags
+from mjlab.rl.checkpoint import load_checkpoint, save_checkpoint
 from mjlab.rl.config import RslRlOffPolicyRunnerCfg
 from mjlab.rl.learners import acting_cfg, with_learner
 from mjlab.runs import Checkpoint, Run
@@ -95,19 +96,22 @@ def test_the_run_says_its_learner(of_sac):
 
 
 def test_a_run_from_before_the_bounds_keeps_its_actions_within_one_scale(train, run, tmp_path):
-    run_dir = train(tmp_path / "logs", 1, *SAC, "--agent.algorithm.action-bounds", "scale")
-    file = run_dir / "params" / "agent.yaml"
-    params = yaml.safe_load(file.read_text())
-    assert params["algorithm"].pop("action_bounds") == "scale"
-    file.write_text(yaml.safe_dump(params))
-    flags = ("--log-root", str(tmp_path / "logs"), "--agent.max-iterations", "2")
-    outcome = run("train", TASK, "--agent.resume", "True", *flags)
+    # Its joint ranges are 8 and 16 scales.
+    task, flags = "Mjlab-Lift-Cube-Yam", ("--num-envs", "2", "--device", "cpu")
+    root = ("--log-root", str(tmp_path))
+    outcome = run("train", task, *SAC, *flags, *root, "--agent.max-iterations", "1")
+    assert outcome.status == 0, outcome.message
+    (run_dir,) = tmp_path.glob("*/*/")
+    path = Run(run_dir).newest
+    checkpoint = load_checkpoint(path)
+    for state in (checkpoint["actor_state_dict"], checkpoint["sac_state_dict"]["actor"]):
+        assert state.pop("distribution.bounds").max() > 8.0
+    save_checkpoint(checkpoint, path)
+    outcome = run("train", task, "--agent.resume", "True", *root, "--agent.max-iterations", "2")
     assert outcome.status == 0, outcome.message
     (resumed,) = set(run_dir.parent.iterdir()) - {run_dir}
-    params = yaml.safe_load((resumed / "params" / "agent.yaml").read_text())
-    assert params["algorithm"]["action_bounds"] == "scale"
-    state = Checkpoint(Run(resumed).newest).content["actor_state_dict"]
-    assert not any("bounds" in name for name in state)
+    state = torch.load(Run(resumed).newest, weights_only=True)["actor_state_dict"]
+    assert (state["distribution.bounds"] == 1.0).all()
 
 
 @pytest.mark.parametrize(

@@ -291,7 +291,7 @@ def prepare_teacher(
     flag, teacher = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
     if resumed is not None:
         recorded = resumed.params["agent"].get("teacher_checkpoint")
-        if teacher is not None and teacher != recorded:
+        if teacher is not None and str(resolve_checkpoint(Path(teacher), task)) != recorded:
             raise UserError(
                 f"{flag}: expected {recorded} of the resumed run, got {teacher}; leave it out."
             )

@@ -122,8 +122,8 @@ class RslRlSacAlgorithmCfg:
 
     action_bounds: Literal["scale", "joint_ranges"] = "scale"
     """Bounds of the actions. `scale`: -1 and 1, one action scale from the default joint position.
-    `joint_ranges`: joint position targets reach both ends of each joint's range; other actions as
-    `scale`."""
+    `joint_ranges`: joint position targets reach both ends of each joint's range, and one scale at
+    least; other actions as `scale`. A resumed policy keeps its bounds."""
     batch_size: Count = field(default=2048, metadata=shown("learning", "N"))
     """Number of transitions per update, mirrored ones included."""
     num_updates: Count = field(default=4, metadata=shown("learning", "N"))
@@ -171,7 +171,7 @@ class RslRlSacAlgorithmCfg:
     little effect from drifting to their bounds."""
     teacher: str | None = None
     """Observation group with the actions of a controller for the policy to imitate, (N, actions), e.g.
-    those of `stepping_action`. Values outside (-1, 1) leave an action free. Further values are rows of a
+    those of `stepping_action`. Values outside the bounds leave an action free. Further values are rows of a
     matrix, (N, rows x actions): its product with the distance of the actions counts as that does."""
     teacher_steps: CountOrZero = 0
     """Number of initial environment steps controlled by the teacher, with the policy's exploration."""
@@ -381,8 +381,7 @@ class RslRlBaseRunnerCfg:
     load_checkpoint: str = field(default="model_.*.pt", metadata=shown("resume", "REGEX"))
     """Checkpoint to resume from: regular expression; the newest match is used."""
     clip_actions: Limit | None = None
-    """Bound c: actions are clipped to [-c, c] before the environment. SAC's actions are in (-1, 1);
-    the scale of the action term sets their range."""
+    """Bound c: actions are clipped to [-c, c] before the environment."""
     upload_model: bool = True
     """Upload checkpoints and exported policies to Weights & Biases."""
     save_git_diff: bool = field(default=True, kw_only=True)

@@ -89,7 +89,7 @@ def with_learner(cfg: RslRlBaseRunnerCfg, learner: Learner) -> RslRlBaseRunnerCf
                         f"got {kind} ({field}); use --learner ppo."
                     )
         off_policy = RslRlOffPolicyRunnerCfg(**base)
-        # Unbounded actions reach several scales.
+        # Scales are made for unbounded actions: the YAM's PPO uses six of them.
         off_policy.algorithm.action_bounds = "joint_ranges"
         if symmetry:
             off_policy.algorithm.symmetry_cfg = {_MIRROR_FUNCTION: symmetry[_MIRROR_FUNCTION]}

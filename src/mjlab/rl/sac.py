@@ -140,11 +140,9 @@ class SAC:
         critic_class, critic_cfg = resolve_class(cfg["critic"])
         cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
         if alg_cfg.action_bounds == "joint_ranges":
-            bounds = {"bounds": joint_range_bounds(cast("RslRlVecEnvWrapper", env))}
-            actor_cfg = {
-                **actor_cfg,
-                "distribution_cfg": {**actor_cfg["distribution_cfg"], **bounds},
-            }
+            bounds = joint_range_bounds(cast("RslRlVecEnvWrapper", env))
+            squashed = {"bounds": bounds, **(actor_cfg.get("distribution_cfg") or {})}
+            actor_cfg = {**actor_cfg, "distribution_cfg": squashed}
         actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg)
         critic = critic_class(
             obs,
@@ -505,7 +503,8 @@ def joint_range_bounds(env: RslRlVecEnvWrapper) -> list[float]:
     """Return the actions that reach the ends of the joint ranges, (A,).
 
     For joint position actions, max |q_end - q_default| / scale over both ends of the range, as FastSAC
-    (Seo et al., arXiv 2512.01996). 1 for other actions, and for joints without a range.
+    (Seo et al., arXiv 2512.01996), at least 1: targets beyond the end let a finger press. 1 for other
+    actions, and for joints without a range. At most the environment's `clip_actions`.
     """
     bounds = []
     manager = env.unwrapped.action_manager
@@ -517,7 +516,8 @@ def joint_range_bounds(env: RslRlVecEnvWrapper) -> list[float]:
             reach = torch.maximum(high - term.offset, term.offset - low) / abs(term.scale)
             own = torch.where(reach.isfinite(), reach, 1.0).amax(dim=0)
         bounds += own.tolist()
-    return bounds
+    largest = math.inf if env.clip_actions is None else env.clip_actions
+    return [min(max(bound, 1.0), largest) for bound in bounds]
 
 
 class _HeldNoise:
@@ -599,7 +599,7 @@ class _Teacher:
     such as the motion of a hand. Values of a* outside the bounds leave the policy free.
     """
 
-    def __init__(self, cfg: RslRlSacAlgorithmCfg, bounds: torch.Tensor | float) -> None:
+    def __init__(self, cfg: RslRlSacAlgorithmCfg, bounds: torch.Tensor) -> None:
         self._weight = Schedule("RslRlSacAlgorithmCfg.imitation", cfg.imitation)
         has_weight = any(weight for _, weight in cfg.imitation)
         if cfg.teacher is None and (cfg.teacher_steps > 0 or has_weight):

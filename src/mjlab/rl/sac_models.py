@@ -30,7 +30,7 @@ class SquashedGaussian(Distribution):
     et al., arXiv 1801.01290, appendix C). `std` and `entropy` are those of u.
     """
 
-    bounds: torch.Tensor | float
+    bounds: torch.Tensor
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class SquashedGaussian(Distribution):
             bounds: Bounds b of the actions, (A,). None: 1.
 
         Raises:
-            ValueError: `init_std` is not within the range.
+            ValueError: `init_std` is not within the range, or `bounds` are not one positive number per action.
         """
         super().__init__(output_dim)
         self._low, self._high = map(float, log_std_range)
@@ -59,10 +59,17 @@ class SquashedGaussian(Distribution):
             )
         self._init_std = init_std
         self._mean = self._log_std = torch.zeros(0)
-        if bounds is None:
-            self.bounds = 1.0
-        else:
-            self.register_buffer("bounds", torch.tensor(bounds))
+        values = [1.0] * output_dim if bounds is None else list(bounds)
+        if len(values) != output_dim or not all(0.0 < value < math.inf for value in values):
+            raise ValueError(
+                f"SquashedGaussian bounds: expected {output_dim} positive numbers, got {values}."
+            )
+        self.register_buffer("bounds", torch.tensor(values, dtype=torch.float32))
+
+    def _load_from_state_dict(self, state_dict: dict, prefix: str, *args: Any) -> None:
+        # Actions of checkpoints without bounds are in (-1, 1).
+        state_dict.setdefault(f"{prefix}bounds", torch.ones_like(self.bounds))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def input_dim(self) -> int:
@@ -124,10 +131,10 @@ class SquashedGaussian(Distribution):
 class _BoundedMean(nn.Module):
     _bounds: torch.Tensor
 
-    def __init__(self, num_actions: int, bounds: torch.Tensor | float) -> None:
+    def __init__(self, num_actions: int, bounds: torch.Tensor) -> None:
         super().__init__()
         self._num_actions = num_actions
-        self.register_buffer("_bounds", torch.as_tensor(bounds))
+        self.register_buffer("_bounds", bounds)
 
     def forward(self, mlp_output: torch.Tensor) -> torch.Tensor:
         return self._bounds * torch.tanh(mlp_output[..., : self._num_actions])

@@ -31,8 +31,6 @@ Kind = Literal["cpu", "gpu"]
 
 DATA = Path(__file__).parents[1] / "reference"
 """Folder of the bundled references."""
-STUDENT = "student"
-"""Profile of tasks that are learned from a teacher."""
 METRIC = "mean_return"
 """Evaluation metric to compare. Every task has it, and learning increases it."""
 FALSE_ALARMS = 0.05
@@ -119,6 +117,8 @@ class Reference:
     """Profile of the task."""
     flags: list[str]
     """Further flags of `train`."""
+    teacher: list[str] = dataclasses.field(default_factory=list)
+    """Task and flags of `train` of the teacher, for a student."""
     seeds: list[SeedRecord] = dataclasses.field(default_factory=list)
     """Seeds, in ascending order."""
 
@@ -388,7 +388,7 @@ class Comparison:
     def is_within(self) -> bool:
         """True if the run ends within, and at least half of its points are in the band.
 
-        A healthy seed is outside with probability at most `FALSE_ALARMS` = 3 a, for any dependence
+        With two seeds or more, a healthy seed is outside with probability at most `FALSE_ALARMS` = 3 a, for any dependence
         between the points of a curve: the expected fraction of points outside is a, so the fraction
         exceeds 1/2 with probability at most 2 a (Markov), and the run ends outside with probability
         a.

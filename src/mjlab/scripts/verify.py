@@ -16,7 +16,6 @@ from mjlab.cli.resume import resume_flags
 from mjlab.runs import Run, runs_in
 from mjlab.runs.reference import (
     DATA,
-    STUDENT,
     Comparison,
     Kind,
     NotEvaluatedError,
@@ -32,7 +31,7 @@ from mjlab.runs.run import DONE
 from mjlab.utils.errors import BadCallError, UserError
 from mjlab.utils.ranges import Seed
 from mjlab.utils.signals import Interrupted
-from mjlab.utils.string import counted
+from mjlab.utils.string import command_line, counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,10 +101,10 @@ def _prepare(
             f"The reference of {task}: expected a solved seed or at least 2 seeds, got "
             f"{len(reference.seeds)}; use `make reference TASKS={task}` for more."
         )
-    if reference.profile == STUDENT and cfg.teacher_checkpoint is None and not cfg.resume:
+    if reference.teacher and cfg.teacher_checkpoint is None and not cfg.resume:
         raise UserError(
-            f"verify {task}: expected a teacher, got none; use --teacher-checkpoint. `docs/reference/runs` "
-            "has the command that trains one."
+            f"verify {task}: expected a teacher, got none; use --teacher-checkpoint with a run of "
+            f"`uv run mjlab train {command_line(reference.teacher)}`."
         )
     if cfg.seed in (seed.seed for seed in reference.seeds):
         # Allowed: the curve differs on other machines or with other library versions.
@@ -163,30 +162,32 @@ def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
             (seed.commit for seed in reference.seeds),
         )
     )
+    has_band = len(reference.seeds) > 1
     speeds = [seed.run.steps_per_second for seed in reference.seeds]
     lines = [
         f"Reference  {counted(len(reference.seeds), 'seed')} on {machines}, commit {commits}, {versions}",
         f"Speed      {run.steps_per_second:,.0f} steps/s (collecting and learning); reference "
         f"{min(speeds):,.0f} to {max(speeds):,.0f}",
         "",
-        f"{'samples':>12}  {'mean return':>12}  {'reference':>12}  band",
+        f"{'samples':>12}  {'mean return':>12}  {'reference':>12}{'  band' if has_band else ''}",
     ]
     last = len(comparison.samples) - 1
     for row in range(_ROWS):
         i = round(row * last / (_ROWS - 1))
         middle, half = comparison.mean[i], comparison.half[i]
+        band = f"  [{middle - half:.4g}, {middle + half:.4g}]" if has_band else ""
         outside = "" if comparison.within[i] else "   outside"
         lines.append(
-            f"{comparison.samples[i]:>12,.0f}  {comparison.values[i]:>12.4g}  {middle:>12.4g}  "
-            f"[{middle - half:.4g}, {middle + half:.4g}]{outside}"
+            f"{comparison.samples[i]:>12,.0f}  {comparison.values[i]:>12.4g}  {middle:>12.4g}{band}{outside}"
         )
     if comparison.limit is not None:
-        taken = [seed.run.samples for seed in reference.seeds]
+        taken = sorted({seed.run.samples for seed in reference.seeds})
+        spread = f"{taken[0]:,} to {taken[-1]:,}" if len(taken) > 1 else f"{taken[0]:,}"
         solved = comparison.solved_at
         lines += [
             "",
             f"Solved     {'not' if solved is None else f'after {solved:,} samples'}; reference after "
-            f"{min(taken):,} to {max(taken):,}, a healthy seed within {comparison.limit:,.0f}",
+            f"{spread}, a healthy seed within {comparison.limit:,.0f}",
         ]
     return "\n".join([*lines, ""])
 
@@ -195,7 +196,8 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
     from mjlab.rl.plot import LABELS, plot_curves
 
     def draw(axes: Axes) -> None:
-        for sign, label in ((-1, "band of a new seed"), (1, None)):
+        edges = ((-1, "band of a new seed"), (1, None)) if len(curves) > 1 else ()
+        for sign, label in edges:
             edge = comparison.mean + sign * comparison.half
             axes.plot(comparison.samples / 1e6, edge, "--", color="gray", lw=1, label=label)
         axes.plot(*run.curve_in_millions(), color="tab:red", marker=".", label="this run")
@@ -204,7 +206,7 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
 
     curves = [seed.run.curve_in_millions() for seed in reference.seeds]
     return plot_curves(
-        {f"reference, {len(curves)} seeds": curves},
+        {f"reference, {counted(len(curves), 'seed')}": curves},
         output,
         title=reference.task,
         xlabel="Samples (millions)",
@@ -240,22 +242,21 @@ def command(argv: list[str], prog: str) -> None:
     comparison = compare(runs, run, reference.standard_error)
     print(f"\n{report(reference, run, comparison)}")
     print(f"Picture    {_draw(reference, run, comparison, run_dir / 'verify.png')}")
-    part = f"{comparison.within.mean():.0%} of the way within the band"
+    part = f"{comparison.within.mean():.0%} of the way within the band, "
+    often = "At most one healthy seed in twenty is"
     if len(runs) == 1:
-        part = "no band, with one seed"
+        part, often = "", "The reference has one seed, so a healthy one may be"
     if run.ended not in DONE:
-        print(
-            f"So far     {part}. Training was {run.ended}: the same command with --resume goes on."
-        )
+        print(f"So far     {part}training was {run.ended}: the same command with --resume goes on.")
         raise Interrupted(stopped or signal.SIGINT)
     end = "its end" if comparison.limit is None else "the samples until it is solved"
-    where = f"{part}, {end} {'within' if comparison.ends_within else 'outside'}"
+    where = f"{part}{end} {'within' if comparison.ends_within else 'outside'}"
     if comparison.is_within:
         print(f"Verdict    within: {where}.")
         return
     print(
-        f"Verdict    OUTSIDE: {where}. At most one healthy seed in twenty is; try --seed "
-        f"{cfg.seed + 1000} before you look for the reason."
+        f"Verdict    OUTSIDE: {where}. {often}; try --seed {cfg.seed + 1000} before you look for the "
+        "reason."
     )
     sys.exit(_OUTSIDE)
 

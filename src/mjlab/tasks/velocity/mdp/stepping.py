@@ -46,7 +46,7 @@ _START = 2.75
 # Largest action: atanh(1) is infinite.
 _LARGEST = 0.97
 # Outside the action range: not imitated.
-_FREE = 2.0
+_FREE = 1e6
 
 
 @dataclass(kw_only=True)
@@ -100,7 +100,7 @@ class stepping_action:
 
     with y the distance of the hip from the middle, and swing legs turn the ankles against the trunk,
     dq = -a . (roll, pitch, 0). Hips of stance legs start from their measured positions. Other joints are at
-    their default positions. A joint that turns the leg about the vertical is 2, outside the action range,
+    their default positions. A joint that turns the leg about the vertical is 1e6, outside the action range,
     and therefore not imitated.
 
     Params:

@@ -189,7 +189,7 @@ def _learner(rl_cfg: RslRlOnPolicyRunnerCfg, mirror: str | None) -> RslRlOffPoli
     # At most 0.3 of a joint's bound.
     cfg.actor.distribution_cfg = squashed_gaussian(0.15, log_std_max=-1.2)
     algorithm = cfg.algorithm
-    # The action's scale is the bound.
+    # The action term's scales are far less than the joint ranges, which have not been tried.
     algorithm.action_bounds = "scale"
     # Five updates of batch size 2,048 take as long as stepping 1,024 environments; replay ratio: 10.
     algorithm.num_updates = 5
