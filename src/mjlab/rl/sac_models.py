@@ -66,10 +66,12 @@ class SquashedGaussian(Distribution):
             )
         self.register_buffer("bounds", torch.tensor(values, dtype=torch.float32))
 
-    def _load_from_state_dict(self, state_dict: dict, prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(
+        self, state_dict: dict, prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
         # Actions of checkpoints without bounds are in (-1, 1).
         state_dict.setdefault(f"{prefix}bounds", torch.ones_like(self.bounds))
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     @property
     def input_dim(self) -> int:
