@@ -364,6 +364,8 @@ def test_flags_that_would_teach_nothing_are_refused(run, student, tmp_path):
     assert "was trained with other terms" in run("train", *other).message
     logs = ["--log-root", str(student[1].parents[1]), "--agent.resume", "True"]
     argv = [TASK, *SMALL, *logs, *STUDENT, "--agent.load-run", student[1].name]
+    same = run("train", *argv, "--agent.teacher-checkpoint", str(student[0]))
+    assert same.status == 0, same.message
     outcome = run("train", *argv, "--agent.teacher-checkpoint", "another.pt")
     assert f"expected {teacher} of the resumed run, got another.pt" in outcome.message
 

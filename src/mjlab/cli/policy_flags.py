@@ -291,7 +291,8 @@ def prepare_teacher(
     flag, teacher = "--agent.teacher-checkpoint", cfg.teacher_checkpoint
     if resumed is not None:
         recorded = resumed.params["agent"].get("teacher_checkpoint")
-        if teacher is not None and str(resolve_checkpoint(Path(teacher), task)) != recorded:
+        file = Path(recorded or "").resolve()
+        if teacher is not None and Path(teacher).resolve() not in (file, file.parent):
             raise UserError(
                 f"{flag}: expected {recorded} of the resumed run, got {teacher}; leave it out."
             )
