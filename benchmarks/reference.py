@@ -111,6 +111,16 @@ EVALUATION_FLAGS: dict[str, tuple[str, ...]] = {
     ),
 }
 """Flags of tasks whose evaluations would otherwise take as long as their training."""
+CLIPS = {
+    "Mjlab-Cartpole-Swingup": "swingup",
+    "Mjlab-Lift-Cube-Yam": "lift",
+    "Mjlab-Multi-Cube-Seg-Yam": "multi_cube",
+    "Mjlab-Tracking-Flat-Unitree-G1": "g1_tracking",
+    "Mjlab-Velocity-Flat-Unitree-G1-No-State-Estimation": "g1",
+    "Mjlab-Velocity-Flat-Unitree-Go1-No-State-Estimation": "go1",
+    "Mjlab-Velocity-Rough-Unitree-G1": "g1_rough",
+}
+"""Clips of policies, of `tools/make_clips.py`."""
 # For a task without the profile: tasks have one environment, and an evaluation of the cartpole takes the
 # time of ten iterations.
 _FLAGS = ["--num-envs", "512", "--agent.evaluation.min-interval", "6"]
@@ -414,6 +424,8 @@ def _deciding(reference: Reference) -> list[str]:
 def _section(task: str, references: list[Reference]) -> str:
     """Return the plot of a task, and a table of its seeds for each kind of device."""
     lines = [f"## {task}", "", f"![Curves of {task}]({task}.png)", ""]
+    if task in CLIPS:
+        lines += [f"![A policy of {task}](../../images/{CLIPS[task]}.webp)", ""]
     for reference in references:
         newest = reference.seeds[-1]
         names = _all_metrics(newest.evaluation)

@@ -329,7 +329,7 @@ def test_a_record_says_how_it_was_made(made):
 
 
 def test_settings_of_references_are_of_stock_tasks(module):
-    assert {*module.SEEDS, *module.EVALUATION_FLAGS} <= set(module.stock_tasks())
+    assert {*module.SEEDS, *module.EVALUATION_FLAGS, *module.CLIPS} <= set(module.stock_tasks())
 
 
 def test_the_page_shows_what_was_run(made, module):
