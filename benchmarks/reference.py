@@ -214,7 +214,8 @@ def _reference(task: str, options: Options) -> Reference:
     if options.again:
         return new
     raise UserError(
-        f"{path} flags: expected {shlex.join(new.train_flags)}, got {shlex.join(old.train_flags)}; "
+        f"{path} flags: expected {shlex.join([*new.train_flags, *new.teacher])}, got "
+        f"{shlex.join([*old.train_flags, *old.teacher])}; "
         "use AGAIN=1 to replace all of its seeds."
     )
 
@@ -229,7 +230,7 @@ def _train(reference: Reference, seed: int, commit: str, options: Options) -> Se
             return None
         if Run(teacher).state not in DONE:
             raise RuntimeError(
-                f"The teacher, {teacher}: expected a solved run, got one of {options.minutes:g} minutes; "
+                f"The teacher, {teacher}: expected a finished run, got one of {options.minutes:g} minutes; "
                 "use more --minutes."
             )
         trained += ["--agent.teacher-checkpoint", str(Run(teacher).newest)]

@@ -139,10 +139,10 @@ class SAC:
         actor_class, actor_cfg = resolve_class(cfg["actor"])
         critic_class, critic_cfg = resolve_class(cfg["critic"])
         cfg["obs_groups"] = resolve_obs_groups(obs, cfg["obs_groups"], ["actor", "critic"])
-        if alg_cfg.action_bounds == "joint_ranges":
+        distribution = actor_cfg.get("distribution_cfg")
+        if distribution and alg_cfg.action_bounds == "joint_ranges":
             bounds = joint_range_bounds(cast("RslRlVecEnvWrapper", env))
-            squashed = {"bounds": bounds, **(actor_cfg.get("distribution_cfg") or {})}
-            actor_cfg = {**actor_cfg, "distribution_cfg": squashed}
+            actor_cfg = {**actor_cfg, "distribution_cfg": {"bounds": bounds, **distribution}}
         actor = actor_class(obs, cfg["obs_groups"], "actor", env.num_actions, **actor_cfg)
         critic = critic_class(
             obs,

@@ -115,7 +115,8 @@ def _prepare(
     train_flags += ["--agent.run-name", f"verify_seed_{cfg.seed}", "--log-root", cfg.log_root]
     train_flags += ["--agent.max-iterations", str(_iterations(reference))]
     train_flags += ["--device", cfg.device] if cfg.device is not None else []
-    if cfg.teacher_checkpoint is not None:
+    # A resumed run keeps its teacher.
+    if cfg.teacher_checkpoint is not None and not cfg.resume:
         train_flags += ["--agent.teacher-checkpoint", cfg.teacher_checkpoint]
     done = None
     if cfg.resume:
