@@ -39,7 +39,11 @@ class FakeEnv:
         self.render_mode = None
         self.step_dt = 0.5
         self.max_episode_length = cfg.episode_steps
-        self.action_manager = SimpleNamespace(total_action_dim=2)
+        self.action_manager = SimpleNamespace(
+            total_action_dim=2,
+            active_terms=["force"],
+            get_term=lambda _: SimpleNamespace(action_dim=2),
+        )
         self.command_manager = self.termination_manager = SimpleNamespace(active_terms=[])
         self.scene = SimpleNamespace(terrain=None)
         self.curricula_in_use, self.curricula_held = dict, nullcontext

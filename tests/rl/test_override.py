@@ -222,6 +222,7 @@ FIXED: dict[str, Settings] = {
         "actor.obs_normalization": False,
         "critic.obs_normalization": False,
         "actor.distribution_cfg.init_std": 0.4,
+        "algorithm.action_bounds": "joint_ranges",
         "algorithm.num_atoms": 51,
     },
     "distillation": {

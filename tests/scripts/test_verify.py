@@ -444,7 +444,7 @@ def test_seeds_with_other_flags_are_not_mixed(maker):
 
 
 def test_a_task_that_fails_is_named(empty):
-    with pytest.raises(RuntimeError, match="Training of seed 1 ended with status 2"):
+    with pytest.raises(RuntimeError, match=f"Training of {TASK}, seed 1, ended with status 2"):
         empty.make(seeds=1, flags=["--no-such-flag"])
 
 

@@ -33,7 +33,7 @@ from mjlab.rl.config import RslRlSacAlgorithmCfg
 from mjlab.rl.replay import ReplayStorage
 from mjlab.rl.sac_models import SacActorModel, TwinCriticModel
 from mjlab.rl.schedule import Schedule
-from mjlab.utils.errors import check_field
+from mjlab.utils.errors import UserError, check_field
 from mjlab.utils.memory import check_memory
 
 if TYPE_CHECKING:
@@ -482,7 +482,15 @@ class SAC:
         """Set a setting that `load` restored: weight decay, alpha, or the seed.
 
         Settings with which the algorithm was built, such as learning rates, act already.
+
+        Raises:
+            UserError: bounds of actions, which the policy was trained with.
         """
+        if name == "action_bounds":
+            raise UserError(
+                "--agent.algorithm.action-bounds: expected those that the policy was trained with, got "
+                f"{value!r}; leave it out, or train a new run."
+            )
         if name == "weight_decay":
             for group in self.optimizer.param_groups[:2]:
                 group[name] = float(value)
