@@ -373,6 +373,11 @@ class Comparison:
     """Number of samples until solved. None: not solved."""
 
     @property
+    def has_band(self) -> bool:
+        """True if the reference has two seeds or more."""
+        return bool(self.half[0] < math.inf)
+
+    @property
     def within(self) -> np.ndarray:
         """True where the run is within the band, (P,) bool. False for NaN."""
         return abs(self.values - self.mean) <= self.half
@@ -388,10 +393,10 @@ class Comparison:
     def is_within(self) -> bool:
         """True if the run ends within, and at least half of its points are in the band.
 
-        With two seeds or more, a healthy seed is outside with probability at most `FALSE_ALARMS` = 3 a, for any dependence
-        between the points of a curve: the expected fraction of points outside is a, so the fraction
-        exceeds 1/2 with probability at most 2 a (Markov), and the run ends outside with probability
-        a.
+        With two seeds or more, a healthy seed is outside with probability at most `FALSE_ALARMS` = 3 a,
+        for any dependence between the points of a curve: the expected fraction of points outside is a,
+        so the fraction exceeds 1/2 with probability at most 2 a (Markov), and the run ends outside with
+        probability a.
         """
         return self.ends_within and bool(self.within.mean() >= 0.5)
 

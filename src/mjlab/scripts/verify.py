@@ -163,20 +163,19 @@ def report(reference: Reference, run: RunRecord, comparison: Comparison) -> str:
             (seed.commit for seed in reference.seeds),
         )
     )
-    has_band = len(reference.seeds) > 1
     speeds = [seed.run.steps_per_second for seed in reference.seeds]
     lines = [
         f"Reference  {counted(len(reference.seeds), 'seed')} on {machines}, commit {commits}, {versions}",
         f"Speed      {run.steps_per_second:,.0f} steps/s (collecting and learning); reference "
         f"{min(speeds):,.0f} to {max(speeds):,.0f}",
         "",
-        f"{'samples':>12}  {'mean return':>12}  {'reference':>12}{'  band' if has_band else ''}",
+        f"{'samples':>12}  {'mean return':>12}  {'reference':>12}{'  band' if comparison.has_band else ''}",
     ]
     last = len(comparison.samples) - 1
     for row in range(_ROWS):
         i = round(row * last / (_ROWS - 1))
         middle, half = comparison.mean[i], comparison.half[i]
-        band = f"  [{middle - half:.4g}, {middle + half:.4g}]" if has_band else ""
+        band = f"  [{middle - half:.4g}, {middle + half:.4g}]" if comparison.has_band else ""
         outside = "" if comparison.within[i] else "   outside"
         lines.append(
             f"{comparison.samples[i]:>12,.0f}  {comparison.values[i]:>12.4g}  {middle:>12.4g}{band}{outside}"
@@ -197,7 +196,7 @@ def _draw(reference: Reference, run: RunRecord, comparison: Comparison, output: 
     from mjlab.rl.plot import LABELS, plot_curves
 
     def draw(axes: Axes) -> None:
-        edges = ((-1, "band of a new seed"), (1, None)) if len(curves) > 1 else ()
+        edges = ((-1, "band of a new seed"), (1, None)) if comparison.has_band else ()
         for sign, label in edges:
             edge = comparison.mean + sign * comparison.half
             axes.plot(comparison.samples / 1e6, edge, "--", color="gray", lw=1, label=label)
@@ -245,7 +244,7 @@ def command(argv: list[str], prog: str) -> None:
     print(f"Picture    {_draw(reference, run, comparison, run_dir / 'verify.png')}")
     part = f"{comparison.within.mean():.0%} of the way within the band, "
     often = "At most one healthy seed in twenty is"
-    if len(runs) == 1:
+    if not comparison.has_band:
         part, often = "", "The reference has one seed, so a healthy one may be"
     if run.ended not in DONE:
         print(f"So far     {part}training was {run.ended}: the same command with --resume goes on.")
