@@ -71,7 +71,7 @@ PROFILE = "cpu"
 STUDENT = "student"
 TEACHER = [
     *("Mjlab-Lift-Cube-Yam", "--profile", PROFILE),
-    # Students of one cube reach 72 to 84 % with such teachers, 38 to 51 % with those of mirror images.
+    # Students of one cube reach 72 to 84 % with such teachers, 39 to 51 % with those of mirror images.
     *("--agent.algorithm.symmetry-cfg", "None"),
     *("--agent.annealing", "((280,1.0),(300,0.25))"),
     *("--agent.evaluation.first-iteration", "250"),
@@ -344,6 +344,7 @@ more seed and compares it with these.
 - **Final**: result of `evaluate` for the last policies, on seeds not used in training: the mean over seeds and, in
   brackets, the lowest and the highest end of their 95 % intervals. The table shows the metrics that solve the task;
   the sections show all.
+- Clips may show other policies of a task, such as those of the demo.
 - Curves: mean evaluation returns over seeds, with one sample standard deviation shaded. The last point of a run that
   ended between two evaluations is its final result.
 """

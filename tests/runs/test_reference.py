@@ -205,13 +205,24 @@ def test_where_all_were_solved_a_run_is_to_be_solved_in_time():
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_where_there_is_one_seed_a_run_is_to_be_solved_in_four_times_its_samples(late):
-    solved = run_record(RISING[:10], np.arange(10) + 1.0)
+@pytest.mark.parametrize("ends", [(10,), (7, 10)])
+def test_with_one_or_two_seeds_a_run_is_to_be_solved_in_four_times_their_samples(ends, late):
+    solved = [run_record(RISING[:end], np.arange(end) + 1.0) for end in ends]
     run = dataclasses.replace(
         run_record(np.array(RISING[:10]) - 900.0, np.arange(10) + 1.0),
-        samples=4 * solved.samples + late,
+        samples=4 * solved[-1].samples + late,
     )
-    assert compare([solved], run, 0.1).is_within == (not late)
+    assert compare(solved, run, 0.1).is_within == (not late)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("ends", [(100.0,), (90.0, 110.0)])
+def test_with_one_or_two_unsolved_seeds_a_run_is_to_end_with_half_of_their_return(ends, sign):
+    """For two seeds, Student's t is 38: no run would be outside of a band."""
+    seeds = [run_record([-500.0, sign * end], ended="minutes") for end in ends]
+    for drop, is_within in ((0.49, True), (0.51, False)):
+        run = run_record([-500.0, 100.0 * (sign - drop)], ended="finished")
+        assert compare(seeds, run, 0.1).is_within == is_within
 
 
 @settings(max_examples=60)

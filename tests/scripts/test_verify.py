@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -123,11 +124,11 @@ def verify(run, made, tmp_path):
     return verify
 
 
-def raise_returns(reference: dict) -> None:
+def raise_returns(reference: dict, by: float = 900.0) -> None:
     """Let the reference be of a task with much higher returns."""
     for seed in reference["seeds"]:
         figures = seed["run"]["figures"]
-        figures["mean_return"] = [value + 900.0 for value in figures["mean_return"]]
+        figures["mean_return"] = [value + by for value in figures["mean_return"]]
 
 
 # verify
@@ -190,6 +191,25 @@ def test_with_one_solved_seed_only_being_solved_counts(verify):
     assert "inf" not in outcome.out
 
 
+def test_with_one_unsolved_seed_the_end_counts(verify):
+    def raised_by(returns: float) -> Callable[[dict], None]:
+        def edit(reference: dict) -> None:
+            raise_returns(reference, returns)
+            one_seed(reference)
+
+        return edit
+
+    outcome = verify(edit=raised_by(900.0))
+    assert outcome.status == 1
+    assert (
+        "Verdict    OUTSIDE: its end outside. The reference has fewer than three seeds"
+        in outcome.out
+    )
+    assert "a healthy seed has a mean return of" in outcome.out
+    assert "inf" not in outcome.out
+    assert verify("--resume", edit=raised_by(-900.0)).status == 0
+
+
 @pytest.mark.slow
 def test_an_interrupted_run_is_kept_and_goes_on(verify, tmp_path, monkeypatch):
     with stopped_after(2):
@@ -245,7 +265,6 @@ def one_seed(reference: dict) -> None:
     [
         (("--resume",), None, "expected a run of `verify"),
         (("--device", "gpu"), None, "got 'gpu'"),
-        ((), one_seed, "expected a solved seed or at least 2 seeds, got 1"),
         (
             (),
             lambda reference: reference.update(teacher=["A", "--x"]),

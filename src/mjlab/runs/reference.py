@@ -43,8 +43,12 @@ _EVERY_ITERATION = "Perf/collection_time"
 _POINTS = 60
 # Number of comparison points, equally spaced in samples.
 _GRID = 101
+# Least seeds of a band: for two, t_1 = 38, and the band is wider than all returns.
+_MIN_SEEDS = 3
 # Upper bound of `samples_limit`, in multiples of the slowest seed's samples.
 _MAX_SLOWDOWN = 4.0
+# Largest part of the mean return that a healthy seed lacks in the end, without a band.
+_MAX_DROP = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,14 +315,14 @@ def band(
 
     with probability 1 - a, if seeds are normally distributed. Student's t accounts for the uncertainty
     of s: for n = 3 and a = 1/60, t = 7.6 instead of 2.4 for the normal distribution. Seeds may agree
-    by chance, so s is at least `standard_error`, that of one evaluation. For n = 1, the half width is
+    by chance, so s is at least `standard_error`, that of one evaluation. For n < 3, the half width is
     infinite.
     """
     import numpy as np
 
     values = np.stack([np.interp(at, *curve) for curve in curves])
     mean = values.mean(axis=0)
-    if len(curves) == 1:
+    if len(curves) < _MIN_SEEDS:
         return mean, np.full_like(mean, np.inf)
     deviation = np.maximum(values.std(axis=0, ddof=1), standard_error)
     return mean, _width(len(curves), 1.0 - _TAIL / 2) * deviation
@@ -328,20 +332,21 @@ def samples_limit(runs: Sequence[RunRecord]) -> float | None:
     """Return the upper bound on the samples until a new seed is solved; None unless all `runs` were.
 
     The bound is the upper end of a one-sided prediction interval, as in `band`, for the logarithm of
-    the samples, and at most four times the samples of the slowest seed, which is the bound of a single
-    seed. The deviation is at least the distance between two evaluations.
+    the samples, and at most four times the samples of the slowest seed, which is the bound of one or
+    two seeds. The deviation is at least the distance between two evaluations.
     """
     import numpy as np
 
     if any(run.ended != "solved" for run in runs):
         return None
-    if len(runs) == 1:
-        return _MAX_SLOWDOWN * runs[0].samples
+    most = _MAX_SLOWDOWN * max(run.samples for run in runs)
+    if len(runs) < _MIN_SEEDS:
+        return most
     logarithms = np.log([run.samples for run in runs])
     steps = [1.0 - (run.samples_at[-2:-1] or [0])[0] / run.samples_at[-1] for run in runs]
     deviation = max(logarithms.std(ddof=1), float(np.mean(steps)))
     limit = math.exp(logarithms.mean() + _width(len(runs), 1.0 - _TAIL) * deviation)
-    return min(limit, _MAX_SLOWDOWN * max(run.samples for run in runs))
+    return min(limit, most)
 
 
 def _width(count: int, probability: float) -> float:
@@ -368,13 +373,15 @@ class Comparison:
     half: np.ndarray
     """Half width of the band, (P,)."""
     limit: float | None
-    """Maximum number of samples until solved. None: the run must end in the band."""
+    """Maximum number of samples until solved. None: the run must end in the band, not below `least`."""
+    least: float
+    """Least return in the end. -inf if the reference has a band."""
     solved_at: int | None
     """Number of samples until solved. None: not solved."""
 
     @property
     def has_band(self) -> bool:
-        """True if the reference has two seeds or more."""
+        """True if the reference has three seeds or more."""
         return bool(self.half[0] < math.inf)
 
     @property
@@ -384,16 +391,19 @@ class Comparison:
 
     @property
     def ends_within(self) -> bool:
-        """True if solved within `limit`; for `limit` None, if the last point is in the band."""
+        """True if solved within `limit`; for `limit` None, if the last point is in the band.
+
+        Without a band, if it is not below `least`.
+        """
         if self.limit is None:
-            return bool(self.within[-1])
+            return bool(self.within[-1] and self.values[-1] >= self.least)
         return self.solved_at is not None and self.solved_at <= self.limit
 
     @property
     def is_within(self) -> bool:
         """True if the run ends within, and at least half of its points are in the band.
 
-        With two seeds or more, a healthy seed is outside with probability at most `FALSE_ALARMS` = 3 a,
+        With three seeds or more, a healthy seed is outside with probability at most `FALSE_ALARMS` = 3 a,
         for any dependence between the points of a curve: the expected fraction of points outside is a,
         so the fraction exceeds 1/2 with probability at most 2 a (Markov), and the run ends outside with
         probability a.
@@ -422,5 +432,6 @@ def compare(runs: Sequence[RunRecord], run: RunRecord, standard_error: float) ->
         mean=mean,
         half=half,
         limit=samples_limit(runs),
+        least=-math.inf if len(runs) >= _MIN_SEEDS else float(mean[-1] - _MAX_DROP * abs(mean[-1])),
         solved_at=run.samples if run.ended == "solved" else None,
     )
