@@ -102,7 +102,7 @@ def rl_cfg() -> RslRlOnPolicyRunnerCfg:
     return cfg
 
 
-cpu = cpu_profile(num_steps_per_env=24, desired_kl=0.05, gamma=0.98, max_iterations=1500)
+cpu = cpu_profile(num_steps_per_env=24, gamma=0.98, max_iterations=1500)
 
 register_mjlab_task(TASK, env_cfg=env_cfg, rl_cfg=rl_cfg, profiles={"cpu": cpu})
 

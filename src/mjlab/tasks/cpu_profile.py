@@ -29,7 +29,7 @@ def cpu_profile(
     hidden_dims: tuple[int, ...] = (128, 64),
     init_std: float | None = None,
     entropy_coef: float = 0.01,
-    desired_kl: float = 0.03,
+    desired_kl: float = 0.05,
     gamma: float = 0.97,
     num_epochs: int | None = None,
     max_iterations: int = 2000,

@@ -136,7 +136,6 @@ cpu = cpu_profile(
     num_envs=256,
     num_steps_per_env=12,
     hidden_dims=(64, 64),
-    desired_kl=0.05,
     max_iterations=500,
 )
 """The `cpu` profile of both tasks. `docs/guides/experiments.md` has the experiments."""

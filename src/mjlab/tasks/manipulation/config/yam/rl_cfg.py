@@ -48,6 +48,7 @@ _REACH, _NARROW_REACH = "lift", "lift_narrow"
 _NARROW_STD = 0.04
 _SHARED: dict[str, Any] = {
     "num_steps_per_env": 16,
+    "desired_kl": 0.03,
     "gamma": 0.98,
     "max_iterations": 6000,
     "save_interval": 200,

@@ -97,7 +97,6 @@ cpu = cpu_profile(
     hidden_dims=(256, 128),
     init_std=0.8,
     entropy_coef=0.005,
-    desired_kl=0.05,
     gamma=0.98,
     max_iterations=6000,
     save_interval=200,
