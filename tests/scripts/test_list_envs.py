@@ -17,13 +17,15 @@ def test_all_tasks_are_listed_in_order(run):
     assert list_tasks() == sorted(list_tasks())
 
 
-def test_tasks_with_solved_reference_runs_show_their_minutes(run):
+def test_tasks_with_reference_runs_show_their_minutes(run):
     lines = {line.split()[1]: line for line in run("list_envs").out.splitlines()}
     for task, line in lines.items():
         path = reference_path(DATA, task, "cpu")
-        minutes = Reference.load(path).usual_minutes if path.is_file() else None
-        assert ("min" in line.split()) == (minutes is not None)
-        assert minutes is None or f" {minutes:.1f} min" in line
+        assert ("min" in line.split()) == path.is_file()
+        if path.is_file():
+            minutes = Reference.load(path).usual_minutes
+            said = "not solved in " if minutes is None else f"usually {minutes:.1f} min"
+            assert said in line
     assert Reference.load(reference_path(DATA, "Mjlab-Cartpole-Swingup", "cpu")).usual_minutes
 
 

@@ -39,16 +39,20 @@ def command(argv: list[str], prog: str) -> None:
 
 
 def _usual_time(task: str) -> str:
-    """Return the time until reference runs on a CPU were solved, or an empty string."""
+    """Return the time of reference runs on a CPU, until solved or stopped, or an empty string."""
     from mjlab.runs.reference import DATA, Reference, reference_path
 
     path = reference_path(DATA, task, "cpu")
     reference = Reference.load(path) if path.is_file() else None
-    if reference is None or reference.usual_minutes is None:
+    if reference is None or not reference.seeds:
         return ""
-    cores = reference.seeds[-1].machine["cores"]
+    minutes, said = reference.usual_minutes, "usually"
+    if minutes is None:
+        minutes, said = max(seed.run.seconds for seed in reference.seeds) / 60.0, "not solved in"
     profile = "" if reference.profile is None else f" with {reference.profile}"
-    return f"usually {reference.usual_minutes:.1f} min{profile} on {counted(cores, 'core')}"
+    teacher = ", after its teacher," if reference.teacher else ""
+    cores = counted(reference.seeds[-1].machine["cores"], "core")
+    return f"{said} {minutes:.1f} min{profile}{teacher} on {cores}"
 
 
 def main() -> None:
