@@ -66,6 +66,9 @@ _LIFTING_EASED_SAMPLES = 2_000_000
 _UNCHANGED_LEVELS_SAMPLES = 400_000
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 """Symmetry augmentation function of robots with left and right."""
+# Four units are a motor's full torque. A Go1 on rough ground, seed 2, answered the first steps of an episode with
+# actions of 13, then of 100, and fell: 36 % of 140 within 8 s, 6 % with this bound.
+_MAX_ACTION = 4.0
 _SOLVED = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
 
@@ -239,8 +242,13 @@ def cpu_with_gait(
                 # From 3.0 to 3.2 M. The Go1, seed 1, fell in 22 to 30 % of its episodes before, in 20 to 22 % after.
                 rl_cfg.annealing = ((735, 1.0), (785, 0.25))
 
+    def bound_actions(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
+        if not _is_flat(env_cfg):
+            rl_cfg.clip_actions = _MAX_ACTION
+
     return cpu_profile(
         ease,
+        policy=bound_actions,
         num_envs=_NUM_ENVS,
         num_steps_per_env=8,
         init_std=0.8,
