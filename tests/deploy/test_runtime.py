@@ -68,6 +68,8 @@ def test_pipeline_of_terms_memory_and_clips(tmp_path):
     # Episodes of 20 steps: memory and histories restart.
     assert trace["first"].nonzero()[0].tolist() == [0, 20, 40]
     contract = json.loads((folder / "contract.json").read_text())
+    # The network clips.
+    assert contract["policy"]["clip"] is None
     by_name = {term["name"]: term for term in contract["observations"][0]["terms"]}
     assert by_name["pole_vel"]["noise"]["n_max"] == 1.0
     assert by_name["pole_vel"]["delay"] == [0, 2]

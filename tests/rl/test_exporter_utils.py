@@ -19,6 +19,7 @@ import torch
 from mjlab.rl.exporter_utils import (
     OnnxPolicyError,
     attach_metadata_to_onnx,
+    clips_actions,
     get_base_metadata,
     list_to_csv_str,
     load_onnx_policy,
@@ -126,6 +127,21 @@ def test_the_onnx_policy_computes_what_the_torch_policy_does(make_runner, tmp_pa
             expected = policy({"actor": 3 * rows}).numpy()
         (actual,) = session.run(["actions"], {"obs": (3 * rows).numpy()})
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
+
+
+def test_the_onnx_policy_clips_actions_as_training_does(make_runner, tmp_path: Path):
+    runner, path = make_runner(), tmp_path / "policy.onnx"
+    rows = torch.randn(1, 2, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        free = runner.get_inference_policy()({"actor": rows}).numpy()
+    limit = 0.5 * float(np.abs(free).max())
+    for clip in (None, limit):
+        runner.env.clip_actions = clip
+        runner.export_policy_to_onnx(str(tmp_path), path.name)
+        assert clips_actions(path) == (clip is not None)
+        (actions,) = onnxruntime.InferenceSession(str(path)).run(None, {"obs": rows.numpy()})
+        expected = free if clip is None else free.clip(-clip, clip)
+        np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-6)
 
 
 def test_a_cartpole_run_leaves_a_policy_with_its_metadata(tmp_path: Path):

@@ -24,7 +24,7 @@ def test_tasks_with_reference_runs_show_their_minutes(run):
         assert ("min" in line.split()) == path.is_file()
         if path.is_file():
             minutes = Reference.load(path).usual_minutes
-            said = "not solved in " if minutes is None else f"usually {minutes:.1f} min"
+            said = " solved in " if minutes is None else f"usually {minutes:.1f} min"
             assert said in line
     assert Reference.load(reference_path(DATA, "Mjlab-Cartpole-Swingup", "cpu")).usual_minutes
 

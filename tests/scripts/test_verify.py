@@ -265,6 +265,7 @@ def one_seed(reference: dict) -> None:
     [
         (("--resume",), None, "expected a run of `verify"),
         (("--device", "gpu"), None, "got 'gpu'"),
+        ((), lambda reference: reference.update(seeds=[]), "expected one seed or more, got none"),
         (
             (),
             lambda reference: reference.update(teacher=["A", "--x"]),

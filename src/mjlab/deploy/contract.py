@@ -38,7 +38,7 @@ from mjlab.envs.mdp.actions import (
     JointVelocityAction,
     RelativeJointPositionAction,
 )
-from mjlab.rl.exporter_utils import joint_actuators, joint_gains, shortest
+from mjlab.rl.exporter_utils import clips_actions, joint_actuators, joint_gains, shortest
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
@@ -164,7 +164,7 @@ class Contract:
                 "inputs": self.inputs,
                 "output": "actions",
                 "size": env.action_manager.total_action_dim,
-                "clip": self.nominal.action_clip,
+                "clip": None if clips_actions(self.policy) else self.nominal.action_clip,
             },
             "observations": observations,
             "commands": [

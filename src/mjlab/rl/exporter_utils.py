@@ -44,6 +44,7 @@ import hashlib
 import io
 import logging
 import math
+import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -120,8 +121,13 @@ def export_with_metadata(
     return True
 
 
-def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
+def export_to_onnx(
+    model: Any, path: Path, verbose: bool = False, clip_actions: float | None = None
+) -> None:
     """Write `model`, the result of rsl_rl's `as_onnx`, to `path`, with batch size 1.
+
+    The graph clips actions to [-clip_actions, clip_actions], as the environment does in training, because
+    programs on robots do not.
 
     The graph computes any batch size, because the export with a dynamic batch dimension keeps reshapes
     from fixing it; `OnnxPolicy` reads such a file for any number of environments. The tracing exporter
@@ -130,6 +136,8 @@ def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
     """
     if getattr(model, "obs_dim_1d", None) == 0:
         model = _ImagesOnly(model)
+    if clip_actions is not None:
+        model = _Clipped(model, clip_actions)
     model.to("cpu")
     model.eval()
     memories = _memories(model.input_names, model.output_names)
@@ -165,6 +173,35 @@ def export_to_onnx(model: Any, path: Path, verbose: bool = False) -> None:
     _declare_batch_size(exported.graph, 1)
     exported.metadata_props.add(key=_BATCH_KEY, value=_ANY_BATCH)
     write_atomically(path, exported.SerializeToString())
+
+
+def clips_actions(path: str | os.PathLike[str]) -> bool:
+    """Return True if the graph in `path` clips the actions itself; files of earlier versions do not."""
+    import onnx
+
+    nodes = onnx.load(path).graph.node
+    return any(node.op_type == "Clip" and _ACTIONS in node.output for node in nodes)
+
+
+class _Clipped(torch.nn.Module):
+    """Model whose first output, the actions, is clipped."""
+
+    def __init__(self, model: Any, limit: float) -> None:
+        super().__init__()
+        self.model, self.limit = model, limit
+        self.input_names, self.output_names = model.input_names, model.output_names
+
+    def get_dummy_inputs(self) -> tuple[torch.Tensor, ...]:
+        """Return those of the model."""
+        return self.model.get_dummy_inputs()
+
+    def forward(self, *inputs: torch.Tensor) -> Any:
+        """Return the outputs of the model."""
+        outputs = self.model(*inputs)
+        if isinstance(outputs, torch.Tensor):
+            return outputs.clamp(-self.limit, self.limit)
+        actions, *others = outputs
+        return actions.clamp(-self.limit, self.limit), *others
 
 
 class _ImagesOnly(torch.nn.Module):

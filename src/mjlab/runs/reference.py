@@ -47,8 +47,8 @@ _GRID = 101
 _MIN_SEEDS = 3
 # Upper bound of `samples_limit`, in multiples of the slowest seed's samples.
 _MAX_SLOWDOWN = 4.0
-# Largest part of the mean return that a healthy seed lacks in the end, without a band.
-_MAX_DROP = 0.5
+# What a healthy seed may lack of the mean return in the end, without a band: a share, and standard errors.
+_MAX_DROP, _MAX_ERRORS = 0.5, 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -426,12 +426,13 @@ def compare(runs: Sequence[RunRecord], run: RunRecord, standard_error: float) ->
         end = min(end, curve[0][-1])
     samples = np.linspace(begin, max(begin, end), _GRID)
     mean, half = band(curves, samples, standard_error)
+    drop = max(_MAX_DROP * abs(mean[-1]), _MAX_ERRORS * standard_error)
     return Comparison(
         samples=samples,
         values=np.interp(samples, *curve),
         mean=mean,
         half=half,
         limit=samples_limit(runs),
-        least=-math.inf if len(runs) >= _MIN_SEEDS else float(mean[-1] - _MAX_DROP * abs(mean[-1])),
+        least=-math.inf if len(runs) >= _MIN_SEEDS else float(mean[-1] - drop),
         solved_at=run.samples if run.ended == "solved" else None,
     )

@@ -21,7 +21,7 @@ def command(argv: list[str], prog: str) -> None:
     """Run `list-envs`: exits 0, or 1 if nothing matches."""
     parser = argparse.ArgumentParser(
         prog=prog,
-        description="List the registered tasks, their profiles, and the minutes that training usually takes.",
+        description="List the registered tasks, their profiles, and the minutes of reference runs.",
     )
     parser.add_argument("--keyword", help="show only tasks whose name contains KEYWORD")
     args = parser.parse_args(argv)
@@ -48,7 +48,10 @@ def _usual_time(task: str) -> str:
         return ""
     minutes, said = reference.usual_minutes, "usually"
     if minutes is None:
-        minutes, said = max(seed.run.seconds for seed in reference.seeds) / 60.0, "not solved in"
+        runs = [seed.run for seed in reference.seeds]
+        solved = sum(run.ended == "solved" for run in runs)
+        minutes = max(run.seconds for run in runs) / 60.0
+        said = f"{solved} of {counted(len(runs), 'seed')} solved in"
     profile = "" if reference.profile is None else f" with {reference.profile}"
     teacher = ", after its teacher," if reference.teacher else ""
     cores = counted(reference.seeds[-1].machine["cores"], "core")

@@ -96,6 +96,11 @@ def _prepare(
     cfg = parse_flags(VerifyConfig, VerifyConfig(), flags, f"{prog} {task}")
     reference = load_reference(task, cfg)
     resolve_device(cfg.device)
+    if not reference.seeds:
+        raise UserError(
+            f"The reference of {task}: expected one seed or more, got none; use "
+            f"`make reference TASKS={task}`."
+        )
     if reference.teacher and cfg.teacher_checkpoint is None and not cfg.resume:
         raise UserError(
             f"verify {task}: expected a teacher, got none; use --teacher-checkpoint with a run of "
@@ -124,11 +129,11 @@ def _prepare(
 
 
 def _iterations(reference: Reference) -> int:
-    """Return the iterations until a healthy seed is solved, or those of the shortest run."""
+    """Return the iterations until a healthy seed is solved, or until the first run's last evaluation."""
     runs = [seed.run for seed in reference.seeds]
     limit = samples_limit(runs)
     if limit is None:
-        return min(run.iterations for run in runs)
+        return min(run.samples_at[-1] * run.iterations // run.samples for run in runs)
     return math.ceil(limit * runs[0].iterations / runs[0].samples)
 
 

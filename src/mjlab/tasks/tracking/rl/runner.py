@@ -139,7 +139,8 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             super().export_policy_to_onnx(path, filename, verbose)
             return
         policy = self.alg.get_policy().as_onnx(verbose=verbose)
-        export_to_onnx(PolicyWithReference(policy, motion), Path(path) / filename, verbose)
+        exported = PolicyWithReference(policy, motion)
+        export_to_onnx(exported, Path(path) / filename, verbose, self.env.clip_actions)
 
     def onnx_metadata(self) -> dict[str, Any]:
         """Return the base metadata plus anchor, tracked bodies and motions of the reference."""

@@ -66,7 +66,7 @@ _LIFTING_EASED_SAMPLES = 2_000_000
 _UNCHANGED_LEVELS_SAMPLES = 400_000
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 """Symmetry augmentation function of robots with left and right."""
-# Four units are a motor's full torque. A Go1 on rough ground, seed 2, answered the first steps of an episode with
+# Four units of the stock action scale are a motor's full torque. A Go1 on rough ground, seed 2, answered the first steps of an episode with
 # actions of 13, then of 100, and fell: 36 % of 140 within 8 s, 6 % with this bound.
 _MAX_ACTION = 4.0
 _SOLVED = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
@@ -198,7 +198,8 @@ def cpu_with_gait(
         solved_below: Errors (m/s, rad/s), or their shares of those of a robot that stands still, and
             failure rate below which training stops. None: those of the Go1, with twice the failure rate on
             rough ground. Evaluations start at a training error 4 % above the one of linear velocity.
-            On rough ground, exploration fades after 3 M samples.
+            On rough ground, exploration fades after 3 M samples, and actions are clipped to 4 action scales
+            unless the task has its own `clip_actions`.
         mirror: Symmetry augmentation, as of `cpu_profile`. None for a robot without left and right.
     """
     solved = solved_below or _SOLVED
@@ -243,7 +244,7 @@ def cpu_with_gait(
                 rl_cfg.annealing = ((735, 1.0), (785, 0.25))
 
     def bound_actions(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
-        if not _is_flat(env_cfg):
+        if not _is_flat(env_cfg) and rl_cfg.clip_actions is None:
             rl_cfg.clip_actions = _MAX_ACTION
 
     return cpu_profile(
