@@ -30,6 +30,12 @@ def gaussian_distribution(init_std: float = 1.0) -> dict[str, Any]:
     return {"class_name": "GaussianDistribution", "init_std": init_std, "std_type": "scalar"}
 
 
+def bounded_gaussian(bound: float, init_std: float = 1.0) -> dict[str, Any]:
+    """Return a `distribution_cfg`: as `gaussian_distribution`; mean actions are clipped to [-bound, bound]."""
+    gaussian = gaussian_distribution(init_std)
+    return {**gaussian, "class_name": "mjlab.rl.bounded_gaussian:BoundedGaussian", "bound": bound}
+
+
 def squashed_gaussian(init_std: float = 0.15, log_std_max: float = 0.0) -> dict[str, Any]:
     """Return a `distribution_cfg`: tanh-squashed Gaussian with state-dependent standard deviations."""
     return {

@@ -40,6 +40,7 @@ from mjlab.rl.config import (
     RslRlModelCfg,
     RslRlOnPolicyRunnerCfg,
     RslRlPpoAlgorithmCfg,
+    bounded_gaussian,
     gaussian_distribution,
 )
 from mjlab.rl.learners import with_learner
@@ -66,9 +67,10 @@ _LIFTING_EASED_SAMPLES = 2_000_000
 _UNCHANGED_LEVELS_SAMPLES = 400_000
 MIRROR = "mjlab.tasks.velocity.symmetry:mirror_left_right"
 """Symmetry augmentation function of robots with left and right."""
-# Four units of the stock action scale are a motor's full torque. A Go1 on rough ground, seed 2, answered the first steps of an episode with
-# actions of 13, then of 100, and fell: 36 % of 140 within 8 s, 6 % with this bound.
+# Four units of the stock action scale are a motor's full torque. A Go1 on rough ground, seed 2, answered the
+# first steps of an episode with actions of 13, then of 100, and fell: 36 % of 140 within 8 s, 6 % with this bound.
 _MAX_ACTION = 4.0
+_STD = 0.8
 _SOLVED = {"lin_vel_error": 0.25, "ang_vel_error": 0.35, "failure_rate": 0.05}
 
 
@@ -170,7 +172,7 @@ def cpu_without_gait(
     return cpu_profile(
         ease,
         num_envs=_NUM_ENVS,
-        init_std=0.8,
+        init_std=_STD,
         desired_kl=0.03,
         simple_contacts=True,
         unpushed_samples=2_000_000,
@@ -198,8 +200,7 @@ def cpu_with_gait(
         solved_below: Errors (m/s, rad/s), or their shares of those of a robot that stands still, and
             failure rate below which training stops. None: those of the Go1, with twice the failure rate on
             rough ground. Evaluations start at a training error 4 % above the one of linear velocity.
-            On rough ground, exploration fades after 3 M samples, and actions are clipped to 4 action scales
-            unless the task has its own `clip_actions`.
+            On rough ground, exploration fades after 3 M samples, and the policy acts within 4 action scales.
         mirror: Symmetry augmentation, as of `cpu_profile`. None for a robot without left and right.
     """
     solved = solved_below or _SOLVED
@@ -243,16 +244,16 @@ def cpu_with_gait(
                 # From 3.0 to 3.2 M. The Go1, seed 1, fell in 22 to 30 % of its episodes before, in 20 to 22 % after.
                 rl_cfg.annealing = ((735, 1.0), (785, 0.25))
 
-    def bound_actions(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlBaseRunnerCfg) -> None:
-        if not _is_flat(env_cfg) and rl_cfg.clip_actions is None:
-            rl_cfg.clip_actions = _MAX_ACTION
+    def bound_actions(env_cfg: ManagerBasedRlEnvCfg, rl_cfg: RslRlOnPolicyRunnerCfg) -> None:
+        if not _is_flat(env_cfg):
+            rl_cfg.actor.distribution_cfg = bounded_gaussian(_MAX_ACTION, _STD)
 
     return cpu_profile(
         ease,
         policy=bound_actions,
         num_envs=_NUM_ENVS,
         num_steps_per_env=8,
-        init_std=0.8,
+        init_std=_STD,
         num_epochs=3,
         physics_steps=3,
         simple_contacts=True,
