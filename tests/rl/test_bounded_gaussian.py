@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import onnxruntime
+import pytest
 import torch
 
 from mjlab.rl.config import RslRlModelCfg, bounded_gaussian, gaussian_distribution
-from mjlab.rl.exporter_utils import clips_actions
+from mjlab.rl.exporter_utils import action_limit
 
 BOUND = 1e-3
 
@@ -33,6 +34,6 @@ def test_only_the_policy_that_acts_is_bounded(make_runner, tmp_path: Path):
     assert np.abs(acted[0]).max() > BOUND
     path = tmp_path / "policy.onnx"
     runner.export_policy_to_onnx(str(tmp_path), path.name)
-    assert clips_actions(path)
+    assert action_limit(path) == pytest.approx(BOUND)
     (actions,) = onnxruntime.InferenceSession(str(path)).run(None, {"obs": rows.numpy()})
     np.testing.assert_allclose(actions, acted[1], rtol=0, atol=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 import subprocess
 import sys
@@ -18,8 +19,8 @@ import torch
 
 from mjlab.rl.exporter_utils import (
     OnnxPolicyError,
+    action_limit,
     attach_metadata_to_onnx,
-    clips_actions,
     get_base_metadata,
     list_to_csv_str,
     load_onnx_policy,
@@ -138,7 +139,7 @@ def test_the_onnx_policy_clips_actions_as_training_does(make_runner, tmp_path: P
     for clip in (None, limit):
         runner.env.clip_actions = clip
         runner.export_policy_to_onnx(str(tmp_path), path.name)
-        assert clips_actions(path) == (clip is not None)
+        assert action_limit(path) == pytest.approx(math.inf if clip is None else clip)
         (actions,) = onnxruntime.InferenceSession(str(path)).run(None, {"obs": rows.numpy()})
         expected = free if clip is None else free.clip(-clip, clip)
         np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-6)

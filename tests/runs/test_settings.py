@@ -40,6 +40,21 @@ def test_other_joint_patterns_hold_as_a_whole():
     assert again.events["push_robot"].params["velocity_range"] == {"x": (-1.0, 1.0)}
 
 
+@pytest.mark.parametrize("is_bounded", [True, False])
+def test_a_bound_of_actions_is_kept_as_trained(is_bounded):
+    """Also where the profile has had one since then, or has none any more."""
+    free, bounded = (
+        load_rl_cfg(task, profile="cpu") for task in (GO1, GO1.replace("Flat", "Rough"))
+    )
+    trained, registered = (bounded, free) if is_bounded else (free, bounded)
+    settings = {
+        one.path: one.recorded for one in differences(registered, to_plain(trained), "agent")
+    }
+    again, left_out = apply_settings(registered, settings, "agent")
+    assert left_out == {}
+    assert again.actor.distribution_cfg == trained.actor.distribution_cfg
+
+
 def test_typed_patterns_are_recorded_as_typed():
     flags = ["--env.actions.joint-pos.scale", "{'.*': 0.5}"]
     # A key that begins with a dot, with the registered value.

@@ -38,7 +38,7 @@ from mjlab.envs.mdp.actions import (
     JointVelocityAction,
     RelativeJointPositionAction,
 )
-from mjlab.rl.exporter_utils import clips_actions, joint_actuators, joint_gains, shortest
+from mjlab.rl.exporter_utils import action_limit, joint_actuators, joint_gains, shortest
 from mjlab.utils.lab_api.string import resolve_matching_names_values
 
 if TYPE_CHECKING:
@@ -134,6 +134,14 @@ class Contract:
                 )
             self.measurements.setdefault(measurement.name, measurement)
 
+    @property
+    def _clip(self) -> float | None:
+        """Bound of the actions; None if there is none, or the network has it."""
+        clip = self.nominal.action_clip
+        # The network's is in single precision.
+        has_own = clip is None or action_limit(self.policy) <= np.float32(clip)
+        return None if has_own else clip
+
     def as_dict(self, source: Mapping[str, Any], golden: Mapping[str, Any]) -> dict[str, Any]:
         """Return the contract, with the origin of the policy and a summary of the golden trace."""
         env, entity = self.subject.env, self.subject.entity
@@ -164,7 +172,7 @@ class Contract:
                 "inputs": self.inputs,
                 "output": "actions",
                 "size": env.action_manager.total_action_dim,
-                "clip": None if clips_actions(self.policy) else self.nominal.action_clip,
+                "clip": self._clip,
             },
             "observations": observations,
             "commands": [

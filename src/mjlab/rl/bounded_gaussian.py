@@ -12,9 +12,9 @@ class BoundedGaussian(GaussianDistribution):
     """Gaussian whose mean is clipped to [-bound, bound] wherever the policy acts without exploring.
 
     That is in evaluations, `play` and exported networks. A policy that observes its last action may answer
-    a large one by a larger one, up to a hundred action scales. Training is that of a Gaussian: with
-    exploring actions clipped (`clip_actions`), means drift beyond the bound, where nothing pulls them
-    back, and a Go1 on rough ground tracked its commands a third worse.
+    a large one by a larger one, up to a hundred action scales. PPO trains it as any Gaussian, except for
+    a mirror loss (`use_mirror_loss`), which has no gradient beyond the bound. With exploring actions
+    clipped, too (`clip_actions`), errors of a Go1 on rough ground were 18 to 31 % larger.
     """
 
     def __init__(self, output_dim: int, bound: float, **gaussian: Any) -> None:

@@ -31,7 +31,7 @@ def gaussian_distribution(init_std: float = 1.0) -> dict[str, Any]:
 
 
 def bounded_gaussian(bound: float, init_std: float = 1.0) -> dict[str, Any]:
-    """Return a `distribution_cfg`: as `gaussian_distribution`; mean actions are clipped to [-bound, bound]."""
+    """Return a `distribution_cfg`: Gaussian; without exploration, actions are clipped to [-bound, bound]."""
     gaussian = gaussian_distribution(init_std)
     return {**gaussian, "class_name": "mjlab.rl.bounded_gaussian:BoundedGaussian", "bound": bound}
 

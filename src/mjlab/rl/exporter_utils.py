@@ -175,12 +175,22 @@ def export_to_onnx(
     write_atomically(path, exported.SerializeToString())
 
 
-def clips_actions(path: str | os.PathLike[str]) -> bool:
-    """Return True if the graph in `path` clips the actions itself; files of earlier versions do not."""
+def action_limit(path: str | os.PathLike[str]) -> float:
+    """Return the bound c of the actions of a graph that clips them to [-c, c]; inf without one.
+
+    Files of earlier versions have none.
+    """
     import onnx
 
-    nodes = onnx.load(path).graph.node
-    return any(node.op_type == "Clip" and _ACTIONS in node.output for node in nodes)
+    graph = onnx.load(path).graph
+    values = {tensor.name: tensor for tensor in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Constant":
+            values[node.output[0]] = node.attribute[0].t
+        if node.op_type == "Clip" and _ACTIONS in node.output:
+            low, high = (float(onnx.numpy_helper.to_array(values[name])) for name in node.input[1:])
+            return max(-low, high)
+    return math.inf
 
 
 class _Clipped(torch.nn.Module):

@@ -763,11 +763,13 @@ class MjlabOnPolicyRunner(OnPolicyRunner):
     ) -> None:
         """Write the policy (normalizer, network, deterministic head) to `path`/`filename`.
 
-        Opset 18, batch size 1; input `obs`, output `actions`, clipped to `clip_actions`. Image models have an additional
-        input per image group, by name; recurrent models their hidden state.
+        Opset 18, batch size 1; input `obs`, output `actions`, clipped to `clip_actions`. Image models
+        have an additional input per image group, by name; recurrent models their hidden state.
         """
         model = self.alg.get_policy().as_onnx(verbose=verbose)
-        export_to_onnx(model, Path(path) / filename, verbose, self.env.clip_actions)
+        # Environments of other packages may lack it.
+        limit = getattr(self.env, "clip_actions", None)
+        export_to_onnx(model, Path(path) / filename, verbose, limit)
 
     def export_policy(self, path: str | None = None) -> str | None:
         """Write the policy as ONNX with deployment metadata.

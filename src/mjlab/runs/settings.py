@@ -181,8 +181,7 @@ def apply_settings(cfg: C, settings: Mapping[str, Any], path: str) -> tuple[C, d
         if first != path or not rest or is_of_the_session(name):
             continue
         try:
-            is_file = name == "agent.teacher_checkpoint"
-            is_safe = is_file or _is_import_free(value) or _is_own_network(name, value)
+            is_safe = name == "agent.teacher_checkpoint" or _is_safe(name, value)
             if path == "agent" and not is_safe:
                 raise TypeError("code named by a run is not imported; set it by its flag")
             cfg = _updated(cfg, type(cfg), rest.split("."), value)
@@ -305,18 +304,19 @@ def _typed(value: Any, declared: Any, current: Any) -> Any:
     raise TypeError(f"expected {getattr(declared, '__name__', declared)}, got {value!r}")
 
 
-def _is_import_free(value: Any) -> bool:
+def _is_safe(path: str, value: Any) -> bool:
+    """Return True if nothing in `value` is imported, except networks of this package."""
     if isinstance(value, dict):
-        return all(_is_import_free(item) for item in value.values())
+        return all(_is_safe(f"{path}.{key}", item) for key, item in value.items())
     if isinstance(value, list):
-        return all(_is_import_free(item) for item in value)
-    return not isinstance(value, str) or value.isidentifier()
+        return all(_is_safe(path, item) for item in value)
+    return not isinstance(value, str) or value.isidentifier() or _is_own_network(path, value)
 
 
-def _is_own_network(path: str, value: Any) -> bool:
+def _is_own_network(path: str, value: str) -> bool:
     from torch import nn
 
-    module, _, name = str(value).partition(":")
+    module, _, name = value.partition(":")
     if not path.endswith(".class_name") or not module.startswith("mjlab."):
         return False
     try:

@@ -129,7 +129,7 @@ def _prepare(
 
 
 def _iterations(reference: Reference) -> int:
-    """Return the iterations until a healthy seed is solved, or until the first run's last evaluation."""
+    """Return the iterations until a healthy seed is solved, or until the earliest last evaluation."""
     runs = [seed.run for seed in reference.seeds]
     limit = samples_limit(runs)
     if limit is None:

@@ -63,7 +63,9 @@ def test_given_bounds_hold_on_all_ground(task):
 def test_policies_act_within_bounds_on_rough_ground(task):
     actors = [load_rl_cfg(task, profile="cpu").actor]
     if "blind" in list_profiles(task):
-        actors.append(load_rl_cfg(task, profile="blind").teacher)
+        student = load_rl_cfg(task, profile="blind")
+        actors.append(student.teacher)
+        assert student.clip_actions == 4.0
     for actor in actors:
         # One unit is a quarter of a motor's torque.
         assert actor.distribution_cfg.get("bound") == (4.0 if "Rough" in task else None)

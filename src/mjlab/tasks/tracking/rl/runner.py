@@ -140,7 +140,8 @@ class MotionTrackingOnPolicyRunner(ExportingOnPolicyRunner):
             return
         policy = self.alg.get_policy().as_onnx(verbose=verbose)
         exported = PolicyWithReference(policy, motion)
-        export_to_onnx(exported, Path(path) / filename, verbose, self.env.clip_actions)
+        limit = getattr(self.env, "clip_actions", None)
+        export_to_onnx(exported, Path(path) / filename, verbose, limit)
 
     def onnx_metadata(self) -> dict[str, Any]:
         """Return the base metadata plus anchor, tracked bodies and motions of the reference."""

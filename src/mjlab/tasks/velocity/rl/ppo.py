@@ -190,7 +190,8 @@ def cpu_with_gait(
     """Return the `cpu` profile of a legged robot whose gait is known.
 
     Three physics steps per environment step: with two, the tracking errors on the task are half as
-    large again as in training.
+    large again as in training. On rough ground, exploration fades after 3 M samples, and the policy acts
+    within 4 action scales.
 
     Args:
         groups: Two groups of feet, by their position in the sensor `feet_ground_contact`, that take turns
@@ -200,7 +201,6 @@ def cpu_with_gait(
         solved_below: Errors (m/s, rad/s), or their shares of those of a robot that stands still, and
             failure rate below which training stops. None: those of the Go1, with twice the failure rate on
             rough ground. Evaluations start at a training error 4 % above the one of linear velocity.
-            On rough ground, exploration fades after 3 M samples, and the policy acts within 4 action scales.
         mirror: Symmetry augmentation, as of `cpu_profile`. None for a robot without left and right.
     """
     solved = solved_below or _SOLVED
@@ -295,6 +295,8 @@ def with_blind_student(teacher: Profile) -> Profile:
         rl_cfg.num_steps_per_env = _BLIND_STEPS
         cfg = with_learner(rl_cfg, "distillation")
         cfg.obs_groups["student"] = (_STUDENT,)
+        # Its teacher acts within this bound.
+        cfg.clip_actions = _MAX_ACTION
         return cfg
 
     return Profile(add_student, teacher.easing)
