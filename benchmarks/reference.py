@@ -71,7 +71,7 @@ PROFILE = "cpu"
 STUDENT = "student"
 TEACHER = [
     *("Mjlab-Lift-Cube-Yam", "--profile", PROFILE),
-    # Students of one cube reach 72 to 84 % with such teachers, 39 to 51 % with those of mirror images.
+    # Students of one cube reach 69 to 84 % with such teachers, 39 to 51 % with those of mirror images.
     *("--agent.algorithm.symmetry-cfg", "None"),
     *("--agent.annealing", "((280,1.0),(300,0.25))"),
     *("--agent.evaluation.first-iteration", "250"),

@@ -25,7 +25,6 @@ from mjlab.scripts.demo import DEMOS
 from mjlab.tasks.registry import load_env_cfg
 from mjlab.terrains import (
     BoxInvertedPyramidStairsTerrainCfg,
-    BoxPyramidStairsTerrainCfg,
     SubTerrainCfg,
     TerrainEntityCfg,
     TerrainGeneratorCfg,
@@ -106,14 +105,6 @@ CLIPS = {
         start=0.9, seconds=3.0, body="robot/trunk", lookat=(0.0, 0.0, 0.05), distance=2.0, azimuth=105.0,
         elevation=-14.0,
     ),
-    "go1_rough": Clip(
-        "Mjlab-Velocity-Rough-Unitree-Go1",
-        command={"lin_vel_x": (0.8, 0.8), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
-        terrain=BoxPyramidStairsTerrainCfg(
-            size=(8.0, 8.0), step_height_range=(0.1, 0.1), step_width=0.3, platform_width=2.0
-        ),
-        start=0.6, seconds=3.6, body="robot/trunk", lookat=(0.0, 0.0, 0.6), distance=2.6, azimuth=110.0,
-    ),
     "g1": Clip(
         DEMOS["g1"].task, "cpu", DEMOS["g1"].policy, num_envs=2, spacing=1.2,
         command={"lin_vel_x": (0.8, 0.8), "lin_vel_y": (0.0, 0.0), "ang_vel_z": (0.0, 0.0)},
@@ -132,10 +123,6 @@ CLIPS = {
     "lift": Clip(
         "Mjlab-Lift-Cube-Yam", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0, elevation=-16.0,
         seconds=3.0,
-    ),
-    "color": Clip(
-        "Mjlab-Lift-Cube-Yam-Rgb", "student", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0,
-        elevation=-16.0, seconds=5.0, speed=2.0,
     ),
     "multi_cube": Clip(
         "Mjlab-Multi-Cube-Seg-Yam", "student", lookat=(0.25, 0.0, 0.22), distance=1.2, azimuth=130.0,
