@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mjlab.rl.exporter_utils import action_limit
 from mjlab.scripts import deploy
 
 QUICK = ("--steps", "4")
@@ -54,13 +55,15 @@ def test_a_checkpoint_and_its_export_are_the_same_policy(run, trained, tmp_path)
     np.testing.assert_allclose(*actions, atol=1e-6)
 
 
-def test_settings_of_the_run_are_in_the_contract(run, train, tmp_path):
+def test_settings_of_the_run_are_in_the_bundle(run, train, tmp_path):
     trained = train(tmp_path / "logs", 1, "--env.decimation", "4", "--agent.clip-actions", "2.5")
     outcome = run("deploy", str(trained), "--output", str(tmp_path / "bundle"), *QUICK)
     assert outcome.status == 0, outcome.err
     contract = contract_of(tmp_path / "bundle")
     assert contract["rates"]["decimation"] == 4
-    assert contract["policy"]["clip"] == 2.5
+    # The network clips, so that programs need not.
+    assert contract["policy"]["clip"] is None
+    assert action_limit(tmp_path / "bundle" / "policy.onnx") == 2.5
 
 
 def test_a_signal_leaves_nothing(run, trained, tmp_path, monkeypatch):
